@@ -1,0 +1,3 @@
+"""ShadowHound data logger: a robot's data off the robot, whole and trusted."""
+
+__all__: list[str] = []

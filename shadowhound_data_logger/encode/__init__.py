@@ -1,0 +1,1 @@
+"""Batches of raw messages become objects: one registry from format name to encoder."""

@@ -1,0 +1,72 @@
+"""One tree of errors: each says what happened, carries its data, and names a remedy.
+
+``str(error)`` is one sentence an operator can act on; ``error.data`` is for programs; no error ever holds a secret.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class DataLoggerError(Exception):
+    """Base of everything this package raises on purpose."""
+
+    def __init__(self, message: str, *, remedy: str = '', **data: Any) -> None:
+        super().__init__(message)
+        self.remedy = remedy
+        self.data = data
+
+    def __str__(self) -> str:
+        message = super().__str__()
+        return f'{message} ({self.remedy})' if self.remedy else message
+
+
+class SettingError(DataLoggerError):
+    """A parameter or environment variable is unknown or wrong; ``data`` has name, value and allowed."""
+
+    def __init__(self, name: str, value: object, allowed: str) -> None:
+        super().__init__(f'{name} = {value!r}: allowed is {allowed}', name=name, value=value, allowed=allowed)
+
+
+class NameRefused(DataLoggerError):
+    """A name that would become part of an object key is not safe there."""
+
+
+class Rejected(DataLoggerError):
+    """A message could not be encoded; ``reason`` is the short word under which the ledger counts it."""
+
+    def __init__(self, reason: str, detail: str = '') -> None:
+        super().__init__(f'{reason}: {detail}' if detail else reason, reason=reason)
+        self.reason = reason
+
+
+class SpoolError(DataLoggerError):
+    """The spool cannot be opened or written (another process, no space, no permission)."""
+
+
+class StoreError(DataLoggerError):
+    """Base of what a store reports about a request; the subclass decides what delivery does next."""
+
+
+class StoreUnavailable(StoreError):
+    """Transient: refused, reset, timed out, 5xx, throttled. The same request may succeed later."""
+
+
+class CredentialsRejected(StoreError):
+    """The store refuses the key, the signature or the clock: no object's fault, everything waits."""
+
+
+class BucketMissing(StoreError):
+    """The bucket does not exist and could not be created; its objects wait."""
+
+
+class AccessDenied(StoreError):
+    """The credentials are valid, but not for this object."""
+
+
+class ObjectRefused(StoreError):
+    """Terminal for this object: the store will never take it (bad key, too large, ...)."""
+
+
+class ForeignObject(StoreError):
+    """The key holds other content already; it is never overwritten."""

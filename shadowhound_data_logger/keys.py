@@ -1,0 +1,93 @@
+"""Object keys: templates, uniqueness and safety. A name from outside never becomes part of a key unchecked."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from string import Formatter
+from typing import Final
+
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.errors import NameRefused, SettingError
+
+MAX_KEY_BYTES: Final = 1024
+"""S3's limit on a key; https://docs.aws.amazon.com/AmazonS3/latest/userguide/object-keys.html"""
+MAX_SEGMENT_BYTES: Final = 200
+"""Below the 255 of a file name, with room for ``_NNN`` and ``.part``: the spool's tree is the bucket's."""
+MAX_NAME_BYTES: Final = 64
+"""A robot, sensor or mission type is a word, not a text."""
+
+_NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9_.-]*')
+_SEGMENT = re.compile(r"[A-Za-z0-9!_.*'()=+@-]+")
+_FIELDS: Final = ('robot', 'sensor', 'date', 'time', 'ext')
+
+
+def check_name(name: str, what: str) -> str:
+    """The name unchanged, if it can stand in a key: letters, digits, ``_ - .``, at most 64 bytes, no ``..``.
+
+    Raises NameRefused otherwise; ``what`` says in the error whose name it is.
+    """
+    if not _NAME.fullmatch(name) or '..' in name or len(name.encode()) > MAX_NAME_BYTES:
+        raise NameRefused(
+            f'{what} {name[:80]!r} cannot be part of an object key',
+            remedy=f'use letters, digits, "_", "-" and ".", at most {MAX_NAME_BYTES}, beginning with a letter or digit',
+            name=name,
+        )
+    return name
+
+
+def check_key(key: str) -> str:
+    """The key unchanged, if every S3 server, a Linux file system and a shell can hold it; raises NameRefused."""
+    segments = key.split('/')
+    if len(key.encode()) > MAX_KEY_BYTES:
+        raise NameRefused(f'the key {key[:80]!r}... has more than {MAX_KEY_BYTES} bytes', name=key)
+    for segment in segments:
+        if not _SEGMENT.fullmatch(segment) or segment in {'.', '..'} or len(segment) > MAX_SEGMENT_BYTES:
+            raise NameRefused(f'the key {key[:200]!r} has an unsafe part {segment[:80]!r}', name=key)
+    return key
+
+
+def unique(key: str, attempt: int) -> str:
+    """The ``attempt``-th name of a key: ``a/120000_front.jpg``, then ``a/120000_front_1.jpg``, ``_2``, ..."""
+    if attempt == 0:
+        return key
+    folder, slash, name = key.rpartition('/')
+    stem, dot, extension = name.partition('.')
+    return f'{folder}{slash}{stem}_{attempt}{dot}{extension}'
+
+
+@dataclass(frozen=True, slots=True)
+class KeyTemplate:
+    """A key with ``{robot} {sensor} {date} {time} {ext}`` in it.
+
+    ``{date}`` is YYYYMMDD, ``{time}`` HHMMSS or, where objects can come faster than one a second or on fractions
+    of it, HHMMSS_mmm; both UTC. A template without them would give two objects one name, and is refused.
+    """
+
+    template: str
+
+    @classmethod
+    def parse(cls, template: str, setting: str) -> KeyTemplate:
+        """Raises SettingError naming ``setting``."""
+        allowed = 'a key such as "{robot}/camera/{date}/{time}_front.jpg", with {date} and {time} in it'
+        try:
+            fields = [field for _, field, _, _ in Formatter().parse(template) if field is not None]
+        except ValueError:
+            raise SettingError(setting, template, allowed) from None
+        if not {'date', 'time'} <= set(fields) or not set(fields) <= set(_FIELDS):
+            raise SettingError(setting, template, allowed)
+        if not template.startswith('{robot}/'):
+            raise SettingError(setting, template, 'a key that begins with "{robot}/"')
+        try:
+            cls(template).render(robot='r', sensor='s', stamp_ns=0, period_ns=SECOND, ext='x')
+        except (NameRefused, ValueError, AttributeError, LookupError):
+            raise SettingError(setting, template, allowed) from None
+        return cls(template)
+
+    def render(self, *, robot: str, sensor: str, stamp_ns: int, period_ns: int, ext: str) -> str:
+        """The key of an object that begins at ``stamp_ns``; ``period_ns`` is the least time between two of them."""
+        when = utc(stamp_ns)
+        time = when.strftime('%H%M%S')
+        if period_ns % SECOND or not period_ns:
+            time = f'{time}_{stamp_ns % SECOND // 1_000_000:03d}'
+        return check_key(self.template.format(robot=robot, sensor=sensor, date=when.strftime('%Y%m%d'), time=time, ext=ext))

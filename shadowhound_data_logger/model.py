@@ -1,0 +1,105 @@
+"""The only things that stages exchange: frozen, slotted, without behaviour of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Sample(NamedTuple):
+    """One message as it was taken: its time (D3) and its serialized form (CDR with the 4-byte encapsulation header)."""
+
+    stamp_ns: int
+    cdr: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """The samples of one sensor that become one object; ``samples`` is never empty and of one type."""
+
+    sensor: str
+    topic: str
+    type: str
+    samples: tuple[Sample, ...]
+    size: int
+    """Bytes of CDR in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class DataObject:
+    """A finished object on its way into the spool: where it wants to go, its bytes, and what it is."""
+
+    bucket: str
+    key: str
+    """The wanted key; the spool makes it unique (``_1``, ``_2``, ...)."""
+    body: bytes
+    content_type: str
+    sensor: str
+    topic: str | None
+    """The ROS topic its samples count for in the ledger; None for bookkeeping."""
+    type: str
+    samples: int
+    t_start_ns: int
+    t_end_ns: int
+    priority: int = 5
+    """0 ... 9; 0 is shipped first and evicted last."""
+    protected: bool = False
+    """Never evicted (D9)."""
+    held: str | None = None
+    """Why it has no final name yet; None when it may be shipped."""
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    """Further S3 user metadata: lower-case names, printable ASCII values."""
+
+
+class State(str, Enum):
+    """Where a spooled object is; the value is the ledger's word for it."""
+
+    PENDING = 'pending'
+    HELD = 'held'
+    DELIVERED = 'delivered'
+    EVICTED = 'evicted'
+    QUARANTINED = 'quarantined'
+    DEDUPLICATED = 'deduplicated'
+
+
+@dataclass(frozen=True, slots=True)
+class SpooledObject:
+    """A durable object as the index knows it: its bytes lie at ``path`` until the store confirmed them."""
+
+    id: int
+    bucket: str
+    key: str
+    path: Path
+    size: int
+    sha256: str
+    """Lower-case hex of the content."""
+    content_type: str
+    metadata: Mapping[str, str]
+    """S3 user metadata, ``sha256`` among it."""
+    priority: int
+    created_ns: int
+    attempts: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectInfo:
+    """What a store says of one object that it holds."""
+
+    bucket: str
+    key: str
+    size: int
+    sha256: str | None
+    """From the object's metadata; None where a listing does not tell, or a foreign writer set none."""
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    content_type: str = ''
+
+
+class Put(str, Enum):
+    """How a confirmed put ended."""
+
+    CREATED = 'created'
+    IDENTICAL = 'identical'
+    """The key held the very same content already (an earlier try whose answer was lost): a success."""

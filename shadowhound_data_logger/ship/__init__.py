@@ -1,0 +1,1 @@
+"""Delivery of what is spooled: schedule, retry, upload."""

@@ -1,0 +1,1 @@
+"""A simulated Go2 and an embedded Tower, for the demo and the tests."""

@@ -1,0 +1,1 @@
+"""Disk before network: the durable spool, its index and the ledger."""

@@ -1,0 +1,1 @@
+"""Where objects are kept: S3, a folder, or memory; one Protocol (``base.py``), one conformance suite."""
