@@ -1,0 +1,83 @@
+"""The registry of formats, and the one call that turns a batch into an object. No input makes it raise."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.encode.image import encode_image
+from shadowhound_data_logger.encode.payload import Encoder, Job, Payload, one_message
+from shadowhound_data_logger.encode.pointcloud import encode_cloud
+from shadowhound_data_logger.encode.records import encode_records
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.errors import NameRefused
+from shadowhound_data_logger.keys import KeyTemplate
+from shadowhound_data_logger.model import Batch, DataObject
+
+ENCODERS: Final[Mapping[str, Encoder]] = {
+    'jpeg': one_message(encode_image),
+    'pcd': one_message(encode_cloud),
+    'json': encode_records,
+}
+"""Format name of the settings -> encoder. A new format is one file and one line here (and its name in config.FORMATS)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Encoding:
+    """What became of a batch: ``object.samples`` plus the sum of ``rejected`` is its number of samples."""
+
+    object: DataObject | None
+    """None when no sample could be encoded."""
+    rejected: Mapping[str, int]
+    """Reason -> number of samples that are not in the object."""
+
+
+def encode(batch: Batch, sensor: SensorSettings, robot: str, types: MessageTypes) -> Encoding:
+    """Encode a batch in the sensor's format. Thread-safe; a sample that cannot be encoded is counted, the rest goes on."""
+    rejected: Counter[str] = Counter()
+    payload = ENCODERS[sensor.format](Job(batch, sensor, robot, types), rejected)
+    if payload is None:
+        return Encoding(None, dict(rejected))
+    try:
+        key = KeyTemplate(sensor.key).render(
+            robot=robot,
+            sensor=sensor.name,
+            stamp_ns=payload.kept[0].stamp_ns,
+            period_ns=sensor.period_ns,
+            ext=payload.ext,
+        )
+    except NameRefused:
+        rejected['unsafe_key'] += len(payload.kept)
+        return Encoding(None, dict(rejected))
+    return Encoding(_object(batch, sensor, robot, payload, key), dict(rejected))
+
+
+def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, key: str) -> DataObject:
+    start_ns = min(sample.stamp_ns for sample in payload.kept)
+    end_ns = max(sample.stamp_ns for sample in payload.kept)
+    metadata = {
+        'robot': robot,
+        'sensor': sensor.name,
+        'topic': batch.topic,
+        'type': batch.type,
+        'count': str(len(payload.kept)),
+        't_start_ns': str(start_ns),
+        't_end_ns': str(end_ns),
+    }
+    return DataObject(
+        bucket=sensor.bucket,
+        key=key,
+        body=payload.body,
+        content_type=payload.content_type,
+        sensor=sensor.name,
+        topic=batch.topic,
+        type=batch.type,
+        samples=len(payload.kept),
+        t_start_ns=start_ns,
+        t_end_ns=end_ns,
+        priority=sensor.priority,
+        metadata={**payload.metadata, **metadata},
+    )

@@ -1,0 +1,155 @@
+"""Message definitions by ROS type name, and what they make of CDR bytes, in pure Python (``rosbags``).
+
+Owns the definitions. Whatever the bytes are, only Rejected leaves this module, and no length in them makes it allocate.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable
+from functools import cached_property
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Final
+
+from rosbags.interfaces import Nodetype
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.errors import Rejected
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
+
+HEADER: Final = 'std_msgs/msg/Header'
+PLACEHOLDER: Final = 'structure_needs_at_least_one_member'
+"""The field that rosidl puts into a message without any; it carries nothing."""
+
+_TYPE_NAME = re.compile(r'[A-Za-z]\w*/msg/[A-Za-z]\w*', re.ASCII)
+_STAMP_LE: Final = struct.Struct('<iI')
+_STAMP_BE: Final = struct.Struct('>iI')
+_STAMP_OFFSET: Final = 4
+"""Behind the encapsulation header of CDR, where a message that begins with a std_msgs/msg/Header has its stamp."""
+
+
+def header_stamp_ns(cdr: bytes | memoryview) -> int:
+    """``header.stamp`` in ns of a message whose first field is a std_msgs/msg/Header; 0 where the bytes are too few."""
+    if len(cdr) < _STAMP_OFFSET + _STAMP_LE.size:
+        return 0
+    sec, nanosec = (_STAMP_LE if cdr[1] else _STAMP_BE).unpack_from(cdr, _STAMP_OFFSET)
+    return int(sec) * SECOND + int(nanosec)
+
+
+class MessageTypes:
+    """Definitions by type name (``sensor_msgs/msg/Imu``), read when first asked for, then kept.
+
+    Looked for in ``<prefix>/share/<package>/msg/<Name>.msg`` of each prefix (the entries of AMENT_PREFIX_PATH, in their
+    order), else among the standard messages that ``rosbags`` ships. What was not found once stays unknown for the life
+    of the object. Thread-safe: ``_lock`` guards every change, readers see only what is complete.
+    """
+
+    def __init__(self, prefixes: Iterable[str | Path] = ()) -> None:
+        self._prefixes = tuple(Path(prefix) for prefix in prefixes if str(prefix))
+        self._store = Typestore()
+        self._known: dict[str, Fielddefs] = {}
+        self._unknown: dict[str, str] = {}
+        self._lock = Lock()
+
+    def deserialize(self, type_name: str, cdr: bytes | memoryview) -> Any:
+        """The message as a ``rosbags`` dataclass: numbers, str, lists, numpy arrays that may be views of ``cdr``.
+
+        Text that is no UTF-8 is kept with U+FFFD in place of the bad bytes, as rclpy does.
+        Raises Rejected: ``unknown_type``, or ``malformed`` (truncated, too long, lengths that lie, no CDR at all).
+        """
+        self.fields(type_name)
+        try:
+            try:
+                return self._store.deserialize_cdr(cdr, type_name)
+            except SerdeError as error:
+                if not isinstance(error.__cause__, UnicodeDecodeError):
+                    raise
+                return self._store.deserialize_cdr(_LenientText(cdr), type_name)
+        except SerdeError as error:
+            raise Rejected('malformed', str(error)) from error
+
+    def fields(self, type_name: str) -> Fielddefs:
+        """The fields in order, as (name in the definition, ``rosbags`` description). Raises Rejected: ``unknown_type``."""
+        known = self._known.get(type_name)
+        return self._load(type_name) if known is None else known
+
+    def has_header(self, type_name: str) -> bool:
+        """Whether the message begins with a std_msgs/msg/Header; False where the type is not known."""
+        try:
+            _, description = self.fields(type_name)[0]
+        except Rejected:
+            return False
+        return description == (Nodetype.NAME, HEADER)
+
+    def _load(self, type_name: str) -> Fielddefs:
+        with self._lock:
+            if type_name in self._unknown:
+                raise Rejected('unknown_type', self._unknown[type_name])
+            try:
+                definitions: Typesdict = {}
+                self._collect(type_name, definitions, ())
+                self._store.register(definitions)
+                self._store.get_msgdef(type_name)  # compiled here, under the lock, with all that is nested in it
+            except (LookupError, TypesysError, OSError, UnicodeDecodeError) as error:
+                self._unknown[type_name] = str(error.args[0] if isinstance(error, LookupError) else error)
+                raise Rejected('unknown_type', self._unknown[type_name]) from error
+            self._known[type_name] = self._store.fielddefs[type_name][1]
+            return self._known[type_name]
+
+    def _collect(self, type_name: str, definitions: Typesdict, within: tuple[str, ...]) -> None:
+        """Add the definition of a type and of all it is made of. Raises LookupError with a sentence."""
+        if type_name in within:
+            raise LookupError(f'{type_name} contains itself')
+        if type_name in definitions or type_name in self._store.fielddefs:
+            return
+        definition = self._find(type_name)
+        for _, description in definition[type_name][1]:
+            nested = nested_type(description)
+            if nested is not None:
+                self._collect(nested, definitions, (*within, type_name))
+        definitions.update(definition)
+
+    def _find(self, type_name: str) -> Typesdict:
+        if not _TYPE_NAME.fullmatch(type_name):
+            raise LookupError(f'{type_name!r} is no message type')
+        package, _, name = type_name.split('/')
+        for prefix in self._prefixes:
+            path = prefix / 'share' / package / 'msg' / f'{name}.msg'
+            if path.is_file():
+                return get_types_from_msg(path.read_text(encoding='utf-8'), type_name)
+        if type_name not in self._shipped.fielddefs:
+            raise LookupError(f'no definition of {type_name}: is its package installed and sourced?')
+        return {type_name: self._shipped.fielddefs[type_name]}
+
+    @cached_property
+    def _shipped(self) -> Typestore:
+        """The standard messages of the newest distribution; loaded late because it takes 0.1 s."""
+        return get_typestore(Stores.LATEST)
+
+
+def nested_type(description: FieldDesc) -> str | None:
+    """The type name of a field that is a message, or an array or sequence of them; else None."""
+    if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return nested_type(description[1][0])
+    return description[1] if description[0] == Nodetype.NAME else None
+
+
+class _LenientText(bytes):
+    """CDR whose slices decode to text whatever they hold: ``rosbags`` decodes ``bytes(cdr[start:end])``."""
+
+    def __getitem__(self, where: Any) -> Any:
+        part = super().__getitem__(where)
+        return _LenientText(part) if isinstance(part, bytes) else part
+
+    def __bytes__(self) -> bytes:
+        return self
+
+    def decode(self, encoding: str = 'utf-8', errors: str = 'replace') -> str:
+        return super().decode(encoding, 'replace' if errors == 'strict' else errors)
