@@ -1,0 +1,74 @@
+"""The two judgements every store shares: is a spooled file still what it was, and is what a key holds the same."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from shadowhound_data_logger.errors import ForeignObject, NameRefused, ObjectRefused
+from shadowhound_data_logger.keys import check_key, check_name
+from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+
+CHUNK_BYTES: Final = 1 << 20
+"""Most objects are smaller: they are read, hashed and sent as one piece."""
+
+
+def check_target(bucket: str, key: str) -> None:
+    """Raises ObjectRefused (``data['reason'] == 'name'``) for a bucket or key that no store may be asked for."""
+    try:
+        check_name(bucket, 'the bucket')
+        check_key(key)
+    except NameRefused as error:
+        raise ObjectRefused(str(error), reason='name', bucket=bucket, key=key) from error
+
+
+def chunks(item: SpooledObject) -> Iterator[bytes]:
+    """The file's content in pieces; raises ObjectRefused (``data['reason'] == 'damaged'``) where it is not ``item``'s.
+
+    The verdict comes after the last piece: nothing of it is final before the iterator ended.
+    """
+    digest, size = hashlib.sha256(), 0
+    try:
+        with item.path.open('rb', buffering=0) as file:
+            while size <= item.size and (chunk := file.read(CHUNK_BYTES)):
+                size += len(chunk)
+                digest.update(chunk)
+                yield chunk
+    except FileNotFoundError as error:
+        raise _damaged(item, 'it is gone') from error
+    except OSError as error:
+        raise _damaged(item, f'it cannot be read: {error.strerror}') from error
+    if size != item.size:
+        raise _damaged(item, f'it has not {item.size} bytes')
+    if digest.hexdigest() != item.sha256:
+        raise _damaged(item, 'its SHA-256 is another')
+
+
+def object_metadata(item: SpooledObject) -> dict[str, str]:
+    """What a store keeps beside the content: the object's own metadata, ``sha256`` always among it."""
+    return {**item.metadata, 'sha256': item.sha256}
+
+
+def identical_or_foreign(item: SpooledObject, held: ObjectInfo, content_sha256: Callable[[], str]) -> Put:
+    """Judge a key that is taken: ``Put.IDENTICAL``, or ForeignObject.
+
+    ``content_sha256`` is asked only when the sizes agree and no metadata tells (another program wrote it).
+    """
+    found = held.sha256
+    if held.size == item.size:
+        found = found or content_sha256()
+        if found == item.sha256:
+            return Put.IDENTICAL
+    raise ForeignObject(
+        f'{item.bucket}/{item.key} holds other content already ({held.size} bytes, ours has {item.size})',
+        remedy='it is never overwritten; does a second writer use the same robot name?',
+        bucket=item.bucket, key=item.key, held_size=held.size, held_sha256=found, size=item.size, sha256=item.sha256,
+    )  # fmt: skip
+
+
+def _damaged(item: SpooledObject, detail: str) -> ObjectRefused:
+    return ObjectRefused(
+        f'the spooled file of {item.bucket}/{item.key} is not what was spooled: {detail}',
+        remedy=f'look at {item.path}', reason='damaged', bucket=item.bucket, key=item.key, path=str(item.path),
+    )  # fmt: skip

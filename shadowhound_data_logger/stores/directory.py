@@ -1,0 +1,231 @@
+"""A folder laid out as a bucket store: ``<folder>/<bucket>/<key>``, every object whole, durable and never overwritten.
+
+What S3 keeps as metadata lies beside the buckets in ``<folder>/.metadata/<bucket>/<key>.json``: unlike extended attributes it
+survives ``cp``, ``tar`` and any file system, and unlike a file next to the object it is no object to ``aws s3 sync`` or a glob.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
+from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_target, chunks, identical_or_foreign, object_metadata
+
+METADATA: Final = '.metadata'
+PARTS: Final = '.part'
+"""Unfinished files, on the same file system as the buckets; both names are impossible for a bucket."""
+
+_REFUSED: Final = {errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.EFBIG}
+_DENIED: Final = {errno.EACCES, errno.EPERM}
+_NO_LINKS: Final = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS}
+_FULL: Final = {errno.ENOSPC, errno.EDQUOT}
+
+
+class DirectoryStore:
+    """Objects as files. Several processes may use one folder: ``link(2)`` decides who was first."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+
+    def __repr__(self) -> str:
+        return f'DirectoryStore({str(self._directory)!r})'
+
+    def open(self) -> None:
+        """Nothing to acquire: the folder is made by the first put."""
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def describe(self) -> str:
+        return f'the folder {self._directory}'
+
+    def put(self, item: SpooledObject) -> Put:
+        check_target(item.bucket, item.key)
+        target = self._path(item.bucket, item.key)
+        with self._touching(item.bucket, item.key):
+            if not target.exists():
+                with self._part() as part:
+                    _write(part, chunks(item))
+                    if _appear(part, target):
+                        self._write_metadata(item)
+                        return Put.CREATED
+            if target.is_dir():
+                raise OSError(errno.EISDIR, 'a folder has this name')
+            held = self._info(item.bucket, item.key)
+            end = identical_or_foreign(item, held, lambda: _sha256(target))
+            if held.sha256 is None:  # power was cut between the content and its metadata
+                self._write_metadata(item)
+            return end
+
+    def head(self, bucket: str, key: str) -> ObjectInfo | None:
+        check_target(bucket, key)
+        with self._touching(bucket, key):
+            return self._info(bucket, key) if self._path(bucket, key).is_file() else None
+
+    def get(self, bucket: str, key: str) -> bytes:
+        check_target(bucket, key)
+        with self._touching(bucket, key):
+            try:
+                return self._path(bucket, key).read_bytes()
+            except FileNotFoundError as error:
+                raise ObjectRefused(f'there is no {bucket}/{key}', reason='missing', bucket=bucket, key=key) from error
+
+    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
+        check_target(bucket, 'any')
+        root = self._directory / bucket
+        with self._touching(bucket, prefix):
+            keys = sorted(key for key in _keys(root) if key.startswith(prefix))
+        for key in keys:
+            with self._touching(bucket, key):
+                size = (root / key).stat().st_size
+            yield ObjectInfo(bucket, key, size, None)
+
+    def probe(self) -> None:
+        """Writes and removes a file: a full disk, a missing mount or a read-only one shows here as it does in a put."""
+        with self._touching(), self._part() as part:
+            _write(part, iter((b'probe',)))
+
+    def _path(self, bucket: str, key: str) -> Path:
+        return self._directory / bucket / key
+
+    @contextmanager
+    def _touching(self, bucket: str = '', key: str = '') -> Iterator[None]:
+        """Nothing but a StoreError leaves."""
+        try:
+            yield
+        except OSError as error:
+            raise _translated(error, self._directory, bucket, key) from error
+
+    @contextmanager
+    def _part(self) -> Iterator[Path]:
+        """A name for an unfinished file, which is gone afterwards."""
+        part = self._directory / PARTS / uuid.uuid4().hex
+        part.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield part
+        finally:
+            part.unlink(missing_ok=True)
+
+    def _write_metadata(self, item: SpooledObject) -> None:
+        record = {'content_type': item.content_type, 'metadata': object_metadata(item)}
+        beside = self._beside(item.bucket, item.key)
+        _make_folders(beside.parent)
+        with self._part() as part:
+            _write(part, iter((json.dumps(record).encode(),)))
+            part.replace(beside)
+        _sync_folder(beside.parent)
+
+    def _info(self, bucket: str, key: str) -> ObjectInfo:
+        size = self._path(bucket, key).stat().st_size
+        try:
+            record = json.loads(self._beside(bucket, key).read_bytes())
+        except (FileNotFoundError, ValueError):
+            return ObjectInfo(bucket, key, size, None)
+        metadata = record['metadata']
+        return ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, record['content_type'])
+
+    def _beside(self, bucket: str, key: str) -> Path:
+        return self._directory / METADATA / bucket / f'{key}.json'
+
+
+def _translated(error: OSError, directory: Path, bucket: str, key: str) -> StoreError:
+    """What an error of the file system means for delivery."""
+    data: dict[str, Any] = {'bucket': bucket, 'key': key, 'errno': error.errno}
+    if error.errno in _FULL:
+        return StoreUnavailable(f'no space left in {directory}', remedy='free some space there', **data)
+    if error.errno in _DENIED:
+        remedy = f'may this user write to {directory}?'
+        return AccessDenied(f'no permission for {error.filename or directory}', remedy=remedy, **data)
+    if error.errno in _REFUSED and directory.is_dir():
+        detail = f'{directory} cannot hold {bucket}/{key}: {error.strerror}'
+        return ObjectRefused(detail, reason='name', **data)
+    return StoreUnavailable(f'{directory} cannot be used: {error.strerror}', remedy='is the disk mounted and writable?', **data)
+
+
+def _write(path: Path, content: Iterator[bytes]) -> None:
+    """A new file with this content, on the disk before it returns."""
+    with path.open('xb') as file:
+        for chunk in content:
+            file.write(chunk)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _appear(part: Path, target: Path) -> bool:
+    """Give the whole file its final name for good; False when the name is taken (a bare rename would overwrite it)."""
+    _make_folders(target.parent)
+    try:
+        os.link(part, target)
+    except FileExistsError:
+        return False
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        if not _rename_alone(part, target):
+            return False
+    _sync_folder(target.parent)
+    return True
+
+
+def _rename_alone(part: Path, target: Path) -> bool:
+    """``link`` for exFAT and its kind, which have none: one process at a time looks, then renames."""
+    with part.with_name('rename.lock').open('wb') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if target.exists():
+            return False
+        part.rename(target)
+        return True
+
+
+def _make_folders(folder: Path) -> None:
+    """The folder and its parents, each new one's name on the disk."""
+    missing = [folder]
+    while not missing[-1].parent.exists():
+        missing.append(missing[-1].parent)
+    for path in reversed(missing):
+        try:
+            path.mkdir()
+        except FileExistsError:
+            if not path.is_dir():
+                raise OSError(errno.ENOTDIR, 'a part of the key is an object') from None
+        else:
+            _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open('rb', buffering=0) as file:
+        while chunk := file.read(CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def _keys(root: Path) -> Iterator[str]:
+    """The keys of a bucket, in no order; none when there is no such bucket."""
+    if not root.exists():
+        return
+    for folder, _, names in os.walk(root, onerror=_raise):
+        prefix = Path(folder).relative_to(root)
+        yield from (str(prefix / name) for name in names)
+
+
+def _raise(error: OSError) -> None:
+    raise error

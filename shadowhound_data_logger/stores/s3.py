@@ -1,0 +1,187 @@
+"""An S3 server as a store.
+
+Guarantees: a put is one PUT with ``If-None-Match: *``, a CRC32 that the server verifies and ``sha256`` as metadata, and whether
+the server honours the condition is proved before it is relied on: MinIO before 2024 and some others ignore it and overwrite.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import logging
+import threading
+import time
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import Enum
+from typing import IO, Final
+
+from shadowhound_data_logger.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.stores.content import check_target, chunks, identical_or_foreign
+from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
+
+STREAM_BYTES: Final = 64 << 20
+"""Larger objects are read twice from the disk (hash, send) instead of once into memory."""
+BUCKET_PAUSE_S: Final = 10.0
+"""A bucket that could not be created is not asked for again sooner: each of its objects would ask."""
+
+_log = logging.getLogger(__name__)
+
+
+class _Condition(Enum):
+    """What is known of this server and ``If-None-Match: *``."""
+
+    UNPROVED = 'unproved'
+    HONOURED = 'honoured'
+    IGNORED = 'ignored'
+
+
+class S3Store:
+    """``_lock`` guards what was learnt of the server: ``_condition``, and which buckets it refused to create."""
+
+    def __init__(self, settings: StoreSettings, upload: UploadSettings) -> None:
+        self._s3 = S3Requests(settings, upload)
+        self._lock = threading.Lock()
+        self._condition = _Condition.UNPROVED
+        self._refused: dict[str, tuple[float, BucketMissing]] = {}
+
+    def __repr__(self) -> str:
+        return f'S3Store({self._s3.endpoint!r})'
+
+    def open(self) -> None:
+        """Raises SettingError for an endpoint no request can be sent to, or a botocore that is too old."""
+        self._s3.open()
+
+    def close(self) -> None:
+        self._s3.close()
+
+    def describe(self) -> str:
+        return f'the S3 server at {self._s3.endpoint}'
+
+    def put(self, item: SpooledObject) -> Put:
+        check_target(item.bucket, item.key)
+        with _verified(item) as (body, crc32):
+            try:
+                return self._put(item, body, crc32)
+            except BucketMissing as error:
+                self._create_bucket(item.bucket, error)
+                return self._put(item, body, crc32)
+
+    def head(self, bucket: str, key: str) -> ObjectInfo | None:
+        check_target(bucket, key)
+        return self._s3.head(bucket, key)
+
+    def get(self, bucket: str, key: str) -> bytes:
+        check_target(bucket, key)
+        return b''.join(self._s3.content(bucket, key))
+
+    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
+        check_target(bucket, 'any')
+        yield from sorted(self._s3.list(bucket, prefix), key=lambda info: info.key)
+
+    def probe(self) -> None:
+        self._s3.probe()
+
+    def _put(self, item: SpooledObject, body: bytes | IO[bytes], crc32: str) -> Put:
+        """One confirmed put; it looks before it leaps as long as the server's word on the condition is not proved."""
+        if self._condition is not _Condition.HONOURED:
+            held = self._look(item)
+            if held is not None:
+                return self._judge(item, held)
+        conditional = self._condition is not _Condition.IGNORED
+        sent = self._s3.put(item, body, crc32, conditional=conditional)
+        if sent is Sent.NOT_IMPLEMENTED:
+            self._learn(_Condition.IGNORED, 'does not know')
+            self._s3.put(item, body, crc32, conditional=False)
+        elif sent is Sent.TAKEN:
+            self._learn(_Condition.HONOURED)
+            return self._judge(item, self._s3.head(item.bucket, item.key))
+        elif self._condition is _Condition.UNPROVED:
+            self._prove(item, body, crc32)
+        return Put.CREATED
+
+    def _look(self, item: SpooledObject) -> ObjectInfo | None:
+        try:
+            return self._s3.head(item.bucket, item.key)
+        except AccessDenied:
+            if self._condition is _Condition.IGNORED:  # without a look it could overwrite
+                raise
+            return None  # credentials that may write only: the server has to judge
+
+    def _prove(self, item: SpooledObject, body: bytes | IO[bytes], crc32: str) -> None:
+        """Put the very same content once more: a server that takes it would have taken other content as well."""
+        try:
+            sent = self._s3.put(item, body, crc32, conditional=True)
+        except StoreUnavailable as error:  # the put itself is confirmed; the next one will prove it
+            _log.debug('the condition is not proved yet: %s', error)
+            return
+        if sent is Sent.TAKEN:
+            self._learn(_Condition.HONOURED)
+        else:
+            self._learn(_Condition.IGNORED, 'ignores')
+
+    def _learn(self, condition: _Condition, how: str = '') -> None:
+        with self._lock:
+            known = self._condition
+            self._condition = condition
+        if condition is _Condition.IGNORED and known is not condition:
+            _log.warning(
+                'Tower at %s %s If-None-Match: each put looks first now, which is slower and does not see a second writer in '
+                'the same instant (update the S3 server: MinIO of 2024 or later, SeaweedFS)', self._s3.endpoint, how,
+            )  # fmt: skip
+
+    def _judge(self, item: SpooledObject, held: ObjectInfo | None) -> Put:
+        if held is not None:
+            if held.sha256 is None:  # nobody of ours wrote it: be sure that it is an S3 server that says so
+                self._s3.probe()
+            return identical_or_foreign(item, held, lambda: self._sha256(item))
+        what = f'{item.bucket}/{item.key} on {self._s3.endpoint}'
+        where = {'endpoint': self._s3.endpoint, 'bucket': item.bucket, 'key': item.key}
+        if next(self._s3.list(item.bucket, f'{item.key}/'), None):  # SeaweedFS answers 412 to the name of a folder
+            raise ObjectRefused(f'{what} is a folder', **where, reason='name')
+        raise StoreUnavailable(f'{what} was there and is gone again', **where)
+
+    def _sha256(self, item: SpooledObject) -> str:
+        digest = hashlib.sha256()
+        for chunk in self._s3.content(item.bucket, item.key):
+            digest.update(chunk)
+        return digest.hexdigest()
+
+    def _create_bucket(self, bucket: str, missing: BucketMissing) -> None:
+        """Returns when the bucket is there; raises BucketMissing, without asking again for some seconds."""
+        with self._lock:
+            since, refusal = self._refused.get(bucket, (float('-inf'), missing))
+        if time.monotonic() - since < BUCKET_PAUSE_S:
+            raise refusal
+        try:
+            self._s3.create_bucket(bucket)
+        except (AccessDenied, ObjectRefused) as error:
+            refusal = BucketMissing(
+                f'there is no bucket {bucket} on Tower at {self._s3.endpoint}, and these credentials may not create it',
+                remedy=missing.remedy, **missing.data,
+            )  # fmt: skip
+            with self._lock:
+                self._refused[bucket] = (time.monotonic(), refusal)
+            raise refusal from error
+        _log.info('created the bucket %s on %s', bucket, self._s3.endpoint)
+
+
+@contextmanager
+def _verified(item: SpooledObject) -> Iterator[tuple[bytes | IO[bytes], str]]:
+    """The content, checked against ``item``, and its CRC32 as S3 writes it (base64 of four big-endian bytes)."""
+    if item.size <= STREAM_BYTES:
+        body = b''.join(chunks(item))
+        yield body, _base64(zlib.crc32(body))
+        return
+    crc32 = 0
+    for chunk in chunks(item):
+        crc32 = zlib.crc32(chunk, crc32)
+    with item.path.open('rb') as file:
+        yield file, _base64(crc32)
+
+
+def _base64(crc32: int) -> str:
+    return base64.b64encode(crc32.to_bytes(4, 'big')).decode('ascii')

@@ -1,0 +1,208 @@
+"""What an S3 client's failure means for delivery, in one table: the error class, words for the operator, and a remedy.
+
+Codes: https://docs.aws.amazon.com/AmazonS3/latest/API/ErrorResponses.html, and MinIO's ``cmd/api-errors.go`` for ``XMinio...``,
+``SlowDownWrite``, ``InvalidTokenId``. No message repeats a request, so none can hold a secret.
+"""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from botocore import exceptions as boto
+from botocore.parsers import ResponseParserError
+
+from shadowhound_data_logger.errors import (
+    AccessDenied,
+    BucketMissing,
+    CredentialsRejected,
+    ObjectRefused,
+    StoreError,
+    StoreUnavailable,
+)
+
+REQUEST_ERRORS: Final = (boto.BotoCoreError, boto.ClientError, ResponseParserError, OSError)
+"""Everything a request through botocore can raise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What was asked of whom: the nouns of an error message."""
+
+    endpoint: str
+    """URL without credentials."""
+    bucket: str = ''
+    key: str = ''
+    connect_timeout_s: float = 0.0
+    read_timeout_s: float = 0.0
+
+
+_Row = tuple[type[StoreError], str, str]
+
+_KEYS = 'check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY'
+_SESSION = 'check AWS_SESSION_TOKEN; a server of your own needs none'
+_CLOCK = 'set the clock of this machine and of Tower: `timedatectl` on both'
+_REGION = 'set AWS_DEFAULT_REGION to the region of the server'
+_NAME = 'the object waits in quarantine; rename it there'
+_WIRE = 'it is sent again; if it goes on, suspect memory or the network'
+_AGAIN = 'it is tried again'
+_POLICY = 'the key pair is valid; give it s3:PutObject and s3:GetObject on {bucket}'
+_SPACE = 'make room on Tower'
+_BUCKET = 'create it (`aws --endpoint-url {endpoint} s3 mb s3://{bucket}`), or let these credentials create buckets'
+_NOT_S3 = 'is this the port of the S3 server? `curl -i {endpoint}`'
+
+_CODES: Final[dict[str, _Row]] = {
+    'InvalidAccessKeyId': (CredentialsRejected, 'Tower at {endpoint} does not know the access key id', _KEYS),
+    'SignatureDoesNotMatch': (CredentialsRejected, 'Tower at {endpoint} refuses the signature: the secret key is wrong', _KEYS),
+    'AuthorizationHeaderMalformed': (CredentialsRejected, 'Tower at {endpoint} refuses the signature: another region', _REGION),
+    'InvalidRegion': (CredentialsRejected, 'Tower at {endpoint} refuses the region', _REGION),
+    'PermanentRedirect': (StoreUnavailable, 'Tower at {endpoint} has {bucket} in another region', _REGION),
+    'TemporaryRedirect': (StoreUnavailable, 'Tower at {endpoint} has {bucket} in another region', _REGION),
+    'IllegalLocationConstraintException': (StoreUnavailable, 'Tower at {endpoint} has {bucket} in another region', _REGION),
+    'ExpiredToken': (CredentialsRejected, 'the session token for {endpoint} has expired', _SESSION),
+    'InvalidToken': (CredentialsRejected, 'Tower at {endpoint} refuses the session token', _SESSION),
+    'InvalidTokenId': (CredentialsRejected, 'Tower at {endpoint} refuses the session token', _SESSION),
+    'InvalidSecurity': (CredentialsRejected, 'Tower at {endpoint} refuses the credentials', _KEYS),
+    'AccountProblem': (CredentialsRejected, 'Tower at {endpoint} has closed the account', _KEYS),
+    'NotSignedUp': (CredentialsRejected, 'Tower at {endpoint} has no such account', _KEYS),
+    'RequestTimeTooSkewed': (CredentialsRejected, 'the clocks of this machine and of {endpoint} differ too much', _CLOCK),
+    'RequestExpired': (CredentialsRejected, 'the clocks of this machine and of {endpoint} differ too much', _CLOCK),
+    'AccessDenied': (AccessDenied, 'Tower at {endpoint} denies these credentials {bucket}/{key}', _POLICY),
+    'AllAccessDisabled': (AccessDenied, 'Tower at {endpoint} denies everyone {bucket}/{key}', _POLICY),
+    'NoSuchBucket': (BucketMissing, 'there is no bucket {bucket} on Tower at {endpoint}', _BUCKET),
+    'InvalidBucketName': (BucketMissing, 'Tower at {endpoint} allows no bucket of the name {bucket}',
+                          'use 3 to 63 lower-case letters, digits and "-"'),
+    'NoSuchKey': (ObjectRefused, 'there is no {bucket}/{key} on Tower at {endpoint}', ''),
+    'KeyTooLongError': (ObjectRefused, 'the key {key:.80} is too long for Tower at {endpoint}', _NAME),
+    'InvalidObjectName': (ObjectRefused, 'Tower at {endpoint} allows no object of the name {key}', _NAME),
+    'XMinioInvalidObjectName': (ObjectRefused, 'Tower at {endpoint} allows no object of the name {key}', _NAME),
+    'XMinioObjectExistsAsDirectory': (ObjectRefused, 'Tower at {endpoint} has a folder of the name {bucket}/{key}', _NAME),
+    'XMinioParentIsObject': (ObjectRefused, 'a folder of {bucket}/{key} is an object on Tower at {endpoint}', _NAME),
+    'EntityTooLarge': (ObjectRefused, '{bucket}/{key} is too large for Tower at {endpoint}', ''),
+    'InvalidArgument': (ObjectRefused, 'Tower at {endpoint} refuses a property of {bucket}/{key}', ''),
+    'BadDigest': (StoreUnavailable, '{bucket}/{key} was damaged on its way to {endpoint}', _WIRE),
+    'InvalidDigest': (StoreUnavailable, '{bucket}/{key} was damaged on its way to {endpoint}', _WIRE),
+    'XAmzContentChecksumMismatch': (StoreUnavailable, '{bucket}/{key} was damaged on its way to {endpoint}', _WIRE),
+    'XAmzContentSHA256Mismatch': (StoreUnavailable, '{bucket}/{key} was damaged on its way to {endpoint}', _WIRE),
+    'IncompleteBody': (StoreUnavailable, '{bucket}/{key} reached {endpoint} incompletely', _WIRE),
+    'RequestTimeout': (StoreUnavailable, 'Tower at {endpoint} gave up waiting for the rest of {bucket}/{key}', _AGAIN),
+    'SlowDown': (StoreUnavailable, 'Tower at {endpoint} is overloaded ({status} {code})', _AGAIN),
+    'SlowDownRead': (StoreUnavailable, 'Tower at {endpoint} is overloaded ({status} {code})', _AGAIN),
+    'SlowDownWrite': (StoreUnavailable, 'Tower at {endpoint} is overloaded ({status} {code})', _AGAIN),
+    'TooManyRequests': (StoreUnavailable, 'Tower at {endpoint} is overloaded ({status} {code})', _AGAIN),
+    'ConditionalRequestConflict': (StoreUnavailable, 'another put of {bucket}/{key} is under way on {endpoint}', _AGAIN),
+    'OperationAborted': (StoreUnavailable, 'another request for {bucket} is under way on {endpoint}', _AGAIN),
+    'XMinioStorageFull': (StoreUnavailable, 'the disk of Tower at {endpoint} is full', _SPACE),
+    'XMinioAdminBucketQuotaExceeded': (StoreUnavailable, 'the quota of bucket {bucket} on {endpoint} is used up', _SPACE),
+    'XMinioBackendDown': (StoreUnavailable, 'the storage behind Tower at {endpoint} is down', 'look at the log of the server'),
+    'XMinioInsecureClientRequest': (StoreUnavailable, 'Tower at {endpoint} wants TLS', 'use https:// in AWS_ENDPOINT_URL'),
+}  # fmt: skip
+
+_NO_KEYS: Final = (boto.NoCredentialsError, boto.PartialCredentialsError, boto.CredentialRetrievalError, boto.NoAuthTokenError)
+_BROKEN: Final = (boto.ConnectionClosedError, boto.ResponseStreamingError, boto.IncompleteReadError, ConnectionResetError)
+
+_FAILURES: Final[tuple[tuple[type[BaseException] | tuple[type[BaseException], ...], _Row], ...]] = (
+    (_NO_KEYS, (CredentialsRejected, 'there are no credentials for Tower at {endpoint}',
+                'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY')),
+    (boto.ParamValidationError, (ObjectRefused,
+                                 'no S3 request can carry {bucket}/{key}: its metadata or type is no plain text', '')),
+    (ResponseParserError, (StoreUnavailable, '{endpoint} does not answer like an S3 server', _NOT_S3)),
+    (ssl.SSLCertVerificationError, (StoreUnavailable, 'the certificate of Tower at {endpoint} is not trusted',
+                                    'set AWS_CA_BUNDLE to the certificate of the authority that signed it')),
+    (boto.SSLError, (StoreUnavailable, 'no TLS connection to Tower at {endpoint}',
+                     'does the server speak TLS there? else use http:// in AWS_ENDPOINT_URL')),
+    (boto.ProxyConnectionError, (StoreUnavailable, 'the proxy to {endpoint} cannot be reached', 'add Tower to NO_PROXY')),
+    (boto.ConnectTimeoutError, (StoreUnavailable, 'no connection to Tower at {endpoint} within {connect_timeout_s:g} s',
+                                'is Tower on, and the WiFi?')),
+    (boto.ReadTimeoutError, (StoreUnavailable, 'Tower at {endpoint} gave no answer within {read_timeout_s:g} s',
+                             'does the server hang? look at its log')),
+    (ConnectionRefusedError, (StoreUnavailable, 'Tower at {endpoint} refused the connection',
+                              'is the S3 server running? `curl -i {endpoint}`')),
+    (socket.gaierror, (StoreUnavailable, 'the name of Tower at {endpoint} cannot be resolved',
+                       'use its IP address in AWS_ENDPOINT_URL')),
+    (_BROKEN, (StoreUnavailable, 'Tower at {endpoint} broke the connection off', _AGAIN)),
+)  # fmt: skip
+"""Failures without an answer; the first row of which the error or one of its causes is an instance."""
+
+
+def classify(error: Exception, request: Request) -> StoreError:
+    """The error of our tree for one of ``REQUEST_ERRORS``; transient or terminal is decided here and nowhere else.
+
+    What is not known is StoreUnavailable: an object that waits is better than one in quarantine for a fault not its own.
+    """
+    if isinstance(error, boto.ClientError):
+        return _answered(error, request)
+    kind, message, remedy = _unanswered(error)
+    return _error(kind, message, remedy, request, code=type(error).__name__)
+
+
+def public_url(url: str) -> str:
+    """The URL without a user name or password that somebody put into it."""
+    parts = urlsplit(url)
+    return parts._replace(netloc=parts.netloc.rpartition('@')[2]).geturl()
+
+
+def code_of(error: boto.ClientError) -> str:
+    """The S3 error code; the HTTP status as text where the answer had no S3 body."""
+    code: str = error.response.get('Error', {}).get('Code', '')
+    return code or str(status_of(error))
+
+
+def status_of(error: boto.ClientError) -> int:
+    """The HTTP status, 0 where there is none."""
+    return error.response.get('ResponseMetadata', {}).get('HTTPStatusCode', 0)
+
+
+def _answered(error: boto.ClientError, request: Request) -> StoreError:
+    code, status = code_of(error), status_of(error)
+    row = _CODES.get(code)
+    if row is None and (status >= 500 or status in {408, 409, 425, 429, 499}):
+        row = (StoreUnavailable, 'Tower at {endpoint} answers with a server error ({status} {code})', 'look at its log')
+    elif row is None and not code.isdigit() and status in {401, 403}:
+        row = (AccessDenied, 'Tower at {endpoint} denies these credentials {bucket}/{key} ({code})', _POLICY)
+    elif row is None and not code.isdigit() and status >= 400:
+        row = (ObjectRefused, 'Tower at {endpoint} refuses {bucket}/{key} ({status} {code}: {detail})', '')
+    elif row is None and status == 403 and error.operation_name == 'HeadObject':
+        row = _CODES['AccessDenied']
+    elif row is None:  # a captive portal, a proxy, a web server on this port: nobody's object is at fault
+        row = (StoreUnavailable, '{endpoint} does not answer like an S3 server ({status} without an S3 error)', _NOT_S3)
+    detail = str(error.response.get('Error', {}).get('Message', ''))[:200]
+    return _error(*row, request, code=detail if code.isdigit() else code, status=status, detail=detail)
+
+
+def _unanswered(error: Exception) -> _Row:
+    if isinstance(error, boto.ParamValidationError) and 'nvalid bucket name' in str(error):
+        return _CODES['InvalidBucketName']
+    causes = tuple(_causes(error))
+    for kinds, row in _FAILURES:
+        if any(isinstance(cause, kinds) for cause in causes):
+            return row
+    reason = next((cause.strerror for cause in reversed(causes) if isinstance(cause, OSError) and cause.strerror), '')
+    reason = reason or type(error).__name__
+    return StoreUnavailable, f'Tower at {{endpoint}} cannot be reached: {reason}', 'is the WiFi connected?'
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    """What led to the error, the first cause last; urllib3 hides some in ``args`` and botocore in ``kwargs``."""
+    seen: list[BaseException | None] = [None]
+    waiting: list[Any] = [error]
+    while waiting:
+        cause = waiting.pop(0)
+        if isinstance(cause, BaseException) and cause not in seen:
+            seen.append(cause)
+            yield cause
+            inner = getattr(cause, 'kwargs', {})
+            waiting += [*cause.args, getattr(cause, 'reason', None), cause.__cause__, cause.__context__, inner.get('error')]
+
+
+def _error(kind: type[StoreError], message: str, remedy: str, request: Request, **data: Any) -> StoreError:
+    nouns = {
+        'endpoint': request.endpoint, 'bucket': request.bucket, 'key': request.key,
+        'connect_timeout_s': request.connect_timeout_s, 'read_timeout_s': request.read_timeout_s, **data,
+    }  # fmt: skip
+    facts = {'endpoint': request.endpoint, 'bucket': request.bucket, 'key': request.key, 'reason': data['code'], **data}
+    return kind(message.format(**nouns), remedy=remedy.format(**nouns), **facts)

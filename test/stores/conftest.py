@@ -1,0 +1,56 @@
+"""Every store behind one fixture, and objects to put into it."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from moto.server import ThreadedMotoServer
+from stores.spooled import QUICK, Spool
+
+from shadowhound_data_logger.config import StoreSettings
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.memory import MemoryStore
+
+STORES = ('memory', 'directory', 'moto', pytest.param('seaweed', marks=pytest.mark.seaweedfs))
+
+
+@pytest.fixture
+def bucket() -> str:
+    """A bucket that does not exist yet."""
+    return f'bucket-{uuid.uuid4().hex[:12]}'
+
+
+@pytest.fixture
+def spool(tmp_path: Path, bucket: str) -> Spool:
+    """Makes spooled objects, for ``bucket`` unless told otherwise."""
+    return Spool(tmp_path, bucket)
+
+
+@pytest.fixture(scope='session')
+def moto() -> Iterator[StoreSettings]:
+    """A moto server, over real HTTP."""
+    server = ThreadedMotoServer(ip_address='127.0.0.1', port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield StoreSettings(endpoint_url=f'http://{host}:{port}', access_key_id='any', secret_access_key='any')
+    server.stop()
+
+
+@pytest.fixture(params=STORES)
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ObjectStore]:
+    """Each store, open."""
+    opened: ObjectStore = MemoryStore()
+    if request.param == 'directory':
+        opened = open_store(StoreSettings(directory=tmp_path / 'store'), QUICK)
+    elif request.param == 'moto':
+        opened = open_store(request.getfixturevalue('moto'), QUICK)
+    elif request.param == 'seaweed':
+        tower: Tower = request.getfixturevalue('seaweed')
+        opened = open_store(tower.store_settings(), QUICK)
+    yield opened
+    opened.close()

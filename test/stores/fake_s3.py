@@ -1,0 +1,182 @@
+"""A small S3 look-alike over HTTP whose faults are set by hand, and sockets that behave badly."""
+
+from __future__ import annotations
+
+import hashlib
+import socket
+import ssl
+import struct
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from urllib.parse import unquote, urlsplit
+
+
+class FakeS3(ThreadingHTTPServer):
+    """Holds objects; ``condition`` is what it does with If-None-Match; an ``answer`` is given to everything."""
+
+    daemon_threads = True
+
+    def __init__(
+        self, *, condition: str = 'honoured', answer: tuple[int, bytes] | None = None, without_buckets: bool = False
+    ) -> None:
+        super().__init__(('127.0.0.1', 0), _Handler)
+        self.condition = condition
+        self.answer = answer
+        self.without_buckets = without_buckets
+        self.creations = 0
+        """How often a bucket was to be created, which is denied where there are to be none."""
+        self.forbid_head = False
+        self.objects: dict[str, tuple[bytes, dict[str, str]]] = {}
+        self.requests: list[str] = []
+        """Methods, in order."""
+
+    @property
+    def url(self) -> str:
+        return f'http://127.0.0.1:{self.server_port}'
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = 'HTTP/1.1'
+    server: FakeS3
+
+    def do_PUT(self) -> None:
+        body = self.rfile.read(int(self.headers.get('Content-Length') or 0))
+        if self._told():
+            return
+        key = unquote(urlsplit(self.path).path)
+        if self.server.without_buckets:
+            creation = key.count('/') == 1
+            self.server.creations += creation
+            self._answer(*((403, error('AccessDenied')) if creation else (404, error('NoSuchBucket'))))
+            return
+        if self.headers.get('If-None-Match'):
+            if self.server.condition == 'not implemented':
+                self._answer(501, error('NotImplemented', 'A header you provided implies functionality'))
+                return
+            if self.server.condition == 'honoured' and key in self.server.objects:
+                self._answer(412, error('PreconditionFailed'))
+                return
+        kept = {name: value for name, value in self.headers.items() if name.lower().startswith(('x-amz-meta-', 'content-type'))}
+        self.server.objects[key] = (body, kept)
+        self._answer(200, b'', etag(body))
+
+    def do_HEAD(self) -> None:
+        if self.server.forbid_head:
+            self._answer(403, b'')
+            return
+        self._content(b'')
+
+    def do_GET(self) -> None:
+        if self.path == '/' and not self.server.answer:
+            self._answer(200, b'<?xml version="1.0"?><ListAllMyBucketsResult><Buckets/></ListAllMyBucketsResult>')
+            return
+        if self.server.forbid_head:
+            self.server.requests.append('GET')
+            self._answer(403, error('AccessDenied'))
+            return
+        self._content(None)
+
+    def _content(self, instead: bytes | None) -> None:
+        if self._told():
+            return
+        held = self.server.objects.get(unquote(urlsplit(self.path).path))
+        if held is None:
+            self._answer(404, error('NoSuchKey') if instead is None else b'')
+            return
+        body = held[0] if instead is None else instead
+        self._answer(200, body, {**held[1], **etag(held[0])}, len(held[0]))
+
+    def _told(self) -> bool:
+        self.server.requests.append(self.command)
+        if self.server.answer is None:
+            return False
+        self._answer(*self.server.answer)
+        return True
+
+    def _answer(self, status: int, body: bytes, headers: dict[str, str] | None = None, length: int | None = None) -> None:
+        self.send_response(status)
+        for name, value in (headers or {}).items():
+            self.send_header(name, value)
+        self.send_header('Content-Length', str(len(body) if length is None else length))
+        self.end_headers()
+        if self.command != 'HEAD':
+            self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Quiet."""
+
+
+def error(code: str, message: str = 'no') -> bytes:
+    """The body of an S3 error."""
+    return f'<?xml version="1.0"?><Error><Code>{code}</Code><Message>{message}</Message></Error>'.encode()
+
+
+def etag(body: bytes) -> dict[str, str]:
+    return {'ETag': f'"{hashlib.md5(body, usedforsecurity=False).hexdigest()}"'}
+
+
+@contextmanager
+def served(server: FakeS3) -> Iterator[FakeS3]:
+    thread = threading.Thread(target=server.serve_forever, kwargs={'poll_interval': 0.01})
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+@contextmanager
+def hung() -> Iterator[str]:
+    """A server that takes connections and never answers."""
+    with socket.create_server(('127.0.0.1', 0)) as listening:
+        yield f'http://127.0.0.1:{listening.getsockname()[1]}'
+
+
+@contextmanager
+def refused() -> Iterator[str]:
+    """A port on which nobody listens, and nobody else can begin to."""
+    with socket.socket() as bound:
+        bound.bind(('127.0.0.1', 0))
+        yield f'http://127.0.0.1:{bound.getsockname()[1]}'
+
+
+@contextmanager
+def resetting(answer: bytes) -> Iterator[str]:
+    """A server that resets every connection after the first bytes of an answer."""
+    listening = socket.create_server(('127.0.0.1', 0))
+
+    def serve() -> None:
+        while True:
+            try:
+                connection, _ = listening.accept()
+            except OSError:
+                return
+            with connection:
+                connection.recv(65536)
+                connection.sendall(answer)
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield f'http://127.0.0.1:{listening.getsockname()[1]}'
+    finally:
+        listening.shutdown(socket.SHUT_RDWR)
+        listening.close()
+        thread.join()
+
+
+@contextmanager
+def with_tls(certificate: str, key: str) -> Iterator[str]:
+    """An S3 look-alike behind TLS."""
+    server = FakeS3()
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    server.socket = context.wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
+    server.handle_error = lambda *_: None  # type: ignore[method-assign]
+    with served(server):
+        yield server.url.replace('http:', 'https:')

@@ -1,0 +1,36 @@
+"""Spooled objects of some content, for tests."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from itertools import count
+from pathlib import Path
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.model import SpooledObject
+
+QUICK = UploadSettings(threads=8, connect_timeout_s=2.0, read_timeout_s=20.0)
+
+
+class Spool:
+    """Makes spooled objects whose files lie in one folder."""
+
+    def __init__(self, folder: Path, bucket: str) -> None:
+        self._folder = folder
+        self._bucket = bucket
+        self._numbers = count()
+
+    def __call__(
+        self, key: str, content: bytes, *, bucket: str = '', content_type: str = 'image/jpeg',
+        metadata: Mapping[str, str] | None = None,
+    ) -> SpooledObject:  # fmt: skip
+        """A file with this content, and what the index would know of it."""
+        number = next(self._numbers)
+        path = self._folder / f'spooled-{number}'
+        path.write_bytes(content)
+        sha256 = hashlib.sha256(content).hexdigest()
+        return SpooledObject(
+            id=number, bucket=bucket or self._bucket, key=key, path=path, size=len(content), sha256=sha256,
+            content_type=content_type, metadata={'sha256': sha256, **(metadata or {})}, priority=5, created_ns=0,
+        )  # fmt: skip

@@ -1,0 +1,189 @@
+"""What every store does alike."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from stores.spooled import Spool
+
+from shadowhound_data_logger.errors import ForeignObject, ObjectRefused
+from shadowhound_data_logger.model import Put, SpooledObject
+from shadowhound_data_logger.stores.base import ObjectStore
+
+ALL_CHARACTERS = "thor/AZaz09!_.*'()=+@-/AZaz09!_.*'()=+@-.jpg"
+HOSTILE = ('../escape', 'a/../../b', '/absolute', 'a//b', 'a/./b', 'a/b/', 'nul\0', 'new\nline', 'ä', 'a b', '', 'k' * 1025)
+
+
+def test_what_was_put_is_got(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """The content comes back byte for byte."""
+    content = os.urandom(50_000)
+    assert store.put(spool('thor/camera/20251018/120000_front.jpg', content)) is Put.CREATED
+    assert store.get(bucket, 'thor/camera/20251018/120000_front.jpg') == content
+
+
+def test_head_tells_size_type_and_metadata(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """The metadata make the round trip, the content's SHA-256 among them."""
+    item = spool('a.pcd', b'points', content_type='application/vnd.pcd', metadata={'topic': '/point_cloud2', 'samples': '7'})
+    store.put(item)
+    info = store.head(bucket, 'a.pcd')
+    assert info is not None
+    assert (info.bucket, info.key, info.size, info.sha256) == (bucket, 'a.pcd', 6, item.sha256)
+    assert info.content_type == 'application/vnd.pcd'
+    assert info.metadata == {'topic': '/point_cloud2', 'samples': '7', 'sha256': item.sha256}
+
+
+def test_sha256_is_kept_where_the_item_has_no_metadata(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """An object is verifiable even when its spooled metadata leave the hash out."""
+    item = dataclasses.replace(spool('a', b'x'), metadata={})
+    store.put(item)
+    info = store.head(bucket, 'a')
+    assert info is not None
+    assert info.sha256 == item.sha256
+
+
+def test_head_of_nothing_is_none(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """Neither a missing bucket, a missing key nor a folder is an object."""
+    assert store.head(bucket, 'a') is None
+    store.put(spool('a/b', b'x'))
+    assert store.head(bucket, 'c') is None
+    assert store.head(bucket, 'a') is None
+
+
+def test_get_of_nothing_is_refused(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """A missing key is named in the error."""
+    store.put(spool('a', b'x'))
+    with pytest.raises(ObjectRefused, match=f'there is no {bucket}/b'):
+        store.get(bucket, 'b')
+
+
+def test_list_is_in_key_order_and_under_the_prefix(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """A prefix is a string, not a folder; sizes are told."""
+    for key in ('thor/b', 'thor/a/2', 'thor/a/1', 'thor/a-1', 'tachi/a'):
+        store.put(spool(key, key.encode()))
+    assert [(info.key, info.size) for info in store.list(bucket, 'thor/a')] == [('thor/a-1', 8), ('thor/a/1', 8), ('thor/a/2', 8)]
+    assert [info.key for info in store.list(bucket)] == ['tachi/a', 'thor/a-1', 'thor/a/1', 'thor/a/2', 'thor/b']
+
+
+def test_list_of_nothing_is_empty(store: ObjectStore, bucket: str) -> None:
+    """A bucket that nobody has written to yet holds nothing."""
+    assert list(store.list(bucket)) == []
+
+
+def test_the_same_again_is_a_success(store: ObjectStore, spool: Spool) -> None:
+    """A put whose answer was lost can be repeated, whatever its size."""
+    for key, content in (('zero', b''), ('one', b'1'), ('many', os.urandom(10_000))):
+        assert store.put(spool(key, content)) is Put.CREATED
+        assert store.put(spool(key, content)) is Put.IDENTICAL
+
+
+@pytest.mark.parametrize('other', [b'the second', b'another length'])
+def test_other_content_never_overwrites(store: ObjectStore, spool: Spool, bucket: str, other: bytes) -> None:
+    """A taken key raises ForeignObject, of the same length or not, and keeps content and metadata."""
+    first = spool('a', b'the first!', metadata={'writer': 'first'})
+    store.put(first)
+    with pytest.raises(ForeignObject, match='holds other content') as caught:
+        store.put(spool('a', other, metadata={'writer': 'second'}))
+    assert caught.value.data['held_size'] == first.size
+    assert store.get(bucket, 'a') == b'the first!'
+    info = store.head(bucket, 'a')
+    assert info is not None
+    assert (info.metadata['writer'], info.sha256) == ('first', first.sha256)
+
+
+def test_of_concurrent_writers_one_wins(request: pytest.FixtureRequest, store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """Eight threads put different content under one key: one is stored, whole, and the others are told."""
+    if 'moto' in request.node.callspec.id:
+        pytest.skip('moto looks and writes without a lock: its race is not ours')
+    items = [spool('a', bytes([number]) * 5000) for number in range(8)]
+
+    def put(item: SpooledObject) -> Put | None:
+        try:
+            return store.put(item)
+        except ForeignObject:
+            return None
+
+    with ThreadPoolExecutor(len(items)) as pool:
+        ends = list(pool.map(put, items))
+    assert sorted(end.value for end in ends if end) == ['created']
+    winner = items[ends.index(Put.CREATED)]
+    assert store.get(bucket, 'a') == winner.path.read_bytes()
+    info = store.head(bucket, 'a')
+    assert info is not None
+    assert info.sha256 == winner.sha256
+
+
+def test_concurrent_puts_into_a_new_bucket_all_succeed(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """A missing bucket is created once, however many objects wait for it."""
+    items = [spool(f'{number:02d}', os.urandom(1000)) for number in range(16)]
+    with ThreadPoolExecutor(8) as pool:
+        assert set(pool.map(store.put, items)) == {Put.CREATED}
+    assert [info.key for info in store.list(bucket)] == [item.key for item in items]
+
+
+def test_an_empty_object_is_an_object(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """Zero bytes are stored, listed and got."""
+    store.put(spool('empty', b''))
+    assert store.get(bucket, 'empty') == b''
+    assert [(info.key, info.size) for info in store.list(bucket)] == [('empty', 0)]
+
+
+def test_every_character_of_a_key_survives(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """A key of all allowed characters is put, got, headed and listed as itself."""
+    store.put(spool(ALL_CHARACTERS, b'x'))
+    assert store.get(bucket, ALL_CHARACTERS) == b'x'
+    assert store.head(bucket, ALL_CHARACTERS) is not None
+    assert [info.key for info in store.list(bucket)] == [ALL_CHARACTERS]
+
+
+@pytest.mark.parametrize('key', HOSTILE)
+def test_a_hostile_key_is_refused_everywhere(store: ObjectStore, spool: Spool, bucket: str, key: str) -> None:
+    """No key leaves its bucket or the safe alphabet."""
+    for ask in (lambda: store.put(spool(key, b'x')), lambda: store.head(bucket, key), lambda: store.get(bucket, key)):
+        with pytest.raises(ObjectRefused):
+            ask()
+    with pytest.raises(ObjectRefused):
+        store.put(spool('a', b'x', bucket='../other'))
+
+
+@pytest.mark.parametrize('damage', ['content', 'shorter', 'longer', 'gone', 'unreadable'])
+def test_a_damaged_file_is_refused(store: ObjectStore, spool: Spool, bucket: str, damage: str) -> None:
+    """What is no longer what was spooled is not stored under its name."""
+    item = spool('a', b'as it was')
+    if damage in {'gone', 'unreadable'}:
+        item.path.unlink()
+    if damage == 'unreadable':
+        item.path.mkdir()
+    if damage in {'content', 'shorter', 'longer'}:
+        item.path.write_bytes({'content': b'as it WAS', 'shorter': b'as it', 'longer': b'as it was, and more'}[damage])
+    with pytest.raises(ObjectRefused, match='not what was spooled') as caught:
+        store.put(item)
+    assert caught.value.data['reason'] == 'damaged'
+    assert store.head(bucket, 'a') is None
+
+
+def test_a_probe_of_a_store_that_is_there_says_nothing(store: ObjectStore) -> None:
+    """Neither a bucket nor an object is needed."""
+    store.probe()
+
+
+def test_open_and_close_may_be_repeated(store: ObjectStore, spool: Spool) -> None:
+    """Opening twice is one opening; closing twice is no error."""
+    store.open()
+    store.put(spool('a', b'x'))
+    store.close()
+    store.close()
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(content=st.binary(max_size=4096))
+def test_any_content_survives(store: ObjectStore, spool: Spool, bucket: str, content: bytes) -> None:
+    """No byte is special on the way."""
+    item = spool(f'any/{hashlib.sha256(content).hexdigest()}', content)
+    assert store.put(item) in set(Put)
+    assert store.get(bucket, item.key) == content

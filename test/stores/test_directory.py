@@ -1,0 +1,152 @@
+"""What is particular to the folder: its layout, its durability, and the errors of a file system."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stores.spooled import QUICK, Spool
+
+from shadowhound_data_logger.config import StoreSettings
+from shadowhound_data_logger.errors import AccessDenied, ForeignObject, ObjectRefused, StoreError, StoreUnavailable
+from shadowhound_data_logger.model import Put
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.directory import DirectoryStore
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / 'not' / 'yet' / 'store'
+
+
+@pytest.fixture
+def store(folder: Path) -> DirectoryStore:
+    return DirectoryStore(folder)
+
+
+def _failing(number: int) -> Callable[..., Any]:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    return fail
+
+
+def test_without_an_endpoint_the_store_is_a_folder(folder: Path) -> None:
+    """Defaults work with nothing set, and nothing is written before the first put."""
+    store = open_store(StoreSettings(directory=folder), QUICK)
+    assert store.describe() == f'the folder {folder}'
+    assert not folder.exists()
+
+
+def test_the_folder_is_laid_out_like_the_bucket(store: DirectoryStore, folder: Path, spool: Spool) -> None:
+    """Beside a bucket's objects lies nothing that a sync or a glob would take for one, and no unfinished file is left."""
+    store.put(spool('thor/camera/a.jpg', b'x', bucket='sensor-data'))
+    files = {str(path.relative_to(folder)) for path in folder.rglob('*') if path.is_file()}
+    assert files == {'sensor-data/thor/camera/a.jpg', '.metadata/sensor-data/thor/camera/a.jpg.json'}
+
+
+def test_what_a_power_cut_left_is_completed(store: DirectoryStore, folder: Path, spool: Spool, bucket: str) -> None:
+    """Content without its metadata is recognized by its hash, and the next put writes them."""
+    item = spool('a', b'content')
+    store.put(item)
+    (folder / '.metadata' / bucket / 'a.json').unlink()
+    held = store.head(bucket, 'a')
+    assert held is not None
+    assert held.sha256 is None
+    assert store.put(item) is Put.IDENTICAL
+    held = store.head(bucket, 'a')
+    assert held is not None
+    assert held.sha256 == item.sha256
+
+
+def test_a_file_put_there_by_hand_is_never_overwritten(store: DirectoryStore, folder: Path, spool: Spool, bucket: str) -> None:
+    """It has no metadata, but it has content."""
+    (folder / bucket).mkdir(parents=True)
+    (folder / bucket / 'a').write_bytes(b'by hand')
+    with pytest.raises(ForeignObject):
+        store.put(spool('a', b'by node'))
+    assert (folder / bucket / 'a').read_bytes() == b'by hand'
+
+
+def test_everything_is_synced_before_it_has_its_name(
+    store: DirectoryStore, folder: Path, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file is synced before the link, the folder after it: a power cut shows all of an object or nothing."""
+    events: list[str] = []
+    sync, link = os.fsync, os.link
+
+    def synced(descriptor: int) -> None:
+        events.append('sync ' + Path(f'/proc/self/fd/{descriptor}').readlink().parent.name)
+        sync(descriptor)
+
+    def linked(source: Path, target: Path) -> None:
+        events.append('link')
+        link(source, target)
+
+    store.put(spool('thor/first', b'x'))
+    monkeypatch.setattr(os, 'fsync', synced)
+    monkeypatch.setattr(os, 'link', linked)
+    store.put(spool('thor/second', b'x'))
+    assert events[:3] == ['sync .part', 'link', f'sync {bucket}']
+
+
+@pytest.mark.parametrize(
+    ('number', 'kind', 'words'),
+    [
+        (errno.ENOSPC, StoreUnavailable, 'no space left'),
+        (errno.EDQUOT, StoreUnavailable, 'no space left'),
+        (errno.EIO, StoreUnavailable, 'is the disk mounted'),
+        (errno.EROFS, StoreUnavailable, 'is the disk mounted'),
+        (errno.EACCES, AccessDenied, 'no permission'),
+        (errno.ENAMETOOLONG, ObjectRefused, 'cannot hold'),
+    ],
+)
+def test_errors_of_the_file_system(
+    number: int, kind: type[StoreError], words: str,
+    store: DirectoryStore, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """A full or sick disk is waited for; nothing half-written is left, and later the same put succeeds."""
+    item = spool('a', b'x')
+    with monkeypatch.context() as broken:
+        broken.setattr(os, 'fsync', _failing(number))
+        with pytest.raises(kind, match=words):
+            store.put(item)
+        with pytest.raises(kind):
+            store.probe()
+    assert store.head(bucket, 'a') is None
+    assert store.put(item) is Put.CREATED
+
+
+def test_a_folder_that_cannot_be_one_condemns_no_object(spool: Spool) -> None:
+    """A wrong setting (the folder is a file, or below one) is waited for, by put and by probe."""
+    item = spool('a', b'x')
+    for folder in (item.path, item.path / 'below'):
+        store = DirectoryStore(folder)
+        with pytest.raises(StoreUnavailable, match=str(folder)):
+            store.put(item)
+        with pytest.raises(StoreUnavailable, match=str(folder)):
+            store.probe()
+
+
+def test_an_object_is_no_folder_and_a_folder_no_object(store: DirectoryStore, spool: Spool) -> None:
+    """A file system cannot hold both ``a`` and ``a/b``: the second is refused for good."""
+    store.put(spool('a/b', b'x'))
+    for key in ('a', 'a/b/c'):
+        with pytest.raises(ObjectRefused, match='cannot hold'):
+            store.put(spool(key, b'y'))
+
+
+def test_a_file_system_without_links(
+    store: DirectoryStore, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without hard links (exFAT) objects are still whole and never overwritten."""
+    monkeypatch.setattr(os, 'link', _failing(errno.EPERM))
+    assert store.put(spool('a', b'first')) is Put.CREATED
+    with pytest.raises(ForeignObject):
+        store.put(spool('a', b'other'))
+    assert store.get(bucket, 'a') == b'first'
+    assert store.put(spool('a', b'first')) is Put.IDENTICAL
