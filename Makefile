@@ -1,0 +1,37 @@
+# Every target makes the environment first (see scripts/setup); with nothing to do that takes milliseconds.
+
+.DEFAULT_GOAL := help
+.PHONY: help setup test check format demo bench lock clean
+
+PYTEST_ARGS ?=
+
+help: ## this list
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+
+setup: ## make the environment (.venv, go2_interfaces); PYTHON=... names the interpreter
+	@PYTHON="$(PYTHON)" scripts/setup
+
+test: setup ## run all tests; PYTEST_ARGS="-k spool -x" is handed on
+	scripts/with-env pytest $(PYTEST_ARGS)
+
+check: setup ## lint, format and types
+	scripts/with-env ruff check .
+	scripts/with-env ruff format --check .
+	scripts/with-env mypy
+
+format: setup ## let ruff repair and format what it can
+	scripts/with-env ruff check --fix .
+	scripts/with-env ruff format .
+
+demo: setup ## a simulated Go2, an embedded Tower and one patrol mission, about a minute
+	scripts/with-env python -m shadowhound_data_logger.sim.demo
+
+bench: setup ## benchmarks against the baseline, as ratios
+	@for file in bench/[a-z]*.py; do echo "$$file"; scripts/with-env python "$$file" || exit 1; done
+
+lock: setup ## write requirements/*.txt anew from requirements/*.in; LOCK_ARGS=--upgrade renews the pins
+	scripts/lock $(LOCK_ARGS)
+
+clean: ## remove the environment and everything that was built
+	rm -rf .venv .cache build install log demo .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,66 @@
+"""Launches the data logger with its parameter file, in a namespace if asked to, and starts it again when it crashes.
+
+ros2 launch shadowhound_data_logger sensor_logger.launch.py namespace:=tachi params_file:=/path/to/my.yaml
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from launch import LaunchContext, LaunchDescription
+from launch.action import Action
+from launch.actions import DeclareLaunchArgument, LogInfo, RegisterEventHandler, SetEnvironmentVariable, TimerAction
+from launch.event_handlers import OnProcessExit
+from launch.events.process import ProcessExited
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+FOLDER = Path(__file__).resolve().parent
+RESTART_AFTER_S = 2.0
+FINAL = (0, 2)
+"""Exit codes that mean what they say: asked to stop, and settings that were refused. Starting again would change neither."""
+PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
+"""Fast DDS 3 reads the first and warns of the second, Fast DDS 2 knows the second only."""
+FAST_DDS_2 = ('humble', 'iron', 'jazzy')
+
+
+def profile() -> list[Action]:
+    """Name the Fast DDS profile that lets raw images through, unless there is one already."""
+    if any(os.environ.get(name) for name in PROFILE_VARIABLES):
+        return []
+    variable = PROFILE_VARIABLES[os.environ.get('ROS_DISTRO') in FAST_DDS_2]
+    return [SetEnvironmentVariable(variable, str(FOLDER / 'fastdds_shm.xml'))]
+
+
+def logger() -> list[Action]:
+    """The node, and what to do when it ends."""
+    node = Node(  # without a name: the node has one, and launch would warn of a second one at each restart
+        package='shadowhound_data_logger',
+        executable='sensor_logger_node',
+        namespace=LaunchConfiguration('namespace'),
+        parameters=[LaunchConfiguration('params_file')],
+        output='screen',
+        emulate_tty=True,
+    )
+
+    def ended(event: ProcessExited, context: LaunchContext) -> list[Any]:
+        if event.returncode in FINAL or context.is_shutdown:
+            return []
+        again = LogInfo(msg=f'sensor_logger_node ended with {event.returncode}: it starts again in {RESTART_AFTER_S:g} s')
+        return [again, TimerAction(period=RESTART_AFTER_S, actions=logger())]
+
+    return [RegisterEventHandler(OnProcessExit(target_action=node, on_exit=ended)), node]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """What `ros2 launch` asks for."""
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument('params_file', default_value=str(FOLDER / 'go2.yaml'), description='The parameter file.'),
+            DeclareLaunchArgument('namespace', default_value='', description='Namespace of the robot, for several robots.'),
+            *profile(),
+            *logger(),
+        ]
+    )

@@ -1,0 +1,37 @@
+"""Builds the package for colcon (ament_python) and for pip; the version stands in package.xml as well, a test compares them."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'shadowhound_data_logger'
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    description='Takes the sensor data of a Unitree Go2 off the robot: whole, verified, and accounted for.',
+    long_description='A ROS 2 data logger that stores every message, or lists it with the reason why not.',
+    author='ShadowHound maintainers',
+    maintainer='ShadowHound maintainers',
+    maintainer_email='maintainers@shadowhound.invalid',
+    license='Apache-2.0',
+    packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
+    package_data={PACKAGE: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),
+        ('share/' + PACKAGE, ['package.xml']),
+        ('share/' + PACKAGE + '/launch_configs', sorted(str(path) for path in Path('launch_configs').glob('*.*'))),
+    ],
+    zip_safe=False,
+    python_requires='>=3.10',
+    # The same as requirements/runtime.in, which says what each is for.
+    install_requires=['boto3>=1.36', 'click>=8.1', 'numpy>=1.21', 'orjson>=3.9', 'rich>=13', 'rosbags>=0.11.9', 'simplejpeg>=1.7'],
+    extras_require={'missions': ['mlflow-skinny>=3.5'], 'test': ['pytest']},  # colcon runs pytest where a test extra names it
+    entry_points={
+        'console_scripts': [
+            'sensor_logger_node = shadowhound_data_logger.capture.sensor_logger_node:main',
+            'sim_go2_node = shadowhound_data_logger.sim.sim_go2_node:main',
+            'shadowhound-data = shadowhound_data_logger.cli.main:main',
+        ],
+    },
+)

@@ -1,0 +1,187 @@
+"""What is said in several files of the package is the same in all of them."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+REQUIREMENTS = ROOT / 'requirements'
+PROFILE = ROOT / 'launch_configs' / 'fastdds_shm.xml'
+INTERFACES = ROOT / 'interfaces' / 'go2_interfaces'
+MEBI = 1 << 20
+
+
+def setup_arguments() -> dict[str, Any]:
+    """The literal arguments of setup() in setup.py, by name."""
+    tree = ast.parse((ROOT / 'setup.py').read_text())
+    call = next(node for node in ast.walk(tree) if isinstance(node, ast.Call) and getattr(node.func, 'id', '') == 'setup')
+    literal = {}
+    for keyword in call.keywords:
+        try:
+            literal[str(keyword.arg)] = ast.literal_eval(keyword.value)
+        except ValueError:
+            continue
+    return literal
+
+
+def requirements(name: str) -> dict[str, str]:
+    """The requirements of a file, by the package's name: the whole requirement without comment and blanks."""
+    lines = ((REQUIREMENTS / name).read_text()).splitlines()
+    wanted = [line.split('#')[0].strip() for line in lines if line.split('#')[0].strip()]
+    return {re.split(r'[^A-Za-z0-9_.-]', line)[0].lower(): line for line in wanted}
+
+
+def locked(name: str) -> set[str]:
+    """The packages that a lock file pins."""
+    return set(re.findall(r'^([a-z0-9_.-]+)==', (REQUIREMENTS / name).read_text(), re.MULTILINE))
+
+
+def console_scripts() -> list[str]:
+    """The entry points of setup.py, as `name = module:function`."""
+    points = setup_arguments()['entry_points']
+    return list(points['console_scripts'])
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    """package.xml, setup.py and the changelog's newest heading, where there is one, name the same version."""
+    version = ElementTree.parse(ROOT / 'package.xml').findtext('version')
+    assert version == setup_arguments()['version']
+    headings = re.findall(r'^(\d+\.\d+\.\d+) \(', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
+    assert headings[:1] in ([], [version])
+
+
+def test_the_package_is_registered_under_its_name() -> None:
+    """The marker that ROS looks for has the name of the package and is installed."""
+    name = ElementTree.parse(ROOT / 'package.xml').findtext('name')
+    assert setup_arguments().get('name', name) == name
+    assert (ROOT / 'resource' / str(name)).is_file()
+    assert 'share/ament_index/resource_index/packages' in (ROOT / 'setup.py').read_text()
+
+
+@pytest.mark.parametrize('point', console_scripts())
+def test_an_entry_point_leads_to_a_function(point: str) -> None:
+    """A command that is installed can be started: its module imports and has the function."""
+    module, _, function = point.partition(' = ')[2].partition(':')
+    if module.split('.')[1] in {'capture', 'sim'} and importlib.util.find_spec('rclpy') is None:
+        pytest.skip('this command needs ROS')
+    assert callable(getattr(importlib.import_module(module), function))
+
+
+def test_setup_py_asks_for_what_the_lock_is_made_from() -> None:
+    """`pip install .` and the lock files start from the same requirements."""
+    assert sorted(setup_arguments()['install_requires']) == sorted(requirements('runtime.in').values())
+
+
+@pytest.mark.parametrize('name', sorted(path.name for path in REQUIREMENTS.glob('*.in')))
+def test_every_dependency_has_its_reason(name: str) -> None:
+    """docs/dependencies.md names each package that a .in file asks for."""
+    page = set(re.findall(r'[a-z0-9_.-]+', (ROOT / 'docs' / 'dependencies.md').read_text().lower()))
+    wanted = {package.split('[')[0] for package in requirements(name)}
+    assert wanted, name
+    assert not wanted - page
+
+
+@pytest.mark.parametrize(
+    ('lock', 'sources'),
+    [
+        ('uv.txt', ['uv.in']),
+        ('runtime.txt', ['runtime.in']),
+        ('robot.txt', ['runtime.in']),
+        ('wheels.txt', ['runtime.in', 'ros.in', 'dev.in']),
+        ('sourced.txt', ['runtime.in', 'dev.in']),
+    ],
+)
+def test_a_lock_file_holds_what_it_is_made_from(lock: str, sources: list[str]) -> None:
+    """No requirement was added without `make lock`, and each pin has a hash."""
+    wanted = {package.split('[')[0] for source in sources for package in requirements(source)}
+    assert not wanted - locked(lock)
+    text = (REQUIREMENTS / lock).read_text()
+    pins = re.findall(r'^[a-z0-9_.-]+==.*\\\n    --hash=sha256:', text, re.MULTILINE)
+    assert len(pins) == len(re.findall(r'^[a-z0-9_.-]+==', text, re.MULTILINE))
+
+
+@pytest.mark.parametrize('lock', ['robot.txt', 'sourced.txt'])
+def test_beside_a_sourced_ros_numpy_stays_at_1(lock: str) -> None:
+    """The message packages of Humble and Jazzy were compiled against numpy 1 and crash on numpy 2."""
+    assert set(re.findall(r'^numpy==(\d+)\.', (REQUIREMENTS / lock).read_text(), re.MULTILINE)) == {'1'}
+
+
+def test_the_shared_memory_segment_holds_a_second_of_raw_images() -> None:
+    """The Fast DDS profile is the default one, uses its transports, and its segment is at least 32 MiB."""
+    tree = ElementTree.parse(PROFILE)
+    space = {'dds': 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'}
+    transports = {t.findtext('dds:transport_id', '', space): t for t in tree.iterfind('.//dds:transport_descriptor', space)}
+    participant = tree.find('.//dds:participant', space)
+    assert participant is not None
+    assert participant.get('is_default_profile') == 'true'
+    used = {node.text for node in participant.iterfind('.//dds:userTransports/dds:transport_id', space)}
+    assert used == set(transports)
+    assert {t.findtext('dds:type', '', space) for t in transports.values()} == {'SHM', 'UDPv4'}
+    shared = next(t for t in transports.values() if t.findtext('dds:type', '', space) == 'SHM')
+    assert int(shared.findtext('dds:segment_size', '0', space)) >= 32 * MEBI
+
+
+def test_every_message_definition_is_built() -> None:
+    """CMakeLists.txt of go2_interfaces names each .msg file, and nothing else."""
+    built = set(re.findall(r'"(msg/\w+\.msg)"', (INTERFACES / 'CMakeLists.txt').read_text()))
+    assert built == {f'msg/{path.name}' for path in (INTERFACES / 'msg').glob('*.msg')}
+    assert (ROOT / 'interfaces' / 'COLCON_IGNORE').exists()
+
+
+def test_no_file_names_a_package_index() -> None:
+    """Where packages come from is the machine's business: nothing in the repository ties it to one host."""
+    if shutil.which('git') is None or not (ROOT / '.git').exists():
+        pytest.skip('not a git checkout')
+    hosts = ['pypi' + '.org', 'python' + 'hosted.org', 'registry.' + 'npmjs.org', 'deb.' + 'debian.org', 'index' + '-url =']
+    expression = [argument for host in hosts for argument in ('-e', host)]
+    found = subprocess.run(
+        ['git', 'grep', '-I', '-l', '-F', '--untracked', *expression], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 1, found.stdout + found.stderr
+
+
+@pytest.mark.parametrize('script', ['setup', 'with-env', 'lock'])
+def test_a_script_is_executable_and_parses(script: str) -> None:
+    """The scripts are plain sh: dash and bash both read them."""
+    path = ROOT / 'scripts' / script
+    assert path.stat().st_mode & 0o111
+    assert subprocess.run(['sh', '-n', str(path)], check=False, capture_output=True).returncode == 0
+
+
+def test_with_env_says_what_to_do_when_there_is_no_environment(tmp_path: Path) -> None:
+    """In a fresh clone it names `make setup` and fails."""
+    (tmp_path / 'scripts').mkdir()
+    script = shutil.copy(ROOT / 'scripts' / 'with-env', tmp_path / 'scripts')
+    said = subprocess.run([script, 'true'], capture_output=True, text=True, check=False)
+    assert said.returncode == 1
+    assert 'make setup' in said.stderr
+
+
+def test_with_env_keeps_a_profile_that_the_user_has_set(tmp_path: Path) -> None:
+    """A Fast DDS profile of the user's own is not replaced by ours."""
+    if not (ROOT / '.venv' / 'done').exists():
+        pytest.skip('no environment made by scripts/setup')
+    bare = {
+        name: value for name, value in os.environ.items() if 'PROFILES_FILE' not in name and name != 'SHADOWHOUND_ENVIRONMENT'
+    }
+    own = {**bare, 'FASTRTPS_DEFAULT_PROFILES_FILE': str(tmp_path / 'mine.xml')}
+    for variables, expected in ((own, 'mine.xml'), (bare, 'fastdds_shm.xml')):
+        command = [
+            str(ROOT / 'scripts' / 'with-env'),
+            'sh',
+            '-c',
+            'echo "$FASTDDS_DEFAULT_PROFILES_FILE$FASTRTPS_DEFAULT_PROFILES_FILE"',
+        ]
+        said = subprocess.run(command, capture_output=True, text=True, check=False, env=variables)
+        assert Path(said.stdout.strip()).name == expected, said.stderr
