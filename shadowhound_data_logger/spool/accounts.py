@@ -1,0 +1,229 @@
+"""What became of every message, counted in memory: the live half of the ledger (D10).
+
+One lock guards all of it. Every message is received once, and then skipped, rejected, dropped or stored once; whatever
+has no outcome yet is open. ``snapshot`` is taken by the spool inside a group commit, so that what is durable balances too.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Final
+
+MAX_REMEMBERED: Final = 4096
+"""Single numbers remembered per publisher (missed ones that may come late): a bound, far above any history depth."""
+
+EXACT, REPORTED, RECEIVED_ONLY = 'exact', 'reported', 'received-only'
+GRADES: Final = (EXACT, REPORTED, RECEIVED_ONLY)
+"""How good a topic's accounting is, best first; over several sessions the worst counts."""
+
+
+@dataclass(slots=True)
+class Span:
+    """The numbers of one publisher on one topic, from the first one taken.
+
+    ``published`` = ``received`` + sum of ``missed``, always. A span inherited from an earlier session starts with zero
+    counts and that session's ``first`` and ``last``: the gap before its first message is then missed by ``restart``.
+    """
+
+    first: int | None = None
+    last: int | None = None
+    inherited: bool = False
+    published: int = 0
+    received: int = 0
+    missed: Counter[str] = field(default_factory=Counter)
+    _holes: dict[int, str] = field(default_factory=dict)
+    _early: set[int] = field(default_factory=set)
+
+    def observe(self, number: int) -> bool:
+        """Count a message by its sequence number; False if it was counted before (a repeat)."""
+        if self.last is None:
+            self.last = number
+            if self.first is None:
+                self.first = number
+        elif number > self.last:
+            if number > self.last + 1:
+                self._miss(self.last + 1, number)
+            self.last = number
+        elif number in self._holes:
+            self.missed[self._holes.pop(number)] -= 1
+            self.published -= 1
+        elif self.first is not None and number < self.first and number not in self._early:
+            # TRANSIENT_LOCAL delivers history from before the first number taken.
+            if len(self._early) >= MAX_REMEMBERED:
+                return False
+            self._early.add(number)
+        else:
+            return False
+        self.inherited = False
+        self.received += 1
+        self.published += 1
+        return True
+
+    def rebase(self) -> None:
+        """Forget where the numbers stood: what comes until the next message was not listened to on purpose."""
+        self.last = None
+        self.inherited = False
+        self._holes.clear()
+
+    def _miss(self, start: int, stop: int) -> None:
+        cause = 'restart' if self.inherited else 'transport'
+        self.missed[cause] += stop - start
+        self.published += stop - start
+        if not self.inherited and len(self._holes) + stop - start <= MAX_REMEMBERED:
+            self._holes.update(dict.fromkeys(range(start, stop), cause))
+
+
+@dataclass(slots=True)
+class TopicAccount:
+    """One topic of one session. Mutated only under the lock of the Accounts it belongs to."""
+
+    type: str = ''
+    accounting: str = EXACT
+    received: int = 0
+    skipped: int = 0
+    stored: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
+    dropped: Counter[str] = field(default_factory=Counter)
+    publishers: dict[str, Span] = field(default_factory=dict)
+    last_kept_ns: int = 0
+    """Stamp of the newest sample that is durable: a restarted node goes on sampling after it."""
+
+    @property
+    def open(self) -> int:
+        """Messages without an outcome yet: in an open batch, the queue, an encoder or before their commit."""
+        return self.received - self.skipped - self.stored - self.rejected.total() - self.dropped.total()
+
+    def receive(self, publisher: str | None, number: int | None) -> bool:
+        """Count one taken message; False for a repeat. Without number or publisher it is only received."""
+        if publisher is None or number is None:
+            if self.accounting == EXACT:
+                self.accounting = RECEIVED_ONLY
+        else:
+            span = self.publishers.get(publisher)
+            if span is None:
+                span = self.publishers[publisher] = Span()
+            if not span.observe(number):
+                return False
+        self.received += 1
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherRow:
+    """A durable Span."""
+
+    topic: str
+    publisher: str
+    first: int | None
+    last: int | None
+    published: int
+    received: int
+    missed: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class TopicRow:
+    """A durable TopicAccount."""
+
+    topic: str
+    type: str
+    accounting: str
+    received: int
+    skipped: int
+    stored: int
+    rejected: Mapping[str, int]
+    dropped: Mapping[str, int]
+    last_kept_ns: int
+
+    @property
+    def open(self) -> int:
+        return self.received - self.skipped - self.stored - sum(self.rejected.values()) - sum(self.dropped.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The accounts at one instant, as a group commit writes them."""
+
+    topics: tuple[TopicRow, ...]
+    publishers: tuple[PublisherRow, ...]
+
+
+class Accounts:
+    """All topics of this session. Thread-safe: ``entry`` holds the lock, the other methods take it."""
+
+    def __init__(self, inherited: Iterable[PublisherRow] = (), last_kept: Mapping[str, int] | None = None) -> None:
+        self._lock = threading.Lock()
+        self._topics: dict[str, TopicAccount] = {}
+        self._dirty = False
+        self._inherited: dict[str, dict[str, Span]] = {}
+        self._last_kept = dict(last_kept or {})
+        for row in inherited:
+            spans = self._inherited.setdefault(row.topic, {})
+            spans[row.publisher] = Span(row.first, row.last, inherited=True)
+
+    @contextmanager
+    def entry(self, topic: str) -> Iterator[TopicAccount]:
+        """The topic's account, under the lock: keep it short."""
+        with self._lock:
+            self._dirty = True
+            yield self._account(topic)
+
+    def reject(self, topic: str, reasons: Mapping[str, int]) -> None:
+        with self.entry(topic) as account:
+            account.rejected.update(reasons)
+
+    def drop(self, topic: str, reason: str, count: int) -> None:
+        with self.entry(topic) as account:
+            account.dropped[reason] += count
+
+    def store(self, stored: Mapping[str, tuple[int, int]]) -> None:
+        """Samples that a group commit made durable: topic -> (count, stamp of the newest)."""
+        with self._lock:
+            for topic, (count, newest_ns) in stored.items():
+                account = self._account(topic)
+                account.stored += count
+                account.last_kept_ns = max(account.last_kept_ns, newest_ns)
+
+    def last_kept_ns(self, topic: str) -> int:
+        """Stamp of the topic's newest durable sample of any session, 0 for none."""
+        with self._lock:
+            account = self._topics.get(topic)
+            return max(account.last_kept_ns if account else 0, self._last_kept.get(topic, 0))
+
+    def snapshot(self, stored: Mapping[str, tuple[int, int]]) -> Snapshot | None:
+        """The state as it will be once ``stored`` is durable; None when nothing changed since the last one."""
+        with self._lock:
+            if not self._dirty and not stored:
+                return None
+            self._dirty = False
+            return Snapshot(
+                tuple(self._row(topic, account, *stored.get(topic, (0, 0))) for topic, account in self._topics.items()),
+                tuple(
+                    PublisherRow(topic, publisher, span.first, span.last, span.published, span.received, dict(+span.missed))
+                    for topic, account in self._topics.items()
+                    for publisher, span in account.publishers.items()
+                    if span.published
+                ),
+            )
+
+    def mark_dirty(self) -> None:
+        """The last snapshot did not become durable: write it again."""
+        with self._lock:
+            self._dirty = True
+
+    def _account(self, topic: str) -> TopicAccount:
+        account = self._topics.get(topic)
+        if account is None:
+            account = self._topics[topic] = TopicAccount(publishers=self._inherited.pop(topic, {}))
+        return account
+
+    @staticmethod
+    def _row(topic: str, account: TopicAccount, count: int, newest_ns: int) -> TopicRow:
+        return TopicRow(
+            topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
+            dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
+        )  # fmt: skip

@@ -1,0 +1,241 @@
+"""The spool's index: one SQLite file that says what every object is and where it stands, and keeps the accounts.
+
+Written by one connection under one lock, in transactions that are durable when they return (WAL, synchronous=FULL);
+read by any number of others. Its transaction is the one commit point of the spool: an object exists once its row does.
+Totals are kept by triggers, so that rows of delivered objects may be forgotten without a total changing.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.spool.accounts import PublisherRow, Snapshot, TopicRow
+
+SCHEMA_VERSION: Final = 1
+BUSY_TIMEOUT_S: Final = 10.0
+_STATES: Final = ', '.join(f"'{state.value}'" for state in State)
+_SCHEMA: Final = f"""
+CREATE TABLE objects (
+  id INTEGER PRIMARY KEY AUTOINCREMENT,
+  bucket TEXT NOT NULL, key TEXT NOT NULL,
+  state TEXT NOT NULL CHECK (state IN ({_STATES})), reason TEXT,
+  priority INTEGER NOT NULL, protected INTEGER NOT NULL,
+  sensor TEXT NOT NULL, topic TEXT, type TEXT NOT NULL,
+  samples INTEGER NOT NULL, bytes INTEGER NOT NULL, sha256 TEXT NOT NULL,
+  content_type TEXT NOT NULL, metadata TEXT NOT NULL,
+  t_start_ns INTEGER NOT NULL, t_end_ns INTEGER NOT NULL,
+  created_ns INTEGER NOT NULL, settled_ns INTEGER,
+  UNIQUE (bucket, key));
+CREATE INDEX pending ON objects (priority, id) WHERE state = 'pending';
+CREATE INDEX evictable ON objects (priority DESC, id) WHERE state IN ('pending', 'held') AND NOT protected;
+CREATE INDEX settled ON objects (settled_ns) WHERE state IN ('delivered', 'deduplicated', 'evicted');
+CREATE TABLE tally (
+  topic TEXT NOT NULL, state TEXT NOT NULL,
+  objects INTEGER NOT NULL DEFAULT 0, bytes INTEGER NOT NULL DEFAULT 0, samples INTEGER NOT NULL DEFAULT 0,
+  PRIMARY KEY (topic, state)) WITHOUT ROWID;
+CREATE TRIGGER spooled AFTER INSERT ON objects BEGIN
+  INSERT INTO tally VALUES (ifnull(NEW.topic, ''), 'spooled', 1, NEW.bytes, NEW.samples)
+    ON CONFLICT DO UPDATE SET objects = objects + 1, bytes = bytes + NEW.bytes, samples = samples + NEW.samples;
+  INSERT INTO tally VALUES (ifnull(NEW.topic, ''), NEW.state, 1, NEW.bytes, NEW.samples)
+    ON CONFLICT DO UPDATE SET objects = objects + 1, bytes = bytes + NEW.bytes, samples = samples + NEW.samples;
+END;
+CREATE TRIGGER moved AFTER UPDATE OF state ON objects WHEN OLD.state <> NEW.state BEGIN
+  UPDATE tally SET objects = objects - 1, bytes = bytes - OLD.bytes, samples = samples - OLD.samples
+    WHERE topic = ifnull(OLD.topic, '') AND state = OLD.state;
+  INSERT INTO tally VALUES (ifnull(NEW.topic, ''), NEW.state, 1, NEW.bytes, NEW.samples)
+    ON CONFLICT DO UPDATE SET objects = objects + 1, bytes = bytes + NEW.bytes, samples = samples + NEW.samples;
+END;
+CREATE TABLE sessions (
+  id INTEGER PRIMARY KEY AUTOINCREMENT, robot TEXT NOT NULL, boot_id TEXT NOT NULL, pid INTEGER NOT NULL,
+  started_ns INTEGER NOT NULL, ended_ns INTEGER);
+CREATE TABLE accounts (
+  session INTEGER NOT NULL, topic TEXT NOT NULL, type TEXT NOT NULL, accounting TEXT NOT NULL,
+  received INTEGER NOT NULL, skipped INTEGER NOT NULL, stored INTEGER NOT NULL,
+  rejected TEXT NOT NULL, dropped TEXT NOT NULL, last_kept_ns INTEGER NOT NULL,
+  PRIMARY KEY (session, topic)) WITHOUT ROWID;
+CREATE TABLE publishers (
+  session INTEGER NOT NULL, topic TEXT NOT NULL, publisher TEXT NOT NULL, first INTEGER, last INTEGER,
+  published INTEGER NOT NULL, received INTEGER NOT NULL, missed TEXT NOT NULL,
+  PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
+PRAGMA user_version = {SCHEMA_VERSION};
+"""
+_OBJECT: Final = 'id, bucket, key, bytes, sha256, content_type, metadata, priority, created_ns, state, reason'
+
+
+class Index:
+    """New; open once; close once. Methods that write belong to the owner of the spool's lock."""
+
+    def __init__(self, path: Path, *, read_only: bool = False) -> None:
+        self._path = path
+        self._read_only = read_only
+        self._connection: sqlite3.Connection | None = None
+
+    def open(self) -> None:
+        """Raises sqlite3.DatabaseError for a damaged file, SpoolError for one of a newer version or no access."""
+        mode = 'ro' if self._read_only else 'rwc'
+        try:
+            connection = sqlite3.connect(
+                f'{self._path.absolute().as_uri()}?mode={mode}', uri=True, timeout=BUSY_TIMEOUT_S,
+                isolation_level=None, check_same_thread=False,
+            )  # fmt: skip
+        except sqlite3.OperationalError as error:
+            raise SpoolError(f'cannot open the spool index {self._path}: {error}', remedy='is the path right, and may you read it?') from error
+        try:
+            self._prepare(connection)
+        except BaseException:
+            connection.close()
+            raise
+        self._connection = connection
+
+    def _prepare(self, connection: sqlite3.Connection) -> None:
+        version = connection.execute('PRAGMA user_version').fetchone()[0]
+        if version > SCHEMA_VERSION:
+            raise SpoolError(f'the spool index {self._path} is of version {version}, this program knows {SCHEMA_VERSION}',
+                             remedy='update shadowhound_data_logger')  # fmt: skip
+        if self._read_only:
+            return
+        connection.execute('PRAGMA journal_mode = WAL')
+        connection.execute('PRAGMA synchronous = FULL')
+        if version == 0:
+            connection.executescript(f'BEGIN IMMEDIATE; {_SCHEMA} COMMIT;')
+
+    def close(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    @property
+    def db(self) -> sqlite3.Connection:
+        if self._connection is None:
+            raise SpoolError('the spool index is not open')
+        return self._connection
+
+    def check(self) -> None:
+        """Raises sqlite3.DatabaseError when the file is damaged."""
+        answer = self.db.execute('PRAGMA quick_check(1)').fetchone()[0]
+        if answer != 'ok':
+            raise sqlite3.DatabaseError(str(answer))
+
+    @contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """All or nothing, durable on leaving."""
+        self.db.execute('BEGIN IMMEDIATE')
+        try:
+            yield self.db
+        except BaseException:
+            self.db.execute('ROLLBACK')
+            raise
+        self.db.execute('COMMIT')
+
+    # -- objects ---------------------------------------------------------------------------------------------------
+
+    def has(self, bucket: str, key: str) -> bool:
+        return self.db.execute('SELECT 1 FROM objects WHERE bucket = ? AND key = ?', (bucket, key)).fetchone() is not None
+
+    def insert(self, item: DataObject, key: str, sha256: str, state: State, reason: str | None,
+               metadata: Mapping[str, str], now_ns: int) -> int:  # fmt: skip
+        """Add a row under the final key; returns its id."""
+        cursor = self.db.execute(
+            'INSERT INTO objects (bucket, key, state, reason, priority, protected, sensor, topic, type, samples, bytes, sha256,'
+            ' content_type, metadata, t_start_ns, t_end_ns, created_ns) VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
+            (item.bucket, key, state.value, reason, item.priority, item.protected, item.sensor, item.topic, item.type,
+             item.samples, len(item.body), sha256, item.content_type, json.dumps(dict(metadata)),
+             item.t_start_ns, item.t_end_ns, now_ns),
+        )  # fmt: skip
+        return int(cursor.lastrowid or 0)
+
+    def move(self, ids: Iterable[int], state: State, reason: str | None, now_ns: int) -> None:
+        """Give objects another state; the totals follow."""
+        self.db.executemany(
+            'UPDATE objects SET state = ?, reason = ?, settled_ns = ? WHERE id = ? AND state IN (?, ?)',
+            ((state.value, reason, now_ns, number, State.PENDING.value, State.HELD.value) for number in ids),
+        )
+
+    def pending(self, limit: int, *, oldest: bool, without: Sequence[str] = ()) -> list[sqlite3.Row]:
+        """Objects to ship: most important first or oldest first, none of the buckets ``without``."""
+        order = 'id' if oldest else 'priority, id'
+        blocked = f' AND bucket NOT IN ({",".join("?" * len(without))})' if without else ''
+        return self.rows(f"state = 'pending'{blocked} ORDER BY {order} LIMIT ?", (*without, limit))
+
+    def rows(self, where: str, values: Sequence[object] = ()) -> list[sqlite3.Row]:
+        """Object rows by a condition of this package's own (never of a user's)."""
+        cursor = self.db.execute(f'SELECT {_OBJECT} FROM objects WHERE {where}', tuple(values))  # noqa: S608 - own constants only
+        cursor.row_factory = sqlite3.Row
+        return cursor.fetchall()
+
+    def evictable(self, limit: int) -> list[sqlite3.Row]:
+        """What a full disk costs first: lowest priority, then oldest; never a protected object."""
+        return self.rows("state IN ('pending', 'held') AND NOT protected ORDER BY priority DESC, id LIMIT ?", (limit,))
+
+    def payload_bytes(self) -> int:
+        """Bytes of all payload that lies in the spool."""
+        query = "SELECT ifnull(sum(bytes), 0) FROM tally WHERE state IN ('pending', 'held', 'quarantined')"
+        return int(self.db.execute(query).fetchone()[0])
+
+    def forget(self, before_ns: int) -> None:
+        """Drop rows of objects that left the spool before then; totals stay."""
+        self.db.execute(
+            "DELETE FROM objects WHERE id IN (SELECT id FROM objects WHERE state IN ('delivered', 'deduplicated', 'evicted')"
+            ' AND settled_ns < ? LIMIT 10000)',
+            (before_ns,),
+        )
+
+    # -- accounts --------------------------------------------------------------------------------------------------
+
+    def begin_session(self, robot: str, boot_id: str, pid: int, now_ns: int) -> int:
+        cursor = self.db.execute('INSERT INTO sessions (robot, boot_id, pid, started_ns) VALUES (?,?,?,?)', (robot, boot_id, pid, now_ns))
+        return int(cursor.lastrowid or 0)
+
+    def end_session(self, session: int, now_ns: int) -> None:
+        self.db.execute('UPDATE sessions SET ended_ns = ? WHERE id = ?', (now_ns, session))
+
+    def write(self, session: int, snapshot: Snapshot) -> None:
+        """Replace the session's accounts by a newer snapshot."""
+        self.db.executemany(
+            'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?)',
+            ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
+              json.dumps(row.rejected), json.dumps(row.dropped), row.last_kept_ns) for row in snapshot.topics),
+        )  # fmt: skip
+        self.db.executemany(
+            'INSERT OR REPLACE INTO publishers VALUES (?,?,?,?,?,?,?,?)',
+            ((session, row.topic, row.publisher, row.first, row.last, row.published, row.received, json.dumps(row.missed))
+             for row in snapshot.publishers),
+        )  # fmt: skip
+
+    def sessions(self, *, ended: bool) -> list[int]:
+        condition = 'NOT NULL' if ended else 'NULL'
+        return [row[0] for row in self.db.execute(f'SELECT id FROM sessions WHERE ended_ns IS {condition} ORDER BY id')]  # noqa: S608
+
+    def topics(self, session: int | None = None) -> list[TopicRow]:
+        """Accounts of one session, or of all in the order of the sessions."""
+        where, values = ('WHERE session = ?', (session,)) if session is not None else ('', ())
+        rows = self.db.execute(
+            'SELECT topic, type, accounting, received, skipped, stored, rejected, dropped, last_kept_ns'
+            f' FROM accounts {where} ORDER BY session', values,  # noqa: S608
+        )  # fmt: skip
+        return [TopicRow(*row[:6], json.loads(row[6]), json.loads(row[7]), row[8]) for row in rows]
+
+    def publishers(self) -> list[PublisherRow]:
+        """All spans in the order of the sessions: the last row of a publisher says where its numbers stand."""
+        rows = self.db.execute('SELECT topic, publisher, first, last, published, received, missed FROM publishers ORDER BY session')
+        return [PublisherRow(*row[:6], json.loads(row[6])) for row in rows]
+
+    def tally(self) -> list[tuple[str, str, int, int, int]]:
+        """(topic or '', state or 'spooled', objects, bytes, samples)."""
+        return self.db.execute('SELECT topic, state, objects, bytes, samples FROM tally').fetchall()
+
+
+def spooled(row: sqlite3.Row, path: Path) -> SpooledObject:
+    """The object of a row."""
+    return SpooledObject(
+        id=row['id'], bucket=row['bucket'], key=row['key'], path=path, size=row['bytes'], sha256=row['sha256'],
+        content_type=row['content_type'], metadata=json.loads(row['metadata']), priority=row['priority'],
+        created_ns=row['created_ns'],
+    )  # fmt: skip

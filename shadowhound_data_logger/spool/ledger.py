@@ -1,0 +1,97 @@
+"""The ledger: what became of every message and every object, read from the spool's index, and whether it closes (D10)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool.accounts import EXACT, GRADES
+from shadowhound_data_logger.spool.index import Index
+
+STATES: Final = tuple(state.value for state in State)
+
+
+def read(spool: Path, robot: str) -> dict[str, Any]:
+    """The ledger of a spool folder, as ``shadowhound-data ledger --json`` prints it; works while a node runs.
+
+    Raises SpoolError when there is no spool. Unknown figures are None, never 0.
+    """
+    path = spool / 'index.db'
+    if not path.is_file():
+        raise SpoolError(f'there is no spool in {spool}', remedy='has the node run here? SHADOWHOUND_HOME names its folder')
+    index = Index(path, read_only=True)
+    index.open()
+    try:
+        return of_index(index, robot)
+    finally:
+        index.close()
+
+
+def of_index(index: Index, robot: str) -> dict[str, Any]:
+    """The ledger of an open index, all of one instant."""
+    index.db.execute('BEGIN')
+    try:
+        topics, publishers, tally = index.topics(), index.publishers(), index.tally()
+    finally:
+        index.db.execute('COMMIT')
+    accounts = {topic: _topic(topic, topics, publishers, tally) for topic in sorted({row.topic for row in topics})}
+    objects = {what: sum(row[2] for row in tally if row[1] == what) for what in ('spooled', *STATES)}
+    volume = {what: sum(row[3] for row in tally if row[1] == what) for what in ('spooled', *STATES)}
+    ledger: dict[str, Any] = {'robot': robot, 'balanced': True, 'topics': accounts, 'objects': objects, 'bytes': volume}
+    ledger['balanced'] = not imbalances(ledger)
+    return ledger
+
+
+def imbalances(ledger: Mapping[str, Any]) -> list[str]:
+    """One sentence for each identity that does not hold; empty when the ledger closes."""
+    found: list[str] = []
+    for topic, row in ledger['topics'].items():
+        settled = row['skipped'] + sum(row['rejected'].values()) + sum(row['dropped'].values()) + row['stored'] + row['open']
+        if row['received'] != settled or row['open'] < 0:
+            found.append(f'{topic}: received {row["received"]}, but skipped + rejected + dropped + stored + open = {settled}')
+        if row['published'] is not None and row['published'] != row['received'] + row['missed']:
+            found.append(f'{topic}: published {row["published"]}, but received + missed = {row["received"] + row["missed"]}')
+        if row['missed'] is not None and row['missed'] != sum(row['missed_by'].values()):
+            found.append(f'{topic}: missed {row["missed"]}, but by cause {sum(row["missed_by"].values())}')
+        if row['stored'] != sum(row['stored_in'].values()):
+            found.append(f'{topic}: stored {row["stored"]}, but in objects there are {sum(row["stored_in"].values())}')
+    for what in ('objects', 'bytes'):
+        parts = sum(ledger[what][state] for state in STATES)
+        if ledger[what]['spooled'] != parts:
+            found.append(f'{what}: spooled {ledger[what]["spooled"]}, but by state {parts}')
+    return found
+
+
+def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tuple[str, str, int, int, int]]) -> dict[str, Any]:
+    rows = [row for row in topics if row.topic == topic]
+    spans = [row for row in publishers if row.topic == topic]
+    accounting = max((row.accounting for row in rows), key=GRADES.index)
+    missed_by: Counter[str] = Counter()
+    for span in spans:
+        missed_by.update(span.missed)
+    exact = accounting == EXACT
+    return {
+        'type': rows[-1].type,
+        'accounting': accounting,
+        'published': sum(span.published for span in spans) if exact else None,
+        'received': sum(row.received for row in rows),
+        'missed': missed_by.total() if exact else None,
+        'missed_by': dict(missed_by) if exact else {},
+        'skipped': sum(row.skipped for row in rows),
+        'rejected': _sum(row.rejected for row in rows),
+        'dropped': _sum(row.dropped for row in rows),
+        'stored': sum(row.stored for row in rows),
+        'open': sum(row.open for row in rows),
+        'stored_in': {state: sum(row[4] for row in tally if row[:2] == (topic, state)) for state in STATES},
+    }
+
+
+def _sum(mappings: Any) -> dict[str, int]:
+    total: Counter[str] = Counter()
+    for mapping in mappings:
+        total.update(mapping)
+    return dict(+total)

@@ -1,0 +1,275 @@
+"""The durable spool: what ``commit`` returned has survived the death of the process and of the power (D5, D6, D9).
+
+A group commit writes and syncs the payloads as ``incoming/<id>.part``, then commits one index transaction that holds
+the new objects, the outcomes of deliveries and the accounts, then renames the parts to their final names. The transaction
+is the only commit point, so objects and ledger cannot disagree; a rename that did not happen is completed by recovery.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import logging
+import os
+import sqlite3
+import threading
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.clock import SECOND, Clock
+from shadowhound_data_logger.config import SpoolSettings
+from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.keys import check_key, unique
+from shadowhound_data_logger.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.files import Tree
+from shadowhound_data_logger.spool.index import Index, spooled
+from shadowhound_data_logger.spool.recovery import Recovery, open_index, recover
+
+log = logging.getLogger(__name__)
+
+DAY_NS: Final = 24 * 3600 * SECOND
+EVICTION_STEP: Final = 64
+"""Objects looked at for one round of eviction."""
+OVERHEAD_BYTES: Final = 8192
+"""What an object costs on disk beyond its bytes: a block's rounding and its share of the index."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What delivery found out about an object: it leaves PENDING for ``state``."""
+
+    item: SpooledObject
+    state: State
+    reason: str | None = None
+
+
+class Spool:
+    """Life: New; open once; commit, pending, ... from any thread; close once.
+
+    ``_lock`` guards the writing connection and makes a commit and its renames one step for ``pending``.
+    """
+
+    def __init__(self, root: Path, settings: SpoolSettings, clock: Clock, robot: str) -> None:
+        self.root = root
+        self.accounts = Accounts()
+        self.recovery = Recovery()
+        self._settings = settings
+        self._clock = clock
+        self._robot = robot
+        self._tree = Tree(root)
+        self._lock = threading.Lock()
+        self._index = Index(root / 'index.db')
+        self._session = 0
+        self._session_lock: int | None = None
+        self._forgot_ns = 0
+
+    def open(self) -> None:
+        """Create or recover the spool and begin a session. Raises SpoolError naming the folder and what to do."""
+        try:
+            self._tree.create()
+            with _flock(self.root / 'recovery.lock'):
+                self._index = open_index(self.root / 'index.db', self.recovery)
+                recover(self._tree, self._index, self._clock.wall_ns(), self.recovery)
+                self._begin()
+        except OSError as error:
+            raise SpoolError(f'the spool {self.root} cannot be used: {error.strerror or error}',
+                             remedy='set SHADOWHOUND_HOME to a folder that this user may write, with space on it') from error  # fmt: skip
+        if self.recovery.found_anything:
+            log.warning('spool %s: %s', self.root, self.recovery.describe())
+
+    def close(self) -> None:
+        """Commit the last accounts and end the session; idempotent."""
+        if not self._session:
+            return
+        with self._lock:
+            snapshot = self.accounts.snapshot({})
+            with self._index.transaction():
+                if snapshot:
+                    self._index.write(self._session, snapshot)
+                self._index.end_session(self._session, self._clock.wall_ns())
+            self._index.close()
+            self._session = 0
+        if self._session_lock is not None:
+            os.close(self._session_lock)
+            self._session_lock = None
+
+    def commit(self, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = ()) -> list[SpooledObject]:
+        """One group commit. Returns the objects that may be shipped now, under their final keys.
+
+        Raises OSError or sqlite3.OperationalError when nothing of it became durable; the caller tries again. Objects
+        for which there is no room at all are recorded as evicted (D9).
+        """
+        now_ns = self._clock.wall_ns()
+        with self._lock:
+            evicted = self._make_room(sum(len(item.body) + OVERHEAD_BYTES for item in objects), now_ns)
+            fits = evicted is not None
+            stored = _count(objects)
+            snapshot = self.accounts.snapshot(stored)
+            try:
+                with self._index.transaction():
+                    added = [self._add(item, now_ns, fits) for item in objects]
+                    if added and fits:
+                        self._tree.sync_incoming()
+                    for outcome in outcomes:
+                        self._index.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
+                    if snapshot is not None:
+                        self._index.write(self._session, snapshot)
+                    self._forget(now_ns)
+            except BaseException:
+                self.accounts.mark_dirty()
+                raise
+            self.accounts.store(stored)
+            self._place(added)
+            self._settle(outcomes)
+        return [item for item, state in added if state is State.PENDING]
+
+    def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
+                without: Sequence[str] = ()) -> list[SpooledObject]:  # fmt: skip
+        """Up to ``limit`` objects to ship: the most important first, or the oldest first.
+
+        ``exclude`` are ids already in somebody's hands, ``without`` buckets that cannot take anything now.
+        """
+        with self._lock:
+            rows = self._index.pending(limit + len(exclude), oldest=oldest, without=without)
+        found: list[SpooledObject] = []
+        for row in rows:
+            if row['id'] not in exclude and len(found) < limit:
+                path = self._tree.path(State.PENDING, None, row['bucket'], row['key'])
+                if not path.exists():  # another process has committed it and not renamed it yet
+                    self._tree.place(self._tree.part(row['id']), path)
+                found.append(spooled(row, path))
+        return found
+
+    def pending_count(self) -> int:
+        with self._lock:
+            return sum(row[2] for row in self._index.tally() if row[1] == State.PENDING.value)
+
+    @contextmanager
+    def drain_lock(self) -> Iterator[bool]:
+        """Held by the one process that ships (D6); yields False when another one has it."""
+        with _flock(self.root / 'drain.lock', wait=False) as mine:
+            yield mine
+
+    # -- under the lock --------------------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        now_ns = self._clock.wall_ns()
+        with self._index.transaction():
+            self._session = self._index.begin_session(self._robot, self._clock.boot_id, os.getpid(), now_ns)
+        path = self.root / 'sessions' / str(self._session)
+        self._session_lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        fcntl.flock(self._session_lock, fcntl.LOCK_EX)
+        last = {(row.topic, row.publisher): row for row in self._index.publishers()}
+        kept: dict[str, int] = {}
+        for row in self._index.topics():
+            kept[row.topic] = max(kept.get(row.topic, 0), row.last_kept_ns)
+        self.accounts = Accounts(last.values(), kept)
+
+    def _add(self, item: DataObject, now_ns: int, fits: bool) -> tuple[SpooledObject, State]:
+        """Row and part of one object, inside the transaction."""
+        state, reason = (State.HELD, item.held) if item.held else (State.PENDING, None)
+        if not fits and not item.protected:
+            state, reason = State.EVICTED, 'no_room'
+        key = self._free_key(item.bucket, check_key(item.key))
+        sha256 = hashlib.sha256(item.body).hexdigest()
+        metadata = {**item.metadata, 'sha256': sha256}
+        number = self._index.insert(item, key, sha256, state, reason, metadata, now_ns)
+        if state is not State.EVICTED:
+            self._tree.write_part(number, item.body, _description(item, sha256, metadata))
+            path = self._tree.path(state, reason, item.bucket, key)
+        else:
+            path = self._tree.part(number)
+        return SpooledObject(number, item.bucket, key, path, len(item.body), sha256, item.content_type, metadata,
+                             item.priority, now_ns), state  # fmt: skip
+
+    def _free_key(self, bucket: str, wanted: str) -> str:
+        """The wanted key or the first of its ``_1``, ``_2``, ... that was never given out (D7)."""
+        attempt = 0
+        while self._index.has(bucket, key := unique(wanted, attempt)):
+            attempt += 1
+        return check_key(key)
+
+    def _place(self, added: Iterable[tuple[SpooledObject, State]]) -> None:
+        for item, state in added:
+            if state is not State.EVICTED:
+                self._tree.place(self._tree.part(item.id), item.path)
+
+    def _settle(self, outcomes: Iterable[Outcome]) -> None:
+        """Let the files follow their rows."""
+        for outcome in outcomes:
+            if outcome.state is State.QUARANTINED:
+                self._tree.place(outcome.item.path, self._tree.path(outcome.state, outcome.reason, outcome.item.bucket, outcome.item.key))
+            else:
+                self._tree.remove(outcome.item.path)
+
+    def _make_room(self, needed: int, now_ns: int) -> int | None:
+        """Evict until ``needed`` bytes fit; the number of objects it cost, None when they cannot fit."""
+        evicted = 0
+        while needed:
+            over = max(self._index.payload_bytes() + needed - self._settings.max_bytes,
+                       self._settings.min_free_bytes + needed - self._tree.free_bytes())  # fmt: skip
+            if over <= 0:
+                return evicted
+            rows = self._index.evictable(EVICTION_STEP)
+            if not rows:
+                log.error('spool %s: %d bytes too many and nothing left that may be evicted', self.root, over)
+                return None
+            chosen: list[sqlite3.Row] = []
+            for row in rows:
+                if over > 0:
+                    chosen.append(row)
+                    over -= row['bytes']
+            with self._index.transaction():
+                self._index.move([row['id'] for row in chosen], State.EVICTED, 'no_room', now_ns)
+            for row in chosen:
+                self._tree.remove(self._tree.path(State(row['state']), row['reason'], row['bucket'], row['key']))
+            evicted += len(chosen)
+            log.warning('spool %s: evicted %d objects to make room', self.root, len(chosen))
+        return evicted
+
+    def _forget(self, now_ns: int) -> None:
+        """Once an hour, drop rows of deliveries that nobody will ask for any more."""
+        if now_ns - self._forgot_ns > 3600 * SECOND:
+            self._forgot_ns = now_ns
+            self._index.forget(now_ns - round(self._settings.remember_days * DAY_NS))
+
+
+def _description(item: DataObject, sha256: str, metadata: Mapping[str, str]) -> dict[str, object]:
+    """What a file must say of itself so that its row can be made again."""
+    return {
+        'bucket': item.bucket, 'key': item.key, 'sha256': sha256, 'content_type': item.content_type, 'sensor': item.sensor,
+        'topic': item.topic, 'type': item.type, 'samples': item.samples, 't_start_ns': item.t_start_ns,
+        't_end_ns': item.t_end_ns, 'priority': item.priority, 'protected': item.protected, 'metadata': dict(metadata),
+    }  # fmt: skip
+
+
+def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, int]]:
+    """topic -> (samples, stamp of the newest)."""
+    counts: dict[str, tuple[int, int]] = {}
+    for item in objects:
+        if item.topic is not None:
+            count, newest_ns = counts.get(item.topic, (0, 0))
+            counts[item.topic] = (count + item.samples, max(newest_ns, item.t_end_ns))
+    return counts
+
+
+@contextmanager
+def _flock(path: Path, *, wait: bool = True) -> Iterator[bool]:
+    """An advisory lock that dies with its process; yields whether it was had."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in {errno.EAGAIN, errno.EACCES}:
+                raise
+            yield False
+        else:
+            yield True
+    finally:
+        os.close(descriptor)
