@@ -11,6 +11,7 @@ from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import NameRefused, SettingError
 from shadowhound_data_logger.keys import KeyTemplate, check_name
 
@@ -50,9 +51,11 @@ class SensorSettings:
 
     @property
     def period_ns(self) -> int:
-        """The least time between two objects, ns; 0 where it is not known (every message is one)."""
+        """The time between two objects as far as their names go, ns; 0 where every message is one."""
         if self.batch_s:
             return round(self.batch_s * 1e9)
+        if self.on_change:
+            return SECOND
         return round(1e9 / self.rate_hz) if self.rate_hz else 0
 
 
@@ -181,11 +184,16 @@ class Settings:
             name, value = next(iter(given.items()))
             known = sorted({'robot', 'sensors', *_GROUPS, *(sensor.name for sensor in sensors)})
             raise SettingError(name, value, f'no parameter of that name; there are {_near(name, sensors, known)}')
-        home = Path(environ.get('SHADOWHOUND_HOME') or '~/.shadowhound').expanduser().absolute()
-        return cls(robot=robot, home=home, sensors=sensors, store=store_settings(environ, home), **groups)
+        folder = home(environ)
+        return cls(robot=robot, home=folder, sensors=sensors, store=store_settings(environ, folder), **groups)
 
 
-def store_settings(environ: Mapping[str, str], home: Path) -> StoreSettings:
+def home(environ: Mapping[str, str]) -> Path:
+    """The folder of the spool and, without a server, of the store: SHADOWHOUND_HOME, else ``~/.shadowhound``."""
+    return Path(environ.get('SHADOWHOUND_HOME') or '~/.shadowhound').expanduser().absolute()
+
+
+def store_settings(environ: Mapping[str, str], folder: Path) -> StoreSettings:
     """The store the environment names; raises SettingError for an endpoint that is no http(s) URL."""
     endpoint = environ.get('AWS_ENDPOINT_URL') or None
     if endpoint and not endpoint.startswith(('http://', 'https://')):
@@ -196,7 +204,7 @@ def store_settings(environ: Mapping[str, str], home: Path) -> StoreSettings:
         secret_access_key=environ.get('AWS_SECRET_ACCESS_KEY') or None,
         session_token=environ.get('AWS_SESSION_TOKEN') or None,
         region=environ.get('AWS_REGION') or environ.get('AWS_DEFAULT_REGION') or 'us-east-1',
-        directory=home / 'store',
+        directory=folder / 'store',
     )
 
 
@@ -229,7 +237,14 @@ def _sensors(given: dict[str, Any]) -> tuple[SensorSettings, ...]:
         raise SettingError('sensors', names, 'a list of names')
     if len(set(names)) != len(names):
         raise SettingError('sensors', names, 'a list of names, each once')
-    return tuple(_sensor(name, given) for name in names)
+    sensors = tuple(_sensor(name, given) for name in names)
+    owners: dict[str, str] = {}
+    for sensor in sensors:
+        for topic in sensor.topics:
+            if topic in owners:
+                raise SettingError(f'{sensor.name}.topics', list(sensor.topics), f'a topic that is not {owners[topic]}.topics already')
+            owners[topic] = sensor.name
+    return sensors
 
 
 def _sensor(name: str, given: dict[str, Any]) -> SensorSettings:

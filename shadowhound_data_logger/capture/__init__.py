@@ -1,1 +1,1 @@
-"""The only folder that imports rclpy: messages are taken from DDS here and handed on as they came."""
+"""From the robot to closed batches: the only folder that imports rclpy. Messages are taken from DDS and handed on as they came."""

@@ -1,0 +1,83 @@
+"""How to listen to a topic, decided from its publishers in the graph (D4). Plain Python: rclpy's types end in ``Endpoint``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil
+from typing import Final
+
+from shadowhound_data_logger.config import IntakeSettings
+
+LARGE_TYPES: Final = {
+    'sensor_msgs/msg/Image': 2 << 20,
+    'sensor_msgs/msg/PointCloud2': 1 << 20,
+    'sensor_msgs/msg/CompressedImage': 256 << 10,
+    'nav_msgs/msg/OccupancyGrid': 1 << 20,
+    'go2_interfaces/msg/VoxelMapCompressed': 256 << 10,
+}
+"""Bytes a message of the types that are not small, for sizing the history; generous guesses, not limits."""
+LARGE_RATE_HZ: Final = 60.0
+SMALL_BYTES: Final = 4096
+DEPTH_MARGIN: Final = 4
+"""History depth is rate times poll period times this (D1)."""
+MIN_DEPTH: Final = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """One publisher of a topic."""
+
+    gid: str
+    type: str
+    reliable: bool
+    transient_local: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A subscription as it should be."""
+
+    topic: str
+    type: str
+    reliable: bool
+    transient_local: bool
+    depth: int
+
+    def describe(self) -> str:
+        """For a log line: ``/odom (nav_msgs/msg/Odometry, RELIABLE, depth 400)``."""
+        reliability = 'RELIABLE' if self.reliable else 'BEST_EFFORT'
+        return f'{self.topic} ({self.type}, {reliability}{", TRANSIENT_LOCAL" * self.transient_local}, depth {self.depth})'
+
+
+def plans(topic: str, publishers: Sequence[Endpoint], expected_type: str | None, settings: IntakeSettings) -> tuple[Plan, ...]:
+    """The subscriptions that miss nothing of what these publishers send; none while not even the type is known.
+
+    A RELIABLE subscription gets nothing from a BEST_EFFORT publisher, and a BEST_EFFORT one may lose what a RELIABLE
+    publisher would have repeated. So there is one of each while both kinds of publisher exist, and while none does yet:
+    whatever comes is then matched as it should be from its first message on. What both receive is a repeat, and dropped.
+    With several types on a topic the most common one is heard.
+    """
+    counts = Counter(publisher.type for publisher in publishers)
+    name = counts.most_common(1)[0][0] if counts else expected_type
+    if not name:
+        return ()
+    reliable = [publisher for publisher in publishers if publisher.type == name and publisher.reliable]
+    best_effort = [publisher for publisher in publishers if publisher.type == name and not publisher.reliable]
+    size = depth(name, settings)
+    found: list[Plan] = []
+    if reliable or not best_effort:
+        latched = bool(reliable) and all(publisher.transient_local for publisher in reliable)
+        found.append(Plan(topic, name, reliable=True, transient_local=latched, depth=size))
+    if best_effort or not reliable:
+        found.append(Plan(topic, name, reliable=False, transient_local=False, depth=size))
+    return tuple(found)
+
+
+def depth(type_name: str, settings: IntakeSettings) -> int:
+    """Messages a subscription must hold between two drains, bounded in bytes."""
+    size = LARGE_TYPES.get(type_name, SMALL_BYTES)
+    rate_hz = LARGE_RATE_HZ if type_name in LARGE_TYPES else settings.max_rate_hz
+    wanted = ceil(rate_hz * settings.poll_s * DEPTH_MARGIN)
+    return max(1, min(max(wanted, MIN_DEPTH), settings.history_bytes // size))

@@ -1,0 +1,130 @@
+"""One subscription, drained instead of called back (D1). The seam to what rclpy of each distribution offers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Any, Final, NamedTuple
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from shadowhound_data_logger.capture.endpoints import Endpoint, Plan
+
+try:
+    from rclpy.event_handler import SubscriptionEventCallbacks
+except ImportError:  # Humble
+    from rclpy.qos_event import SubscriptionEventCallbacks
+
+MAX_TAKES: Final = 20_000
+"""Takes of one drain: beyond it the other topics have their turn first."""
+
+
+class Taken(NamedTuple):
+    """A serialized message with what the middleware knows of it; None where it does not say."""
+
+    cdr: bytes
+    source_ns: int
+    publisher: str | None
+    number: int | None
+
+
+class PolledGroup(CallbackGroup):
+    """Keeps what is in it out of every wait set.
+
+    That holds for event handlers too: in rmw_fastrtps a reader's events and its data share one condition, so a wait set
+    with an event of an undrained subscription returns at once, for ever (a whole core, measured on Kilted).
+    """
+
+    def can_execute(self, entity: Any) -> bool:  # noqa: ARG002 - the base class's arguments
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:  # noqa: ARG002
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
+class TypeUnavailable(LookupError):
+    """The message package of a type is not installed here."""
+
+
+def message_class(type_name: str) -> type:
+    """The rclpy class of ``package/msg/Name``; raises TypeUnavailable."""
+    package, _, name = type_name.partition('/msg/')
+    try:
+        return getattr(import_module(f'{package}.msg'), name)  # type: ignore[no-any-return]
+    except (ImportError, AttributeError, ValueError) as error:
+        raise TypeUnavailable(f'{type_name}: {error}') from error
+
+
+def endpoints(node: Node, topic: str) -> list[Endpoint]:
+    """The publishers of a resolved topic as the graph knows them."""
+    return [
+        Endpoint(
+            gid=bytes(info.endpoint_gid).hex(),
+            type=info.topic_type,
+            reliable=info.qos_profile.reliability is ReliabilityPolicy.RELIABLE,
+            transient_local=info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL,
+        )
+        for info in node.get_publishers_info_by_topic(topic)
+    ]
+
+
+class Reader:
+    """A live subscription. Created, drained and closed by the intake thread alone: a take after a destroy raises."""
+
+    def __init__(self, node: Node, plan: Plan, group: PolledGroup) -> None:
+        """Raises TypeUnavailable when the message package is missing."""
+        self.plan = plan
+        self._node = node
+        self._class = message_class(plan.type)
+        self._publishers: dict[bytes, str] = {}
+        profile = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=plan.depth,
+            reliability=ReliabilityPolicy.RELIABLE if plan.reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if plan.transient_local else DurabilityPolicy.VOLATILE,
+        )
+        self._subscription = node.create_subscription(
+            self._class, plan.topic, _never_called, profile, callback_group=group, raw=True,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        )  # fmt: skip
+
+    def matched(self) -> int:
+        """Number of publishers it is matched with."""
+        handle = self._subscription.handle
+        with handle:
+            return int(handle.get_publisher_count())
+
+    def drain(self, only_publisher: str | None) -> Iterator[Taken]:
+        """Everything that waits, oldest first. ``only_publisher`` names the sender where the middleware does not."""
+        handle = self._subscription.handle
+        with handle:
+            take, message_type = handle.take_message, self._class
+            for _ in range(MAX_TAKES):
+                taken = take(message_type, True)
+                if taken is None:
+                    return
+                cdr, info = taken
+                yield Taken(cdr, info['source_timestamp'], self._publisher(info) or only_publisher, info.get('publication_sequence_number'))
+
+    def close(self) -> None:
+        self._node.destroy_subscription(self._subscription)
+
+    def _publisher(self, info: Mapping[str, Any]) -> str | None:
+        """The sender's gid in hex; Jazzy and older do not give it."""
+        gid = info.get('publisher_gid')
+        if gid is None:
+            return None
+        data = gid['data']
+        name = self._publishers.get(data)
+        if name is None:
+            name = self._publishers[data] = bytes(data).hex()
+        return name
+
+
+def _never_called(_: bytes) -> None:
+    raise AssertionError('a polled subscription was executed')

@@ -1,0 +1,88 @@
+"""``sensor_logger_node``: what the robot publishes goes to the store, and the ledger says what became of it.
+
+    ros2 run shadowhound_data_logger sensor_logger_node --ros-args --params-file go2.yaml -r __ns:=/tachi
+
+Exit codes: 0 asked to stop, 1 a failure, 2 settings refused.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import time
+from types import FrameType
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from shadowhound_data_logger.capture import parameters
+from shadowhound_data_logger.capture.log_bridge import RosHandler
+from shadowhound_data_logger.capture.pipeline import Pipeline
+from shadowhound_data_logger.errors import DataLoggerError, SettingError
+
+SPIN_S = 0.2
+"""How long a signal may wait to be seen."""
+SECOND_SIGNAL_S = 1.0
+"""A second signal later than this ends the node at once; an earlier one is the same key press."""
+
+
+class StopSignals:
+    """SIGINT and SIGTERM ask to stop; a second one, later, ends the process: what is spooled is durable already."""
+
+    def __init__(self) -> None:
+        self.first_s: float | None = None
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    @property
+    def received(self) -> bool:
+        return self.first_s is not None
+
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
+        if self.first_s is None:
+            self.first_s = time.monotonic()
+        elif time.monotonic() - self.first_s > SECOND_SIGNAL_S:
+            os._exit(128 + number)
+
+
+def main(args: list[str] | None = None) -> int:
+    """The console script; ``args`` are ROS arguments without the program's name."""
+    rclpy.init(args=[sys.argv[0], *(sys.argv[1:] if args is None else args)], signal_handler_options=SignalHandlerOptions.NO)
+    stop = StopSignals()
+    node = Node('sensor_logger_node', automatically_declare_parameters_from_overrides=True)
+    logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
+    try:
+        run(node, stop)
+    except SettingError as error:
+        node.get_logger().fatal(f'refused to start: {error}')
+        return 2
+    except DataLoggerError as error:
+        node.get_logger().fatal(str(error))
+        return 1
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def run(node: Node, stop: StopSignals) -> None:
+    """Log until a signal comes."""
+    pipeline = Pipeline(node, parameters.load(node))
+    pipeline.open()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not stop.received:
+            executor.spin_once(timeout_sec=SPIN_S)
+    finally:
+        node.get_logger().info('closing: open batches are finished and delivered')
+        pipeline.close()
+        executor.shutdown()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,42 @@
+"""``shadowhound-data VERB``: exit code 0 is fine, 1 a finding, 2 bad usage."""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from shadowhound_data_logger.cli.ledger import ledger
+from shadowhound_data_logger.errors import DataLoggerError
+
+
+@click.group(context_settings={'help_option_names': ['-h', '--help']})
+@click.version_option(package_name='shadowhound_data_logger', prog_name='shadowhound-data')
+def cli() -> None:
+    """What became of a robot's data: ask its spool and its store.
+
+    SHADOWHOUND_HOME names the folder of the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT the robot (default thor).
+    """
+
+
+cli.add_command(ledger)
+
+
+def main() -> None:
+    """The console script."""
+    try:
+        sys.exit(cli(standalone_mode=False) or 0)
+    except click.exceptions.Exit as error:
+        sys.exit(error.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(2)
+    except click.Abort:
+        sys.exit(130)
+    except DataLoggerError as error:
+        click.echo(f'shadowhound-data: {error}', err=True)
+        sys.exit(1)
+
+
+if __name__ == '__main__':
+    main()

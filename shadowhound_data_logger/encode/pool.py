@@ -1,0 +1,65 @@
+"""The encode pool: threads that turn batches into objects and hand them to the spool writer.
+
+Every sample that goes in comes out as stored or as rejected with a reason, also when an encoder has a fault of its own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.encode.queue import BatchQueue
+from shadowhound_data_logger.encode.registry import encode
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.model import Batch, DataObject
+from shadowhound_data_logger.worker import Worker
+
+WAIT_S: Final = 0.5
+Reject = Callable[[str, Mapping[str, int]], None]
+
+
+class EncodePool:
+    """New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake."""
+
+    def __init__(self, queue: BatchQueue, sensors: Mapping[str, SensorSettings], robot: str, types: MessageTypes,
+                 put: Callable[[DataObject], None], reject: Reject, threads: int) -> None:  # fmt: skip
+        self._queue = queue
+        self._sensors = sensors
+        self._robot = robot
+        self._types = types
+        self._put = put
+        self._reject = reject
+        self.workers = [Worker(f'encode-{number}', self._step) for number in range(threads)]
+
+    def open(self) -> None:
+        for worker in self.workers:
+            worker.start()
+
+    def close(self, deadline_s: float) -> bool:
+        """Encode what is queued, then end; False if that took longer than the deadline. Idempotent."""
+        end = time.monotonic() + deadline_s
+        self._queue.close()
+        for worker in self.workers:
+            worker.stop()
+        done = [worker.join(end - time.monotonic()) for worker in self.workers]
+        while all(done) and time.monotonic() < end and (batch := self._queue.get(0.0)) is not None:
+            self._encode(batch)
+        return all(done) and not self._queue.status().messages
+
+    def _step(self) -> None:
+        batch = self._queue.get(WAIT_S)
+        if batch is not None:
+            self._encode(batch)
+
+    def _encode(self, batch: Batch) -> None:
+        try:
+            encoding = encode(batch, self._sensors[batch.sensor], self._robot, self._types)
+        except BaseException:
+            self._reject(batch.topic, {'encoder_failed': len(batch.samples)})
+            raise
+        if encoding.rejected:
+            self._reject(batch.topic, encoding.rejected)
+        if encoding.object is not None:
+            self._put(encoding.object)

@@ -1,0 +1,101 @@
+"""The one thread that writes the spool: it groups finished objects and outcomes of deliveries into durable commits.
+
+At most one commit every ``commit_s``; the first after a quiet time happens at once. A commit that fails (a full or
+read-only disk) is tried again with everything that was in it; meanwhile ``put`` blocks the encoders, not the intake.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Sequence
+from typing import Final
+
+from shadowhound_data_logger.keys import check_key
+from shadowhound_data_logger.model import DataObject, SpooledObject
+from shadowhound_data_logger.spool.spool import Outcome, Spool
+from shadowhound_data_logger.worker import Worker
+
+MAX_WAITING_BYTES: Final = 32 << 20
+"""Encoded bytes in memory before encoders have to wait."""
+HEARTBEAT_S: Final = 1.0
+"""How often the accounts become durable when there is nothing else to commit."""
+
+
+class SpoolWriter:
+    """New; open once; put, settle, flush from any thread; close once. ``_changed`` guards the lists."""
+
+    def __init__(self, spool: Spool, commit_s: float, *, spooled: Callable[[Sequence[SpooledObject]], None] = lambda _: None,
+                 settled: Callable[[Collection[int]], None] = lambda _: None) -> None:  # fmt: skip
+        self._spool = spool
+        self._commit_s = commit_s
+        self._spooled = spooled
+        self._settled = settled
+        self._changed = threading.Condition()
+        self._objects: deque[DataObject] = deque()
+        self._outcomes: deque[Outcome] = deque()
+        self._bytes = 0
+        self._added = self._done = 0
+        self._urgent = False
+        self._last_commit = -HEARTBEAT_S
+        self.worker = Worker('spool-writer', self._step)
+
+    def open(self) -> None:
+        self.worker.start()
+
+    def put(self, item: DataObject) -> None:
+        """Queue an object for the next commit; waits while too many bytes wait. Raises NameRefused for a bad key."""
+        check_key(item.key)
+        with self._changed:
+            self._changed.wait_for(lambda: self._bytes < MAX_WAITING_BYTES or self.worker.stopping)
+            self._objects.append(item)
+            self._bytes += len(item.body)
+            self._added += 1
+            self._changed.notify_all()
+
+    def settle(self, outcomes: Sequence[Outcome]) -> None:
+        """Queue outcomes of deliveries for the next commit; never waits."""
+        with self._changed:
+            self._outcomes.extend(outcomes)
+            self._added += len(outcomes)
+            self._changed.notify_all()
+
+    def flush(self, deadline_s: float) -> bool:
+        """Whether everything put and settled before this call became durable in time."""
+        with self._changed:
+            target = self._added
+            self._urgent = True
+            self._changed.notify_all()
+            return self._changed.wait_for(lambda: self._done >= target, deadline_s)
+
+    def close(self, deadline_s: float) -> bool:
+        """Commit what is queued and end the thread; False when that did not work in time. Idempotent."""
+        end = time.monotonic() + deadline_s
+        flushed = self.flush(deadline_s)
+        self.worker.stop()
+        with self._changed:
+            self._changed.notify_all()
+        return self.worker.join(end - time.monotonic() + HEARTBEAT_S) and flushed
+
+    def _step(self) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._objects or self._outcomes or self._urgent or self.worker.stopping, HEARTBEAT_S)
+            pause_s = self._last_commit + self._commit_s - time.monotonic()
+            if pause_s > 0 and not self._urgent:
+                self._changed.wait_for(lambda: self._urgent or self.worker.stopping, pause_s)
+            objects, outcomes = list(self._objects), list(self._outcomes)
+        self._last_commit = time.monotonic()
+        spooled = self._spool.commit(objects, outcomes)
+        with self._changed:
+            for _ in objects:
+                self._bytes -= len(self._objects.popleft().body)
+            for _ in outcomes:
+                self._outcomes.popleft()
+            self._done += len(objects) + len(outcomes)
+            self._urgent = self._urgent and bool(self._objects or self._outcomes)
+            self._changed.notify_all()
+        if outcomes:
+            self._settled({outcome.item.id for outcome in outcomes})
+        if spooled:
+            self._spooled(spooled)
