@@ -103,3 +103,12 @@ class Put(str, Enum):
     CREATED = 'created'
     IDENTICAL = 'identical'
     """The key held the very same content already (an earlier try whose answer was lost): a success."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What delivery found out about an object: it leaves PENDING for ``state``."""
+
+    item: SpooledObject
+    state: State
+    reason: str | None = None

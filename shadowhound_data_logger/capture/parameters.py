@@ -9,7 +9,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from shadowhound_data_logger.config import FOREIGN, Settings, default_parameters
+from shadowhound_data_logger.config import DEFAULT_SENSORS, FOREIGN, Settings, default_parameters
 
 FIXED: Final = 'settings are read at the start: change the parameter file and start the node again'
 
@@ -21,11 +21,9 @@ def load(node: Node) -> Settings:
     """
     given = {name: _plain(parameter.value) for name, parameter in node.get_parameters_by_prefix('').items()}
     settings = Settings.load(given, os.environ, node.get_namespace())
-    chosen = {sensor.name for sensor in settings.sensors}
+    unused = set(DEFAULT_SENSORS) - {sensor.name for sensor in settings.sensors}
     for name, default in default_parameters().items():
-        group = name.split('.')[0]
-        known = group in chosen or '.' not in name or not any(name.startswith(f'{sensor}.') for sensor in default_parameters()['sensors'])
-        if known and not node.has_parameter(name):
+        if name.partition('.')[0] not in unused and not node.has_parameter(name):
             node.declare_parameter(name, default)
     node.add_on_set_parameters_callback(_refuse)
     return settings

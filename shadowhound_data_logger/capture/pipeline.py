@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from rclpy.node import Node
@@ -16,7 +17,7 @@ from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.pool import EncodePool
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.model import DataObject, Outcome
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Spool
@@ -44,9 +45,9 @@ class Pipeline:
         settings = self._settings
         self._store = open_store(settings.store, settings.upload)
         self.spool.open()
-        self.uploader = Uploader(self.spool, self._store, settings.upload, lambda outcomes: self.writer.settle(outcomes))
+        self.uploader = Uploader(self.spool, self._store, settings.upload, self._settle)
         self.writer = SpoolWriter(self.spool, settings.spool.commit_s, spooled=lambda _: self.uploader.wake(),
-                                  settled=lambda ids: self.uploader.settled(ids))  # fmt: skip
+                                  settled=self.uploader.settled)  # fmt: skip
         types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         self.queue = BatchQueue(settings.queue)
         sensors = {sensor.name: sensor for sensor in settings.sensors}
@@ -78,6 +79,9 @@ class Pipeline:
         self.writer.close(1.0)
         self.spool.close()
         self._store.close()
+
+    def _settle(self, outcomes: Sequence[Outcome]) -> None:
+        self.writer.settle(outcomes)
 
     def _ledger(self) -> DataObject:
         """The ledger as an object of its own, for the store."""

@@ -30,7 +30,7 @@ class Taken(NamedTuple):
     number: int | None
 
 
-class PolledGroup(CallbackGroup):
+class PolledGroup(CallbackGroup):  # type: ignore[misc]  # rclpy has no types
     """Keeps what is in it out of every wait set.
 
     That holds for event handlers too: in rmw_fastrtps a reader's events and its data share one condition, so a wait set
@@ -109,7 +109,8 @@ class Reader:
                 if taken is None:
                     return
                 cdr, info = taken
-                yield Taken(cdr, info['source_timestamp'], self._publisher(info) or only_publisher, info.get('publication_sequence_number'))
+                publisher = self._publisher(info) or only_publisher
+                yield Taken(cdr, info['source_timestamp'], publisher, info.get('publication_sequence_number'))
 
     def close(self) -> None:
         self._node.destroy_subscription(self._subscription)

@@ -42,8 +42,8 @@ class Source:
         self._types = types
         self._group = group
         self._offer = offer
-        self._topics = [node.resolve_topic_name(topic) for topic in sensor.topics]
-        self._types_expected = dict(zip(self._topics, sensor.types))
+        self._topics: list[str] = [node.resolve_topic_name(topic) for topic in sensor.topics]
+        self._types_expected = dict(zip(self._topics, sensor.types, strict=False))
         self._chosen = self._topics[0]
         self._absent_since_s: float | None = None
         self._type = ''
@@ -78,7 +78,8 @@ class Source:
                     self._readers.append(Reader(self._node, plan, self._group))
         except TypeUnavailable as error:
             self._unavailable.add(wanted[0].type)
-            log.warning('%s: %s is not logged: its message package is not installed here (%s)', self.sensor.name, self._chosen, error)
+            text = '%s: %s is not logged: its message package is not installed here (%s)'
+            log.warning(text, self.sensor.name, self._chosen, error)
             return
         if publishers and set(wanted) != self._heard:
             self._heard = set(wanted)
@@ -193,7 +194,7 @@ class Source:
 
     def _is_repeat(self, source_ns: int, cdr: bytes) -> bool:
         """Whether a message without a number came by another of our subscriptions already: same time, same content."""
-        if len(self._readers) < 2:  # noqa: PLR2004 - one subscription delivers each message once
+        if len(self._readers) < 2:  # one subscription delivers each message once
             self._recent.clear()
             return False
         mark = (source_ns, crc32(cdr))
