@@ -183,7 +183,7 @@ class Settings:
         if given:
             name, value = next(iter(given.items()))
             known = sorted({'robot', 'sensors', *_GROUPS, *(sensor.name for sensor in sensors)})
-            raise SettingError(name, value, f'no parameter of that name; there are {_near(name, sensors, known)}')
+            raise SettingError(name, value, f'only a known name: {_near(name, sensors, known)}')
         folder = home(environ)
         return cls(robot=robot, home=folder, sensors=sensors, store=store_settings(environ, folder), **groups)
 

@@ -25,7 +25,7 @@ class SettingError(DataLoggerError):
     """A parameter or environment variable is unknown or wrong; ``data`` has name, value and allowed."""
 
     def __init__(self, name: str, value: object, allowed: str) -> None:
-        super().__init__(f'{name} = {value!r}: allowed is {allowed}', name=name, value=value, allowed=allowed)
+        super().__init__(f'{name} = {value!r} is refused; allowed is {allowed}', name=name, value=value, allowed=allowed)
 
 
 class NameRefused(DataLoggerError):

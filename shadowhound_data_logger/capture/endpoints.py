@@ -81,3 +81,33 @@ def depth(type_name: str, settings: IntakeSettings) -> int:
     rate_hz = LARGE_RATE_HZ if type_name in LARGE_TYPES else settings.max_rate_hz
     wanted = ceil(rate_hz * settings.poll_s * DEPTH_MARGIN)
     return max(1, min(max(wanted, MIN_DEPTH), settings.history_bytes // size))
+
+
+class Senders:
+    """Who sent a message, where the middleware gives its number but not its sender's gid (Jazzy and older).
+
+    With one publisher in the graph it is that one. Its successor is told from it before the graph shows the change: its
+    numbers begin anew while the time of sending goes on.
+    """
+
+    def __init__(self) -> None:
+        self.gids: list[str] = []
+        self._successors = 0
+        self._number = 0
+        self._sent_ns = 0
+
+    def look(self, gids: list[str]) -> None:
+        """What the graph says now."""
+        if gids and gids != self.gids:
+            self.gids = gids
+            self._successors = 0
+
+    def name(self, number: int | None, sent_ns: int) -> str | None:
+        """A name for the sender of this message; None where there is more than one, or no number."""
+        if number is None or len(self.gids) != 1:
+            return None
+        if number <= self._number and sent_ns > self._sent_ns:
+            self._successors += 1
+        if sent_ns >= self._sent_ns:
+            self._number, self._sent_ns = number, sent_ns
+        return f'{self.gids[0]}.{self._successors}'

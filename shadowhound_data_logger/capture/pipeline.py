@@ -39,6 +39,7 @@ class Pipeline:
         self._clock = SystemClock.of_this_machine()
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
         self._node = node
+        self._day = self._today()
 
     def open(self) -> None:
         """Raises SpoolError or SettingError; nothing is left open then."""
@@ -63,15 +64,16 @@ class Pipeline:
     def close(self) -> None:
         """Close the open batches, make all durable, deliver for at most ``shutdown.drain_s``, leave the rest in the spool."""
         end_s = time.monotonic() + CLOSE_S
-        for name, done in (
-            ('intake', self.intake.close(CLOSE_S)),
-            ('encode pool', self.pool.close(end_s - time.monotonic())),
-            ('spool writer', self.writer.flush(end_s - time.monotonic())),
-        ):
-            if not done:
-                log.error('the %s did not finish in %.0f s', name, CLOSE_S)
-        self.writer.put(self._ledger())
-        self.writer.flush(1.0)
+        finished = {
+            'intake': self.intake.close(CLOSE_S),
+            'encode pool': self.pool.close(end_s - time.monotonic()),
+            'spool writer': self.writer.flush(end_s - time.monotonic()),
+        }
+        for name in (name for name, done in finished.items() if not done):
+            log.error('the %s did not finish in %.0f s', name, CLOSE_S)
+        if all(finished.values()):
+            self.writer.put(self._ledger())
+            self.writer.flush(1.0)
         drain_s = self._settings.shutdown.drain_s
         if drain_s and not self.uploader.drain(drain_s):
             log.warning('%d objects stay in the spool %s and are delivered later', self.spool.pending_count(), self.spool.root)
@@ -79,6 +81,16 @@ class Pipeline:
         self.writer.close(1.0)
         self.spool.close()
         self._store.close()
+
+    def tick(self) -> None:
+        """Called now and then: at the turn of each UTC day the ledger goes to the store."""
+        day = self._today()
+        if day != self._day:
+            self._day = day
+            self.writer.put(self._ledger())
+
+    def _today(self) -> str:
+        return f'{utc(self._clock.wall_ns()):%Y%m%d}'
 
     def _settle(self, outcomes: Sequence[Outcome]) -> None:
         self.writer.settle(outcomes)

@@ -81,7 +81,7 @@ class Reader:
         self.plan = plan
         self._node = node
         self._class = message_class(plan.type)
-        self._publishers: dict[bytes, str] = {}
+        self._names: dict[bytes, str] = {}
         profile = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
             depth=plan.depth,
@@ -99,8 +99,8 @@ class Reader:
         with handle:
             return int(handle.get_publisher_count())
 
-    def drain(self, only_publisher: str | None) -> Iterator[Taken]:
-        """Everything that waits, oldest first. ``only_publisher`` names the sender where the middleware does not."""
+    def drain(self) -> Iterator[Taken]:
+        """Everything that waits, oldest first."""
         handle = self._subscription.handle
         with handle:
             take, message_type = handle.take_message, self._class
@@ -109,8 +109,7 @@ class Reader:
                 if taken is None:
                     return
                 cdr, info = taken
-                publisher = self._publisher(info) or only_publisher
-                yield Taken(cdr, info['source_timestamp'], publisher, info.get('publication_sequence_number'))
+                yield Taken(cdr, info['source_timestamp'], self._publisher(info), info.get('publication_sequence_number'))
 
     def close(self) -> None:
         self._node.destroy_subscription(self._subscription)
@@ -121,9 +120,9 @@ class Reader:
         if gid is None:
             return None
         data = gid['data']
-        name = self._publishers.get(data)
+        name = self._names.get(data)
         if name is None:
-            name = self._publishers[data] = bytes(data).hex()
+            name = self._names[data] = bytes(data).hex()
         return name
 
 

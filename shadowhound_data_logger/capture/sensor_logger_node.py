@@ -58,7 +58,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         run(node, stop)
     except SettingError as error:
-        node.get_logger().fatal(f'refused to start: {error}')
+        node.get_logger().fatal(f'{error}')
         return 2
     except DataLoggerError as error:
         node.get_logger().fatal(str(error))
@@ -78,6 +78,7 @@ def run(node: Node, stop: StopSignals) -> None:
     try:
         while not stop.received:
             executor.spin_once(timeout_sec=SPIN_S)
+            pipeline.tick()
     finally:
         node.get_logger().info('closing: open batches are finished and delivered')
         pipeline.close()

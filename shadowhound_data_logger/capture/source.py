@@ -10,7 +10,7 @@ from zlib import crc32
 from rclpy.node import Node
 
 from shadowhound_data_logger.capture.batching import Batcher
-from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, plans
+from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, plans
 from shadowhound_data_logger.capture.gate import Gate, gate_for
 from shadowhound_data_logger.capture.reader import PolledGroup, Reader, Taken, TypeUnavailable, endpoints
 from shadowhound_data_logger.clock import is_sane
@@ -50,7 +50,7 @@ class Source:
         self._readers: list[Reader] = []
         self._retiring: dict[Reader, float] = {}
         self._heard: set[Plan] = set()
-        self._only_publisher: str | None = None
+        self._senders = Senders()
         self._has_header = False
         self._gate: Gate | None = None
         self._batcher: Batcher | None = None
@@ -65,7 +65,7 @@ class Source:
     def refresh(self, now_s: float) -> None:
         """Look at the graph and subscribe as its publishers ask for it."""
         publishers = self._choose(now_s)
-        self._only_publisher = publishers[0].gid if len(publishers) == 1 else None
+        self._senders.look([publisher.gid for publisher in publishers])
         wanted = plans(self._chosen, publishers, self._types_expected.get(self._chosen), self._settings)
         if not wanted or wanted[0].type in self._unavailable:
             return
@@ -167,8 +167,10 @@ class Source:
     # -- messages --------------------------------------------------------------------------------------------------
 
     def _take(self, reader: Reader, now_s: float) -> None:
-        taken = list(reader.drain(self._only_publisher))
+        taken = list(reader.drain())
         if taken and self._batcher is not None:
+            if taken[0].publisher is None and not self._senders.gids:
+                self._senders.look([publisher.gid for publisher in endpoints(self._node, self._chosen)])
             for sample in self._keep(reader.plan.topic, taken):
                 for batch in self._batcher.add(sample, now_s):
                     self._offer(batch)
@@ -180,8 +182,10 @@ class Source:
         if gate is None:
             return kept
         with self._accounts.entry(topic) as account:
-            for cdr, source_ns, publisher, number in taken:
-                if (number is None and self._is_repeat(source_ns, cdr)) or not account.receive(publisher, number):
+            for cdr, source_ns, gid, number in taken:
+                publisher = gid or self._senders.name(number, source_ns)
+                numbered = number is not None and publisher is not None
+                if (not numbered and self._is_repeat(source_ns, cdr)) or not account.receive(publisher, number):
                     continue
                 stamp_ns = header_stamp_ns(cdr) if self._has_header else 0
                 if not is_sane(stamp_ns, source_ns):
