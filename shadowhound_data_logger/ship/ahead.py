@@ -1,0 +1,103 @@
+"""The next objects to ship, looked up some at a time, so that a claim costs the same whatever the backlog."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import Final
+
+from shadowhound_data_logger.model import SpooledObject
+
+IMPORTANT: Final = 64
+"""Objects asked for by importance at a time."""
+OLDEST: Final = 16
+"""Objects asked for by age at a time; a fourth, as they are claimed."""
+OLDEST_EVERY: Final = 4
+"""Each fourth object is the oldest of all, so that neither the backlog nor what is live starves."""
+LOOK_EVERY_S: Final = 1.0
+"""Other processes spool too (D6) and wake nobody here: an idle drain looks this often."""
+
+
+class Ahead:
+    """Two orders over the same objects, and when to ask for more. Guarded by the lock of the Schedule it belongs to."""
+
+    def __init__(self) -> None:
+        self._important: dict[int, SpooledObject] = {}
+        self._oldest: dict[int, SpooledObject] = {}
+        self._taken = 0
+        self._stale = True
+        self._more = False
+        self._looking = False
+        self._settled_meanwhile: set[int] = set()
+        self._looked_at = float('-inf')
+
+    def __len__(self) -> int:
+        return len(self._important)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether what is here is all that the spool has."""
+        return not (self._stale or self._more or self._looking)
+
+    # -- looking ---------------------------------------------------------------------------------------------------
+
+    def outdate(self) -> None:
+        """The spool may hold others by now."""
+        self._stale = True
+
+    def wants_look(self, now: float, low: int, since: Iterable[float]) -> bool:
+        """Whether to look now: something changed, fewer than ``low`` are left, or not yet looked since one of those times."""
+        if self._looking:
+            return False
+        if self._stale or any(self._looked_at < moment <= now for moment in since):
+            return True
+        return len(self) < low and (self._more or now - self._looked_at >= LOOK_EVERY_S)
+
+    def has_looked_since(self, moment: float) -> bool:
+        return self._looked_at >= moment and not self._looking
+
+    def begin_look(self, now: float) -> None:
+        self._looking, self._stale, self._looked_at = True, False, now
+
+    def end_look(self, important: Sequence[SpooledObject], oldest: Sequence[SpooledObject], *,
+                 taken: Collection[int], without: Collection[str]) -> None:  # fmt: skip
+        """Replace what is here, but for what is ``taken``, of a bucket ``without``, or was settled while the look read it."""
+        late, self._settled_meanwhile, self._looking = self._settled_meanwhile, set(), False
+        self._more = len(important) >= IMPORTANT
+        gone = late.union(taken)
+        self._important, self._oldest = (
+            {item.id: item for item in items if item.id not in gone and item.bucket not in without}
+            for items in (important, oldest)
+        )
+
+    def fail_look(self) -> None:
+        self._looking, self._stale = False, True
+
+    def settled(self, ids: Collection[int]) -> None:
+        """A look that is under way may have read these before they were settled."""
+        if self._looking:
+            self._settled_meanwhile.update(ids)
+
+    # -- claiming --------------------------------------------------------------------------------------------------
+
+    def take(self, allowed: Callable[[SpooledObject], bool]) -> SpooledObject | None:
+        """Remove and return the first one that is allowed now."""
+        queues = [self._important, self._oldest]
+        if self._taken % OLDEST_EVERY == OLDEST_EVERY - 1:
+            queues.reverse()
+        for queue in queues:
+            item = next((item for item in queue.values() if allowed(item)), None)
+            if item is not None:
+                self._important.pop(item.id, None)
+                self._oldest.pop(item.id, None)
+                self._taken += 1
+                return item
+        return None
+
+    def holds(self, bucket: str) -> bool:
+        return any(item.bucket == bucket for queue in (self._important, self._oldest) for item in queue.values())
+
+    def drop(self, bucket: str) -> None:
+        """Forget the objects of a bucket; a later look finds them again."""
+        for queue in (self._important, self._oldest):
+            for number in [item.id for item in queue.values() if item.bucket == bucket]:
+                del queue[number]

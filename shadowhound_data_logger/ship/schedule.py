@@ -1,0 +1,225 @@
+"""Which object is sent next, and what a failure means for the others: every decision of delivery, and no I/O (D6 to D8).
+
+A thread asks ``step`` what to do, does it outside the lock, and reports back with ``found``, ``delivered``, ``failed`` or
+``crashed``. A failure is held against the store, or the bucket, unless a delivery since tells that it is the object's
+own: then the object alone waits (or, denied twice while its bucket takes others, goes to quarantine).
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final
+
+from shadowhound_data_logger.errors import StoreError
+from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.ship.ahead import LOOK_EVERY_S, Ahead
+from shadowhound_data_logger.ship.history import History
+from shadowhound_data_logger.ship.outage import Breakers, Notice
+from shadowhound_data_logger.ship.retry import Verdict, decide, quarantine_reason
+from shadowhound_data_logger.ship.steps import Look, Rest, Ruling, Ship, Snapshot, Step
+
+MANY_DEFERRED: Final = 64
+"""From here on most probes are objects that failed before: a long outage does not touch ever more objects."""
+FRESH_PROBE_EVERY: Final = 16
+SHORTEST_REST_S: Final = 0.01
+
+
+class Schedule:
+    """Thread-safe; ``_changed`` is the one lock over all of it. Times are seconds of the clock that is handed in."""
+
+    def __init__(self, threads: int, backoff_s: float, monotonic: Callable[[], float], rng: random.Random) -> None:
+        self._threads = threads
+        self._now = monotonic
+        self._changed = threading.Condition()
+        self._version = 0
+        self._active: bool | None = None
+        self._stopped = False
+        self._ahead = Ahead()
+        self._breakers = Breakers(backoff_s, rng)
+        self._history = History(backoff_s, rng)
+        self._in_flight: dict[int, int] = {}  # id -> deliveries when it was claimed
+        self._unsettled: set[int] = set()
+        self._retries = 0
+        self._last_error = ''
+
+    # -- what to do ------------------------------------------------------------------------------------------------
+
+    def step(self) -> Step | None:
+        """What the calling thread does next; None when it is to end."""
+        with self._changed:
+            now = self._now()
+            if self._stopped:
+                return None
+            store = self._breakers.store
+            if not self._active or (store and not store.may_probe(now)):
+                return self._rest(now)
+            if self._ahead.wants_look(now, self._threads, self._breakers.open_since(now)):
+                self._ahead.begin_look(now)
+                return Look(self._taken(), self._breakers.without(now))
+            item = self._claim(now)
+            return Ship(item) if item else self._rest(now)
+
+    def rest(self, rest: Rest) -> None:
+        """Block until something changed since that ``step``, at most ``rest.seconds``."""
+        with self._changed:
+            if self._version == rest.version:
+                self._changed.wait(rest.seconds)
+
+    # -- what became of it -----------------------------------------------------------------------------------------
+
+    def found(self, important: Sequence[SpooledObject], oldest: Sequence[SpooledObject]) -> None:
+        """The answer to a Look, each in its order."""
+        with self._changed:
+            now = self._now()
+            closed = self._breakers.without(now)
+            self._ahead.end_look(important, oldest, taken=self._taken(), without=closed)
+            self._notify()
+
+    def look_failed(self, error: Exception) -> None:
+        """The spool could not be asked; it is asked again."""
+        with self._changed:
+            self._last_error = f'{type(error).__name__}: {error}'
+            self._ahead.fail_look()
+            self._notify()
+
+    def delivered(self, item: SpooledObject) -> Sequence[Notice]:
+        """The store confirmed it: it counts as pending until ``settled``."""
+        with self._changed:
+            if any(True for _ in self._breakers):
+                self._ahead.outdate()
+            self._history.deliver(item)
+            notices = self._breakers.succeed(item, self._now())
+            self._let_go(item)
+            self._unsettled.add(item.id)
+            return notices
+
+    def failed(self, item: SpooledObject, error: StoreError) -> Ruling:
+        """The store did not take it. With a reason to quarantine, it counts as pending until ``settled``."""
+        with self._changed:
+            now, verdict = self._now(), decide(error)
+            self._last_error = str(error)
+            if verdict is Verdict.QUARANTINE or (verdict is Verdict.DENIED and self._history.is_denied_alone(item)):
+                self._history.forget(item)
+                self._let_go(item)
+                self._unsettled.add(item.id)
+                return Ruling(quarantine_reason(error))
+            alone = verdict is Verdict.RETRY and self._history.fails_alone(item, self._in_flight[item.id])
+            if verdict in {Verdict.RETRY, Verdict.DENIED}:
+                self._history.defer(item, verdict, now)
+            notices = [] if alone else self._breakers.fail(item, verdict, error, now)
+            self._retries += 1
+            self._ahead.outdate()
+            self._let_go(item)
+            return Ruling(notices=notices)
+
+    def crashed(self, item: SpooledObject, error: Exception) -> None:
+        """This program failed on it, not the store: that object alone waits."""
+        with self._changed:
+            self._last_error = f'{type(error).__name__}: {error}'
+            self._history.defer(item, None, self._now())
+            self._retries += 1
+            self._unsettled.discard(item.id)
+            self._let_go(item)
+
+    def settled(self, ids: Iterable[int]) -> None:
+        """Their outcomes are durable: the spool does not call them pending any more."""
+        with self._changed:
+            durable = frozenset(ids)
+            self._unsettled -= durable
+            self._ahead.settled(durable)
+            self._notify()
+
+    # -- from outside ----------------------------------------------------------------------------------------------
+
+    def wake(self) -> None:
+        """The spool has new objects, or has given some up."""
+        with self._changed:
+            self._ahead.outdate()
+            self._notify()
+
+    def activate(self, active: bool) -> None:
+        """Whether this process drains; while it does not, every step is a Rest."""
+        with self._changed:
+            if active is not self._active:
+                self._active = active
+                self._ahead.outdate()
+                self._notify()
+
+    def stop(self) -> None:
+        """No step any more; what is in flight may still be reported."""
+        with self._changed:
+            self._stopped = True
+            self._notify()
+
+    def drained(self) -> bool | Rest:
+        """True: nothing is pending. False: waiting is no use. Else how long to rest before asking again."""
+        with self._changed:
+            now, store, blocked = self._now(), self._breakers.store, self._breakers.buckets
+            if self._stopped or self._active is False or (store and store.confirmed):
+                return False
+            busy = self._in_flight or self._unsettled or len(self._ahead) or not self._ahead.is_known
+            waiting = any(bucket not in blocked for bucket in self._history.buckets())
+            unsure = store or any(not outage.confirmed for outage in blocked.values())
+            return self._rest(now) if busy or waiting or unsure else not blocked
+
+    def snapshot(self) -> Snapshot:
+        with self._changed:
+            store = self._breakers.store
+            return Snapshot(
+                active=self._active, outage=store.verdict if store else None,
+                blocked={bucket: outage.error for bucket, outage in self._breakers.buckets.items()},
+                in_flight=len(self._in_flight), ready=len(self._ahead), deferred=len(self._history),
+                delivered=self._history.delivered, retries=self._retries, last_error=self._last_error,
+            )  # fmt: skip
+
+    # -- under the lock --------------------------------------------------------------------------------------------
+
+    def _notify(self) -> None:
+        self._version += 1
+        self._changed.notify_all()
+
+    def _taken(self) -> frozenset[int]:
+        """What the spool calls pending and we have in hand."""
+        return frozenset((*self._in_flight, *self._unsettled, *self._history))
+
+    def _let_go(self, item: SpooledObject) -> None:
+        self._in_flight.pop(item.id, None)
+        self._breakers.release(item)
+        self._notify()
+
+    def _claim(self, now: float) -> SpooledObject | None:
+        item = self._take(now)
+        if item is not None:
+            self._in_flight[item.id] = self._history.delivered
+            self._breakers.claim(item)
+            if item.bucket in self._breakers.buckets:  # one probe at a time; the others would only hide what can go
+                self._ahead.drop(item.bucket)
+        return item
+
+    def _take(self, now: float) -> SpooledObject | None:
+        """An object whose own wait is over goes first; a probe is rather one that has not failed yet."""
+
+        def fresh() -> SpooledObject | None:
+            return self._ahead.take(lambda item: self._breakers.lets(item.bucket, now))
+
+        def may_retry(item: SpooledObject) -> bool:
+            return self._may_retry(item, now)
+
+        store = self._breakers.store
+        if store and (len(self._history) < MANY_DEFERRED or store.failures % FRESH_PROBE_EVERY == 0):
+            return fresh() or self._history.soonest(may_retry)
+        return self._history.due(now, may_retry) or fresh()
+
+    def _may_retry(self, item: SpooledObject, now: float) -> bool:
+        """Where a bucket is out, an object that failed there is its probe only if the spool has no other of that bucket."""
+        if item.id in self._in_flight or not self._breakers.lets(item.bucket, now):
+            return False
+        outage = self._breakers.buckets.get(item.bucket)
+        return not outage or (self._ahead.has_looked_since(outage.retry_at) and not self._ahead.holds(item.bucket))
+
+    def _rest(self, now: float) -> Rest:
+        until = [now + LOOK_EVERY_S, self._history.next_due(now)]
+        until += [outage.retry_at for outage in self._breakers if outage.retry_at > now]
+        return Rest(max(min(until) - now, SHORTEST_REST_S), self._version)

@@ -1,0 +1,263 @@
+"""Spooled objects to the store, for as long as it takes: threads that do what the Schedule decides (D6 to D8, D14).
+
+An object leaves the spool only after the store confirmed it, or with the reason why it never will. What is logged is the
+beginning and the end of an outage, never its every object.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import StoreError
+from shadowhound_data_logger.model import Outcome, Put, SpooledObject, State
+from shadowhound_data_logger.ship.ahead import IMPORTANT, OLDEST
+from shadowhound_data_logger.ship.outage import Notice
+from shadowhound_data_logger.ship.retry import Verdict, backoff
+from shadowhound_data_logger.ship.schedule import Schedule
+from shadowhound_data_logger.ship.steps import Look, Rest, Ship, Step
+
+log = logging.getLogger(__name__)
+
+LOCK_EVERY_S: Final = 1.0
+"""How often a drain that another process has is asked for."""
+CRASH_CAP_S: Final = 60.0
+
+
+class Source(Protocol):
+    """What delivery asks of the spool."""
+
+    def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
+                without: Sequence[str] = ()) -> list[SpooledObject]: ...  # fmt: skip
+
+    def pending_count(self) -> int: ...
+
+    def drain_lock(self) -> AbstractContextManager[bool]: ...
+
+
+class Target(Protocol):
+    """What delivery asks of a store (stores/base.py)."""
+
+    def put(self, item: SpooledObject) -> Put: ...
+
+
+@dataclass(frozen=True, slots=True)
+class UploadStatus:
+    """Delivery at one instant, for the status and the progress line."""
+
+    state: str
+    """``idle``, ``shipping``, ``store_down``, ``paused`` (credentials or rights) or ``not_draining`` (another process does)."""
+    last_error: str
+    """The newest failure of this session, with its remedy; it may be over."""
+    delivered: int
+    """Objects confirmed by the store in this session, those that it had already among them."""
+    in_flight: int
+    deferred: int
+    """Objects that failed and wait for their next try."""
+    retries: int
+    """Failed tries of objects that stay pending."""
+    quarantined: int
+    blocked_buckets: Mapping[str, str] = field(default_factory=dict)
+    """Bucket -> why it gets nothing."""
+    worker_failures: int = 0
+    """Defects that the supervision of the threads caught; 0 in a healthy program."""
+
+
+class Uploader:
+    """Life: New; open once; wake, settled, status, drain from any thread; close any number of times.
+
+    It owns the threads ``upload-0`` ... and ``upload-lock``, which holds the drain lock while they run. ``settle`` is
+    called from its threads; whoever makes the outcomes durable calls ``settled`` afterwards.
+    """
+
+    def __init__(
+        self, spool: Source, store: Target, settings: UploadSettings, settle: Callable[[Sequence[Outcome]], None], *,
+        monotonic: Callable[[], float] = time.monotonic, rng: random.Random | None = None,
+    ) -> None:  # fmt: skip
+        self._spool = spool
+        self._store = store
+        self._settle = settle
+        self._monotonic = monotonic
+        self._rng = rng or random.Random()
+        self._schedule = Schedule(settings.threads, settings.backoff_s, monotonic, self._rng)
+        self._workers = [threading.Thread(target=self._work, name=f'upload-{n}', daemon=True) for n in range(settings.threads)]
+        self._keeper = threading.Thread(target=self._keep_lock, name='upload-lock', daemon=True)
+        self._stopping = threading.Event()
+        self._ended = threading.Event()
+        self._lock = threading.Lock()  # guards the three below
+        self._worker_failures = 0
+        self._quarantined: Counter[tuple[str, str]] = Counter()
+        self._tracebacks: set[tuple[str, int]] = set()
+
+    def open(self) -> None:
+        """Begin to deliver."""
+        for thread in (self._keeper, *self._workers):
+            thread.start()
+
+    def wake(self) -> None:
+        """The spool has new objects; cheap, from any thread."""
+        self._schedule.wake()
+
+    def settled(self, ids: Iterable[int]) -> None:
+        """Outcomes of these objects are durable in the spool."""
+        self._schedule.settled(ids)
+
+    def drain(self, deadline_s: float) -> bool:
+        """Wait until nothing is pending and every outcome is durable; whether that is so.
+
+        False after ``deadline_s`` seconds, and at once where waiting is no use: the store is away, the credentials are
+        refused, all that is left belongs to buckets that take nothing, or another process drains.
+        """
+        self._schedule.wake()
+        end = self._monotonic() + deadline_s
+        while isinstance(answer := self._schedule.drained(), Rest):
+            left = end - self._monotonic()
+            if left <= 0:
+                return False
+            self._schedule.rest(Rest(min(left, answer.seconds), answer.version))
+        return answer
+
+    def close(self, deadline_s: float) -> None:
+        """Begin no put any more and wait for those under way, at most ``deadline_s`` seconds; idempotent.
+
+        What is still under way then is left to its daemon thread and reported to nobody: it is pending, and sent again.
+        """
+        self._schedule.stop()
+        self._stopping.set()
+        end = self._monotonic() + deadline_s
+        for thread in self._workers:
+            if thread.ident is not None:
+                thread.join(max(end - self._monotonic(), 0.0))
+        hung = [thread.name for thread in self._workers if thread.is_alive()]
+        if hung and not self._ended.is_set():
+            log.warning('%d uploads did not end within %g s; what they send is sent again next time', len(hung), deadline_s)
+        self._ended.set()
+        if self._keeper.ident is not None:
+            self._keeper.join(max(end - self._monotonic(), 0.1))
+
+    def status(self) -> UploadStatus:
+        now = self._schedule.snapshot()
+        if not now.active:
+            state = 'not_draining'
+        elif now.outage:
+            state = 'paused' if now.outage is Verdict.PAUSE else 'store_down'
+        elif now.in_flight or now.ready:
+            state = 'shipping'
+        else:
+            state = 'paused' if now.blocked else 'shipping' if now.deferred else 'idle'
+        with self._lock:
+            failures, quarantined = self._worker_failures, self._quarantined.total()
+        return UploadStatus(state, now.last_error, now.delivered, now.in_flight, now.deferred, now.retries, quarantined,
+                            now.blocked, failures)  # fmt: skip
+
+    # -- the threads -----------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        failures = 0
+        while not self._ended.is_set():
+            step: Step | None = None
+            try:
+                step = self._schedule.step()
+                if step is None:
+                    return
+                self._do(step)
+                failures = 0
+            except Exception as error:  # noqa: BLE001 - the one supervised catch-all of this loop (D14)
+                failures += 1
+                self._crashed(step, error, failures)
+
+    def _do(self, step: Step) -> None:
+        if isinstance(step, Rest):
+            self._schedule.rest(step)
+        elif isinstance(step, Look):
+            important = self._spool.pending(IMPORTANT, exclude=step.exclude, without=step.without)
+            oldest = important
+            if len(important) == IMPORTANT:
+                oldest = self._spool.pending(OLDEST, exclude=step.exclude, oldest=True, without=step.without)
+            self._schedule.found(important, sorted(oldest, key=lambda item: item.id)[:OLDEST])
+        else:
+            self._ship(step.item)
+
+    def _ship(self, item: SpooledObject) -> None:
+        try:
+            self._store.put(item)
+        except StoreError as error:
+            if not self._ended.is_set():
+                self._failed(item, error)
+        else:
+            if not self._ended.is_set():
+                notices = self._schedule.delivered(item)
+                self._settle((Outcome(item, State.DELIVERED),))
+                self._announce(notices)
+
+    def _failed(self, item: SpooledObject, error: StoreError) -> None:
+        ruling = self._schedule.failed(item, error)
+        if ruling.quarantine is not None:
+            gone = not item.path.exists()
+            self._settle((Outcome(item, State.QUARANTINED, 'missing' if gone else ruling.quarantine),))
+            if gone:  # evicted since it was looked up, as a rule: the index then leaves it as it is
+                log.info('%s/%s is not in the spool any more', item.bucket, item.key)
+            else:
+                self._announce_quarantine(item, ruling.quarantine, error)
+        self._announce(ruling.notices)
+
+    def _crashed(self, step: Step | None, error: Exception, failures: int) -> None:
+        """Count it, say it once a kind, and give the thread a pause that grows."""
+        if isinstance(step, Ship):
+            self._schedule.crashed(step.item, error)
+        elif isinstance(step, Look):
+            self._schedule.look_failed(error)
+        self._count(error)
+        self._stopping.wait(backoff(failures, CRASH_CAP_S, self._rng))
+
+    def _count(self, error: Exception) -> None:
+        place = (type(error).__name__, _line(error))
+        with self._lock:
+            self._worker_failures += 1
+            known = place in self._tracebacks
+            self._tracebacks.add(place)
+        if not known and not self._ended.is_set():  # afterwards the spool and the store are closed under a thread that hung
+            log.error('an upload thread failed and goes on after a pause', exc_info=error)
+
+    def _keep_lock(self) -> None:
+        """Drain while the lock is ours; until then, ask for it every second."""
+        while not self._ended.is_set():
+            try:
+                with self._spool.drain_lock() as mine:
+                    self._schedule.activate(mine)
+                    if mine:
+                        self._ended.wait()
+            except Exception as error:  # noqa: BLE001 - the one supervised catch-all of this loop (D14)
+                self._schedule.activate(False)
+                self._count(error)
+            self._ended.wait(LOCK_EVERY_S)
+
+    # -- words -----------------------------------------------------------------------------------------------------
+
+    def _announce(self, notices: Iterable[Notice]) -> None:
+        for notice in notices:
+            log.log(notice.level, '%s', notice.text(self._spool.pending_count()))
+
+    def _announce_quarantine(self, item: SpooledObject, reason: str, error: StoreError) -> None:
+        """The 1st, 10th, 100th, ... of a kind: each one is listed in the spool, with its reason."""
+        with self._lock:
+            self._quarantined[item.bucket, reason] += 1
+            count = self._quarantined[item.bucket, reason]
+        if str(count).strip('0') == '1':
+            log.error('quarantined (%s, number %d in bucket %s): %s', reason, count, item.bucket, error)
+
+
+def _line(error: BaseException) -> int:
+    """Where it was raised."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace.tb_lineno if trace is not None else 0
