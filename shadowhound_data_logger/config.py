@@ -90,7 +90,7 @@ class SpoolSettings:
     commit_s: float = _setting(0.25, 'Longest time between an encoded object and its group commit.', low=0.01, high=10.0)
     max_bytes: int = _setting(20 * GIBI, 'Most bytes of payload in the spool; beyond it the least important is evicted.', low=MEBI)
     min_free_bytes: int = _setting(2 * GIBI, 'Free space of the file system that is never used.', low=0)
-    remember_days: float = _setting(30.0, 'Days for which delivered keys are remembered.', low=1.0, high=3650.0)
+    remember_days: float = _setting(3.0, 'Days for which delivered keys are remembered.', low=1.0, high=3650.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -39,7 +39,7 @@ def check_name(name: str, what: str) -> str:
 def check_key(key: str) -> str:
     """The key unchanged, if every S3 server, a Linux file system and a shell can hold it; raises NameRefused."""
     segments = key.split('/')
-    if len(key.encode()) > MAX_KEY_BYTES:
+    if len(key.encode(errors='surrogatepass')) > MAX_KEY_BYTES:
         raise NameRefused(f'the key {key[:80]!r}... has more than {MAX_KEY_BYTES} bytes', name=key)
     for segment in segments:
         if not _SEGMENT.fullmatch(segment) or segment in {'.', '..'} or len(segment) > MAX_SEGMENT_BYTES:
@@ -48,12 +48,19 @@ def check_key(key: str) -> str:
 
 
 def unique(key: str, attempt: int) -> str:
-    """The ``attempt``-th name of a key: ``a/120000_front.jpg``, then ``a/120000_front_1.jpg``, ``_2``, ..."""
+    """The ``attempt``-th name of a key: ``a/120000_front.jpg``, then ``a/120000_front_1.jpg``, ``_2``, ...
+
+    A name at the limit of its length loses the end of its stem, so that a key stays one that ``check_key`` allows.
+    """
     if attempt == 0:
         return key
     folder, slash, name = key.rpartition('/')
     stem, dot, extension = name.partition('.')
-    return f'{folder}{slash}{stem}_{attempt}{dot}{extension}'
+    tail = f'_{attempt}{dot}{extension}'
+    room = min(MAX_SEGMENT_BYTES, MAX_KEY_BYTES - len(folder) - len(slash)) - len(tail)
+    if room < 0:  # hardly a stem to number, such as ``.x...x``
+        return f'{folder}{slash}{name[: room + len(dot) + len(extension)]}_{attempt}'
+    return f'{folder}{slash}{stem[:room]}{tail}'
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +78,12 @@ class KeyTemplate:
         """Raises SettingError naming ``setting``."""
         allowed = 'a key such as "{robot}/camera/{date}/{time}_front.jpg", with {date} and {time} in it'
         try:
-            fields = [field for _, field, _, _ in Formatter().parse(template) if field is not None]
+            parts = [part for part in Formatter().parse(template) if part[1] is not None]
         except ValueError:
             raise SettingError(setting, template, allowed) from None
+        fields = [field for _, field, _, _ in parts if field is not None]
+        if any(spec or conversion for _, _, spec, conversion in parts):  # {time:.2s} is the hour: names would collide
+            raise SettingError(setting, template, allowed)
         if not {'date', 'time'} <= set(fields) or not set(fields) <= set(_FIELDS):
             raise SettingError(setting, template, allowed)
         if not template.startswith('{robot}/'):

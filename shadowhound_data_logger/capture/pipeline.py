@@ -14,6 +14,7 @@ from rclpy.node import Node
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.encode.pool import EncodePool
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -83,7 +84,12 @@ class Pipeline:
         self._store.close()
 
     def tick(self) -> None:
-        """Called now and then: at the turn of each UTC day the ledger goes to the store."""
+        """Called now and then: at the turn of each UTC day the ledger goes to the store.
+
+        Raises SpoolError when the spool cannot be mended while it is in use.
+        """
+        if self.writer.damaged:
+            raise SpoolError(f'the index of the spool {self.spool.root} is damaged', remedy='start the node again: it is rebuilt then')
         day = self._today()
         if day != self._day:
             self._day = day

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 MAX_REMEMBERED: Final = 4096
-"""Single numbers remembered per publisher (missed ones that may come late): a bound, far above any history depth."""
+"""Single numbers remembered per publisher (the newest that may still come late): a bound, far above any history depth."""
 
 EXACT, REPORTED, RECEIVED_ONLY = 'exact', 'reported', 'received-only'
 GRADES: Final = (EXACT, REPORTED, RECEIVED_ONLY)
@@ -36,45 +36,53 @@ class Span:
     received: int = 0
     missed: Counter[str] = field(default_factory=Counter)
     _holes: dict[int, str] = field(default_factory=dict)
+    """Number below ``last`` that was not taken -> the cause it is missed by; '' where it was not listened to."""
     _early: set[int] = field(default_factory=set)
+    _base: int | None = None
+    _rebased: bool = False
+
+    def __post_init__(self) -> None:
+        self._base = self.first
 
     def observe(self, number: int) -> bool:
         """Count a message by its sequence number; False if it was counted before (a repeat)."""
-        if self.last is None:
-            self.last = number
-            if self.first is None:
-                self.first = number
+        if self.first is None or self._base is None or self.last is None:
+            self.first = self._base = self.last = number
         elif number > self.last:
             if number > self.last + 1:
-                self._miss(self.last + 1, number)
+                self._skip(self.last + 1, number)
             self.last = number
+            self.inherited = self._rebased = False
         elif number in self._holes:
-            self.missed[self._holes.pop(number)] -= 1
-            self.published -= 1
-        elif self.first is not None and number < self.first and number not in self._early:
+            cause = self._holes.pop(number)
+            if cause:
+                self.missed[cause] -= 1
+                self.published -= 1
+        elif number < self._base and number not in self._early:
             # TRANSIENT_LOCAL delivers history from before the first number taken.
             if len(self._early) >= MAX_REMEMBERED:
                 return False
             self._early.add(number)
+            self.first = min(self.first, number)
         else:
             return False
-        self.inherited = False
         self.received += 1
         self.published += 1
         return True
 
     def rebase(self) -> None:
-        """Forget where the numbers stood: what comes until the next message was not listened to on purpose."""
-        self.last = None
-        self.inherited = False
-        self._holes.clear()
+        """What is published until the next new message was not listened to on purpose: that gap is not missed."""
+        self._rebased = True
 
-    def _miss(self, start: int, stop: int) -> None:
-        cause = 'restart' if self.inherited else 'transport'
-        self.missed[cause] += stop - start
-        self.published += stop - start
-        if not self.inherited and len(self._holes) + stop - start <= MAX_REMEMBERED:
-            self._holes.update(dict.fromkeys(range(start, stop), cause))
+    def _skip(self, start: int, stop: int) -> None:
+        """Count the numbers of a gap as missed, unless nobody listened, and remember them: they may come late."""
+        cause = '' if self._rebased else 'restart' if self.inherited else 'transport'
+        if cause:
+            self.missed[cause] += stop - start
+            self.published += stop - start
+        self._holes.update(dict.fromkeys(range(max(start, stop - MAX_REMEMBERED), stop), cause))
+        while len(self._holes) > MAX_REMEMBERED:
+            del self._holes[next(iter(self._holes))]
 
 
 @dataclass(slots=True)
@@ -200,6 +208,8 @@ class Accounts:
             if not self._dirty and not stored:
                 return None
             self._dirty = False
+            for topic in stored:
+                self._account(topic)
             return Snapshot(
                 tuple(self._row(topic, account, *stored.get(topic, (0, 0))) for topic, account in self._topics.items()),
                 tuple(

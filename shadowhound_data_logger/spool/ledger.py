@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool.accounts import EXACT, GRADES
+from shadowhound_data_logger.spool.accounts import EXACT, GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.index import Index
 
 STATES: Final = tuple(state.value for state in State)
@@ -18,15 +19,18 @@ STATES: Final = tuple(state.value for state in State)
 def read(spool: Path, robot: str) -> dict[str, Any]:
     """The ledger of a spool folder, as ``shadowhound-data ledger --json`` prints it; works while a node runs.
 
-    Raises SpoolError when there is no spool. Unknown figures are None, never 0.
+    Raises SpoolError when there is no spool or it cannot be read. Unknown figures are None, never 0.
     """
     path = spool / 'index.db'
     if not path.is_file():
         raise SpoolError(f'there is no spool in {spool}', remedy='has the node run here? SHADOWHOUND_HOME names its folder')
     index = Index(path, read_only=True)
-    index.open()
     try:
+        index.open()
         return of_index(index, robot)
+    except (sqlite3.Error, ValueError) as error:
+        raise SpoolError(f'the spool index {path} cannot be read: {error}',
+                         remedy='a start of the node rebuilds a damaged one') from error  # fmt: skip
     finally:
         index.close()
 
@@ -38,7 +42,8 @@ def of_index(index: Index, robot: str) -> dict[str, Any]:
         topics, publishers, tally = index.topics(), index.publishers(), index.tally()
     finally:
         index.db.execute('COMMIT')
-    accounts = {topic: _topic(topic, topics, publishers, tally) for topic in sorted({row.topic for row in topics})}
+    names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
+    accounts = {topic: _topic(topic, topics, publishers, tally) for topic in sorted(names)}
     objects = {what: sum(row[2] for row in tally if row[1] == what) for what in ('spooled', *STATES)}
     volume = {what: sum(row[3] for row in tally if row[1] == what) for what in ('spooled', *STATES)}
     ledger: dict[str, Any] = {'robot': robot, 'balanced': True, 'topics': accounts, 'objects': objects, 'bytes': volume}
@@ -61,21 +66,21 @@ def imbalances(ledger: Mapping[str, Any]) -> list[str]:
             found.append(f'{topic}: stored {row["stored"]}, but in objects there are {sum(row["stored_in"].values())}')
     for what in ('objects', 'bytes'):
         parts = sum(ledger[what][state] for state in STATES)
-        if ledger[what]['spooled'] != parts:
-            found.append(f'{what}: spooled {ledger[what]["spooled"]}, but by state {parts}')
+        if ledger[what]['spooled'] != parts or min(ledger[what].values()) < 0:
+            found.append(f'{what}: spooled {ledger[what]["spooled"]}, but by state {parts} ({dict(ledger[what])})')
     return found
 
 
 def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tuple[str, str, int, int, int]]) -> dict[str, Any]:
     rows = [row for row in topics if row.topic == topic]
     spans = [row for row in publishers if row.topic == topic]
-    accounting = max((row.accounting for row in rows), key=GRADES.index)
+    accounting = max((row.accounting for row in rows), key=GRADES.index, default=RECEIVED_ONLY)
     missed_by: Counter[str] = Counter()
     for span in spans:
         missed_by.update(span.missed)
     exact = accounting == EXACT
     return {
-        'type': rows[-1].type,
+        'type': rows[-1].type if rows else '',
         'accounting': accounting,
         'published': sum(span.published for span in spans) if exact else None,
         'received': sum(row.received for row in rows),

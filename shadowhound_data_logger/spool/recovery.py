@@ -7,57 +7,66 @@ are settled: what they had received without an outcome is dropped with the reaso
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import logging
 import os
 import sqlite3
-from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.keys import check_key, check_name
-from shadowhound_data_logger.model import DataObject, State
+from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.accounts import Snapshot, TopicRow
-from shadowhound_data_logger.spool.files import Tree, description_of
-from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.adoption import Adoption, Recovery
+from shadowhound_data_logger.spool.files import Tree
+from shadowhound_data_logger.spool.index import MISSING, Index
+from shadowhound_data_logger.spool.ledger import of_index
 
 log = logging.getLogger(__name__)
 
+DAMAGED: Final = 'damaged'
+REBUILT: Final = 'damaged index rebuilt'
+_DAMAGED: Final = ('malformed', 'disk I/O', 'already exists', 'no such', 'decode', 'unsupported file format')
 _IN_SPOOL: Final = "state IN ('pending', 'held', 'quarantined')"
 
 
-@dataclass(slots=True)
-class Recovery:
-    """What recovery did, by word; all zero after a clean stop."""
+def open_recovered(tree: Tree, now_ns: int, report: Recovery) -> Index:
+    """The index, whole and in agreement with the tree: a damaged one is set aside as ``index.db.damaged-N`` and begun anew.
 
-    counts: Counter[str] = field(default_factory=Counter)
-
-    @property
-    def found_anything(self) -> bool:
-        return bool(+self.counts)
-
-    def describe(self) -> str:
-        return ', '.join(f'{count} {what}' for what, count in sorted((+self.counts).items()))
-
-
-def open_index(path: Path, report: Recovery) -> Index:
-    """The index, whole: a damaged one is set aside as ``index.db.damaged-N`` and begun anew."""
-    index = Index(path)
-    try:
-        index.open()
-        index.check()
-    except sqlite3.DatabaseError as error:
-        if isinstance(error, sqlite3.OperationalError) and 'malformed' not in str(error) and 'disk I/O' not in str(error):
-            raise OSError(f'the spool index {path} cannot be opened: {error}') from error
-        index.close()
-        log.error('the spool index %s is damaged (%s): it is rebuilt from the files', path, error)
-        report.counts['damaged index rebuilt'] += 1
-        _set_aside(path)
+    The caller holds the recovery lock. Raises OSError or sqlite3.OperationalError when the folder cannot be used, SpoolError
+    for an index of a newer version.
+    """
+    path = tree.root / 'index.db'
+    while True:
+        path.touch(mode=0o600)
         index = Index(path)
-        index.open()
-    return index
+        try:
+            index.open()
+            index.check()
+            _recover(tree, index, now_ns, report)
+        except (sqlite3.Error, ValueError, TypeError, AttributeError, OverflowError) as error:
+            index.close()
+            if report.counts[REBUILT] or not _is_damage(path, error):
+                raise
+            log.exception('the spool index %s is damaged: it is rebuilt from the files', path)
+            report.counts[REBUILT] += 1
+            _set_aside(path)
+        except BaseException:
+            index.close()
+            raise
+        else:
+            return index
+
+
+def _is_damage(path: Path, error: Exception) -> bool:
+    """Whether an error says that the index's bytes are wrong, rather than that it cannot be used now.
+
+    A flipped bit can give a record a value of any type: errors that are not SQLite's are such.
+    """
+    if not isinstance(error, sqlite3.OperationalError):
+        return True
+    if 'readonly' in str(error):  # a flipped bit of the header says so as well
+        return os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)
+    return any(word in str(error) for word in _DAMAGED)
 
 
 def _set_aside(path: Path) -> None:
@@ -69,42 +78,53 @@ def _set_aside(path: Path) -> None:
         Path(f'{path}{suffix}').unlink(missing_ok=True)
 
 
-def recover(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
-    """Make index and tree agree and settle dead sessions. The caller holds the recovery lock."""
-    _complete_renames(tree, index, now_ns, report)
-    _adopt_files(tree, index, now_ns, report)
+def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
+    """Make index and tree agree and settle dead sessions."""
+    _follow_rows(tree, index, now_ns, report)
+    _remove_parts(tree, index, report)
+    Adoption(tree, index, now_ns, report).run()
     for session in index.sessions(ended=False):
         if _is_dead(tree, session):
             _settle_session(index, session, now_ns, report)
-            tree.remove(tree.root / 'sessions' / str(session))
+            tree.remove(tree.session(session))
+    of_index(index, '')  # a value in it that is none shows here
     tree.prune()
 
 
-def _complete_renames(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
-    """Every row's file to where the row says it is; parts without a row were never committed."""
+def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
+    """Every row's file to where the row says it is. Other processes may deliver meanwhile."""
     missing: list[int] = []
-    damaged: list[int] = []
-    rows = index.rows(f'{_IN_SPOOL} ORDER BY id')
-    for row in rows:
+    damaged: list[tuple[sqlite3.Row, Path]] = []
+    for row in index.rows(f'{_IN_SPOOL} ORDER BY id'):
         state = State(row['state'])
+        if state is State.QUARANTINED and row['reason'] == MISSING:
+            continue
         path = tree.path(state, row['reason'], row['bucket'], row['key'])
-        if not path.exists():
-            elsewhere = (tree.part(row['id']), tree.path(State.PENDING, None, row['bucket'], row['key']))
-            if any(tree.place(source, path) for source in elsewhere if source != path):
-                report.counts['renames completed'] += 1
-            else:
+        where = path
+        if tree.size(path) is None:
+            # Last its own place again: another process may just have moved it there.
+            places = (tree.part(row['id']), tree.path(State.PENDING, None, row['bucket'], row['key']), path)
+            found = next((place for place in places if tree.size(place) is not None), None)
+            if found is None:
                 missing.append(row['id'])
                 continue
-        if path.stat().st_size != row['bytes'] and state is not State.QUARANTINED:
-            damaged.append(row['id'])
-            tree.place(path, tree.path(State.QUARANTINED, 'damaged', row['bucket'], row['key']))
+            where = found
+            if found != path and tree.place(found, path):
+                where = path
+                report.counts['renames completed'] += 1
+        if state is not State.QUARANTINED and tree.size(where) not in {row['bytes'], None}:
+            damaged.append((row, where))
     if missing or damaged:
         with index.transaction():
-            index.move(missing, State.QUARANTINED, 'missing', now_ns)
-            index.move(damaged, State.QUARANTINED, 'damaged', now_ns)
-    known_missing = sum(row['state'] == State.QUARANTINED.value and row['reason'] == 'missing' for row in rows)
-    report.counts['files missing'] += len(missing) - known_missing
-    report.counts['files damaged'] += len(damaged)
+            report.counts['files missing'] += index.set_missing(missing, now_ns)
+            index.move([row['id'] for row, _ in damaged], State.QUARANTINED, DAMAGED, now_ns)
+    for row, where in damaged:
+        tree.place(where, tree.path(State.QUARANTINED, DAMAGED, row['bucket'], row['key']))
+        report.counts['files damaged'] += 1
+
+
+def _remove_parts(tree: Tree, index: Index, report: Recovery) -> None:
+    """Parts without a row were never committed."""
     # Inside a transaction: another process that is about to commit a part of its own holds the write lock.
     with index.transaction():
         for number, part in tree.parts():
@@ -113,66 +133,10 @@ def _complete_renames(tree: Tree, index: Index, now_ns: int, report: Recovery) -
                 report.counts['uncommitted parts removed'] += 1
 
 
-def _adopt_files(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
-    """Rows for files that have none: those of a lost index, and what somebody copied in."""
-    adopted: dict[str, TopicRow] = {}
-    session = 0
-    for state, reason, bucket, key, path in tree.objects():
-        row = index.db.execute('SELECT state, sha256 FROM objects WHERE bucket = ? AND key = ?', (bucket, key)).fetchone()
-        if row is not None and row[0] in {State.PENDING.value, State.HELD.value, State.QUARANTINED.value}:
-            continue
-        body = path.read_bytes()
-        if row is not None and row[1] == hashlib.sha256(body).hexdigest():
-            tree.remove(path)  # delivered, but the process died before it removed the file
-            report.counts['delivered files removed'] += 1
-            continue
-        item = _described(path, bucket, key, body)
-        if row is not None or item is None:
-            tree.place(path, tree.root / 'foreign' / path.relative_to(tree.root))
-            report.counts['foreign files set aside'] += 1
-            continue
-        with index.transaction():
-            session = session or index.begin_session('recovered', '', 0, now_ns)
-            index.insert(item, key, hashlib.sha256(body).hexdigest(), state, reason, item.metadata, now_ns)
-            if item.topic is not None:
-                adopted[item.topic] = _more(adopted.get(item.topic), item)
-            index.write(session, Snapshot(tuple(adopted.values()), ()))
-            index.end_session(session, now_ns)
-        report.counts['files adopted'] += 1
-
-
-def _described(path: Path, bucket: str, key: str, body: bytes) -> DataObject | None:
-    """The object that a file says it is, checked; None when its name cannot be a key or its content is damaged."""
-    try:
-        check_name(bucket, 'the bucket')
-        check_key(key)
-    except NameRefused:
-        return None
-    said: dict[str, Any] = description_of(path)
-    if said.get('sha256', '') not in {'', hashlib.sha256(body).hexdigest()}:
-        return None
-    now_ns = path.stat().st_mtime_ns
-    return DataObject(
-        bucket=bucket, key=key, body=body, content_type=str(said.get('content_type', 'application/octet-stream')),
-        sensor=str(said.get('sensor', 'unknown')), topic=said.get('topic'), type=str(said.get('type', '')),
-        samples=int(said.get('samples', 0)), t_start_ns=int(said.get('t_start_ns', now_ns)),
-        t_end_ns=int(said.get('t_end_ns', now_ns)), priority=int(said.get('priority', 5)),
-        protected=bool(said.get('protected', False)),
-        metadata={**said.get('metadata', {}), 'sha256': hashlib.sha256(body).hexdigest()},
-    )  # fmt: skip
-
-
-def _more(row: TopicRow | None, item: DataObject) -> TopicRow:
-    """The account of a topic whose only witnesses are its files."""
-    count, newest_ns = (row.stored, row.last_kept_ns) if row else (0, 0)
-    count += item.samples
-    return TopicRow(item.topic or '', item.type, 'received-only', count, 0, count, {}, {}, max(newest_ns, item.t_end_ns))
-
-
 def _is_dead(tree: Tree, session: int) -> bool:
     """Whether the process of a session is gone: its lock file can be locked."""
     try:
-        descriptor = os.open(tree.root / 'sessions' / str(session), os.O_RDWR | os.O_CLOEXEC)
+        descriptor = os.open(tree.session(session), os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:
         return True
     try:
@@ -186,14 +150,11 @@ def _is_dead(tree: Tree, session: int) -> bool:
 
 def _settle_session(index: Index, session: int, now_ns: int, report: Recovery) -> None:
     """Close the accounts of a process that died: what was open is lost, and the ledger says so."""
-    rows = []
+    rows: list[TopicRow] = []
     for row in index.topics(session):
-        lost = row.open
-        if lost:
-            dropped = {**row.dropped, 'restart': row.dropped.get('restart', 0) + lost}
-            row = TopicRow(row.topic, row.type, row.accounting, row.received, row.skipped, row.stored, row.rejected, dropped, row.last_kept_ns)
-            report.counts['messages lost with an open batch'] += lost
-        rows.append(row)
+        dropped = {**row.dropped, 'restart': row.dropped.get('restart', 0) + row.open}
+        rows.append(replace(row, dropped=dropped) if row.open else row)
+        report.counts['messages lost with an open batch'] += row.open
     with index.transaction():
         index.write(session, Snapshot(tuple(rows), ()))
         index.end_session(session, now_ns)

@@ -16,7 +16,7 @@ import sqlite3
 import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -24,28 +24,17 @@ from shadowhound_data_logger.clock import SECOND, Clock
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.keys import check_key, unique
-from shadowhound_data_logger.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index, spooled
-from shadowhound_data_logger.spool.recovery import Recovery, open_index, recover
+from shadowhound_data_logger.spool.recovery import open_recovered
+from shadowhound_data_logger.spool.retention import NO_ROOM, OVERHEAD_BYTES, make_room
 
 log = logging.getLogger(__name__)
 
 DAY_NS: Final = 24 * 3600 * SECOND
-EVICTION_STEP: Final = 64
-"""Objects looked at for one round of eviction."""
-OVERHEAD_BYTES: Final = 8192
-"""What an object costs on disk beyond its bytes: a block's rounding and its share of the index."""
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What delivery found out about an object: it leaves PENDING for ``state``."""
-
-    item: SpooledObject
-    state: State
-    reason: str | None = None
 
 
 class Spool:
@@ -73,12 +62,13 @@ class Spool:
         try:
             self._tree.create()
             with _flock(self.root / 'recovery.lock'):
-                self._index = open_index(self.root / 'index.db', self.recovery)
-                recover(self._tree, self._index, self._clock.wall_ns(), self.recovery)
+                self._index = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
                 self._begin()
-        except OSError as error:
-            raise SpoolError(f'the spool {self.root} cannot be used: {error.strerror or error}',
-                             remedy='set SHADOWHOUND_HOME to a folder that this user may write, with space on it') from error  # fmt: skip
+        except (OSError, sqlite3.Error) as error:
+            self._index.close()
+            reason = getattr(error, 'strerror', None) or error
+            remedy = 'set SHADOWHOUND_HOME to a folder that this user may write, with space on it'
+            raise SpoolError(f'the spool {self.root} cannot be used: {reason}', remedy=remedy) from error
         if self.recovery.found_anything:
             log.warning('spool %s: %s', self.root, self.recovery.describe())
 
@@ -88,11 +78,16 @@ class Spool:
             return
         with self._lock:
             snapshot = self.accounts.snapshot({})
-            with self._index.transaction():
-                if snapshot:
-                    self._index.write(self._session, snapshot)
-                self._index.end_session(self._session, self._clock.wall_ns())
+            try:
+                with self._index.transaction():
+                    if snapshot:
+                        self._index.write(self._session, snapshot)
+                    self._index.end_session(self._session, self._clock.wall_ns())
+            except BaseException:
+                self.accounts.mark_dirty()
+                raise
             self._index.close()
+            self._tree.remove(self._tree.session(self._session))
             self._session = 0
         if self._session_lock is not None:
             os.close(self._session_lock)
@@ -106,14 +101,16 @@ class Spool:
         """
         now_ns = self._clock.wall_ns()
         with self._lock:
-            evicted = self._make_room(sum(len(item.body) + OVERHEAD_BYTES for item in objects), now_ns)
-            fits = evicted is not None
+            needed = sum(len(item.body) + OVERHEAD_BYTES for item in objects)
+            fits = not needed or make_room(self._index, self._tree, self._settings, needed, now_ns)
             stored = _count(objects)
             snapshot = self.accounts.snapshot(stored)
+            added: list[tuple[SpooledObject, State]] = []
             try:
-                with self._index.transaction():
-                    added = [self._add(item, now_ns, fits) for item in objects]
-                    if added and fits:
+                with self._index.transaction(undo=lambda: self._discard(added)):
+                    for item in objects:
+                        added.append(self._add(item, now_ns, fits))  # noqa: PERF401 - undo needs those before a failure
+                    if added:
                         self._tree.sync_incoming()
                     for outcome in outcomes:
                         self._index.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
@@ -124,9 +121,9 @@ class Spool:
                 self.accounts.mark_dirty()
                 raise
             self.accounts.store(stored)
-            self._place(added)
+            placed = self._place(added)
             self._settle(outcomes)
-        return [item for item, state in added if state is State.PENDING]
+        return placed
 
     def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
                 without: Sequence[str] = ()) -> list[SpooledObject]:  # fmt: skip
@@ -139,10 +136,7 @@ class Spool:
         found: list[SpooledObject] = []
         for row in rows:
             if row['id'] not in exclude and len(found) < limit:
-                path = self._tree.path(State.PENDING, None, row['bucket'], row['key'])
-                if not path.exists():  # another process has committed it and not renamed it yet
-                    self._tree.place(self._tree.part(row['id']), path)
-                found.append(spooled(row, path))
+                found.append(spooled(row, self._where(row['id'], row['bucket'], row['key'])))
         return found
 
     def pending_count(self) -> int:
@@ -161,8 +155,7 @@ class Spool:
         now_ns = self._clock.wall_ns()
         with self._index.transaction():
             self._session = self._index.begin_session(self._robot, self._clock.boot_id, os.getpid(), now_ns)
-        path = self.root / 'sessions' / str(self._session)
-        self._session_lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self._session_lock = os.open(self._tree.session(self._session), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._session_lock, fcntl.LOCK_EX)
         last = {(row.topic, row.publisher): row for row in self._index.publishers()}
         kept: dict[str, int] = {}
@@ -174,16 +167,15 @@ class Spool:
         """Row and part of one object, inside the transaction."""
         state, reason = (State.HELD, item.held) if item.held else (State.PENDING, None)
         if not fits and not item.protected:
-            state, reason = State.EVICTED, 'no_room'
+            state, reason = State.EVICTED, NO_ROOM
         key = self._free_key(item.bucket, check_key(item.key))
         sha256 = hashlib.sha256(item.body).hexdigest()
         metadata = {**item.metadata, 'sha256': sha256}
         number = self._index.insert(item, key, sha256, state, reason, metadata, now_ns)
+        path = self._tree.part(number)
         if state is not State.EVICTED:
-            self._tree.write_part(number, item.body, _description(item, sha256, metadata))
+            self._tree.write_part(number, item.body, _description(item, key, sha256, metadata))
             path = self._tree.path(state, reason, item.bucket, key)
-        else:
-            path = self._tree.part(number)
         return SpooledObject(number, item.bucket, key, path, len(item.body), sha256, item.content_type, metadata,
                              item.priority, now_ns), state  # fmt: skip
 
@@ -192,64 +184,58 @@ class Spool:
         attempt = 0
         while self._index.has(bucket, key := unique(wanted, attempt)):
             attempt += 1
-        return check_key(key)
+        return key
 
-    def _place(self, added: Iterable[tuple[SpooledObject, State]]) -> None:
+    def _discard(self, added: Iterable[tuple[SpooledObject, State]]) -> None:
+        """Remove the parts of a transaction that is rolled back: on a full disk they would keep it full."""
+        for item, _ in added:
+            self._tree.remove(self._tree.part(item.id))
+
+    def _place(self, added: Iterable[tuple[SpooledObject, State]]) -> list[SpooledObject]:
+        """Give the files their names; returns the objects that may be shipped."""
+        pending: list[SpooledObject] = []
         for item, state in added:
-            if state is not State.EVICTED:
+            if state is State.PENDING:
+                pending.append(replace(item, path=self._where(item.id, item.bucket, item.key)))
+            elif state is not State.EVICTED:
                 self._tree.place(self._tree.part(item.id), item.path)
+        return pending
+
+    def _where(self, number: int, bucket: str, key: str) -> Path:
+        """The file of a pending object, placed if it was not yet; the part where its place is barred."""
+        path, part = self._tree.path(State.PENDING, None, bucket, key), self._tree.part(number)
+        if not path.is_file() and not self._tree.place(part, path) and part.exists():
+            return part
+        return path
 
     def _settle(self, outcomes: Iterable[Outcome]) -> None:
         """Let the files follow their rows."""
         for outcome in outcomes:
+            item = outcome.item
             if outcome.state is State.QUARANTINED:
-                self._tree.place(outcome.item.path, self._tree.path(outcome.state, outcome.reason, outcome.item.bucket, outcome.item.key))
-            else:
-                self._tree.remove(outcome.item.path)
-
-    def _make_room(self, needed: int, now_ns: int) -> int | None:
-        """Evict until ``needed`` bytes fit; the number of objects it cost, None when they cannot fit."""
-        evicted = 0
-        while needed:
-            over = max(self._index.payload_bytes() + needed - self._settings.max_bytes,
-                       self._settings.min_free_bytes + needed - self._tree.free_bytes())  # fmt: skip
-            if over <= 0:
-                return evicted
-            rows = self._index.evictable(EVICTION_STEP)
-            if not rows:
-                log.error('spool %s: %d bytes too many and nothing left that may be evicted', self.root, over)
-                return None
-            chosen: list[sqlite3.Row] = []
-            for row in rows:
-                if over > 0:
-                    chosen.append(row)
-                    over -= row['bytes']
-            with self._index.transaction():
-                self._index.move([row['id'] for row in chosen], State.EVICTED, 'no_room', now_ns)
-            for row in chosen:
-                self._tree.remove(self._tree.path(State(row['state']), row['reason'], row['bucket'], row['key']))
-            evicted += len(chosen)
-            log.warning('spool %s: evicted %d objects to make room', self.root, len(chosen))
-        return evicted
+                source = self._where(item.id, item.bucket, item.key)
+                self._tree.place(source, self._tree.path(outcome.state, outcome.reason, item.bucket, item.key))
+            elif outcome.state in {State.DELIVERED, State.DEDUPLICATED, State.EVICTED}:
+                self._tree.remove(self._where(item.id, item.bucket, item.key))
 
     def _forget(self, now_ns: int) -> None:
         """Once an hour, drop rows of deliveries that nobody will ask for any more."""
         if now_ns - self._forgot_ns > 3600 * SECOND:
-            self._forgot_ns = now_ns
-            self._index.forget(now_ns - round(self._settings.remember_days * DAY_NS))
+            done = self._index.forget(now_ns - round(self._settings.remember_days * DAY_NS))
+            self._forgot_ns = now_ns if done else 0
 
 
-def _description(item: DataObject, sha256: str, metadata: Mapping[str, str]) -> dict[str, object]:
+def _description(item: DataObject, key: str, sha256: str, metadata: Mapping[str, str]) -> dict[str, object]:
     """What a file must say of itself so that its row can be made again."""
     return {
-        'bucket': item.bucket, 'key': item.key, 'sha256': sha256, 'content_type': item.content_type, 'sensor': item.sensor,
+        'bucket': item.bucket, 'key': key, 'sha256': sha256, 'content_type': item.content_type, 'sensor': item.sensor,
         'topic': item.topic, 'type': item.type, 'samples': item.samples, 't_start_ns': item.t_start_ns,
         't_end_ns': item.t_end_ns, 'priority': item.priority, 'protected': item.protected, 'metadata': dict(metadata),
     }  # fmt: skip
 
 
 def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, int]]:
-    """topic -> (samples, stamp of the newest)."""
+    """By topic: (samples, stamp of the newest)."""
     counts: dict[str, tuple[int, int]] = {}
     for item in objects:
         if item.topic is not None:

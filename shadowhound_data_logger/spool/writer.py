@@ -6,6 +6,7 @@ read-only disk) is tried again with everything that was in it; meanwhile ``put``
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 import time
 from collections import deque
@@ -13,8 +14,8 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Final
 
 from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.model import DataObject, SpooledObject
-from shadowhound_data_logger.spool.spool import Outcome, Spool
+from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject
+from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.worker import Worker
 
 MAX_WAITING_BYTES: Final = 32 << 20
@@ -39,6 +40,8 @@ class SpoolWriter:
         self._added = self._done = 0
         self._urgent = False
         self._last_commit = -HEARTBEAT_S
+        self.damaged = False
+        """Whether the index was found damaged: only the recovery of a new start can mend that."""
         self.worker = Worker('spool-writer', self._step)
 
     def open(self) -> None:
@@ -86,7 +89,11 @@ class SpoolWriter:
                 self._changed.wait_for(lambda: self._urgent or self.worker.stopping, pause_s)
             objects, outcomes = list(self._objects), list(self._outcomes)
         self._last_commit = time.monotonic()
-        spooled = self._spool.commit(objects, outcomes)
+        try:
+            spooled = self._spool.commit(objects, outcomes)
+        except sqlite3.DatabaseError as error:
+            self.damaged = not isinstance(error, sqlite3.OperationalError)
+            raise
         with self._changed:
             for _ in objects:
                 self._bytes -= len(self._objects.popleft().body)

@@ -1,0 +1,174 @@
+"""Files that have no row get one: those of a lost index, what came back, and what somebody copied into the spool.
+
+What a file says of itself is believed only as far as it makes sense; a file that cannot be an object is set aside in
+``foreign/``, and nothing is ever deleted but the file of an object that had left the spool already.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import sqlite3
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from shadowhound_data_logger.errors import NameRefused
+from shadowhound_data_logger.keys import check_key, check_name
+from shadowhound_data_logger.model import DataObject, State
+from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY, Snapshot, TopicRow
+from shadowhound_data_logger.spool.files import Tree, description_of
+from shadowhound_data_logger.spool.index import MISSING, Index
+
+log = logging.getLogger(__name__)
+
+GROUP_FILES: Final = 256
+GROUP_BYTES: Final = 32 << 20
+"""Files adopted in one transaction: one at a time, 100,000 of them would take minutes of syncing."""
+_IN_SPOOL: Final = frozenset({State.PENDING.value, State.HELD.value, State.QUARANTINED.value})
+_LARGEST: Final = (1 << 63) - 1
+
+
+@dataclass(slots=True)
+class Recovery:
+    """What recovery did, by word; all zero after a clean stop."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def found_anything(self) -> bool:
+        return bool(+self.counts)
+
+    def describe(self) -> str:
+        return ', '.join(f'{count} {what}' for what, count in sorted((+self.counts).items()))
+
+
+class _Found(NamedTuple):
+    """A file about to be adopted."""
+
+    state: State
+    reason: str | None
+    item: DataObject
+    sha256: str
+
+
+class Adoption:
+    """One run over the tree: New; run once. The caller holds the recovery lock."""
+
+    def __init__(self, tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
+        self._tree = tree
+        self._index = index
+        self._now_ns = now_ns
+        self._report = report
+        self._session = 0
+        self._group: list[_Found] = []
+        self._topics: dict[str, TopicRow] = {}
+
+    def run(self) -> None:
+        for state, reason, bucket, key, path in self._tree.objects():
+            if not _can_be_named(bucket, key):
+                self._foreign(path)
+                continue
+            row = self._index.db.execute(
+                'SELECT id, state, reason, sha256 FROM objects WHERE bucket = ? AND key = ?', (bucket, key)
+            ).fetchone()
+            if row is not None and row[1] in _IN_SPOOL and row[2] != MISSING:
+                continue
+            try:
+                body = path.read_bytes()
+            except FileNotFoundError:
+                continue  # another process has delivered it meanwhile
+            except OSError as error:
+                log.warning('cannot read %s: %s', path, error)
+                self._report.counts['unreadable files left alone'] += 1
+                continue
+            sha256 = hashlib.sha256(body).hexdigest()
+            if row is not None:
+                self._known(row, sha256, path, self._tree.path(State.PENDING, None, bucket, key))
+            elif (item := _described(path, bucket, key, body, sha256)) is None:
+                self._foreign(path)
+            else:
+                self._group.append(_Found(state, reason, item, sha256))
+                if len(self._group) >= GROUP_FILES or sum(len(found.item.body) for found in self._group) >= GROUP_BYTES:
+                    self._adopt()
+        self._adopt()
+
+    def _known(self, row: sqlite3.Row, sha256: str, path: Path, ready: Path) -> None:
+        """A file whose object is missing or has left the spool."""
+        if row[3] != sha256:
+            self._foreign(path)
+        elif row[1] in _IN_SPOOL:
+            if path == ready or self._tree.place(path, ready):
+                with self._index.transaction():
+                    self._index.set_found(row[0])
+                self._report.counts['missing files back'] += 1
+        else:
+            self._tree.remove(path)  # delivered, but the process died before it removed the file
+            self._report.counts['delivered files removed'] += 1
+
+    def _foreign(self, path: Path) -> None:
+        self._tree.set_aside(path)
+        self._report.counts['foreign files set aside'] += 1
+
+    def _adopt(self) -> None:
+        """Make rows of the group, and the account of each topic whose only witnesses are its files."""
+        if not self._group:
+            return
+        with self._index.transaction():
+            self._session = self._session or self._index.begin_session('recovered', '', 0, self._now_ns)
+            for found in self._group:
+                item = found.item
+                if self._index.has(item.bucket, item.key):
+                    continue  # the same key lies in two folders: the first one counts
+                self._index.insert(item, item.key, found.sha256, found.state, found.reason, item.metadata, self._now_ns)
+                if item.topic is not None:
+                    self._topics[item.topic] = _more(self._topics.get(item.topic), item.topic, item)
+                self._report.counts['files adopted'] += 1
+            self._index.write(self._session, Snapshot(tuple(self._topics.values()), ()))
+            self._index.end_session(self._session, self._now_ns)
+        self._group.clear()
+
+
+def _can_be_named(bucket: str, key: str) -> bool:
+    try:
+        check_name(bucket, 'the bucket')
+        check_key(key)
+    except NameRefused:
+        return False
+    return True
+
+
+def _described(path: Path, bucket: str, key: str, body: bytes, sha256: str) -> DataObject | None:
+    """The object that a file says it is; None when its content is not what it says."""
+    said = description_of(path)
+    if _word(said, 'sha256', sha256) != sha256:
+        return None
+    changed_ns = path.stat().st_mtime_ns
+    metadata = said.get('metadata')
+    words = metadata.items() if isinstance(metadata, dict) else ()
+    return DataObject(
+        bucket=bucket, key=key, body=body, content_type=_word(said, 'content_type', 'application/octet-stream'),
+        sensor=_word(said, 'sensor', 'unknown'), topic=_word(said, 'topic', '') or None, type=_word(said, 'type', ''),
+        samples=_number(said, 'samples', 0), t_start_ns=_number(said, 't_start_ns', changed_ns),
+        t_end_ns=_number(said, 't_end_ns', changed_ns), priority=min(_number(said, 'priority', 5), 9),
+        protected=said.get('protected') is True,
+        metadata={**{name: value for name, value in words if isinstance(value, str)}, 'sha256': sha256},
+    )  # fmt: skip
+
+
+def _word(said: dict[str, Any], name: str, default: str) -> str:
+    value = said.get(name)
+    return value if isinstance(value, str) and value.isprintable() else default
+
+
+def _number(said: dict[str, Any], name: str, default: int) -> int:
+    value = said.get(name)
+    return value if type(value) is int and 0 <= value <= _LARGEST else default
+
+
+def _more(row: TopicRow | None, topic: str, item: DataObject) -> TopicRow:
+    """The topic's account with the samples of one more file."""
+    count, newest_ns = (row.stored, row.last_kept_ns) if row else (0, 0)
+    count += item.samples
+    return TopicRow(topic, item.type, RECEIVED_ONLY, count, 0, count, {}, {}, max(newest_ns, item.t_end_ns))

@@ -1,0 +1,111 @@
+"""Objects for the spool, and what must be true of any spool at any time."""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import SpoolSettings
+from shadowhound_data_logger.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.spool import Outcome, Spool
+
+NOON_NS = 1_760_788_800 * SECOND
+BUCKET = 'sensor-data'
+KEY = 'thor/camera/20251018/120000_front.jpg'
+IN_SPOOL = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine'}
+
+
+@dataclass(slots=True)
+class FakeClock:
+    """Time that passes when told to."""
+
+    now_ns: int = NOON_NS
+    boot_id: str = 'a-boot'
+
+    def wall_ns(self) -> int:
+        return self.now_ns
+
+    def boot_ns(self) -> int:
+        return self.now_ns
+
+
+def new_spool(root: Path, clock: FakeClock | None = None, **settings: float) -> Spool:
+    """A spool that is not open yet, without a lower limit on free space."""
+    return Spool(root, SpoolSettings(**{'min_free_bytes': 0, **settings}), clock or FakeClock(), 'thor')
+
+
+def make(key: str = KEY, body: bytes = b'content', **fields: Any) -> DataObject:
+    """One object of one sample of the camera."""
+    values: dict[str, Any] = {
+        'bucket': BUCKET, 'key': key, 'body': body, 'content_type': 'image/jpeg', 'sensor': 'camera', 'topic': '/camera',
+        'type': 'sensor_msgs/msg/CompressedImage', 'samples': 1, 't_start_ns': NOON_NS, 't_end_ns': NOON_NS, **fields,
+    }  # fmt: skip
+    return DataObject(**values)
+
+
+def receive(spool: Spool, count: int = 1, topic: str = '/camera', publisher: str = 'p') -> None:
+    """Account for as many messages taken, with the numbers that follow."""
+    with spool.accounts.entry(topic) as account:
+        span = account.publishers.get(publisher)
+        first = (span.last or 0) + 1 if span else 1
+        for number in range(first, first + count):
+            assert account.receive(publisher, number)
+
+
+def put(spool: Spool, *objects: DataObject) -> list[SpooledObject]:
+    """Receive and commit."""
+    for item in objects:
+        if item.topic:
+            receive(spool, item.samples, item.topic)
+    return spool.commit(objects)
+
+
+def settle(spool: Spool, item: SpooledObject, state: State, reason: str | None = None) -> None:
+    """Commit one outcome."""
+    spool.commit(outcomes=[Outcome(item, state, reason)])
+
+
+def rows(root: Path) -> list[dict[str, Any]]:
+    """All object rows, read by somebody else."""
+    connection = sqlite3.connect(root / 'index.db')
+    connection.row_factory = sqlite3.Row
+    try:
+        return [dict(row) for row in connection.execute('SELECT * FROM objects ORDER BY id')]
+    finally:
+        connection.close()
+
+
+def files(root: Path) -> dict[str, bytes]:
+    """Every payload in the spool's tree by its path."""
+    folders = ('incoming', 'ready', 'held', 'quarantine', 'foreign')
+    found = [path for name in folders for path in (root / name).rglob('*') if path.is_file() and not path.is_symlink()]
+    return {str(path.relative_to(root)): path.read_bytes() for path in found}
+
+
+def place_of(row: dict[str, Any]) -> str:
+    """Where the file of a row has to be."""
+    state = State(row['state'])
+    reason = '' if state is State.PENDING else f'/{row["reason"] or "unknown"}'
+    return f'{IN_SPOOL[state]}{reason}/{row["bucket"]}/{row["key"]}'
+
+
+def assert_whole(root: Path) -> dict[str, Any]:
+    """Every row in the spool has its whole file, every file its row, and the ledger closes; returns the ledger."""
+    lying = files(root)
+    expected = {}
+    for row in rows(root):
+        if State(row['state']) in IN_SPOOL and row['reason'] != 'missing':
+            expected[place_of(row)] = row
+    assert {name for name in lying if not name.startswith('foreign/')} == set(expected)
+    for name, row in expected.items():
+        if row['reason'] != 'damaged':
+            assert hashlib.sha256(lying[name]).hexdigest() == row['sha256'], name
+    found = ledger.read(root, 'thor')
+    assert ledger.imbalances(found) == []
+    assert found['balanced']
+    return found

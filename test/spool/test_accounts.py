@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shadowhound_data_logger.spool import accounts as module
+from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts, PublisherRow, Span, TopicAccount
+
+
+def taken(span: Span, *numbers: int) -> list[bool]:
+    """Observe numbers one after the other."""
+    return [span.observe(number) for number in numbers]
+
+
+def figures(span: Span) -> tuple[int, int, dict[str, int]]:
+    """(published, received, missed by cause)."""
+    return span.published, span.received, dict(+span.missed)
+
+
+def test_accounting_begins_with_the_first_number_taken() -> None:
+    """What a publisher sent before the match is nobody's loss."""
+    span = Span()
+    assert taken(span, 500, 501) == [True, True]
+    assert figures(span) == (2, 2, {})
+
+
+def test_a_gap_is_missed_by_transport() -> None:
+    """Numbers that were jumped over are published and missed."""
+    span = Span()
+    taken(span, 1, 5)
+    assert figures(span) == (5, 2, {'transport': 3})
+
+
+def test_a_repeat_is_counted_once() -> None:
+    """The same number again is refused, wherever it lies."""
+    span = Span()
+    assert taken(span, 7, 8, 8, 7) == [True, True, False, False]
+    assert figures(span) == (2, 2, {})
+
+
+def test_a_late_number_fills_its_hole() -> None:
+    """A number that was missed and comes after all is received, once."""
+    span = Span()
+    assert taken(span, 1, 4, 3, 3) == [True, True, True, False]
+    assert figures(span) == (4, 3, {'transport': 1})
+
+
+def test_history_before_the_first_number_is_received() -> None:
+    """TRANSIENT_LOCAL history that comes after a live message counts once and makes no gap."""
+    span = Span()
+    assert taken(span, 10, 8, 9, 8, 11) == [True, True, True, False, True]
+    assert figures(span) == (4, 4, {})
+    assert span.first == 8
+
+
+def test_history_taken_before_a_restart_is_not_taken_again() -> None:
+    """A durable span begins at the lowest number taken, so that a restarted node refuses the same history."""
+    accounts = Accounts()
+    with accounts.entry('/map') as account:
+        assert [account.receive('p', number) for number in (10, 8, 9)] == [True] * 3
+    snapshot = accounts.snapshot({})
+    assert snapshot is not None
+    with Accounts(snapshot.publishers).entry('/map') as account:
+        assert [account.receive('p', number) for number in (8, 9, 10, 11)] == [False, False, False, True]
+
+
+def test_the_gap_of_a_restart_has_its_cause() -> None:
+    """Numbers between the earlier session's last and this one's first are missed by restart, later gaps by transport."""
+    span = Span(first=1, last=100, inherited=True)
+    assert taken(span, 100, 111, 113) == [False, True, True]
+    assert figures(span) == (13, 2, {'restart': 10, 'transport': 1})
+
+
+def test_history_does_not_hide_the_restart() -> None:
+    """A message from before the inherited span leaves the cause of the gap after it as it is."""
+    span = Span(first=50, last=100, inherited=True)
+    assert taken(span, 40, 103) == [True, True]
+    assert figures(span) == (4, 2, {'restart': 2})
+
+
+def test_a_late_number_of_a_restart_fills_its_hole() -> None:
+    """A message that overtook others after a restart does not make them repeats."""
+    span = Span(first=1, last=10, inherited=True)
+    assert taken(span, 13, 12) == [True, True]
+    assert figures(span) == (3, 2, {'restart': 1})
+
+
+def test_after_a_rebase_the_gap_is_not_missed() -> None:
+    """What was published while nobody listened on purpose is not published for the ledger."""
+    span = Span()
+    taken(span, 1, 2)
+    span.rebase()
+    assert taken(span, 50, 52) == [True, True]
+    assert figures(span) == (5, 4, {'transport': 1})
+
+
+def test_a_rebase_makes_no_repeat_new() -> None:
+    """Numbers counted before a rebase are refused after it (TRANSIENT_LOCAL delivers again)."""
+    span = Span()
+    taken(span, 1, 2, 3)
+    span.rebase()
+    assert taken(span, 2, 3, 9, 8, 8) == [False, False, True, True, False]
+    assert figures(span) == (5, 5, {})
+
+
+def test_the_newest_holes_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory of holes is bounded, and old holes, which nothing fills any more, make way for new ones."""
+    monkeypatch.setattr(module, 'MAX_REMEMBERED', 4)
+    span = Span()
+    taken(span, 0, 6, 8)  # holes 1..5, then 7
+    assert taken(span, 7, 5, 1) == [True, True, False]
+    assert figures(span) == (9, 5, {'transport': 4})
+
+
+NUMBERS = st.lists(st.integers(0, 60), max_size=80)
+
+
+@given(NUMBERS, st.sets(st.integers(0, 80)), st.none() | st.tuples(st.integers(0, 30), st.integers(0, 30)))
+def test_published_is_received_and_missed(numbers: list[int], rebases: set[int], inherited: tuple[int, int] | None) -> None:
+    """For any numbers in any order, published = received + missed, and each number is accepted at most once."""
+    span = Span(min(inherited), max(inherited), inherited=True) if inherited else Span()
+    accepted: list[int] = []
+    for index, number in enumerate(numbers):
+        if index in rebases:
+            span.rebase()
+        if span.observe(number):
+            accepted.append(number)
+        assert span.published == span.received + sum(span.missed.values())
+        assert min(span.missed.values(), default=0) >= 0
+    assert len(accepted) == len(set(accepted)) == span.received
+
+
+@given(NUMBERS)
+def test_every_new_number_is_received(numbers: list[int]) -> None:
+    """Without a former session, received is the number of distinct numbers, and missed the holes above the first taken."""
+    span = Span()
+    for number in numbers:
+        span.observe(number)
+    distinct = set(numbers)
+    assert span.received == len(distinct)
+    holes = set(range(numbers[0], max(distinct) + 1)) - distinct if numbers else set()
+    assert sum(span.missed.values()) == len(holes)
+
+
+def test_without_a_number_a_message_is_only_received() -> None:
+    """Accounting without numbers is not called exact."""
+    account = TopicAccount()
+    assert account.receive('p', 1)
+    assert account.accounting == EXACT
+    assert account.receive('p', None)
+    assert account.receive(None, 3)
+    assert (account.accounting, account.received) == (RECEIVED_ONLY, 3)
+
+
+def test_two_publishers_have_numbers_of_their_own() -> None:
+    """The same number of two publishers is two messages."""
+    account = TopicAccount()
+    assert [account.receive('a', 1), account.receive('b', 1), account.receive('b', 1)] == [True, True, False]
+    assert account.received == 2
+
+
+def test_open_is_what_has_no_outcome() -> None:
+    """Each message is open until it is skipped, rejected, dropped or stored."""
+    accounts = Accounts()
+    with accounts.entry('/odom') as account:
+        for number in range(10):
+            account.receive('p', number)
+        account.skipped += 3
+    accounts.reject('/odom', {'bad': 1})
+    accounts.drop('/odom', 'full', 2)
+    accounts.store({'/odom': (3, 77)})
+    with accounts.entry('/odom') as account:
+        assert account.open == 1
+    assert accounts.last_kept_ns('/odom') == 77
+
+
+def test_a_snapshot_holds_what_is_about_to_be_durable() -> None:
+    """A snapshot counts the samples of its own commit as stored; without a change there is none."""
+    accounts = Accounts()
+    with accounts.entry('/odom') as account:
+        account.receive('p', 5)
+    snapshot = accounts.snapshot({'/odom': (1, 9)})
+    assert snapshot is not None
+    assert (snapshot.topics[0].stored, snapshot.topics[0].open, snapshot.topics[0].last_kept_ns) == (1, 0, 9)
+    assert snapshot.publishers == (PublisherRow('/odom', 'p', 5, 5, 1, 1, {}),)
+    accounts.store({'/odom': (1, 9)})
+    assert accounts.snapshot({}) is None
+    accounts.mark_dirty()
+    assert accounts.snapshot({}) is not None
+
+
+def test_samples_of_a_topic_that_nobody_received_show() -> None:
+    """An object of a topic without an account makes the topic's account negative at once, not silently nothing."""
+    snapshot = Accounts().snapshot({'/ghost': (2, 1)})
+    assert snapshot is not None
+    assert [(row.topic, row.open) for row in snapshot.topics] == [('/ghost', -2)]
+
+
+def test_the_last_kept_stamp_is_inherited() -> None:
+    """A restarted node goes on sampling after the newest durable sample of any session."""
+    accounts = Accounts(last_kept={'/odom': 50})
+    assert accounts.last_kept_ns('/odom') == 50
+    accounts.store({'/odom': (1, 40)})
+    assert accounts.last_kept_ns('/odom') == 50
+    assert accounts.last_kept_ns('/imu') == 0
