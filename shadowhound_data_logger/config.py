@@ -6,6 +6,7 @@ module are what the node does with nothing set; ``launch_configs/go2.yaml`` spel
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
@@ -17,6 +18,10 @@ from shadowhound_data_logger.keys import KeyTemplate, check_name
 
 MEBI: Final = 1 << 20
 GIBI: Final = 1 << 30
+MIN_RATE_HZ: Final = 1e-4
+"""A message every three hours."""
+_BUCKET: Final = re.compile(r'[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]')
+"""https://docs.aws.amazon.com/AmazonS3/latest/userguide/bucketnamingrules.html"""
 FORMATS: Final = ('jpeg', 'pcd', 'json')
 COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
 IMAGE: Final = 'sensor_msgs/msg/Image'
@@ -178,7 +183,7 @@ class Settings:
         """Raises SettingError (unknown or wrong parameter or variable) naming it, its value and what is allowed."""
         given = {name: value for name, value in parameters.items() if name.split('.')[0] not in FOREIGN}
         robot = _robot(given.pop('robot', ''), environ, namespace)
-        sensors = _sensors(given)
+        sensors = _sensors(given, robot)
         groups = {name: _fill(kind, name, given) for name, kind in _GROUPS.items()}
         if given:
             name, value = next(iter(given.items()))
@@ -196,8 +201,9 @@ def home(environ: Mapping[str, str]) -> Path:
 def store_settings(environ: Mapping[str, str], folder: Path) -> StoreSettings:
     """The store the environment names; raises SettingError for an endpoint that is no http(s) URL."""
     endpoint = environ.get('AWS_ENDPOINT_URL') or None
-    if endpoint and not endpoint.startswith(('http://', 'https://')):
-        raise SettingError('AWS_ENDPOINT_URL', endpoint, 'a URL such as http://TOWER_IP:9000')
+    if endpoint and (not endpoint.startswith(('http://', 'https://')) or '@' in endpoint):
+        shown = endpoint if '@' not in endpoint else '(not shown: it may hold a password)'
+        raise SettingError('AWS_ENDPOINT_URL', shown, 'a URL such as http://TOWER_IP:9000, without user and password')
     return StoreSettings(
         endpoint_url=endpoint,
         access_key_id=environ.get('AWS_ACCESS_KEY_ID') or None,
@@ -213,7 +219,7 @@ def default_parameters() -> dict[str, Any]:
     flat: dict[str, Any] = {'robot': '', 'sensors': list(DEFAULT_SENSORS)}
     for name, kind in _GROUPS.items():
         flat |= {f'{name}.{spec.name}': spec.default for spec in fields(kind)}
-    for sensor in _sensors({}):
+    for sensor in _sensors({}, 'thor'):
         for spec in fields(sensor)[1:]:
             value = getattr(sensor, spec.name)
             flat[f'{sensor.name}.{spec.name}'] = list(value) if isinstance(value, tuple) else value
@@ -231,13 +237,13 @@ def _robot(given: object, environ: Mapping[str, str], namespace: str) -> str:
         raise SettingError('robot', name, error.remedy) from error
 
 
-def _sensors(given: dict[str, Any]) -> tuple[SensorSettings, ...]:
+def _sensors(given: dict[str, Any], robot: str) -> tuple[SensorSettings, ...]:
     names = given.pop('sensors', list(DEFAULT_SENSORS))
     if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
         raise SettingError('sensors', names, 'a list of names')
     if len(set(names)) != len(names):
         raise SettingError('sensors', names, 'a list of names, each once')
-    sensors = tuple(_sensor(name, given) for name in names)
+    sensors = tuple(_sensor(name, given, robot) for name in names)
     owners: dict[str, str] = {}
     for sensor in sensors:
         for topic in sensor.topics:
@@ -247,7 +253,7 @@ def _sensors(given: dict[str, Any]) -> tuple[SensorSettings, ...]:
     return sensors
 
 
-def _sensor(name: str, given: dict[str, Any]) -> SensorSettings:
+def _sensor(name: str, given: dict[str, Any], robot: str) -> SensorSettings:
     if name in {'robot', 'sensors', *_GROUPS, *FOREIGN}:
         raise SettingError('sensors', name, 'names that are not those of other parameters')
     try:
@@ -261,11 +267,14 @@ def _sensor(name: str, given: dict[str, Any]) -> SensorSettings:
         raise SettingError(f'{name}.types', list(sensor.types), 'at most one type for each topic')
     if sensor.batch_s and sensor.format != 'json':
         raise SettingError(f'{name}.batch_s', sensor.batch_s, f'0 with format {sensor.format!r}: only json objects hold several messages')
-    KeyTemplate.parse(sensor.key, f'{name}.key')
+    if 0 < sensor.rate_hz < MIN_RATE_HZ:
+        raise SettingError(f'{name}.rate_hz', sensor.rate_hz, f'0, or at least {MIN_RATE_HZ}')
     try:
-        check_name(sensor.bucket, 'the bucket')
+        KeyTemplate.parse(sensor.key, f'{name}.key').render(robot=robot, sensor=name, stamp_ns=0, period_ns=0, ext='json')
     except NameRefused as error:
-        raise SettingError(f'{name}.bucket', sensor.bucket, error.remedy) from error
+        raise SettingError(f'{name}.key', sensor.key, f'a key of safe length ({error})') from error
+    if not _BUCKET.fullmatch(sensor.bucket) or '..' in sensor.bucket:
+        raise SettingError(f'{name}.bucket', sensor.bucket, 'a bucket name: 3 to 63 lower-case letters, digits, "-" and "."')
     return sensor
 
 

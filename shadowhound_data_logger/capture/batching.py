@@ -27,7 +27,7 @@ class Batcher:
         """Take a sample; returns the batches that are closed by it, in order (mostly none, at most two)."""
         closed: list[Batch] = []
         window = sample.stamp_ns // self._batch_ns if self._batch_ns else 0
-        if self._samples and window != self._window:
+        if self._samples and window > self._window:  # a late sample joins the open batch
             closed.append(self.close())
         if not self._samples:
             self._window = window

@@ -51,16 +51,17 @@ class Plan:
         return f'{self.topic} ({self.type}, {reliability}{", TRANSIENT_LOCAL" * self.transient_local}, depth {self.depth})'
 
 
-def plans(topic: str, publishers: Sequence[Endpoint], expected_type: str | None, settings: IntakeSettings) -> tuple[Plan, ...]:
+def plans(topic: str, publishers: Sequence[Endpoint], expected_type: str | None, settings: IntakeSettings,
+          current_type: str = '') -> tuple[Plan, ...]:  # fmt: skip
     """The subscriptions that miss nothing of what these publishers send; none while not even the type is known.
 
     A RELIABLE subscription gets nothing from a BEST_EFFORT publisher, and a BEST_EFFORT one may lose what a RELIABLE
     publisher would have repeated. So there is one of each while both kinds of publisher exist, and while none does yet:
     whatever comes is then matched as it should be from its first message on. What both receive is a repeat, and dropped.
-    With several types on a topic the most common one is heard.
+    With several types on a topic the one already heard goes on, else the most common one is heard.
     """
     counts = Counter(publisher.type for publisher in publishers)
-    name = counts.most_common(1)[0][0] if counts else expected_type
+    name = max(counts, key=lambda name: (name == current_type, counts[name], name)) if counts else expected_type
     if not name:
         return ()
     reliable = [publisher for publisher in publishers if publisher.type == name and publisher.reliable]

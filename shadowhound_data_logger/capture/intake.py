@@ -35,11 +35,11 @@ class Intake:
         self._queue = queue
         self._priorities = {sensor.name: sensor.priority for sensor in settings.sensors}
         group = PolledGroup()
-        self._sources = [
+        self._sources = deque(
             Source(node, sensor, settings.intake, accounts, types, group, self._offer)
             for sensor in settings.sensors
             if sensor.enabled
-        ]
+        )
         self._requests: deque[Callable[[], None]] = deque()
         self._wake = threading.Event()
         self._next_poll_s = self._next_refresh_s = 0.0
@@ -77,8 +77,9 @@ class Intake:
         self._next_poll_s = now_s + self._settings.intake.poll_s
         if now_s >= self._next_refresh_s:
             self._next_refresh_s = now_s + REFRESH_S
-            for source in self._sources:
-                source.refresh(now_s)
+            for _ in range(len(self._sources)):
+                self._sources.rotate(-1)  # should one fail, it is the turn of the next one in the next round
+                self._sources[-1].refresh(now_s)
         for source in self._sources:
             source.drain(now_s)
         while self._requests:

@@ -10,6 +10,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from shadowhound_data_logger.config import DEFAULT_SENSORS, FOREIGN, Settings, default_parameters
+from shadowhound_data_logger.errors import SettingError
 
 FIXED: Final = 'settings are read at the start: change the parameter file and start the node again'
 
@@ -21,12 +22,29 @@ def load(node: Node) -> Settings:
     """
     given = {name: _plain(parameter.value) for name, parameter in node.get_parameters_by_prefix('').items()}
     settings = Settings.load(given, os.environ, node.get_namespace())
+    _check_topics(node, settings)
     unused = set(DEFAULT_SENSORS) - {sensor.name for sensor in settings.sensors}
     for name, default in default_parameters().items():
         if name.partition('.')[0] not in unused and not node.has_parameter(name):
             node.declare_parameter(name, default)
     node.add_on_set_parameters_callback(_refuse)
     return settings
+
+
+def _check_topics(node: Node, settings: Settings) -> None:
+    """Every topic has a valid name and, once resolved (namespace, remapping), a single sensor. Raises SettingError."""
+    owners: dict[str, str] = {}
+    for sensor in settings.sensors:
+        for topic in sensor.topics:
+            name = f'{sensor.name}.topics'
+            try:
+                resolved = node.resolve_topic_name(topic)
+            except (RuntimeError, ValueError) as error:  # RCLError is the one, InvalidTopicNameException the other
+                reason = str(error).partition(', at ')[0].partition('\n')[0]
+                raise SettingError(name, list(sensor.topics), f'valid topic names, not {topic!r} ({reason})') from error
+            if resolved in owners:
+                raise SettingError(name, list(sensor.topics), f'a topic of its own, and {resolved} is in {owners[resolved]} already')
+            owners[resolved] = name
 
 
 def _plain(value: Any) -> Any:

@@ -7,6 +7,7 @@ import logging
 import os
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import Any
 
 from rclpy.node import Node
@@ -14,7 +15,7 @@ from rclpy.node import Node
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.encode.pool import EncodePool
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -41,12 +42,24 @@ class Pipeline:
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
         self._node = node
         self._day = self._today()
+        self._opened = ExitStack()
 
     def open(self) -> None:
         """Raises SpoolError or SettingError; nothing is left open then."""
+        with ExitStack() as opened:
+            self._open(opened)
+            self._opened = opened.pop_all()
+
+    def _open(self, opened: ExitStack) -> None:
+        """Open the stages; ``opened`` closes them in the opposite order, each whatever happens to the others."""
         settings = self._settings
         self._store = open_store(settings.store, settings.upload)
+        opened.callback(self._store.close)
         self.spool.open()
+        opened.callback(self.spool.close)
+        if not opened.enter_context(self.spool.node_lock()):
+            raise SpoolError(f'another sensor_logger_node logs {settings.robot} to {self.spool.root} already',
+                             remedy='stop it, or give this one a robot name or SHADOWHOUND_HOME of its own')  # fmt: skip
         self.uploader = Uploader(self.spool, self._store, settings.upload, self._settle)
         self.writer = SpoolWriter(self.spool, settings.spool.commit_s, spooled=lambda _: self.uploader.wake(),
                                   settled=self.uploader.settled)  # fmt: skip
@@ -57,13 +70,20 @@ class Pipeline:
                                settings.encode.threads)  # fmt: skip
         self.intake = Intake(self._node, settings, self.spool.accounts, types, self.queue)
         self.writer.open()
+        opened.callback(self.writer.close, 1.0)
         self.pool.open()
         self.uploader.open()
+        opened.callback(self.uploader.close, 0.5)
+        opened.callback(self._finish)
         self.intake.open()
         log.info('logging %s to %s, spool %s', ' '.join(self.intake.topics), self._store.describe(), self.spool.root)
 
     def close(self) -> None:
         """Close the open batches, make all durable, deliver for at most ``shutdown.drain_s``, leave the rest in the spool."""
+        self._opened.close()
+
+    def _finish(self) -> None:
+        """Everything that is in memory to the spool, and from there what can be delivered in time."""
         end_s = time.monotonic() + CLOSE_S
         finished = {
             'intake': self.intake.close(CLOSE_S),
@@ -72,16 +92,13 @@ class Pipeline:
         }
         for name in (name for name, done in finished.items() if not done):
             log.error('the %s did not finish in %.0f s', name, CLOSE_S)
-        if all(finished.values()):
-            self.writer.put(self._ledger())
-            self.writer.flush(1.0)
+        if not all(finished.values()):
+            return
+        self._ship_ledger()
+        self.writer.flush(1.0)
         drain_s = self._settings.shutdown.drain_s
         if drain_s and not self.uploader.drain(drain_s):
             log.warning('%d objects stay in the spool %s and are delivered later', self.spool.pending_count(), self.spool.root)
-        self.uploader.close(0.5)
-        self.writer.close(1.0)
-        self.spool.close()
-        self._store.close()
 
     def tick(self) -> None:
         """Called now and then: at the turn of each UTC day the ledger goes to the store.
@@ -93,10 +110,17 @@ class Pipeline:
         day = self._today()
         if day != self._day:
             self._day = day
-            self.writer.put(self._ledger())
+            self._ship_ledger()
 
     def _today(self) -> str:
         return f'{utc(self._clock.wall_ns()):%Y%m%d}'
+
+    def _ship_ledger(self) -> None:
+        """A ledger that cannot be read now is not worth the node: the next one holds all that this one would."""
+        try:
+            self.writer.put(self._ledger(), wait=False)
+        except DataLoggerError as error:
+            log.warning('the ledger was not shipped: %s', error)
 
     def _settle(self, outcomes: Sequence[Outcome]) -> None:
         self.writer.settle(outcomes)

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.type_support import NoTypeSupportImportedException, check_for_type_support
 
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan
 
@@ -55,9 +56,11 @@ def message_class(type_name: str) -> type:
     """The rclpy class of ``package/msg/Name``; raises TypeUnavailable."""
     package, _, name = type_name.partition('/msg/')
     try:
-        return getattr(import_module(f'{package}.msg'), name)  # type: ignore[no-any-return]
-    except (ImportError, AttributeError, ValueError) as error:
+        found: type = getattr(import_module(f'{package}.msg'), name)
+        check_for_type_support(found)
+    except (ImportError, AttributeError, ValueError, TypeError, NoTypeSupportImportedException) as error:
         raise TypeUnavailable(f'{type_name}: {error}') from error
+    return found
 
 
 def endpoints(node: Node, topic: str) -> list[Endpoint]:

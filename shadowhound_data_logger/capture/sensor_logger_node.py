@@ -51,7 +51,11 @@ class StopSignals:
 
 def main(args: list[str] | None = None) -> int:
     """The console script; ``args`` are ROS arguments without the program's name."""
-    rclpy.init(args=[sys.argv[0], *(sys.argv[1:] if args is None else args)], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=[sys.argv[0], *(sys.argv[1:] if args is None else args)], signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # a parameter file or argument that rcl cannot parse; there is no logger yet
+        print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201
+        return 2
     stop = StopSignals()
     node = Node('sensor_logger_node', automatically_declare_parameters_from_overrides=True)
     logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])

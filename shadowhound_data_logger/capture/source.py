@@ -12,7 +12,7 @@ from rclpy.node import Node
 from shadowhound_data_logger.capture.batching import Batcher
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, plans
 from shadowhound_data_logger.capture.gate import Gate, gate_for
-from shadowhound_data_logger.capture.reader import PolledGroup, Reader, Taken, TypeUnavailable, endpoints
+from shadowhound_data_logger.capture.reader import PolledGroup, Reader, Taken, TypeUnavailable, endpoints, message_class
 from shadowhound_data_logger.clock import is_sane
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
@@ -26,7 +26,7 @@ FALLBACK_S: Final = 1.0
 OVERLAP_S: Final = 0.5
 """How long the old subscription lives beside its successor, at least until that is matched."""
 MAX_RECENT: Final = 10_000
-"""Messages without numbers that are remembered while two subscriptions of a topic exist."""
+"""Messages without numbers that are remembered, to know what a second subscription delivers again."""
 Offer = Callable[[Batch], None]
 
 
@@ -55,6 +55,7 @@ class Source:
         self._gate: Gate | None = None
         self._batcher: Batcher | None = None
         self._unavailable: set[str] = set()
+        self._unheard: set[str] = set()
         self._recent: dict[tuple[int, int], None] = {}
 
     @property
@@ -66,21 +67,16 @@ class Source:
         """Look at the graph and subscribe as its publishers ask for it."""
         publishers = self._choose(now_s)
         self._senders.look([publisher.gid for publisher in publishers])
-        wanted = plans(self._chosen, publishers, self._types_expected.get(self._chosen), self._settings)
-        if not wanted or wanted[0].type in self._unavailable:
+        wanted = plans(self._chosen, publishers, self._types_expected.get(self._chosen), self._settings, self._type)
+        self._warn_of_types(publishers, wanted)
+        if not wanted or not self._is_available(wanted[0].type):
             return
         if wanted[0].type != self._type:
             self._retype(wanted[0].type)
         present = {reader.plan for reader in self._readers}
-        try:
-            for plan in wanted:
-                if plan not in present:
-                    self._readers.append(Reader(self._node, plan, self._group))
-        except TypeUnavailable as error:
-            self._unavailable.add(wanted[0].type)
-            text = '%s: %s is not logged: its message package is not installed here (%s)'
-            log.warning(text, self.sensor.name, self._chosen, error)
-            return
+        for plan in wanted:
+            if plan not in present:
+                self._readers.append(Reader(self._node, plan, self._group))
         if publishers and set(wanted) != self._heard:
             self._heard = set(wanted)
             log.info('%s: %s', self.sensor.name, ' and '.join(plan.describe() for plan in wanted))
@@ -118,6 +114,27 @@ class Source:
         if best != self._chosen and (better or waited):
             self._switch(best, now_s)
         return found[self._chosen]
+
+    def _warn_of_types(self, publishers: Sequence[Endpoint], wanted: Sequence[Plan]) -> None:
+        """Say once which types of a topic with several are not heard."""
+        others = {publisher.type for publisher in publishers} - {plan.type for plan in wanted} - self._unheard
+        if others:
+            self._unheard |= others
+            text = '%s: %s is published with several types; %s is logged, not %s'
+            log.warning(text, self.sensor.name, self._chosen, wanted[0].type, ', '.join(sorted(others)))
+
+    def _is_available(self, type_name: str) -> bool:
+        """Whether messages of the type can be received here; asked before anything is begun or counted for them."""
+        if type_name in self._unavailable:
+            return False
+        try:
+            message_class(type_name)
+        except TypeUnavailable as error:
+            self._unavailable.add(type_name)
+            text = '%s: %s is not logged: its message package is not installed here (%s)'
+            log.warning(text, self.sensor.name, self._chosen, error)
+            return False
+        return True
 
     def _switch(self, topic: str, now_s: float) -> None:
         """Leave the current topic for another one of the sensor's."""
@@ -198,9 +215,6 @@ class Source:
 
     def _is_repeat(self, source_ns: int, cdr: bytes) -> bool:
         """Whether a message without a number came by another of our subscriptions already: same time, same content."""
-        if len(self._readers) < 2:  # one subscription delivers each message once
-            self._recent.clear()
-            return False
         mark = (source_ns, crc32(cdr))
         if mark in self._recent:
             return True

@@ -41,17 +41,18 @@ class EncodePool:
         """Encode what is queued, then end; False if that took longer than the deadline. Idempotent."""
         end = time.monotonic() + deadline_s
         self._queue.close()
+        done = [worker.join(end - time.monotonic()) for worker in self.workers]
         for worker in self.workers:
             worker.stop()
-        done = [worker.join(end - time.monotonic()) for worker in self.workers]
-        while all(done) and time.monotonic() < end and (batch := self._queue.get(0.0)) is not None:
-            self._encode(batch)
-        return all(done) and not self._queue.status().messages
+        return all(done)
 
     def _step(self) -> None:
         batch = self._queue.get(WAIT_S)
         if batch is not None:
             self._encode(batch)
+        elif self._queue.closed:
+            for worker in self.workers:
+                worker.stop()
 
     def _encode(self, batch: Batch) -> None:
         try:

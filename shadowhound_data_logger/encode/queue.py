@@ -62,6 +62,11 @@ class BatchQueue:
             self._closed = True
             self._ready.notify_all()
 
+    @property
+    def closed(self) -> bool:
+        with self._ready:
+            return self._closed
+
     def status(self) -> QueueStatus:
         with self._ready:
             return QueueStatus(sum(len(lane) for lane in self._lanes.values()), self._messages, self._bytes)

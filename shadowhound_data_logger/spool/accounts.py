@@ -40,6 +40,8 @@ class Span:
     _early: set[int] = field(default_factory=set)
     _base: int | None = None
     _rebased: bool = False
+    changed: bool = False
+    """Since the last snapshot."""
 
     def __post_init__(self) -> None:
         self._base = self.first
@@ -68,6 +70,7 @@ class Span:
             return False
         self.received += 1
         self.published += 1
+        self.changed = True
         return True
 
     def rebase(self) -> None:
@@ -167,6 +170,7 @@ class Accounts:
         self._lock = threading.Lock()
         self._topics: dict[str, TopicAccount] = {}
         self._dirty = False
+        self._written: list[Span] = []
         self._inherited: dict[str, dict[str, Span]] = {}
         self._last_kept = dict(last_kept or {})
         for row in inherited:
@@ -196,6 +200,17 @@ class Accounts:
                 account.stored += count
                 account.last_kept_ns = max(account.last_kept_ns, newest_ns)
 
+    def drop_open(self, reason: str) -> int:
+        """At the end: whatever has no outcome yet will never have one. Returns how many messages that were."""
+        with self._lock:
+            lost = 0
+            for account in self._topics.values():
+                if account.open > 0:
+                    lost += account.open
+                    account.dropped[reason] += account.open
+                    self._dirty = True
+            return lost
+
     def last_kept_ns(self, topic: str) -> int:
         """Stamp of the topic's newest durable sample of any session, 0 for none."""
         with self._lock:
@@ -210,13 +225,20 @@ class Accounts:
             self._dirty = False
             for topic in stored:
                 self._account(topic)
+            spans = [
+                (topic, publisher, span)
+                for topic, account in self._topics.items()
+                for publisher, span in account.publishers.items()
+                if span.changed
+            ]
+            self._written = [span for _, _, span in spans]
+            for span in self._written:
+                span.changed = False
             return Snapshot(
                 tuple(self._row(topic, account, *stored.get(topic, (0, 0))) for topic, account in self._topics.items()),
                 tuple(
                     PublisherRow(topic, publisher, span.first, span.last, span.published, span.received, dict(+span.missed))
-                    for topic, account in self._topics.items()
-                    for publisher, span in account.publishers.items()
-                    if span.published
+                    for topic, publisher, span in spans
                 ),
             )
 
@@ -224,6 +246,8 @@ class Accounts:
         """The last snapshot did not become durable: write it again."""
         with self._lock:
             self._dirty = True
+            for span in self._written:
+                span.changed = True
 
     def _account(self, topic: str) -> TopicAccount:
         account = self._topics.get(topic)

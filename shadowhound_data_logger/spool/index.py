@@ -14,6 +14,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.spool.accounts import PublisherRow, Snapshot, TopicRow
@@ -225,10 +226,13 @@ class Index:
         )  # fmt: skip
 
     def forget(self, before_ns: int) -> bool:
-        """Drop rows of objects that left the spool before then, totals stay; False when there may be more of them."""
+        """Drop rows of objects that left the spool before then, totals stay; False when there may be more of them.
+
+        Rows of a time before the clock was set stay: the next boot may begin at that time again, and their keys are taken.
+        """
         cursor = self.db.execute(
             "DELETE FROM objects WHERE id IN (SELECT id FROM objects WHERE state IN ('delivered', 'deduplicated', 'evicted')"
-            ' AND settled_ns < ? LIMIT ?)', (before_ns, FORGET_STEP),
+            ' AND settled_ns BETWEEN ? AND ? LIMIT ?)', (EARLIEST_SANE_NS, before_ns, FORGET_STEP),
         )  # fmt: skip
         return cursor.rowcount < FORGET_STEP
 

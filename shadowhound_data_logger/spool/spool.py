@@ -20,7 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.clock import SECOND, Clock
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.keys import check_key, unique
@@ -77,6 +77,9 @@ class Spool:
         if not self._session:
             return
         with self._lock:
+            lost = self.accounts.drop_open('shutdown')
+            if lost:
+                log.error('%d messages were still in memory when the spool %s was closed', lost, self.root)
             snapshot = self.accounts.snapshot({})
             try:
                 with self._index.transaction():
@@ -101,8 +104,9 @@ class Spool:
         """
         now_ns = self._clock.wall_ns()
         with self._lock:
-            needed = sum(len(item.body) + OVERHEAD_BYTES for item in objects)
-            fits = not needed or make_room(self._index, self._tree, self._settings, needed, now_ns)
+            leaving = sum(outcome.item.size + OVERHEAD_BYTES for outcome in outcomes if outcome.state is not State.QUARANTINED)
+            needed = sum(len(item.body) + OVERHEAD_BYTES for item in objects) - leaving
+            fits = needed <= 0 or make_room(self._index, self._tree, self._settings, needed, now_ns)
             stored = _count(objects)
             snapshot = self.accounts.snapshot(stored)
             added: list[tuple[SpooledObject, State]] = []
@@ -147,6 +151,12 @@ class Spool:
     def drain_lock(self) -> Iterator[bool]:
         """Held by the one process that ships (D6); yields False when another one has it."""
         with _flock(self.root / 'drain.lock', wait=False) as mine:
+            yield mine
+
+    @contextmanager
+    def node_lock(self) -> Iterator[bool]:
+        """Held by the one node that takes this robot's messages: a second one would count and store them again."""
+        with _flock(self.root / f'node-{self._robot}.lock', wait=False) as mine:
             yield mine
 
     # -- under the lock --------------------------------------------------------------------------------------------
@@ -204,7 +214,7 @@ class Spool:
     def _where(self, number: int, bucket: str, key: str) -> Path:
         """The file of a pending object, placed if it was not yet; the part where its place is barred."""
         path, part = self._tree.path(State.PENDING, None, bucket, key), self._tree.part(number)
-        if not path.is_file() and not self._tree.place(part, path) and part.exists():
+        if not os.path.isfile(path) and not self._tree.place(part, path) and os.path.exists(part):  # noqa: PTH110, PTH113 - these never raise
             return part
         return path
 
@@ -220,7 +230,7 @@ class Spool:
 
     def _forget(self, now_ns: int) -> None:
         """Once an hour, drop rows of deliveries that nobody will ask for any more."""
-        if now_ns - self._forgot_ns > 3600 * SECOND:
+        if now_ns - self._forgot_ns > 3600 * SECOND and now_ns > EARLIEST_SANE_NS:
             done = self._index.forget(now_ns - round(self._settings.remember_days * DAY_NS))
             self._forgot_ns = now_ns if done else 0
 

@@ -47,11 +47,12 @@ class SpoolWriter:
     def open(self) -> None:
         self.worker.start()
 
-    def put(self, item: DataObject) -> None:
+    def put(self, item: DataObject, *, wait: bool = True) -> None:
         """Queue an object for the next commit; waits while too many bytes wait. Raises NameRefused for a bad key."""
         check_key(item.key)
         with self._changed:
-            self._changed.wait_for(lambda: self._bytes < MAX_WAITING_BYTES or self.worker.stopping)
+            if wait:
+                self._changed.wait_for(lambda: self._bytes < MAX_WAITING_BYTES or self.worker.stopping)
             self._objects.append(item)
             self._bytes += len(item.body)
             self._added += 1

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from shadowhound_data_logger.errors import ForeignObject, NameRefused, ObjectRefused
+from shadowhound_data_logger.errors import ForeignObject, NameRefused, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.keys import check_key, check_name
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 
+_PASSING: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE, errno.EINTR, errno.EAGAIN})
+"""Troubles of this process or machine that say nothing of the file; EIO does: its disk is rotten."""
 CHUNK_BYTES: Final = 1 << 20
 """Most objects are smaller: they are read, hashed and sent as one piece."""
 
@@ -38,6 +41,8 @@ def chunks(item: SpooledObject) -> Iterator[bytes]:
     except FileNotFoundError as error:
         raise _damaged(item, 'it is gone') from error
     except OSError as error:
+        if error.errno in _PASSING:
+            raise StoreUnavailable(f'the spooled file {item.path} cannot be read now: {error.strerror}') from error
         raise _damaged(item, f'it cannot be read: {error.strerror}') from error
     if size != item.size:
         raise _damaged(item, f'it has not {item.size} bytes')
