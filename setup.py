@@ -25,7 +25,15 @@ setup(
     zip_safe=False,
     python_requires='>=3.10',
     # The same as requirements/runtime.in, which says what each is for.
-    install_requires=['boto3>=1.36', 'click>=8.1', 'numpy>=1.21', 'orjson>=3.9', 'rich>=13', 'rosbags>=0.11.9', 'simplejpeg>=1.7'],
+    install_requires=[
+        'boto3>=1.36',
+        'click>=8.1',
+        'numpy>=1.21',
+        'orjson>=3.9',
+        'rich>=13',
+        'rosbags>=0.11.9',
+        'simplejpeg>=1.7',
+    ],
     extras_require={'missions': ['mlflow-skinny>=3.5'], 'test': ['pytest']},  # colcon runs pytest where a test extra names it
     entry_points={
         'console_scripts': [

@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 
-from shadowhound_data_logger.config import GIBI, Settings, default_parameters
+from shadowhound_data_logger.config import Settings, default_parameters
+from shadowhound_data_logger.options import GIBI
 from shadowhound_data_logger.errors import SettingError
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from shadowhound_data_logger.capture.gate import STEP_BACK_NS
 from shadowhound_data_logger.model import Batch, Sample
 
 MAX_BATCH_BYTES: Final = 4 << 20
@@ -11,7 +12,10 @@ MAX_BATCH_BYTES: Final = 4 << 20
 
 
 class Batcher:
-    """The open batch of one topic: whole windows of ``batch_ns`` in UTC, or with 0 one message each."""
+    """The open batch of one topic: whole windows of ``batch_ns`` in UTC, or with 0 one message each.
+
+    A late sample (of a second publisher with another clock, say) joins the open batch; a clock that was set begins a new one.
+    """
 
     def __init__(self, sensor: str, topic: str, type_name: str, batch_ns: int) -> None:
         self._sensor = sensor
@@ -27,7 +31,7 @@ class Batcher:
         """Take a sample; returns the batches that are closed by it, in order (mostly none, at most two)."""
         closed: list[Batch] = []
         window = sample.stamp_ns // self._batch_ns if self._batch_ns else 0
-        if self._samples and window > self._window:  # a late sample joins the open batch
+        if self._samples and (window > self._window or sample.stamp_ns < self._samples[0].stamp_ns - STEP_BACK_NS):
             closed.append(self.close())
         if not self._samples:
             self._window = window

@@ -43,7 +43,8 @@ def _check_topics(node: Node, settings: Settings) -> None:
                 reason = str(error).partition(', at ')[0].partition('\n')[0]
                 raise SettingError(name, list(sensor.topics), f'valid topic names, not {topic!r} ({reason})') from error
             if resolved in owners:
-                raise SettingError(name, list(sensor.topics), f'a topic of its own, and {resolved} is in {owners[resolved]} already')
+                text = f'a topic of its own, and {resolved} is in {owners[resolved]} already'
+                raise SettingError(name, list(sensor.topics), text)
             owners[resolved] = name
 
 

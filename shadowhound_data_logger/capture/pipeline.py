@@ -15,10 +15,10 @@ from rclpy.node import Node
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.encode.pool import EncodePool
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.model import DataObject, Outcome
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
@@ -106,7 +106,8 @@ class Pipeline:
         Raises SpoolError when the spool cannot be mended while it is in use.
         """
         if self.writer.damaged:
-            raise SpoolError(f'the index of the spool {self.spool.root} is damaged', remedy='start the node again: it is rebuilt then')
+            text = f'the index of the spool {self.spool.root} is damaged'
+            raise SpoolError(text, remedy='start the node again: it is rebuilt then')
         day = self._today()
         if day != self._day:
             self._day = day

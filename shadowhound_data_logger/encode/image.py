@@ -7,10 +7,10 @@ from typing import Any, Final
 import numpy as np
 import simplejpeg
 
-from shadowhound_data_logger.config import COMPRESSED_IMAGE, IMAGE
 from shadowhound_data_logger.encode.payload import Job, Payload
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
+from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE
 
 _COLORSPACES: Final = {'bgr8': ('BGR', 3), 'rgb8': ('RGB', 3), 'mono8': ('GRAY', 1), 'bgra8': ('BGRA', 4), 'rgba8': ('RGBA', 4)}
 """ROS encoding (sensor_msgs/image_encodings.hpp) -> colour space for the encoder and bytes a pixel; alpha is dropped."""

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from shadowhound_data_logger.config import POINT_CLOUD
 from shadowhound_data_logger.encode.payload import Job, Payload
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
+from shadowhound_data_logger.options import POINT_CLOUD
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,0 +1,149 @@
+"""Everything that can be set, with its default, its bounds and its help text. Values only: ``config`` reads and checks them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.clock import SECOND
+
+MEBI: Final = 1 << 20
+GIBI: Final = 1 << 30
+FORMATS: Final = ('jpeg', 'pcd', 'json')
+COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
+IMAGE: Final = 'sensor_msgs/msg/Image'
+POINT_CLOUD: Final = 'sensor_msgs/msg/PointCloud2'
+
+
+def _setting(default: Any, text: str, *, low: float | None = None, high: float | None = None,
+             choices: Sequence[str] = ()) -> Any:  # fmt: skip
+    """A dataclass field that knows its help text and what values it allows."""
+    metadata = {'help': text, 'low': low, 'high': high, 'choices': tuple(choices)}
+    if isinstance(default, (tuple, list)):
+        return field(default_factory=lambda: tuple(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorSettings:
+    """One sensor: the topic it is taken from, what is kept of it, and what becomes of that."""
+
+    name: str
+    enabled: bool = _setting(True, 'Log this sensor.')
+    topics: tuple[str, ...] = _setting((), 'Topics it can come from, the preferred one first; relative to the namespace.')
+    types: tuple[str, ...] = _setting((), 'Expected type of each topic; a publisher that exists overrides it.')
+    rate_hz: float = _setting(1.0, 'Keep the first message of each whole period; 0 keeps every message.', low=0.0, high=1e6)
+    on_change: bool = _setting(False, 'Keep a message only when its content, but for its stamp, is not that of the last one.')
+    batch_s: float = _setting(0.0, 'Seconds of messages an object; 0 makes one object of each message.', low=0.0, high=3600.0)
+    format: str = _setting('json', 'What an object is encoded as.', choices=FORMATS)
+    quality: int = _setting(85, 'JPEG quality where an image has to be encoded.', low=1, high=100)
+    bucket: str = _setting('sensor-data', 'Bucket of its objects.')
+    key: str = _setting('{robot}/{sensor}/{date}/{time}_{sensor}.{ext}', 'Key of an object; {date} and {time} are UTC.')
+    priority: int = _setting(5, '0 ships first and is dropped or evicted last, 9 the other way round.', low=0, high=9)
+
+    @property
+    def period_ns(self) -> int:
+        """The time between two objects as far as their names go, ns; 0 where every message is one."""
+        if self.batch_s:
+            return round(self.batch_s * 1e9)
+        if self.on_change:
+            return SECOND
+        return round(1e9 / self.rate_hz) if self.rate_hz else 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IntakeSettings:
+    """The polled reader (D1)."""
+
+    poll_s: float = _setting(0.05, 'Seconds between two drains of the subscriptions.', low=0.005, high=1.0)
+    history_bytes: int = _setting(32 * MEBI, 'Most bytes one subscription may hold between two drains.', low=MEBI)
+    max_rate_hz: float = _setting(2000.0, 'Rate for which the history of small messages is sized.', low=1.0, high=1e5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueueSettings:
+    """The bounded queue between intake and the encode pool."""
+
+    max_bytes: int = _setting(64 * MEBI, 'Most bytes waiting for an encoder; beyond it the lowest priority is dropped.', low=MEBI)
+    max_messages: int = _setting(50_000, 'Most messages waiting for an encoder.', low=1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncodeSettings:
+    """The encode pool."""
+
+    threads: int = _setting(2, 'Encoder threads.', low=1, high=32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpoolSettings:
+    """The durable spool (D5, D9)."""
+
+    commit_s: float = _setting(0.25, 'Longest time between an encoded object and its group commit.', low=0.01, high=10.0)
+    max_bytes: int = _setting(20 * GIBI, 'Most payload bytes in the spool; beyond it the least important is evicted.', low=MEBI)
+    min_free_bytes: int = _setting(2 * GIBI, 'Free space of the file system that is never used.', low=0)
+    remember_days: float = _setting(3.0, 'Days for which delivered keys are remembered.', low=1.0, high=3650.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UploadSettings:
+    """Delivery (D7, D8)."""
+
+    threads: int = _setting(4, 'Upload threads.', low=1, high=64)
+    connect_timeout_s: float = _setting(5.0, 'Seconds to wait for a connection.', low=0.1, high=60.0)
+    read_timeout_s: float = _setting(30.0, 'Seconds to wait for an answer.', low=0.1, high=600.0)
+    backoff_s: float = _setting(60.0, 'Longest pause between two tries while the store is away.', low=0.1, high=3600.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShutdownSettings:
+    """What a SIGINT or SIGTERM may take."""
+
+    drain_s: float = _setting(3.0, 'Seconds to go on delivering after the open batches are closed.', low=0.0, high=600.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoreSettings:
+    """Where objects go: an S3 server, or without an endpoint a folder of the same layout (D13)."""
+
+    endpoint_url: str | None = None
+    access_key_id: str | None = field(default=None, repr=False)
+    secret_access_key: str | None = field(default=None, repr=False)
+    session_token: str | None = field(default=None, repr=False)
+    region: str = 'us-east-1'
+    directory: Path = Path('store')
+
+
+GROUPS: Final[dict[str, type]] = {
+    'intake': IntakeSettings,
+    'queue': QueueSettings,
+    'encode': EncodeSettings,
+    'spool': SpoolSettings,
+    'upload': UploadSettings,
+    'shutdown': ShutdownSettings,
+}
+DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
+    'camera': {
+        'topics': ('camera/compressed', 'camera/image_raw'), 'types': (COMPRESSED_IMAGE, IMAGE), 'format': 'jpeg',
+        'key': '{robot}/camera/{date}/{time}_front.{ext}', 'priority': 6,
+    },
+    'camera_info': {
+        'topics': ('camera/camera_info',), 'types': ('sensor_msgs/msg/CameraInfo',), 'rate_hz': 0.0, 'on_change': True,
+        'key': '{robot}/camera_info/{date}/{time}_front.{ext}', 'priority': 2,
+    },
+    'lidar': {
+        'topics': ('point_cloud2',), 'types': (POINT_CLOUD,), 'format': 'pcd',
+        'key': '{robot}/lidar/{date}/{time}_scan.{ext}', 'priority': 7,
+    },
+    'imu': {'topics': ('imu',), 'types': ('go2_interfaces/msg/IMU',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4},
+    'odom': {'topics': ('odom',), 'types': ('nav_msgs/msg/Odometry',), 'priority': 3},
+    'states': {
+        'topics': ('go2_states',), 'types': ('go2_interfaces/msg/Go2State',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 3,
+    },
+    'joints': {
+        'topics': ('joint_states',), 'types': ('sensor_msgs/msg/JointState',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4,
+    },
+    'lowstate': {'topics': ('lowstate',), 'types': ('go2_interfaces/msg/LowState',), 'batch_s': 10.0, 'priority': 3},
+}  # fmt: skip

@@ -1,0 +1,99 @@
+"""Which subscriptions a topic gets, from what its publishers offer."""
+
+from __future__ import annotations
+
+import pytest
+
+from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, depth, plans
+from shadowhound_data_logger.config import IntakeSettings
+
+TYPE, OTHER = 'std_msgs/msg/String', 'std_msgs/msg/Int32'
+SETTINGS = IntakeSettings()
+RELIABLE, BEST_EFFORT, LATCHED = (True, False), (False, False), (True, True)
+
+
+def planned(*publishers: tuple[bool, bool], expected: str | None = None) -> list[tuple[bool, bool]]:
+    """(reliable, transient_local) of the subscriptions to publishers of these qualities."""
+    found = [Endpoint(str(number), TYPE, *quality) for number, quality in enumerate(publishers)]
+    return [(plan.reliable, plan.transient_local) for plan in plans('/topic', found, expected, SETTINGS)]
+
+
+@pytest.mark.parametrize(
+    ('publishers', 'subscriptions'),
+    [
+        ([RELIABLE], [RELIABLE]),
+        ([BEST_EFFORT], [BEST_EFFORT]),
+        ([LATCHED], [LATCHED]),
+        ([BEST_EFFORT, RELIABLE], [RELIABLE, BEST_EFFORT]),
+        ([LATCHED, RELIABLE], [RELIABLE]),  # one that asks for TRANSIENT_LOCAL would not hear the other
+        ([LATCHED, BEST_EFFORT], [LATCHED, BEST_EFFORT]),
+        ([(False, True)], [BEST_EFFORT]),  # there is nothing to repeat a history with
+    ],
+)
+def test_every_publisher_can_serve_one(publishers: list[tuple[bool, bool]], subscriptions: list[tuple[bool, bool]]) -> None:
+    """There is one subscription for each kind of publisher, asking for no more than it offers."""
+    assert planned(*publishers) == subscriptions
+
+
+def test_an_expected_topic_is_listened_to_both_ways() -> None:
+    """Before there is a publisher, whatever comes is matched from its first message on."""
+    assert planned(expected=TYPE) == [RELIABLE, BEST_EFFORT]
+
+
+def test_an_unknown_topic_is_not_listened_to() -> None:
+    """Without publisher and expected type there is nothing to subscribe with."""
+    assert planned() == []
+
+
+def test_the_publisher_overrides_the_expected_type() -> None:
+    """The graph knows better than the settings; of two types the most common one is heard."""
+    publishers = [Endpoint('1', OTHER, *BEST_EFFORT), Endpoint('2', TYPE, *RELIABLE), Endpoint('3', TYPE, *RELIABLE)]
+    (plan,) = plans('/topic', publishers, 'some_msgs/msg/Thing', SETTINGS)
+    assert (plan.type, plan.reliable) == (TYPE, True)
+
+
+@pytest.mark.parametrize(
+    ('type_name', 'settings', 'messages'),
+    [
+        (TYPE, IntakeSettings(), 400),  # 2000 Hz for 50 ms, four times
+        (TYPE, IntakeSettings(max_rate_hz=10.0), 10),
+        ('sensor_msgs/msg/Image', IntakeSettings(), 12),
+        ('sensor_msgs/msg/Image', IntakeSettings(history_bytes=4 << 20), 2),
+        ('sensor_msgs/msg/Image', IntakeSettings(history_bytes=1 << 20), 1),
+        (TYPE, IntakeSettings(poll_s=1.0, max_rate_hz=1e5), (32 << 20) // 4096),
+    ],
+)
+def test_the_history_covers_four_polls(type_name: str, settings: IntakeSettings, messages: int) -> None:
+    """Rate times poll period with a margin of four, within the bytes allowed, never 0."""
+    assert depth(type_name, settings) == messages
+
+
+def test_a_plan_in_words() -> None:
+    """The log says how a topic is listened to."""
+    assert (
+        Plan('/odom', TYPE, reliable=True, transient_local=False, depth=400).describe() == f'/odom ({TYPE}, RELIABLE, depth 400)'
+    )
+    latched = Plan('/map', TYPE, reliable=True, transient_local=True, depth=10)
+    assert latched.describe() == f'/map ({TYPE}, RELIABLE, TRANSIENT_LOCAL, depth 10)'
+    assert 'BEST_EFFORT' in Plan('/c', TYPE, reliable=False, transient_local=False, depth=1).describe()
+
+
+def test_a_single_publisher_is_the_sender() -> None:
+    """Where the middleware does not name the sender, the only publisher is it; of two nobody knows."""
+    senders = Senders()
+    assert senders.name(1, 10) is None
+    senders.look(['a'])
+    assert senders.name(2, 20) == senders.name(3, 30) is not None
+    senders.look(['a', 'b'])
+    assert senders.name(4, 40) is None
+    assert senders.name(None, 50) is None
+
+
+def test_a_successor_is_told_from_its_predecessor() -> None:
+    """Numbers that begin anew while time goes on are another publisher's, though the graph does not show it yet."""
+    senders = Senders()
+    senders.look(['a'])
+    first = [senders.name(number, number * 10) for number in (1, 2, 3)]
+    second = [senders.name(number, 100 + number) for number in (1, 2)]
+    assert len({*first}) == len({*second}) == 1
+    assert first[0] != second[0]

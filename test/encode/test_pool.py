@@ -1,0 +1,108 @@
+"""The encode pool: every sample that goes in comes out as stored or as rejected."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Mapping
+
+import pytest
+
+from shadowhound_data_logger.config import QueueSettings, SensorSettings
+from shadowhound_data_logger.encode import pool as pool_module
+from shadowhound_data_logger.encode.pool import EncodePool
+from shadowhound_data_logger.encode.queue import BatchQueue
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.model import Batch, DataObject, Sample
+
+TEXT = b'\x00\x01\x00\x00\x03\x00\x00\x00hi\x00'
+STAMP_NS = 1_760_788_800 * 10**9
+
+
+class Outcome:
+    """What the pool handed on. Thread-safe enough: each list and counter is only added to under the lock."""
+
+    def __init__(self, threads: int = 2) -> None:
+        self.queue = BatchQueue(QueueSettings())
+        self.objects: list[DataObject] = []
+        self.rejected: Counter[str] = Counter()
+        self.lock = threading.Lock()
+        sensors = {'talk': SensorSettings(name='talk', batch_s=1.0)}
+        self.pool = EncodePool(self.queue, sensors, 'thor', MessageTypes(), self.put, self.reject, threads)
+
+    def put(self, item: DataObject) -> None:
+        with self.lock:
+            self.objects.append(item)
+
+    def reject(self, topic: str, reasons: Mapping[str, int]) -> None:
+        assert topic == '/talk'
+        with self.lock:
+            self.rejected.update(reasons)
+
+    @property
+    def samples(self) -> int:
+        return sum(item.samples for item in self.objects)
+
+
+def talk(*cdrs: bytes, sensor: str = 'talk') -> Batch:
+    return Batch(sensor, '/talk', 'std_msgs/msg/String', tuple(Sample(STAMP_NS, cdr) for cdr in cdrs), sum(map(len, cdrs)))
+
+
+def test_good_and_bad_samples_are_told_apart() -> None:
+    """The good ones of a batch are in its object, the bad ones are counted by reason."""
+    outcome = Outcome()
+    outcome.pool.open()
+    outcome.queue.put(talk(TEXT, b'bad', TEXT), 5)
+    outcome.queue.put(talk(b'bad'), 5)
+    assert outcome.pool.close(10)
+    assert (outcome.samples, outcome.rejected) == (2, {'malformed': 2})
+    assert [item.key.split('/')[:2] for item in outcome.objects] == [['thor', 'talk']]
+
+
+def test_close_encodes_what_is_queued() -> None:
+    """Nothing that was queued before the close is lost, and closing again is allowed."""
+    outcome = Outcome(threads=1)
+    for _ in range(200):
+        outcome.queue.put(talk(TEXT), 5)
+    outcome.pool.open()
+    assert outcome.pool.close(30)
+    assert outcome.pool.close(1)
+    assert outcome.samples == 200
+
+
+def test_an_encoder_with_a_fault_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its samples are rejected as encoder_failed, the failure is counted, and the others are encoded all the same."""
+    outcome, encode = Outcome(threads=1), pool_module.encode
+
+    def faulty(batch: Batch, *rest: object) -> object:
+        if len(batch.samples) == 3:
+            raise ZeroDivisionError('a fault')
+        return encode(batch, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(pool_module, 'encode', faulty)
+    outcome.queue.put(talk(TEXT, TEXT, TEXT), 1)
+    outcome.queue.put(talk(TEXT), 5)
+    outcome.pool.open()
+    done = threading.Event()
+    while not outcome.samples:
+        done.wait(0.01)
+    assert outcome.pool.close(10)
+    assert (outcome.samples, outcome.rejected) == (1, {'encoder_failed': 3})
+    assert [worker.failures for worker in outcome.pool.workers] == [1]
+
+
+def test_a_close_that_takes_too_long_says_so() -> None:
+    """A writer that blocks is not waited for longer than told."""
+    outcome, entered, blocked = Outcome(threads=1), threading.Event(), threading.Event()
+
+    def put(_: DataObject) -> None:
+        entered.set()
+        assert blocked.wait(30)
+
+    outcome.pool._put = put
+    outcome.queue.put(talk(TEXT), 5)
+    outcome.pool.open()
+    assert entered.wait(10)
+    assert not outcome.pool.close(0.05)
+    blocked.set()
+    assert outcome.pool.close(10)

@@ -1,0 +1,163 @@
+"""The spool writer: what was put becomes durable in few commits, and a disk that fails delays but loses nothing."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from spool.making import assert_whole, make, receive
+
+from shadowhound_data_logger import worker
+from shadowhound_data_logger.errors import NameRefused
+from shadowhound_data_logger.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.spool import writer as writer_module
+from shadowhound_data_logger.spool.spool import Outcome, Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
+
+
+@pytest.fixture
+def commits(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many objects each commit had that had any."""
+    counts: list[int] = []
+    commit = spool.commit
+
+    def counted(objects: list[DataObject], outcomes: list[Outcome]) -> list[SpooledObject]:
+        if objects:
+            counts.append(len(objects))
+        return commit(objects, outcomes)
+
+    monkeypatch.setattr(spool, 'commit', counted)
+    return counts
+
+
+@pytest.fixture
+def opened(spool: Spool) -> Iterator[Callable[..., SpoolWriter]]:
+    """Opens writers and closes them afterwards."""
+    made: list[SpoolWriter] = []
+
+    def make_writer(commit_s: float = 0.01, **callbacks: Callable[..., None]) -> SpoolWriter:
+        made.append(SpoolWriter(spool, commit_s, **callbacks))
+        made[-1].open()
+        return made[-1]
+
+    yield make_writer
+    for item in made:
+        item.close(5)
+
+
+def test_what_was_put_is_durable_after_a_flush(opened: Callable[..., SpoolWriter], spool: Spool, root: Path) -> None:
+    """A flush returns when all objects put before it are in the spool, and tells the uploader of them."""
+    told: list[SpooledObject] = []
+    writing = opened(60.0, spooled=told.extend)
+    for number in range(20):
+        receive(spool)
+        writing.put(make(f'{number}'))
+    assert writing.flush(10)
+    assert assert_whole(root)['objects']['pending'] == 20
+    assert sorted(item.key for item in told) == sorted(str(number) for number in range(20))
+
+
+def test_objects_share_commits(opened: Callable[..., SpoolWriter], spool: Spool, commits: list[int]) -> None:
+    """After the first commit the others wait for the next one, which takes all of them."""
+    writing = opened(60.0)
+    writing.put(make('first', topic=None))
+    assert writing.flush(10)
+    for number in range(50):
+        writing.put(make(f'{number}', topic=None))
+    assert commits == [1]
+    assert writing.flush(10)
+    assert sum(commits) == 51
+    assert len(commits) <= 3
+
+
+def test_outcomes_are_durable_before_they_are_told(opened: Callable[..., SpoolWriter], spool: Spool, root: Path) -> None:
+    """The uploader hears of a settled object only when its outcome is in the index."""
+    settled: list[int] = []
+    delivered: list[int] = []
+
+    def told(ids: set[int]) -> None:
+        settled.extend(ids)
+        delivered.append(assert_whole(root)['objects']['delivered'])
+
+    writing = opened(settled=told)
+    (item,) = spool.commit([make(topic=None)])
+    writing.settle([Outcome(item, State.DELIVERED)])
+    assert writing.close(10)
+    assert (settled, delivered) == ([item.id], [1])
+
+
+def test_a_failing_disk_loses_nothing(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
+                                      monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """A commit that fails is tried again with all that was in it, until the disk works."""
+    monkeypatch.setattr(worker, 'FIRST_PAUSE_S', 0.001)
+    commit, failures = spool.commit, threading.Semaphore(3)
+
+    def failing(*arguments: object) -> list[SpooledObject]:
+        if failures.acquire(blocking=False):
+            raise OSError(28, 'No space left on device')
+        return commit(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(spool, 'commit', failing)
+    writing = opened()
+    for number in range(5):
+        receive(spool)
+        writing.put(make(f'{number}'))
+    assert writing.flush(10)
+    assert writing.worker.failures == 3
+    assert assert_whole(root)['topics']['/camera']['stored'] == 5
+
+
+def test_encoders_wait_while_too_much_waits(opened: Callable[..., SpoolWriter], spool: Spool,
+                                            monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """With the disk hung, put blocks once the bytes are too many, and goes on when the disk does."""
+    monkeypatch.setattr(writer_module, 'MAX_WAITING_BYTES', 10)
+    commit, hung = spool.commit, threading.Event()
+
+    def hanging(*arguments: object) -> list[SpooledObject]:
+        assert hung.wait(30)
+        return commit(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(spool, 'commit', hanging)
+    writing = opened()
+    writing.put(make('one', b'x' * 10, topic=None))
+    second = threading.Thread(target=writing.put, args=(make('two', b'y', topic=None),))
+    second.start()
+    second.join(0.1)
+    assert second.is_alive()
+    assert not writing.flush(0.01)
+    hung.set()
+    second.join(10)
+    assert not second.is_alive()
+    assert writing.flush(10)
+    assert spool.pending_count() == 2
+
+
+def test_a_bad_key_is_refused_at_once(opened: Callable[..., SpoolWriter]) -> None:
+    """It is the caller's error, and does not stop the commits of others."""
+    writing = opened()
+    with pytest.raises(NameRefused):
+        writing.put(make('../etc/passwd', topic=None))
+    writing.put(make('good', topic=None))
+    assert writing.close(10)
+
+
+def test_the_accounts_become_durable_without_objects(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
+                                                     monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """A topic of which nothing is kept is in the ledger all the same, within a heartbeat."""
+    monkeypatch.setattr(writer_module, 'HEARTBEAT_S', 0.01)
+    with spool.accounts.entry('/camera') as account:
+        account.receive('p', 1)
+        account.skipped += 1
+    written, commit = threading.Event(), spool.commit
+
+    def noticed(*arguments: object) -> list[SpooledObject]:
+        found = commit(*arguments)  # type: ignore[arg-type]
+        written.set()
+        return found
+
+    monkeypatch.setattr(spool, 'commit', noticed)
+    opened()
+    assert written.wait(10)
+    assert assert_whole(root)['topics']['/camera']['skipped'] == 1

@@ -1,0 +1,38 @@
+"""The parameter file spells out exactly the defaults of the code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from shadowhound_data_logger.config import Settings, default_parameters
+
+FOLDER = Path(__file__).parents[1] / 'launch_configs'
+
+
+def flat(tree: dict[str, Any], prefix: str = '') -> dict[str, Any]:
+    """Dotted names, as ROS makes them of a parameter file."""
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        found |= flat(value, f'{prefix}{name}.') if isinstance(value, dict) else {f'{prefix}{name}': value}
+    return found
+
+
+def parameters(path: Path) -> dict[str, Any]:
+    return flat(yaml.safe_load(path.read_text(encoding='utf-8'))['/**']['ros__parameters'])
+
+
+def test_go2_yaml_is_the_defaults() -> None:
+    """Each parameter stands there with its default in its own type, and no other parameter."""
+    given, defaults = parameters(FOLDER / 'go2.yaml'), default_parameters()
+    assert given == defaults
+    assert {name: type(value) for name, value in given.items()} == {name: type(value) for name, value in defaults.items()}
+
+
+@pytest.mark.parametrize('path', sorted(FOLDER.glob('*.yaml')), ids=lambda path: path.name)
+def test_every_parameter_file_is_valid(path: Path) -> None:
+    """The node starts with each of the files."""
+    assert Settings.load(parameters(path), {}).sensors
