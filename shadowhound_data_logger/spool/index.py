@@ -219,10 +219,10 @@ class Index:
         return max(cursor.rowcount, 0)
 
     def set_found(self, number: int) -> None:
-        """The file of a missing object came back to where it waits for delivery."""
+        """The file of a quarantined object is back where it waits for delivery."""
         self.db.execute(
             "UPDATE objects SET state = 'pending', reason = NULL, settled_ns = NULL WHERE id = ?"
-            " AND state = 'quarantined' AND reason = 'missing'", (number,),
+            " AND state = 'quarantined'", (number,),
         )  # fmt: skip
 
     def forget(self, before_ns: int) -> bool:

@@ -109,7 +109,12 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
                 missing.append(row['id'])
                 continue
             where = found
-            if found != path and tree.place(found, path):
+            if state is State.QUARANTINED and found == places[1]:
+                # Moved there by hand, to be tried again; or quarantined when the power went, and then a try costs nothing.
+                with index.transaction():
+                    index.set_found(row['id'])
+                report.counts['quarantined files to be tried again'] += 1
+            elif found != path and tree.place(found, path):
                 where = path
                 report.counts['renames completed'] += 1
         if state is not State.QUARANTINED and tree.size(where) not in {row['bytes'], None}:

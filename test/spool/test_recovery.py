@@ -453,3 +453,13 @@ def test_a_place_never_overwrites_in_foreign(root: Path) -> None:
         path.write_bytes(content)
         tree.set_aside(path)
     assert set(files(root).values()) == {b'1', b'2', b'3'}
+
+
+def test_what_is_moved_back_from_quarantine_is_tried_again(opened: Open, root: Path, used: dict[str, bytes]) -> None:
+    """An operator who moves a quarantined file to ready, as the README says, has it delivered."""
+    source = root / f'quarantine/refused/{BUCKET}/thor/a/1.jpg'
+    source.rename(root / f'ready/{BUCKET}/thor/a/1.jpg')
+    spool = opened()
+    assert spool.recovery.counts['quarantined files to be tried again'] == 1
+    assert 'thor/a/1.jpg' in {item.key for item in spool.pending(99)}
+    assert_whole(root)
