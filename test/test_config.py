@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from shadowhound_data_logger.config import Settings, default_parameters
-from shadowhound_data_logger.options import GIBI
 from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.options import GIBI
 
 
 def load(environ: dict[str, str] | None = None, namespace: str = '/', **parameters: Any) -> Settings:

@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import click
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
+from rich.measure import Measurement
 from rich.table import Table
+from rich.text import Text
 
 from shadowhound_data_logger.config import home
 from shadowhound_data_logger.spool.ledger import imbalances, read
 
+COLUMNS: Final = ('published', 'received', 'missed', 'skipped', 'rejected', 'dropped', 'stored', 'open')
+ALWAYS: Final = frozenset({'published', 'received', 'missed', 'skipped', 'stored'})
+"""The other columns appear once there is something in them."""
+CAUSES: Final = {'missed': 'missed_by', 'rejected': 'rejected', 'dropped': 'dropped'}
+ACCOUNTING: Final = {
+    'reported': 'its messages carry no numbers here: what was missed is known only as far as the middleware reports it',
+    'received-only': 'its messages carry no numbers here: what was missed is not known',
+}
+
 
 @click.command()
 @click.option('--json', 'as_json', is_flag=True, help='Print the ledger as JSON.')
-@click.option('--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool to read  [default: $SHADOWHOUND_HOME/spool]')
+@click.option('--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool  [default: $SHADOWHOUND_HOME/spool]')
 def ledger(*, as_json: bool, spool: Path | None) -> int:
     """Account for every message: stored and where, or lost and why.
 
@@ -27,62 +39,121 @@ def ledger(*, as_json: bool, spool: Path | None) -> int:
     if as_json:
         click.echo(json.dumps(found, indent=2))
     else:
-        show(found, Console())
+        show(found, Console(highlight=False))
     return 0 if found['balanced'] else 1
 
 
-def show(found: dict[str, Any], console: Console) -> None:
-    """The ledger as two tables and a verdict."""
-    console.print(topics_table(found))
-    console.print(_objects_table(found))
-    console.print(verdict(found))
+def show(found: Mapping[str, Any], console: Console) -> None:
+    """The ledger as tables, what there is to say about single topics, and a verdict."""
+    show_whole([topics_table(found), '', objects_table(found), *_section(notes(found)), '', verdict(found)], console)
 
 
-def topics_table(found: dict[str, Any]) -> Table:
+def show_whole(parts: Sequence[RenderableType], console: Console) -> None:
+    """Print, with tables two columns apart where there is room; without a terminal no table is cut or broken."""
+    tables = [part for part in parts if isinstance(part, Table)]
+    for table in tables:
+        table.padding = (0, 2, 0, 0)
+        if _width(table, console) > console.width:
+            table.padding = (0, 1, 0, 0)
+    width = console.width
+    if not console.is_terminal:
+        console.width = max(width, *(_width(table, console) for table in tables))
+    console.print(Group(*parts))
+    console.width = width
+
+
+def topics_table(found: Mapping[str, Any]) -> RenderableType:
     """One row a topic; a dash is a figure that the middleware does not tell."""
-    table = Table(title=f'messages of {found["robot"]}', title_justify='left')
-    for name in ('topic', 'published', 'received', 'missed', 'skipped', 'rejected', 'dropped', 'stored', 'open', 'accounting'):
-        table.add_column(name, justify='left' if name in {'topic', 'accounting'} else 'right')
-    for topic, row in found['topics'].items():
-        table.add_row(
-            topic, _number(row['published']), _number(row['received']), _by_cause(row['missed'], row['missed_by']),
-            _number(row['skipped']), _by_cause(sum(row['rejected'].values()), row['rejected']),
-            _by_cause(sum(row['dropped'].values()), row['dropped']), _number(row['stored']), _number(row['open']), row['accounting'],
-        )  # fmt: skip
+    rows = {topic: _figures(row) for topic, row in found['topics'].items()}
+    if not rows:
+        return Text(f'No message of {found["robot"]} has been received yet.')
+    columns = [name for name in COLUMNS if name in ALWAYS or any(row[name] for row in rows.values())]
+    table = plain_table(f'Messages of {found["robot"]}', ('topic', *columns))
+    for topic, row in rows.items():
+        table.add_row(topic, *(_lossy(name, row[name]) for name in columns))
+    if len(rows) > 1:
+        table.add_section()
+        table.add_row('all', *(_lossy(name, _sum(row[name] for row in rows.values())) for name in columns), style='bold')
     return table
 
 
-def verdict(found: dict[str, Any]) -> str:
+def objects_table(found: Mapping[str, Any]) -> RenderableType:
+    """Where the objects are that the stored messages became."""
+    first = ('spooled', 'delivered', 'pending')
+    states = [*first, *(state for state, count in found['objects'].items() if count and state not in first)]
+    table = plain_table('Objects', ('', *states))
+    table.add_row('objects', *(number(found['objects'][state]) for state in states))
+    table.add_row('size', *(volume(found['bytes'][state]) for state in states))
+    return table
+
+
+def notes(found: Mapping[str, Any]) -> list[str]:
+    """Causes of what was lost, where stored messages are that are not delivered, and accounting that is not exact."""
+    lines = []
+    for topic, row in found['topics'].items():
+        for name, key in CAUSES.items():
+            if row[key]:
+                lines.append(f'{topic}: {name} by {_listed(row[key])}')
+        elsewhere = {state: count for state, count in row['stored_in'].items() if count and state != 'delivered'}
+        if elsewhere:
+            lines.append(f'{topic}: of {row["stored"]:,} stored, {_listed(elsewhere)}')
+        if row['accounting'] in ACCOUNTING:
+            lines.append(f'{topic}: {ACCOUNTING[row["accounting"]]}')
+    return lines
+
+
+def verdict(found: Mapping[str, Any]) -> Text:
     """One line, or one for each identity that does not hold."""
     if found['balanced']:
-        return '[green]the ledger balances:[/] every message received is stored, skipped on purpose, or listed with the reason'
-    return '\n'.join(f'[red]does not balance:[/] {line}' for line in imbalances(found))
+        return Text.assemble(('The ledger balances', 'green'), ': every message is stored, skipped, or listed as lost.')
+    return Text('\n').join(Text.assemble(('Does not balance', 'red'), f': {line}') for line in imbalances(dict(found)))
 
 
-def _objects_table(found: dict[str, Any]) -> Table:
-    table = Table(title='objects', title_justify='left')
-    table.add_column('')
-    for state in found['objects']:
-        table.add_column(state, justify='right')
-    table.add_row('objects', *(_number(count) for count in found['objects'].values()))
-    table.add_row('bytes', *(_bytes(count) for count in found['bytes'].values()))
+def plain_table(title: str, columns: Iterable[str], left: Iterable[str] = ('topic', '')) -> Table:
+    """Without lines, numbers to the right, nothing cut: a topic is broken across lines before it loses a letter."""
+    table = Table(title=title, title_justify='left', title_style='bold', header_style='dim', box=None, pad_edge=False)
+    for name in columns:
+        is_left = name in left
+        table.add_column(name, justify='left' if is_left else 'right', overflow='fold', no_wrap=not is_left)
     return table
 
 
-def _number(value: int | None) -> str:
+def number(value: int | None) -> str:
+    """With separators; a dash for what is not known."""
     return '-' if value is None else f'{value:,}'
 
 
-def _by_cause(total: int | None, causes: dict[str, int]) -> str:
-    """``12 (restart 12)``."""
-    if not total:
-        return _number(total)
-    return f'{total:,} ({", ".join(f"{cause} {count:,}" for cause, count in sorted(causes.items()))})'
-
-
-def _bytes(count: float) -> str:
+def volume(count: float) -> str:
+    """Bytes in decimal units, as disks and networks are sold."""
     for unit in ('B', 'KB', 'MB'):
         if count < 1000:
             return f'{count:.0f} {unit}' if unit == 'B' else f'{count:.1f} {unit}'
         count /= 1000
     return f'{count:.1f} GB'
+
+
+def _width(table: Table, console: Console) -> int:
+    return Measurement.get(console, console.options.update(max_width=1000), table).maximum
+
+
+def _figures(row: Mapping[str, Any]) -> dict[str, int | None]:
+    return {name: sum(row[name].values()) if isinstance(row[name], Mapping) else row[name] for name in COLUMNS}
+
+
+def _sum(values: Iterable[int | None]) -> int | None:
+    """None as soon as one is not known."""
+    known = list(values)
+    return None if None in known else sum(value for value in known if value is not None)
+
+
+def _lossy(name: str, value: int | None) -> str:
+    return f'[yellow]{number(value)}[/]' if name in CAUSES and value else number(value)
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    """``restart 12, transport 3``, the largest first."""
+    return ', '.join(f'{name} {count:,}' for name, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+
+
+def _section(lines: list[str]) -> list[RenderableType]:
+    return ['', *(Text(line) for line in lines)] if lines else []

@@ -47,6 +47,8 @@ class S3Store:
         self._lock = threading.Lock()
         self._condition = _Condition.UNPROVED
         self._refused: dict[str, tuple[float, BucketMissing]] = {}
+        self._created: dict[str, float] = {}
+        self._creating = threading.Lock()  # held while a bucket is created, so that one thread does it
 
     def __repr__(self) -> str:
         return f'S3Store({self._s3.endpoint!r})'
@@ -152,8 +154,15 @@ class S3Store:
 
     def _create_bucket(self, bucket: str, missing: BucketMissing) -> None:
         """Returns when the bucket is there; raises BucketMissing, without asking again for some seconds."""
+        with self._creating:
+            self._create_bucket_once(bucket, missing)
+
+    def _create_bucket_once(self, bucket: str, missing: BucketMissing) -> None:
         with self._lock:
             since, refusal = self._refused.get(bucket, (float('-inf'), missing))
+            created_s = self._created.get(bucket, float('-inf'))
+        if time.monotonic() - created_s < BUCKET_PAUSE_S:
+            return  # by another thread, while this one waited for it
         if time.monotonic() - since < BUCKET_PAUSE_S:
             raise refusal
         try:
@@ -166,6 +175,8 @@ class S3Store:
             with self._lock:
                 self._refused[bucket] = (time.monotonic(), refusal)
             raise refusal from error
+        with self._lock:
+            self._created[bucket] = time.monotonic()
         _log.info('created the bucket %s on %s', bucket, self._s3.endpoint)
 
 

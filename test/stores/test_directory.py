@@ -140,9 +140,7 @@ def test_an_object_is_no_folder_and_a_folder_no_object(store: DirectoryStore, sp
             store.put(spool(key, b'y'))
 
 
-def test_a_file_system_without_links(
-    store: DirectoryStore, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_system_without_links(store: DirectoryStore, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without hard links (exFAT) objects are still whole and never overwritten."""
     monkeypatch.setattr(os, 'link', _failing(errno.EPERM))
     assert store.put(spool('a', b'first')) is Put.CREATED

@@ -1,0 +1,145 @@
+"""``make demo``: a simulated Go2, the real node and a Tower of its own for a minute, and proof that nothing got lost.
+
+Exit codes: 0 all is accounted for and identical in the S3 server, 1 it is not or something failed, 2 bad usage.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.sim import demo_audit, demo_processes, demo_report, demo_run
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores import open_store
+
+MARKER: Final = '.shadowhound-demo'
+"""In a folder that the demo made and may replace."""
+LEAST_S: Final = 5.0
+NO_PROXY: Final = ('NO_PROXY', 'no_proxy')
+
+
+class FolderRefused(DataLoggerError):
+    """The folder cannot be used for a demo."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    options = _parser().parse_args(arguments)
+    if not (options.duration >= LEAST_S and 0 <= options.outage <= options.duration / 2):
+        print(f'demo: --duration is {LEAST_S:g} s at least, --outage half of it at most', file=sys.stderr)
+        return 2
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # which nohup has asked for
+            signal.signal(number, signal.default_int_handler)
+    console = Console(highlight=False)
+    try:
+        with fresh_folder(options.folder) as folder:
+            return run(folder, options.duration, options.outage, console, mlflow=options.mlflow)
+    except KeyboardInterrupt:
+        console.print('\ndemo: stopped. What there is lies in the folder still.')
+        return 130
+    except FolderRefused as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 2
+    except DataLoggerError as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 1
+
+
+def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, mlflow: bool = True) -> int:
+    """Everything, from an empty folder to the verdict."""
+    console.print(f'[bold]A Go2 on patrol for {duration_s:g} s, its data logger, and a Tower to log to.')
+    console.print(f'All of it on this machine, in {folder}/\n')
+    if importlib.util.find_spec('go2_interfaces') is None:
+        console.print('[yellow]go2_interfaces is not installed[/] (make setup builds it where there is a g++):')
+        console.print('/imu, /go2_states and /lowstate are left out.\n')
+    console.print('Starting the Tower, an S3 server and MLflow (some ten seconds) ...')
+    for name in NO_PROXY:
+        os.environ[name] = ','.join(filter(None, (os.environ.get(name), '127.0.0.1')))
+    with Tower(folder / 'tower', mlflow=mlflow) as tower:
+        console.print(f'  S3 server  {tower.endpoint_url}')
+        if mlflow:
+            console.print(f'  MLflow     {tower.tracking_uri}  (empty: missions are not logged yet)')
+        record = _patrol(folder, tower, duration_s, outage_s, console)
+        console.print('\nReading everything back from the S3 server ...\n')
+        store = open_store(tower.store_settings(), UploadSettings())
+        try:
+            audit = demo_audit.audit(folder / 'home' / 'spool', demo_processes.ROBOT, record.published, store)
+        finally:
+            store.close()
+    (folder / 'ledger.json').write_text(json.dumps(audit.ledger, indent=2), encoding='utf-8')
+    demo_report.show_result(audit, record, console)
+    from shadowhound_data_logger.sim import demo_pictures  # noqa: PLC0415 - matplotlib takes a second to load
+
+    pictures = demo_pictures.draw(folder, audit.bodies, record)
+    demo_report.show_where(folder, pictures, os.environ, console)
+    return 1 if audit.problems else 0
+
+
+def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, console: Console) -> demo_run.Record:
+    """The minute itself; afterwards all processes but the Tower have ended."""
+    environ = demo_processes.environment(folder / 'home', tower.environment(), demo_processes.free_domain())
+    console.print(f'Starting the node and the robot (ROS_DOMAIN_ID={environ["ROS_DOMAIN_ID"]}, this machine only) ...')
+    with (
+        demo_processes.start_logger(folder, environ) as node,
+        demo_run.Outage(tower, (duration_s - outage_s) / 2, outage_s) as outage,
+    ):
+        if outage_s:
+            console.print(f'In the middle the S3 server goes away for {outage_s:g} s.\n')
+        with demo_report.progress(console, duration_s) as show:
+            record = demo_run.patrol(folder, node, outage, environ, duration_s, show)
+        began = time.monotonic()
+        node.stop(demo_processes.STOP_S)
+        node.check()
+        console.print(f'The robot has stopped. Asked to end (SIGINT), the node did so in {time.monotonic() - began:.1f} s.')
+    return record
+
+
+@contextmanager
+def fresh_folder(folder: Path) -> Iterator[Path]:
+    """An empty folder that is ours alone; what an earlier demo left in it is gone. Raises FolderRefused."""
+    marker = folder / MARKER
+    if folder.exists() and not marker.is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FolderRefused(f'{folder} is there and no demo made it', remedy='name another one with --folder')
+    folder.mkdir(parents=True, exist_ok=True)
+    with marker.open('w', encoding='ascii') as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FolderRefused(f'another demo is running in {folder}', remedy='name another one with --folder') from None
+        for path in folder.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            elif path != marker:
+                path.unlink()
+        yield folder
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='python -m shadowhound_data_logger.sim.demo', description=__doc__.partition('\n')[0])
+    parser.add_argument('--duration', type=float, default=60.0, metavar='S', help='seconds the robot walks (default 60)')
+    parser.add_argument(
+        '--outage', type=float, default=10.0, metavar='S', help='seconds without the S3 server (default 10; 0: none)'
+    )
+    parser.add_argument('--folder', type=Path, default=Path('demo'), help='where all of it lies (default demo)')
+    parser.add_argument('--no-mlflow', dest='mlflow', action='store_false', help='the S3 server only, which starts sooner')
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(main())

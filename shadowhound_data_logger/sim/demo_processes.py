@@ -1,0 +1,138 @@
+"""The demo's processes: the node and the simulated robot, in a world of their own, and none outlives the demo.
+
+It stops them itself; should it be killed, the kernel asks them to stop.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Final
+
+from shadowhound_data_logger.errors import DataLoggerError, SpoolError
+from shadowhound_data_logger.spool import ledger
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+ROBOT: Final = 'thor'
+READY_S: Final = 60.0
+"""For a process to start on a machine that is busy."""
+DRAIN_S: Final = 15.0
+BACKOFF_S: Final = 4.0
+"""Longest pause between two tries while the S3 server is away: not 60 as by default, for the minute shall show it catch up."""
+STOP_S: Final = 40.0
+TAIL_LINES: Final = 15
+PR_SET_PDEATHSIG: Final = 1
+"""linux/prctl.h"""
+DOMAINS: Final = range(1, 102)
+"""Those whose ports lie below Linux's ephemeral ones; https://docs.ros.org/en/kilted/Concepts/Intermediate/About-Domain-ID.html"""
+FOREIGN_VARIABLES: Final = ('AWS_', 'MLFLOW_', 'SHADOWHOUND_', 'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY', 'ROS_NAMESPACE')
+"""What would lead the demo to somebody's real Tower or robot; a name or the beginning of one."""
+OUR_VARIABLE: Final = 'SHADOWHOUND_ENVIRONMENT'
+"""Set by scripts/with-env; says nothing about data."""
+
+
+class DemoFailed(DataLoggerError):
+    """The demo could not be run to its end."""
+
+
+class Child:
+    """A process of the demo. Its output goes to files; Ctrl-C does not reach it; ``stop`` asks, waits and at last kills."""
+
+    def __init__(self, module: str, arguments: Iterable[str], environ: Mapping[str, str], log: Path) -> None:
+        self.name = module.rpartition('.')[2]
+        self.log = log
+        self._libc = ctypes.CDLL(None)
+        with log.open('wb') as errors, log.with_suffix('.out').open('wb') as output:
+            self._process = subprocess.Popen(
+                [sys.executable, '-m', module, *arguments], env=environ, stdin=subprocess.DEVNULL, stdout=output, stderr=errors,
+                start_new_session=True,
+                # Safe here: the demo has one thread when it starts its processes, and that one outlives them.
+                preexec_fn=self._die_with_the_demo,  # noqa: PLW1509
+            )  # fmt: skip
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.stop(STOP_S)
+
+    @property
+    def is_running(self) -> bool:
+        return self._process.poll() is None
+
+    @property
+    def output(self) -> str:
+        return self.log.with_suffix('.out').read_text(encoding='utf-8')
+
+    def check(self) -> None:
+        """Raises DemoFailed when it has ended, unless all went well."""
+        if self._process.poll():
+            raise self.failed(f'ended with exit code {self._process.returncode}')
+
+    def stop(self, timeout_s: float) -> None:
+        """SIGINT, and SIGKILL after ``timeout_s``; idempotent."""
+        if self.is_running:
+            self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def failed(self, what: str) -> DemoFailed:
+        lines = self.log.read_text(encoding='utf-8', errors='replace').splitlines()[-TAIL_LINES:]
+        return DemoFailed('\n'.join([f'{self.name} {what}; the end of {self.log}:', *lines]))
+
+    def _die_with_the_demo(self) -> None:
+        self._libc.prctl(PR_SET_PDEATHSIG, signal.SIGINT)
+
+
+def free_domain() -> int:
+    """A ROS_DOMAIN_ID on which nobody on this machine listens: its first participant's port is free.
+
+    The ports are those of the RTPS specification, 9.6.1.1: 7400 + 250 * domain + 10 + 2 * participant.
+    """
+    for domain in random.sample(DOMAINS, len(DOMAINS)):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(('', 7400 + 250 * domain + 10))
+            except OSError:
+                continue
+            return domain
+    raise DemoFailed('there is no free ROS_DOMAIN_ID on this machine', remedy='stop some ROS nodes')
+
+
+def environment(home: Path, tower: Mapping[str, str], domain: int) -> dict[str, str]:
+    """Ours, without what leads elsewhere, with the demo's folder, Tower and domain."""
+    kept = {name: value for name, value in os.environ.items() if name == OUR_VARIABLE or not name.startswith(FOREIGN_VARIABLES)}
+    is_humble = os.environ.get('ROS_DISTRO') == 'humble'
+    here = {'ROS_LOCALHOST_ONLY': '1'} if is_humble else {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    ours = {'SHADOWHOUND_HOME': str(home), 'SHADOWHOUND_ROBOT': ROBOT, 'ROS_DOMAIN_ID': str(domain), 'PYTHONUNBUFFERED': '1'}
+    return {**kept, **tower, **here, **ours}
+
+
+def start_logger(folder: Path, environ: Mapping[str, str]) -> Child:
+    """The node, once its spool can be read. Raises DemoFailed when it does not start."""
+    arguments = ['--ros-args', '-p', f'shutdown.drain_s:={DRAIN_S}', '-p', f'upload.backoff_s:={BACKOFF_S}']
+    node = Child('shadowhound_data_logger.capture.sensor_logger_node', arguments, environ, folder / 'node.log')
+    end = time.monotonic() + READY_S
+    while True:
+        try:
+            ledger.read(folder / 'home' / 'spool', ROBOT)
+            return node
+        except SpoolError:
+            if not node.is_running or time.monotonic() > end:
+                node.stop(0.0)
+                raise node.failed('did not start') from None
+            time.sleep(0.1)

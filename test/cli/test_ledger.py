@@ -1,0 +1,140 @@
+"""``shadowhound-data ledger`` on spools and ledgers made here: what it prints, how wide, and its exit codes."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from rich.console import Console
+from spool.making import make, new_spool, put, settle
+
+from shadowhound_data_logger.cli.ledger import ledger, show
+from shadowhound_data_logger.cli.main import main
+from shadowhound_data_logger.model import State
+
+STATES = ('delivered', 'pending', 'held', 'evicted', 'quarantined', 'deduplicated')
+
+
+def a_topic(**figures: Any) -> dict[str, Any]:
+    row = {
+        'type': 'x/msg/Y', 'accounting': 'exact', 'published': 100, 'received': 100, 'missed': 0, 'missed_by': {}, 'skipped': 40,
+        'rejected': {}, 'dropped': {}, 'stored': 60, 'open': 0, 'stored_in': dict.fromkeys(STATES, 0) | {'delivered': 60},
+    }  # fmt: skip
+    return row | figures
+
+
+def a_ledger(balanced: bool = True, **topics: dict[str, Any]) -> dict[str, Any]:
+    piles = {'spooled': 60, 'pending': 0, 'held': 0, 'delivered': 60, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0}
+    named = {f'/{name}'.replace('__', '/'): row for name, row in topics.items()}
+    return {'robot': 'thor', 'balanced': balanced, 'topics': named, 'objects': piles, 'bytes': piles}
+
+
+def shown(found: dict[str, Any], width: int = 80, *, terminal: bool = False) -> str:
+    output = io.StringIO()
+    show(found, Console(file=output, width=width, highlight=False, force_terminal=terminal, color_system=None))
+    return output.getvalue()
+
+
+def test_the_default_topics_fit_into_80_columns() -> None:
+    """Without a terminal no line is longer than 80, no topic is cut, and nothing is abbreviated."""
+    text = shown(a_ledger(camera__camera_info=a_topic(published=1_234_567, received=1_234_567), point_cloud2=a_topic()))
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
+    assert '/camera/camera_info  1,234,567  1,234,567' in text
+    assert '…' not in text
+
+
+def test_a_pipe_gets_every_column_whole() -> None:
+    """What is wider than 80 columns is not wrapped where no terminal asks for it: one line a topic."""
+    losses = {'rejected': {'truncated': 1_000_000}, 'dropped': {'queue_full': 2_000_000}}
+    name = 'tachi__front_camera__image_raw__compressed'
+    text = shown(a_ledger(**{name: a_topic(published=10**9, received=10**9, open=1234, **losses)}))
+    row = next(line for line in text.splitlines() if line.startswith('/tachi'))
+    figures = '1,000,000,000 1,000,000,000 0 40 1,000,000 2,000,000 60 1,234'
+    assert row.split() == ['/tachi/front_camera/image_raw/compressed', *figures.split()]
+
+
+@pytest.mark.parametrize('width', [60, 80])
+def test_a_narrow_terminal_loses_no_letter(width: int) -> None:
+    """On a terminal a long topic is broken across lines rather than cut."""
+    name = 'tachi__front_camera__image_raw__compressed'
+    text = shown(a_ledger(**{name: a_topic()}), width, terminal=True)
+    assert max(map(len, text.splitlines())) <= width
+    assert '/tachi/front_camera/image_raw/compressed' in ''.join(line.split()[0] for line in text.splitlines() if line.strip())
+
+
+def test_columns_without_figures_are_left_out() -> None:
+    """Rejected, dropped and open appear only where there is something in them."""
+    assert not {'rejected', 'dropped', 'open'} & set(shown(a_ledger(imu=a_topic())).split())
+    assert 'dropped' in shown(a_ledger(imu=a_topic(dropped={'queue_full': 1}))).split()
+
+
+def test_causes_are_listed_by_topic() -> None:
+    """What was missed, rejected or dropped is said with its causes, the largest first."""
+    text = shown(a_ledger(imu=a_topic(missed=15, missed_by={'transport': 3, 'restart': 12}), odom=a_topic()))
+    assert '/imu: missed by restart 12, transport 3' in text
+    assert '/odom:' not in text
+
+
+def test_what_is_not_delivered_is_said() -> None:
+    """Stored messages whose objects are elsewhere than in the store are named with where they are."""
+    text = shown(a_ledger(imu=a_topic(stored_in=dict.fromkeys(STATES, 0) | {'delivered': 50, 'pending': 10})))
+    assert '/imu: of 60 stored, pending 10' in text
+
+
+def test_accounting_is_mentioned_only_where_it_is_not_exact() -> None:
+    """Unknown figures are dashes, never 0, and a line says why; the total of a column with one is unknown too."""
+    text = shown(a_ledger(imu=a_topic(accounting='received-only', published=None, missed=None), odom=a_topic()))
+    assert '/imu: its messages carry no numbers' in text
+    assert next(line for line in text.splitlines() if line.startswith('/imu')).split()[1:4] == ['-', '100', '-']
+    assert next(line for line in text.splitlines() if line.startswith('all')).split()[1:4] == ['-', '200', '-']
+    assert 'exact' not in text
+
+
+def test_what_does_not_balance_is_named() -> None:
+    """The verdict names each identity that does not hold."""
+    text = shown(a_ledger(balanced=False, imu=a_topic(stored=59)))
+    assert 'The ledger balances' not in text
+    assert 'Does not balance: /imu: received 100' in text
+
+
+def test_a_spool_without_messages_is_no_error() -> None:
+    """A node that has heard nothing yet has a ledger that balances."""
+    text = shown(a_ledger())
+    assert 'No message of thor has been received yet.' in text
+    assert 'The ledger balances' in text
+
+
+def test_the_command_reads_a_spool_in_use(tmp_path: Path) -> None:
+    """While another holds the spool open: exit code 0, and --json has the same figures as the text."""
+    spool = new_spool(tmp_path / 'spool')
+    spool.open()
+    try:
+        first, _ = put(spool, make('thor/camera/20251018/120000_front.jpg'), make('thor/camera/20251018/120001_front.jpg'))
+        settle(spool, first, State.DELIVERED)
+        text = CliRunner().invoke(ledger, ['--spool', str(tmp_path / 'spool')], standalone_mode=False)
+        as_json = CliRunner().invoke(ledger, ['--json', '--spool', str(tmp_path / 'spool')], standalone_mode=False)
+    finally:
+        spool.close()
+    assert (text.return_value, as_json.return_value) == (0, 0)
+    assert '/camera: of 2 stored, pending 1' in text.stdout
+    found = json.loads(as_json.stdout)
+    assert found['balanced'] is True
+    assert found['topics']['/camera']['stored_in']['delivered'] == 1
+    assert found['objects']['pending'] == 1
+
+
+def test_no_spool_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A folder without a spool ends with exit code 1 and one line that names it and a remedy."""
+    monkeypatch.setattr(sys, 'argv', ['shadowhound-data', 'ledger', '--spool', str(tmp_path / 'none')])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 1
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1
+    assert str(tmp_path / 'none') in error
+    assert 'SHADOWHOUND_HOME' in error

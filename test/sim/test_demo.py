@@ -1,0 +1,301 @@
+"""The demo: its audit on spools made here, its words, its folder; and a short one from end to end."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from rich.console import Console
+from spool.making import make, new_spool, settle
+
+from shadowhound_data_logger.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.sim import demo, demo_processes, demo_report
+from shadowhound_data_logger.sim.demo_audit import Audit, audit
+from shadowhound_data_logger.sim.demo_run import Outage, Reading, Record
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.stores.memory import MemoryStore
+
+CAMERA, IMU, RAW = '/camera/compressed', '/imu', '/camera/image_raw'
+IMU_KEY = 'thor/imu/20251018/120000_imu.json'
+READING = Reading(30.0, 12_345, 412, 398, 14, 25_300_000, 'corridor', 'away')
+
+
+class Scene:
+    """A spool and a store as a run leaves them: two camera frames and a batch of three IMU samples, all delivered."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.spool: Spool = new_spool(root)
+        self.spool.open()
+        self.store = MemoryStore()
+        self.store.open()
+        self.published = {CAMERA: 60, IMU: 3, RAW: 60}
+        with self.spool.accounts.entry(CAMERA) as account:
+            for number in range(11, 61):  # the first ten were published before the match
+                account.receive('p', number)
+            account.skipped += 48
+        with self.spool.accounts.entry(IMU) as account:
+            for number in (1, 2, 3):
+                account.receive('q', number)
+        self.items = self.spool.commit([
+            an_object('thor/camera/20251018/120000_front.jpg', b'one', CAMERA),
+            an_object('thor/camera/20251018/120001_front.jpg', b'two', CAMERA),
+            an_object(IMU_KEY, json.dumps({'samples': [1, 2, 3]}).encode(), IMU, samples=3),
+        ])  # fmt: skip
+
+    def deliver(self, item: SpooledObject) -> None:
+        self.store.put(item)
+        settle(self.spool, item, State.DELIVERED)
+
+    def audit(self) -> Audit:
+        return audit(self.root, 'thor', self.published, self.store)
+
+
+def an_object(key: str, body: bytes, topic: str, samples: int = 1) -> DataObject:
+    metadata = {'sensor': key.split('/')[1], 'topic': topic}
+    return make(key, body, topic=topic, samples=samples, sensor=metadata['sensor'], metadata=metadata)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Iterator[Scene]:
+    """Nothing is delivered yet."""
+    scene = Scene(tmp_path / 'spool')
+    yield scene
+    scene.spool.close()
+
+
+@pytest.fixture
+def good(scene: Scene) -> Scene:
+    """Everything is delivered."""
+    for item in scene.items:
+        scene.deliver(item)
+    return scene
+
+
+def test_an_audit_of_what_is_well_has_no_problems(good: Scene) -> None:
+    """Objects and samples are counted, messages before the match are told apart, an unlogged topic is no problem."""
+    found = good.audit()
+    assert found.problems == ()
+    assert (found.read_back, found.samples) == (3, 5)
+    assert found.messages[CAMERA].before_match == 10
+    assert found.messages[IMU].before_match == 0
+    assert found.messages[RAW].account is None
+    assert (found.piles['camera'].objects, found.piles['camera'].delivered, found.piles['imu'].latest) == (2, 2, IMU_KEY)
+
+
+def test_an_object_that_changed_is_found(good: Scene) -> None:
+    """Content that is not what was spooled is named by its key."""
+    good.store.get = lambda _, key: b'other' if 'front' in key else json.dumps({'samples': [1, 2, 3]}).encode()  # type: ignore[method-assign]
+    assert [problem for problem in good.audit().problems if 'is not what was spooled' in problem] == [
+        'thor/camera/20251018/120000_front.jpg is not what was spooled',
+        'thor/camera/20251018/120001_front.jpg is not what was spooled',
+    ]
+
+
+def test_a_delivered_object_that_is_not_there_is_found(scene: Scene) -> None:
+    """What the spool believes delivered and the bucket does not have is named, and its samples are missing."""
+    for item in scene.items[1:]:
+        scene.deliver(item)
+    settle(scene.spool, scene.items[0], State.DELIVERED)
+    assert scene.audit().problems == (
+        'thor/camera/20251018/120000_front.jpg was delivered, but is not in the bucket',
+        f'{CAMERA}: 2 messages are delivered, but 1 lie in the bucket',
+    )
+
+
+def test_a_message_after_the_last_one_heard_is_found(good: Scene) -> None:
+    """The ledger cannot know of messages that were lost at the very end; the robot's own account does."""
+    good.published[IMU] = 5
+    assert good.audit().problems == (f'{IMU}: 2 of 5 messages are not in the ledger',)
+
+
+def test_what_is_not_delivered_is_a_problem(scene: Scene) -> None:
+    """Objects that wait in the spool are counted, and so are missed messages."""
+    with scene.spool.accounts.entry(IMU) as account:
+        account.receive('q', 6)
+        account.skipped += 1
+    scene.spool.commit([an_object('thor/imu/20251018/120001_imu.json', b'{}', IMU, samples=0)])
+    scene.published[IMU] = 6
+    problems = scene.audit().problems
+    assert f'{IMU}: 2 messages are missed' in problems
+    assert '4 objects are pending' in problems
+
+
+def said(found: Audit, record: Record) -> str:
+    output = io.StringIO()
+    demo_report.show_result(found, record, Console(file=output, width=80, highlight=False))
+    return output.getvalue()
+
+
+def test_the_result_fits_into_80_columns(good: Scene) -> None:
+    """Every topic and key is whole, and every line of the result has its place."""
+    record = Record(good.published, (replace(READING, t=40.0, pending=0),), (25.0, 35.0))
+    text = said(good.audit(), record)
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
+    assert '10 messages went out before the node had found their publishers' in text
+    assert f'{RAW} is not logged' in text
+    assert 'The S3 server was away for 10 s' in text
+    assert '3 objects with 5 messages read back from the S3 server: all as spooled' in text
+    assert IMU_KEY in text
+
+
+def test_the_result_names_what_is_wrong(good: Scene) -> None:
+    """A problem is never called well."""
+    good.published[IMU] = 5
+    text = said(good.audit(), Record(good.published, (READING,), None))
+    assert 'all as spooled' not in text
+    assert f'{IMU}: 2 of 5 messages are not in the ledger' in text
+
+
+def test_catching_up_is_measured_from_the_return() -> None:
+    """The backlog is gone when a tenth of it is left; None when it never went."""
+    waiting = [(0.0, 2), (10.0, 0), (20.0, 50), (30.0, 80), (31.0, 60), (33.0, 8), (34.0, 0)]
+    readings = tuple(replace(READING, t=t, pending=pending) for t, pending in waiting)
+    assert Record({}, readings, (12.0, 30.0)).backlog == 80
+    assert Record({}, readings, (12.0, 30.0)).caught_up_s == pytest.approx(3.0)
+    assert Record({}, readings[:5], (12.0, 30.0)).caught_up_s is None
+
+
+def test_progress_without_a_terminal_is_a_line_every_five_seconds() -> None:
+    """And one at each change of the Tower, and the last one."""
+    output = io.StringIO()
+    with demo_report.progress(Console(file=output, width=80), 20.0) as show:
+        for tenth in range(123):
+            show(replace(READING, t=tenth / 10, tower='up' if tenth < 72 else 'away'))
+    lines = [line.split()[0] for line in output.getvalue().splitlines()]
+    assert lines == ['time', '0', '5', '7', '10', '12']
+
+
+class FakeTower:
+    """Notes what is asked of it."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def stop_s3(self) -> None:
+        self.calls.append('stop')
+
+    def start_s3(self) -> None:
+        self.calls.append('start')
+
+
+def look_until(outage: Outage, t: float, state: str, *, is_last: bool = False) -> None:
+    """The outage's own thread needs a moment to report; pytest's timeout is the deadline."""
+    while outage.state != state:
+        outage.look(t, is_last=is_last)
+
+
+@pytest.mark.timeout(20)
+def test_the_s3_server_goes_away_once_and_comes_back() -> None:
+    """It goes at its time, stays away for its length, and its span is remembered."""
+    tower = FakeTower()
+    with Outage(tower, 25.0, 10.0) as outage:  # type: ignore[arg-type]
+        outage.look(24.9)
+        assert outage.state == 'up'
+        look_until(outage, 25.0, 'away')
+        outage.look(34.9)
+        assert tower.calls == ['stop']
+        look_until(outage, 35.5, 'back')
+        outage.look(60.0)
+    assert tower.calls == ['stop', 'start']
+    assert outage.span == (25.0, 35.5)
+
+
+@pytest.mark.timeout(20)
+def test_the_s3_server_comes_back_at_the_end_whatever_the_time() -> None:
+    """When the robot has stopped the outage is over, so that everything can be delivered."""
+    tower = FakeTower()
+    with Outage(tower, 1.0, 1000.0) as outage:  # type: ignore[arg-type]
+        look_until(outage, 2.0, 'away')
+        look_until(outage, 3.0, 'back', is_last=True)
+    assert tower.calls == ['stop', 'start']
+
+
+def test_nothing_leads_the_demo_to_a_real_robot_or_tower(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Variables of the shell that name a Tower, a robot or peers do not reach the node; the domain is our own."""
+    foreign = {'AWS_ENDPOINT_URL': 'http://real', 'AWS_SESSION_TOKEN': 't', 'SHADOWHOUND_ROBOT': 'tachi', 'ROS_DOMAIN_ID': '7',
+               'ROS_STATIC_PEERS': '10.0.0.1', 'MLFLOW_TRACKING_URI': 'http://real', 'SHADOWHOUND_HOME': '/real'}  # fmt: skip
+    for name, value in foreign.items():
+        monkeypatch.setenv(name, value)
+    found = demo_processes.environment(tmp_path, {'AWS_ENDPOINT_URL': 'http://127.0.0.1:1'}, 42)
+    assert not {'AWS_SESSION_TOKEN', 'ROS_STATIC_PEERS', 'MLFLOW_TRACKING_URI'} & found.keys()
+    assert (found['AWS_ENDPOINT_URL'], found['ROS_DOMAIN_ID'], found['SHADOWHOUND_ROBOT']) == ('http://127.0.0.1:1', '42', 'thor')
+    assert found['SHADOWHOUND_HOME'] == str(tmp_path)
+
+
+def test_a_domain_that_is_in_use_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A domain whose first port is bound on this machine belongs to somebody."""
+    taken, free = 99, 100
+    monkeypatch.setattr(demo_processes, 'DOMAINS', range(taken, free + 1))
+    monkeypatch.setattr('random.sample', lambda domains, _: list(domains))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
+        somebody.bind(('', 7400 + 250 * taken + 10))
+        assert demo_processes.free_domain() == free
+
+
+def test_a_folder_of_an_earlier_demo_is_replaced(tmp_path: Path) -> None:
+    """Its content is gone, the folder itself is there."""
+    folder = tmp_path / 'demo'
+    with demo.fresh_folder(folder):
+        (folder / 'home').mkdir()
+        (folder / 'home' / 'old').touch()
+        (folder / 'old.png').touch()
+    with demo.fresh_folder(folder):
+        assert [path.name for path in folder.iterdir()] == [demo.MARKER]
+
+
+def test_a_folder_of_somebody_else_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit code 2, a line that says so, and nothing is touched."""
+    (tmp_path / 'thesis.tex').touch()
+    assert demo.main(['--folder', str(tmp_path)]) == 2
+    assert 'no demo made it' in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ['thesis.tex']
+
+
+def test_two_demos_do_not_share_a_folder(tmp_path: Path) -> None:
+    """The second is refused and leaves the first one's data alone."""
+    with demo.fresh_folder(tmp_path / 'demo') as folder:
+        (folder / 'data').touch()
+        with pytest.raises(demo.FolderRefused, match='another demo is running'), demo.fresh_folder(folder):
+            pass
+        assert (folder / 'data').exists()
+
+
+@pytest.mark.parametrize(
+    'arguments', [['--duration', '1'], ['--outage', '-1'], ['--duration', '10', '--outage', '6'], ['--duration', 'nan']]
+)
+def test_times_that_make_no_sense_are_refused(arguments: list[str], tmp_path: Path) -> None:
+    """Exit code 2 before anything is made."""
+    assert demo.main([*arguments, '--folder', str(tmp_path / 'demo')]) == 2
+    assert not (tmp_path / 'demo').exists()
+
+
+@pytest.mark.ros
+@pytest.mark.seaweedfs
+@pytest.mark.slow
+def test_a_short_demo_ends_well(tmp_path: Path) -> None:
+    """With a real S3 server, the real node and the simulated robot: exit code 0, a ledger that balances, and three pictures."""
+    pytest.importorskip('rclpy')
+    command = [sys.executable, '-m', 'shadowhound_data_logger.sim.demo', '--no-mlflow']
+    options = ['--duration', '8', '--outage', '2', '--folder', str(tmp_path / 'demo')]
+    environ = os.environ | {'COLUMNS': '80'}
+    done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=110, check=False, env=environ)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert 'The ledger balances' in done.stdout
+    assert 'all as spooled' in done.stdout
+    assert 'AWAY' in done.stdout
+    assert done.stderr == ''
+    assert json.loads((tmp_path / 'demo' / 'ledger.json').read_text())['balanced'] is True
+    for name in ('frames.png', 'patrol.png', 'delivery.png'):
+        with Image.open(tmp_path / 'demo' / name) as picture:
+            assert min(picture.size) > 200
+        assert str(tmp_path / 'demo' / name) in done.stdout
