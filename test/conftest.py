@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -9,6 +11,25 @@ import pytest
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.sim.tower import Tower
+
+
+ENDING_S = 2.0
+"""For threads that were told to end and are not waited for."""
+SERVERS = ('process_request_thread', '_server_entry')
+"""Threads of the stand-in servers (http.server, moto), which end with their clients or the session."""
+
+
+@pytest.fixture(autouse=True)
+def no_thread_is_left() -> Iterator[None]:
+    """A thread that a test began ends with it."""
+    before = set(threading.enumerate())
+    yield
+    end = time.monotonic() + ENDING_S
+    while left := [
+        thread.name for thread in set(threading.enumerate()) - before if not any(name in thread.name for name in SERVERS)
+    ]:
+        assert time.monotonic() < end, f'threads that outlive their test: {left}'
+        time.sleep(0.01)
 
 
 @pytest.fixture(scope='session')

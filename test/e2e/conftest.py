@@ -1,0 +1,101 @@
+"""The real node over real DDS against a real S3 server: a ROS domain and a robot's name of its own for each test."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import secrets
+import socket
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+from e2e.processes import Processes
+from e2e.reading import Objects
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.s3 import S3Store
+
+pytest.importorskip('rclpy')
+
+LIVE: list[Processes] = []
+"""Whose logs are shown when a test fails."""
+DOMAINS = range(1, 102)
+"""Those whose ports lie below the ephemeral ones on Linux; https://docs.ros.org/en/rolling/Concepts/About-Domain-ID.html"""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """All of this folder needs ROS and an S3 server."""
+    for item in items:
+        if Path(__file__).parent in item.path.parents:
+            item.add_marker(pytest.mark.ros)
+            item.add_marker(pytest.mark.seaweedfs)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:  # type: ignore[misc]  # its wrapped result is returned
+    """Show the logs of what runs when a test fails."""
+    report: pytest.TestReport = yield  # type: ignore[assignment, misc]
+    if report.failed:
+        report.sections += [section for started in LIVE for section in started.logs()]
+    return report  # type: ignore[return-value]
+
+
+@contextmanager
+def free_domain() -> Iterator[int]:
+    """A ROS domain that nobody uses, and no other run of these tests takes meanwhile."""
+    for domain in random.sample(DOMAINS, len(DOMAINS)):
+        lock = os.open(Path(tempfile.gettempdir()) / f'shadowhound-test-domain-{domain}.lock', os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as discovery:
+                discovery.bind(('', 7400 + 250 * domain))  # where every participant of the domain listens
+        except OSError:
+            os.close(lock)
+            continue
+        try:
+            yield domain
+        finally:
+            os.close(lock)
+        return
+    pytest.fail('no ROS domain is free')
+
+
+@contextmanager
+def running(folder: Path) -> Iterator[Processes]:
+    """Processes in a domain of their own; whatever happens, none of them stays."""
+    with free_domain() as domain:
+        processes = Processes(folder, domain, f'r{secrets.token_hex(4)}')
+        LIVE.append(processes)
+        try:
+            yield processes
+        finally:
+            LIVE.remove(processes)
+            processes.end()
+
+
+@pytest.fixture
+def processes(tmp_path: Path) -> Iterator[Processes]:
+    with running(tmp_path) as started:
+        yield started
+
+
+@pytest.fixture(scope='module')
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
+    """Processes that the tests of a module share, each test with topics of its own."""
+    with running(tmp_path_factory.mktemp('shared')) as started:
+        yield started
+
+
+@pytest.fixture(scope='module')
+def stored(seaweed: Tower) -> Iterator[Callable[..., Objects]]:
+    """Reads back what the store holds of a robot."""
+    with ExitStack() as stack:
+        store = S3Store(seaweed.store_settings(), UploadSettings())
+        store.open()
+        stack.callback(store.close)
+        yield lambda robot, bucket='sensor-data': Objects.of(store, bucket, robot)

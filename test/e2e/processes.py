@@ -1,0 +1,241 @@
+"""Processes of the tests: the node, the simulated robot, a witness and publishers, each on its own and always reaped."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from shadowhound_data_logger.spool import ledger
+
+HERE = Path(__file__).parent
+NODE = 'shadowhound_data_logger.capture.sensor_logger_node'
+SIM = 'shadowhound_data_logger.sim.sim_go2_node'
+LONG = bool(os.environ.get('SHADOWHOUND_TEST_LONG'))
+"""``SHADOWHOUND_TEST_LONG=1 make test PYTEST_ARGS=test/e2e`` runs the minutes that are promised, instead of seconds."""
+START_S = 20.0
+"""A node takes two seconds to start on an idle machine."""
+T = TypeVar('T')
+
+
+def until(condition: Callable[[], T], what: str, seconds: float = 15.0) -> T:
+    """The first true answer of ``condition``; fails with ``what`` it waited for when that takes too long."""
+    end = time.monotonic() + seconds
+    while not (answer := condition()):
+        assert time.monotonic() < end, f'within {seconds:g} s: {what}'
+        time.sleep(0.02)
+    return answer
+
+
+class Process:
+    """A child whose standard error (and output, unless that is piped) goes to a log file."""
+
+    def __init__(self, name: str, command: Sequence[str], log: Path, environ: Mapping[str, str], *, piped: bool = False) -> None:
+        self.name, self.log_path = name, log
+        pipe = subprocess.PIPE if piped else None
+        with log.open('ab') as file:
+            self.popen = subprocess.Popen(
+                command, stdin=pipe or subprocess.DEVNULL, stdout=pipe or file, stderr=file, env=dict(environ), text=True
+            )
+
+    @property
+    def log(self) -> str:
+        return self.log_path.read_text(encoding='utf-8', errors='replace')
+
+    def said(self, words: str, seconds: float = START_S) -> None:
+        """Wait until the words are in the log."""
+
+        def looked() -> bool:
+            assert words in self.log or self.popen.poll() is None, f'{self.name} ended with {self.popen.returncode}: {self.log}'
+            return words in self.log
+
+        until(looked, f'{self.name} says {words!r}', seconds)
+
+    def signal(self, number: int) -> None:
+        self.popen.send_signal(number)
+
+    def wait(self, seconds: float = 20.0) -> int:
+        return self.popen.wait(seconds)
+
+    def kill(self) -> None:
+        """End it at once; idempotent."""
+        self.popen.kill()
+        self.popen.wait()
+        for stream in (self.popen.stdin, self.popen.stdout):
+            if stream is not None:
+                stream.close()
+
+
+class Node(Process):
+    """A running ``sensor_logger_node``."""
+
+    home: Path
+    robot: str
+
+    def ledger(self) -> dict[str, Any]:
+        """As ``shadowhound-data ledger --json`` prints it; it balances at any time."""
+        found = ledger.read(self.home / 'spool', self.robot)
+        assert ledger.imbalances(found) == []
+        return found
+
+    def topic(self, name: str) -> dict[str, Any]:
+        """The topic's row of the ledger; empty before there is one."""
+        row: dict[str, Any] = self.ledger()['topics'].get(name, {})
+        return row
+
+    def received(self, name: str, count: int, seconds: float = 15.0) -> None:
+        """Wait until that many messages of the topic are durably accounted for."""
+        until(lambda: self.topic(name).get('received', 0) >= count, f'{count} of {name} received: {self.topic(name)}', seconds)
+
+    def settled(self, name: str, count: int, seconds: float = 20.0) -> dict[str, Any]:
+        """Wait until so many of the topic are received and none of them is open or waits for delivery; its row."""
+
+        def done() -> bool:
+            row = self.topic(name)
+            return bool(row and row['received'] >= count and not row['open'] and not row['stored_in']['pending'])
+
+        until(done, f'{count} of {name} delivered: {self.topic(name)}', seconds)
+        return self.topic(name)
+
+    def delivered(self, at_least: int = 1, seconds: float = 20.0) -> None:
+        """Wait until so many objects are delivered and none waits."""
+
+        def done() -> bool:
+            objects = self.ledger()['objects']
+            return bool(objects['delivered'] >= at_least and not objects['pending'])
+
+        until(done, f'{at_least} objects delivered: {self.ledger()["objects"]}', seconds)
+
+    def stop(self, number: int = signal.SIGINT, seconds: float = 20.0) -> dict[str, Any]:
+        """Ask it to end, and see that it does so with exit code 0; its last ledger."""
+        self.signal(number)
+        assert self.wait(seconds) == 0, self.log
+        return self.ledger()
+
+
+class Publisher(Process):
+    """A process with publishers of its own (publisher.py), told what to do line by line."""
+
+    def create(self, topic: str, type_name: str, *, reliable: bool = True, latched: bool = False, depth: int = 1000) -> None:
+        """A publisher by the name of its topic."""
+        self._tell(do='create', topic=topic, type=type_name, reliable=reliable, latched=latched, depth=depth)
+
+    def matched(self, topic: str) -> None:
+        """Wait until somebody listens."""
+        self._tell(do='matched', topic=topic)
+
+    def publish(self, topic: str, messages: Iterable[bytes], period_s: float = 0.002) -> None:
+        """Serialized messages; returns when the last one is out."""
+        self._tell(do='publish', topic=topic, messages=[message.hex() for message in messages], period_s=period_s)
+
+    def heard(self, topic: str, node: Node, message: bytes) -> None:
+        """Publish the message until the node received it, so that whatever follows comes after the match."""
+        self.matched(topic)
+        before = node.topic(topic).get('received', 0)
+
+        def received() -> bool:
+            self.publish(topic, [message], 0.0)
+            return bool(node.topic(topic).get('received', 0) > before)
+
+        until(received, f'{topic} is heard')
+
+    def destroy(self, topic: str) -> None:
+        """At once: what has to arrive must have been received before."""
+        self._tell(do='destroy', topic=topic)
+
+    def end(self) -> None:
+        """It leaves as a node should, so that the others know at once; what has to arrive must have been received before."""
+        self._tell(do='end')
+        assert self.wait() == 0, self.log
+
+    def _tell(self, **order: object) -> None:
+        assert self.popen.stdin is not None
+        assert self.popen.stdout is not None
+        self.popen.stdin.write(json.dumps(order) + '\n')
+        self.popen.stdin.flush()
+        answer = self.popen.stdout.readline()
+        assert answer == 'done\n', f'{order["do"]}: {answer}{self.log}'
+
+
+class Processes:
+    """All that a test starts. ``end`` reaps what still runs."""
+
+    def __init__(self, folder: Path, domain: int, robot: str) -> None:
+        self.folder, self.robot = folder, robot
+        self.started: list[Process] = []
+        foreign = ('AWS_', 'MLFLOW_', 'SHADOWHOUND_HOME', 'SHADOWHOUND_ROBOT', 'ROS_LOCALHOST_ONLY')
+        self.environ = {name: value for name, value in os.environ.items() if not name.startswith(foreign)} | {
+            'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(folder / 'ros'),
+            'RCUTILS_COLORIZED_OUTPUT': '0', 'PYTHONUNBUFFERED': '1',
+        }  # fmt: skip
+
+    def node(
+        self, store: Mapping[str, str] | None = None, parameters: Mapping[str, Any] | None = None, *arguments: str,
+        ready: bool = True, robot: str | None = None, home: str = 'home', environ: Mapping[str, str] | None = None,
+    ) -> Node:  # fmt: skip
+        """The logger: ``store`` is the environment that names one, ``parameters`` are flat ROS names."""
+        name = self._name('node')
+        file = self.folder / f'{name}.yaml'
+        given = {'spool.min_free_bytes': 0, **(parameters or {})}
+        file.write_text(json.dumps({'/**': {'ros__parameters': given}}))
+        robot = self.robot if robot is None else robot
+        own = {'SHADOWHOUND_HOME': str(self.folder / home), 'SHADOWHOUND_ROBOT': robot}
+        command = [sys.executable, '-m', NODE, '--ros-args', '--params-file', str(file), *arguments]
+        node = Node(name, command, self.folder / f'{name}.log', {**self.environ, **own, **(store or {}), **(environ or {})})
+        self.started.append(node)
+        node.home, node.robot = self.folder / home, robot
+        if ready:
+            node.said('logging ')
+        return node
+
+    def sim(self, *parameters: str, namespace: str = '/') -> Process:
+        """The simulated Go2; ``published`` has what it said at its end."""
+        given = [word for parameter in parameters for word in ('-p', parameter)]
+        name = self._name('sim')
+        command = [sys.executable, '-m', SIM, '--ros-args', '-r', f'__ns:={namespace}', *given]
+        return self._keep(Process(name, command, self.folder / f'{name}.log', self.environ))
+
+    def witness(self, topics: Mapping[str, str], output: Path, *, best_effort: Iterable[str] = ()) -> Process:
+        """A second listener that writes all it hears, as it came, to a file (witness.py); SIGTERM ends it."""
+        order = json.dumps({topic: [type_name, topic not in best_effort] for topic, type_name in topics.items()})
+        name = self._name('witness')
+        command = [sys.executable, str(HERE / 'witness.py'), str(output), order]
+        witness = self._keep(Process(name, command, self.folder / f'{name}.log', self.environ))
+        witness.said('ready')
+        return witness
+
+    def publisher(self) -> Publisher:
+        name = self._name('publisher')
+        command = [sys.executable, str(HERE / 'publisher.py')]
+        process = Publisher(name, command, self.folder / f'{name}.log', self.environ, piped=True)
+        self.started.append(process)
+        return process
+
+    def logs(self) -> list[tuple[str, str]]:
+        """Title and end of each log."""
+        return [(f'log of {process.name} ({process.popen.poll()})', process.log[-6000:]) for process in self.started]
+
+    def end(self) -> None:
+        for process in reversed(self.started):
+            process.kill()
+
+    def _keep(self, process: Process) -> Process:
+        self.started.append(process)
+        return process
+
+    def _name(self, kind: str) -> str:
+        return f'{kind}-{len(self.started)}'
+
+
+def published(sim: Process, seconds: float = 60.0) -> dict[str, int]:
+    """Wait for the end of a simulated Go2; topic -> messages, as it counted them itself."""
+    assert sim.wait(seconds) == 0, sim.log
+    line = next(line for line in reversed(sim.log.splitlines()) if line.startswith('{"published"'))
+    counts: dict[str, int] = json.loads(line)['published']
+    return counts

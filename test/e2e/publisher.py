@@ -1,0 +1,75 @@
+"""Program of a test: publishers that do what standard input says, one JSON object a line, each answered with ``done``."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from importlib import import_module
+from typing import Any
+
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+MATCH_S = 15.0
+
+
+def profile(order: dict[str, Any]) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=order['depth'],
+        reliability=ReliabilityPolicy.RELIABLE if order['reliable'] else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if order['latched'] else DurabilityPolicy.VOLATILE,
+    )
+
+
+def message_class(type_name: str) -> Any:
+    package, _, name = type_name.split('/')
+    return getattr(import_module(f'{package}.msg'), name)
+
+
+def obey(order: dict[str, Any], node: Node, publishers: dict[str, Any]) -> None:
+    topic = order.get('topic', '')
+    match order['do']:
+        case 'create':
+            publishers[topic] = node.create_publisher(message_class(order['type']), topic, profile(order))
+        case 'matched':
+            end = time.monotonic() + MATCH_S
+            while not publishers[topic].get_subscription_count():
+                if time.monotonic() > end:
+                    raise TimeoutError(f'nobody listens to {topic}')
+                time.sleep(0.005)
+        case 'publish':
+            due = time.monotonic()
+            for message in order['messages']:
+                time.sleep(max(0.0, due - time.monotonic()))
+                due += order['period_s']
+                publishers[topic].publish(bytes.fromhex(message))
+        case 'destroy':
+            node.destroy_publisher(publishers.pop(topic))
+
+
+def answer() -> None:
+    sys.stdout.write('done\n')
+    sys.stdout.flush()
+
+
+def main() -> None:
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = Node('publisher', start_parameter_services=False, enable_rosout=False)
+    publishers: dict[str, Any] = {}
+    for line in sys.stdin:
+        order = json.loads(line)
+        obey(order, node, publishers)
+        if order['do'] == 'end':
+            break
+        answer()
+    node.destroy_node()
+    rclpy.try_shutdown()
+    answer()
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,156 @@
+"""What is wrong with a store is said so that an operator can act on it, nothing is lost, and delivery goes on by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import boto3
+import pytest
+from e2e.processes import Node, Processes, Publisher, until
+from e2e.reading import STRING, Objects, texts
+from e2e.wire import HANG, PASS, REFUSE, Wire
+
+from shadowhound_data_logger.sim.tower import Tower
+
+TOPIC = '/talk'
+COUNT = 20
+TALK = {
+    'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 0.1,
+    'spool.commit_s': 0.05, 'upload.backoff_s': 0.2, 'upload.connect_timeout_s': 1.0, 'upload.read_timeout_s': 1.0,
+}  # fmt: skip
+
+
+class Talk:
+    """A node, and a publisher whose numbers go up from 0."""
+
+    def __init__(self, node: Node, publisher: Publisher) -> None:
+        self.node, self.publisher, self.count = node, publisher, 0
+
+    def publish(self) -> None:
+        """Some more numbers, durable in the spool when it returns."""
+        self.publisher.publish(TOPIC, texts(range(self.count, self.count + COUNT)))
+        self.count += COUNT
+        until(lambda: self.node.topic(TOPIC).get('stored', 0) == self.count, 'all is spooled')
+
+    def delivered(self, objects: Callable[[], Objects]) -> None:
+        """All numbers so far come to be in the store, once."""
+        self.node.settled(TOPIC, self.count)
+        assert objects().numbers('talk') == list(range(self.count))
+
+
+def talk(processes: Processes, store: dict[str, str], **parameters: Any) -> Talk:
+    node = processes.node(store, {**TALK, **parameters})
+    publisher = processes.publisher()
+    publisher.create(TOPIC, STRING)
+    publisher.matched(TOPIC)
+    return Talk(node, publisher)
+
+
+@pytest.fixture(scope='module')
+def wire(seaweed: Tower) -> Iterator[Wire]:
+    with Wire(seaweed.endpoint_url) as proxy:
+        yield proxy
+
+
+@pytest.fixture(scope='module')
+def wired(shared: Processes, seaweed: Tower, wire: Wire) -> Talk:
+    """A node that reaches the server by the wire."""
+    return talk(shared, {**seaweed.environment(), 'AWS_ENDPOINT_URL': wire.url})
+
+
+@pytest.mark.parametrize(
+    ('mode', 'words'),
+    [
+        pytest.param(REFUSE, 'refused the connection (is the S3 server running?', id='refused connection'),
+        pytest.param(HANG, 'gave no answer within 1 s (does the server hang?', id='hung connection'),
+        pytest.param((500, 'InternalError'), 'answers with a server error (500 InternalError)', id='server error'),
+        pytest.param((503, 'SlowDown'), 'is overloaded (503 SlowDown)', id='overload'),
+        pytest.param((403, 'SignatureDoesNotMatch'), 'refuses the signature: the secret key is wrong', id='wrong secret'),
+        pytest.param((403, 'RequestTimeTooSkewed'), 'the clocks of this machine and of', id='wrong clock'),
+    ],
+)
+def test_a_store_that_fails_and_recovers(
+    wired: Talk, wire: Wire, shared: Processes, stored: Callable[..., Objects], mode: str | tuple[int, str], words: str
+) -> None:
+    """Each fault has a message of its own; what is published meanwhile waits, and is delivered when the fault is gone."""
+    wired.publish()
+    wired.node.settled(TOPIC, wired.count)
+    assert words not in wired.node.log
+    recovered = wired.node.log.count('delivery goes on')
+    wire.set(mode)
+    try:
+        wired.publish()
+        wired.node.said(words)
+        row = wired.node.topic(TOPIC)
+        assert row['stored_in']['pending'] >= 1
+        assert row['stored_in']['quarantined'] == 0
+    finally:
+        wire.set(PASS)
+    wired.delivered(lambda: stored(shared.robot))
+    until(lambda: wired.node.log.count('delivery goes on') == recovered + 1, 'the node says that it is over')
+    assert wired.node.ledger()['objects']['quarantined'] == 0
+
+
+def test_a_server_that_is_not_there_yet(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+    """A node that is started before its server delivers once the server is started."""
+    seaweed.stop_s3()
+    try:
+        talking = talk(processes, seaweed.environment())
+        talking.publish()
+        talking.node.said('refused the connection')
+        assert talking.node.topic(TOPIC)['stored_in']['pending'] == COUNT
+    finally:
+        seaweed.start_s3()
+    talking.delivered(lambda: stored(processes.robot))
+
+
+def test_a_wrong_secret(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+    """A real server's refusal pauses delivery and names the variables, never the secret; a right secret delivers all."""
+    wrong = {**seaweed.environment(), 'AWS_SECRET_ACCESS_KEY': 'not-the-secret'}
+    talking = talk(processes, wrong)
+    talking.publish()
+    talking.node.said('delivery is paused')
+    assert 'the secret key is wrong (check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY)' in talking.node.log
+    assert 'not-the-secret' not in talking.node.log
+    assert talking.node.stop()['objects']['pending'] >= 1
+    processes.node(seaweed.environment(), TALK).delivered()
+    assert stored(processes.robot).numbers('talk') == list(range(COUNT))
+
+
+def test_a_bucket_that_is_missing_is_made(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+    """Where the credentials allow it, the bucket is created, and the log says so."""
+    bucket = f'fresh-{processes.robot}'
+    talking = talk(processes, seaweed.environment(), **{'talk.bucket': bucket})
+    talking.publish()
+    talking.delivered(lambda: stored(processes.robot, bucket))
+    assert f'created the bucket {bucket}' in talking.node.log
+
+
+@pytest.fixture
+def owner(seaweed: Tower) -> Iterator[Any]:
+    """A client of the server's owner."""
+    settings = seaweed.store_settings()
+    client = boto3.client(
+        's3', endpoint_url=settings.endpoint_url, region_name='us-east-1',
+        aws_access_key_id=settings.access_key_id, aws_secret_access_key=settings.secret_access_key,
+    )  # fmt: skip
+    yield client
+    client.close()
+
+
+def test_a_bucket_that_cannot_be_made(processes: Processes, seaweed: Tower, owner: Any, stored: Callable[..., Objects]) -> None:
+    """Where they do not, the error says how to create it; its objects wait and are delivered once it is there."""
+    talking = talk(processes, seaweed.environment('limited'), **{'talk.bucket': 'allowed'})
+    talking.publish()
+    talking.node.said('bucket allowed gets nothing')
+    assert 's3 mb s3://allowed' in talking.node.log
+    assert talking.node.topic(TOPIC)['stored_in']['delivered'] == 0
+    owner.create_bucket(Bucket='allowed')
+    try:
+        talking.delivered(lambda: stored(processes.robot, 'allowed'))
+    finally:  # other tests begin without it
+        processes.end()
+        for item in owner.list_objects_v2(Bucket='allowed').get('Contents', []):
+            owner.delete_object(Bucket='allowed', Key=item['Key'])
+        owner.delete_bucket(Bucket='allowed')

@@ -1,0 +1,187 @@
+"""The default settings and the simulated Go2: all that it published is in the store as it was, and all is accounted for."""
+
+from __future__ import annotations
+
+import io
+import re
+import signal
+from collections import defaultdict
+from collections.abc import Callable
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pypcd4
+import pytest
+from e2e.processes import LONG, Processes, published
+from e2e.reading import TYPES, Objects, assert_same, decode, stamp_ns
+from e2e.witness import Heard, recorded
+
+from shadowhound_data_logger.sim.tower import Tower
+
+SECOND = 10**9
+DURATION_S = 60.0 if LONG else 10.0
+BEST_EFFORT = {'/point_cloud2', '/camera/camera_info'}
+SENSORS = {
+    '/camera/compressed': 'camera', '/camera/camera_info': 'camera_info', '/point_cloud2': 'lidar', '/imu': 'imu',
+    '/odom': 'odom', '/go2_states': 'states', '/joint_states': 'joints', '/lowstate': 'lowstate',
+}  # fmt: skip
+EVERY_MESSAGE = ('/imu', '/go2_states', '/joint_states')
+KEYS = {
+    'camera': r'camera/\d{8}/\d{6}_front\.jpg', 'lidar': r'lidar/\d{8}/\d{6}_scan\.pcd', 'odom': r'odom/\d{8}/\d{6}_odom\.json',
+    'camera_info': r'camera_info/\d{8}/\d{6}_front\.json',
+    **{name: rf'{name}/\d{{8}}/\d{{6}}_{name}\.json' for name in ('imu', 'states', 'joints', 'lowstate')},
+}  # fmt: skip
+
+Messages = dict[str, dict[int, Heard]]
+"""Topic -> stamp -> what the witness heard; the stamp is the header's, else the publisher's."""
+
+
+class Session:
+    """One run of robot, witness and node."""
+
+    def __init__(self, said: dict[str, int], ledger: dict[str, Any], heard: Messages, objects: Objects) -> None:
+        self.said, self.ledger, self.heard, self.objects = said, ledger, heard, objects
+
+    def decoded(self, topic: str, stamp: int) -> Any:
+        return decode(TYPES[topic], self.heard[topic][stamp].cdr)
+
+
+def by_stamp(path: Path) -> Messages:
+    heard: Messages = defaultdict(dict)
+    for message in recorded(path):
+        decoded = decode(TYPES[message.topic], message.cdr)
+        stamp = stamp_ns(decoded) if hasattr(decoded, 'header') else message.source_ns
+        heard[message.topic][stamp] = message
+    return heard
+
+
+@pytest.fixture(scope='module')
+def session(shared: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> Session:
+    node = shared.node(seaweed.environment())
+    recording = shared.folder / 'witness'
+    witness = shared.witness(TYPES, recording, best_effort=BEST_EFFORT)
+    said = published(shared.sim(f'duration_s:={DURATION_S}'), DURATION_S + 30)
+    ledger = node.stop()
+    witness.signal(signal.SIGTERM)
+    assert witness.wait() == 0
+    return Session(said, ledger, by_stamp(recording), stored(shared.robot))
+
+
+pytestmark = pytest.mark.timeout(120 + 2 * DURATION_S)
+
+
+def test_default_profile_is_accounted_for(session: Session) -> None:
+    """Every topic is accounted exactly, nothing is missed, dropped, rejected or open, and all of it is delivered."""
+    assert session.ledger['balanced']
+    assert set(session.ledger['topics']) == set(TYPES)
+    for topic, row in session.ledger['topics'].items():
+        assert (topic, row['accounting'], row['missed'], row['rejected'], row['dropped'], row['open']) == (
+            topic,
+            'exact',
+            0,
+            {},
+            {},
+            0,
+        )
+    objects = session.ledger['objects']
+    assert objects['delivered'] == objects['spooled']
+
+
+def test_default_profile_counts_what_the_robot_counted(session: Session) -> None:
+    """The robot's own count of each topic is the ledger's, from the first message on."""
+    assert {topic: row['published'] for topic, row in session.ledger['topics'].items()} == {
+        topic: count for topic, count in session.said.items() if topic in TYPES
+    }
+
+
+def test_default_profile_in_the_store_is_what_is_stored(session: Session) -> None:
+    """The samples inside the objects of the store are as many as the ledger calls stored."""
+    assert session.objects.counted() == {topic: row['stored'] for topic, row in session.ledger['topics'].items()}
+    for name in ('imu', 'states', 'joints', 'lowstate'):
+        topic = next(topic for topic, sensor in SENSORS.items() if sensor == name)
+        assert len(session.objects.samples(name)) == session.ledger['topics'][topic]['stored']
+
+
+def test_default_profile_keys(session: Session, shared: Processes) -> None:
+    """Objects have the documented keys, in the UTC second of their first sample, and a type and hash."""
+    for key, info in session.objects.infos.items():
+        sensor = key.split('/')[1]
+        assert re.fullmatch(f'{shared.robot}/{KEYS[sensor]}', key)
+        when = datetime.fromtimestamp(int(info.metadata['t_start_ns']) // SECOND, timezone.utc)
+        assert f'{when:%Y%m%d}/{when:%H%M%S}_' in key
+        assert info.metadata['sha256']
+        assert info.content_type == {'jpg': 'image/jpeg', 'json': 'application/json'}.get(key[-3:], info.content_type)
+
+
+@pytest.mark.parametrize('topic', EVERY_MESSAGE)
+def test_default_profile_every_sample_is_there(session: Session, topic: str) -> None:
+    """Of a topic without downsampling every message is in the store, once, under its own time."""
+    stamps = [sample['stamp_ns'] for sample in session.objects.samples(SENSORS[topic])]
+    assert sorted(stamps) == sorted(session.heard[topic])
+    assert len(stamps) == session.said[topic]
+
+
+@pytest.mark.parametrize('topic', ['/imu', '/go2_states', '/joint_states', '/lowstate'])
+def test_default_profile_batches_are_what_was_published(session: Session, topic: str) -> None:
+    """Every field of every sample is the published one, floats bit for bit."""
+    for sample in session.objects.samples(SENSORS[topic]):
+        assert_same(sample, session.decoded(topic, sample['stamp_ns']), TYPES[topic], topic)
+
+
+@pytest.mark.parametrize('topic', ['/camera/compressed', '/point_cloud2', '/odom', '/lowstate'])
+def test_default_profile_keeps_the_first_of_each_second(session: Session, topic: str) -> None:
+    """At 1 Hz the first message of each whole second of UTC is kept, and no other."""
+    firsts: dict[int, int] = {}
+    for stamp in sorted(session.heard[topic]):
+        firsts.setdefault(stamp // SECOND, stamp)
+    if topic == '/lowstate':
+        kept = [sample['stamp_ns'] for sample in session.objects.samples('lowstate')]
+    else:
+        prefix = f'/{SENSORS[topic]}/'
+        kept = [int(info.metadata['t_start_ns']) for key, info in session.objects.infos.items() if prefix in key]
+    assert sorted(kept) == sorted(firsts.values())
+
+
+def test_default_profile_images_are_what_was_published(session: Session) -> None:
+    """A camera object is the published JPEG, byte for byte."""
+    images = session.objects.sensor('camera')
+    assert len(images) >= DURATION_S
+    for key, body in images.items():
+        stamp = int(session.objects.infos[key].metadata['t_start_ns'])
+        assert body == bytes(session.decoded('/camera/compressed', stamp).data)
+
+
+def test_default_profile_clouds_are_what_was_published(session: Session) -> None:
+    """A cloud reads back, by another library, with the published points bit for bit."""
+    clouds = session.objects.sensor('lidar')
+    assert len(clouds) >= DURATION_S
+    for key, body in clouds.items():
+        message = session.decoded('/point_cloud2', int(session.objects.infos[key].metadata['t_start_ns']))
+        cloud = pypcd4.PointCloud.from_fileobj(io.BytesIO(body))
+        assert cloud.fields == ('x', 'y', 'z', 'intensity')
+        points = np.frombuffer(bytes(message.data), '<f4').reshape(-1, 4)
+        assert np.stack([cloud.pc_data[name] for name in cloud.fields], axis=1).tobytes() == points.tobytes()
+
+
+def test_default_profile_odometry_is_what_was_published(session: Session) -> None:
+    """An odometry record has the published pose and twist, and its time in words."""
+    records = session.objects.documents('odom')
+    assert len(records) >= DURATION_S
+    for record in records:
+        message = session.decoded('/odom', record['stamp_ns'])
+        pose, twist = message.pose.pose, message.twist.twist
+        for name, value in (('position', pose.position), ('orientation', pose.orientation),
+                            ('linear_velocity', twist.linear), ('angular_velocity', twist.angular)):  # fmt: skip
+            assert_same(record[name], value, 'geometry_msgs/msg/Any', name)
+        assert (record['frame_id'], record['child_frame_id']) == (message.header.frame_id, message.child_frame_id)
+        assert datetime.fromisoformat(record['timestamp'].replace('Z', '+00:00')).timestamp() == record['stamp_ns'] // 1000 / 1e6
+
+
+def test_default_profile_calibration_is_kept_once(session: Session) -> None:
+    """A calibration that never changes is stored once, as published."""
+    (record,) = session.objects.documents('camera_info')
+    message = session.decoded('/camera/camera_info', record['stamp_ns'])
+    own = {'robot', 'sensor', 'topic', 'type', 'timestamp'}
+    assert_same({name: value for name, value in record.items() if name not in own}, message, TYPES['/camera/camera_info'])

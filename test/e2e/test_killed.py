@@ -1,0 +1,96 @@
+"""A node that is killed again and again under load: what is lost is known, little, and never twice in the store."""
+
+from __future__ import annotations
+
+import itertools
+import signal
+import time
+from collections.abc import Callable
+
+from e2e.processes import Node, Processes, published, until
+from e2e.reading import TYPES, Objects, decode, stamp_ns
+from e2e.witness import recorded
+
+from shadowhound_data_logger.sim.tower import Tower
+
+SECOND = 10**9
+KILLS = 3
+RATES_HZ = {
+    '/camera/compressed': 30, '/camera/camera_info': 30, '/point_cloud2': 10, '/imu': 100, '/odom': 50, '/go2_states': 20,
+    '/joint_states': 50, '/lowstate': 20,
+}  # fmt: skip
+LOSS_S = 1.25
+"""What a kill may cost besides the restart: a batch of a second and a quarter of a second until its commit."""
+SLACK_S = 0.5
+"""Two polls for late messages of a batch, and how exactly a busy machine and this test know the times."""
+WHOLE = {'/imu': 'imu', '/go2_states': 'states', '/joint_states': 'joints'}
+"""Topics of which every message is to be stored."""
+
+
+def received(node: Node) -> dict[str, int]:
+    return {topic: node.topic(topic).get('received', 0) for topic in RATES_HZ}
+
+
+def hears_all_again(node: Node, before: dict[str, int]) -> None:
+    until(lambda: all(count > before[topic] for topic, count in received(node).items()), 'every topic is heard again')
+
+
+def lost(published_ns: list[int], stored_ns: set[int]) -> list[tuple[float, float]]:
+    """Each run of published messages that are not stored: when the last stored one before and the first after it were, s."""
+    runs = []
+    for missing, run in itertools.groupby(enumerate(published_ns), lambda pair: pair[1] not in stored_ns):
+        if missing:
+            places = [place for place, _ in run]
+            before, after = max(places[0] - 1, 0), min(places[-1] + 1, len(published_ns) - 1)
+            runs.append((published_ns[before] / SECOND, published_ns[after] / SECOND))
+    return runs
+
+
+def test_kill_and_restart_under_load(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+    """The ledger balances and knows of each message; a kill makes one gap, no longer than the restart and 1.25 s."""
+    environ = seaweed.environment()
+    node = processes.node(environ)
+    recording = processes.folder / 'witness'
+    witness = processes.witness({topic: TYPES[topic] for topic in WHOLE}, recording)
+    sim = processes.sim()
+    restarts: list[tuple[float, float]] = []
+    for _ in range(KILLS):
+        node.received('/imu', node.topic('/imu').get('received', 0) + 150)
+        node.kill()
+        killed, before = time.time(), received(node)
+        node = processes.node(environ)
+        hears_all_again(node, before)
+        restarts.append((killed, time.time()))
+    node.received('/imu', node.topic('/imu')['received'] + 150)
+    sim.signal(signal.SIGINT)
+    said = published(sim)
+    ledger = node.stop()
+    witness.signal(signal.SIGTERM)
+    assert witness.wait() == 0
+
+    away_s = sum(heard - killed + LOSS_S + SLACK_S for killed, heard in restarts)
+    assert set(ledger['topics']) == set(TYPES)
+    for topic, row in ledger['topics'].items():
+        assert (topic, row['accounting'], row['published'], row['open']) == (topic, 'exact', said[topic], 0)
+        assert set(row['missed_by']) | set(row['dropped']) <= {'restart'}, topic
+        assert row['missed'] <= RATES_HZ[topic] * away_s, topic
+        assert row['rejected'] == {}
+    assert ledger['topics']['/imu']['missed_by']['restart'] > 0
+
+    objects = stored(processes.robot)
+    assert objects.counted() == {topic: row['stored'] for topic, row in ledger['topics'].items()}
+    heard_ns: dict[str, list[int]] = {topic: [] for topic in WHOLE}
+    for message in recorded(recording):
+        decoded = decode(TYPES[message.topic], message.cdr)
+        heard_ns[message.topic].append(stamp_ns(decoded) if hasattr(decoded, 'header') else message.source_ns)
+    for topic, name in WHOLE.items():
+        stamps = [sample['stamp_ns'] for sample in objects.samples(name)]
+        assert len(stamps) == len(set(stamps)), 'nothing is twice in the store'
+        gaps = lost(sorted(heard_ns[topic]), set(stamps))
+        assert len(gaps) <= KILLS, topic
+        for start, end in gaps:
+            killed, heard = next((killed, heard) for killed, heard in restarts if start <= heard and end >= killed - LOSS_S)
+            assert end - start <= heard - killed + LOSS_S + SLACK_S, topic
+    for name in ('camera', 'odom', 'lidar'):
+        seconds = [int(info.metadata['t_start_ns']) // SECOND for key, info in objects.infos.items() if f'/{name}/' in key]
+        assert len(seconds) == len(set(seconds)), 'a restart within a second keeps nothing of it twice'

@@ -1,0 +1,67 @@
+"""A camera whose driver publishes raw images only, and one that is compressed later: nothing is missed on either way."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import simplejpeg
+from e2e.processes import LONG, Node, Processes, until
+from e2e.reading import Objects, cdr
+
+from shadowhound_data_logger.sim.tower import Tower
+
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+RAW_TOPIC, JPEG_TOPIC = '/camera/image_raw', '/camera/compressed'
+FRAMES = 60
+"""Two seconds at 30 Hz, 55 MB."""
+
+
+def switched(node: Node, topic: str, times: int) -> None:
+    words = f'camera: taken from {topic} now'
+    until(lambda: node.log.count(words) >= times, f'{words}, {times} times')
+
+
+def test_raw_images_are_not_missed(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+    """30 raw images a second arrive, BEST_EFFORT and 921 KB each; compressed ones are taken as long as there are any."""
+    node = processes.node(seaweed.environment(), {'sensors': ['camera']})
+    sim = processes.sim('compressed:=false')
+    switched(node, RAW_TOPIC, 1)
+    node.received(RAW_TOPIC, FRAMES)
+    republisher = processes.publisher()
+    republisher.create(JPEG_TOPIC, COMPRESSED, depth=10)
+    switched(node, JPEG_TOPIC, 1)
+    before = node.topic(RAW_TOPIC)['received']
+    jpeg = simplejpeg.encode_jpeg(np.zeros((48, 64, 3), np.uint8))
+    republisher.matched(JPEG_TOPIC)
+    republisher.publish(JPEG_TOPIC, [cdr(COMPRESSED, format='jpeg', data=jpeg)] * 60, 1 / 30)
+    node.received(JPEG_TOPIC, 60)
+    assert node.topic(RAW_TOPIC)['received'] <= before + 60  # what came before it left, and was not durably counted yet
+    republisher.destroy(JPEG_TOPIC)
+    switched(node, RAW_TOPIC, 2)
+    node.received(RAW_TOPIC, before + FRAMES // 2)
+    sim.signal(signal.SIGINT)
+    assert sim.wait() == 0
+    ledger = node.stop()
+    raw, compressed = ledger['topics'][RAW_TOPIC], ledger['topics'][JPEG_TOPIC]
+    assert (raw['missed'], raw['accounting'], raw['rejected'], raw['dropped']) == (0, 'exact', {}, {})
+    assert (compressed['missed'], compressed['received'], compressed['published']) == (0, 60, 60)
+    objects = stored(processes.robot)
+    assert objects.counted() == {RAW_TOPIC: raw['stored'], JPEG_TOPIC: compressed['stored']}
+    sizes = {RAW_TOPIC: (480, 640), JPEG_TOPIC: (48, 64)}
+    for key, body in objects.sensor('camera').items():
+        assert simplejpeg.decode_jpeg_header(body)[:2] == sizes[objects.infos[key].metadata['topic']]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not LONG, reason='a minute long: set SHADOWHOUND_TEST_LONG=1')
+def test_a_minute_of_raw_images(processes: Processes, seaweed: Tower) -> None:
+    """1,800 raw images, and each of them received."""
+    node = processes.node(seaweed.environment(), {'sensors': ['camera']})
+    sim = processes.sim('compressed:=false', 'duration_s:=60.0')
+    assert sim.wait(90) == 0
+    row = node.stop()['topics'][RAW_TOPIC]
+    assert row['missed'] == 0
+    assert row['received'] >= 1700  # the first second passes while it waits for a compressed topic
