@@ -331,7 +331,7 @@ def test_a_wrong_value_is_named(name: str, value: object) -> None:
     with pytest.raises(SettingError) as caught:
         SimSettings.load({name: value})
     assert caught.value.data['name'] == name
-    assert str(caught.value).startswith(f'{name} = {value!r}: allowed is')
+    assert str(caught.value).startswith(f'{name} = {value!r} is refused; allowed is')
 
 
 def test_whole_numbers_and_the_parameters_of_rclpy_are_taken() -> None:
