@@ -21,7 +21,7 @@ from e2e.witness import Heard, recorded
 from shadowhound_data_logger.sim.tower import Tower
 
 SECOND = 10**9
-DURATION_S = 60.0 if LONG else 10.0
+DURATION_S = 60.0 if LONG else 7.0
 BEST_EFFORT = {'/point_cloud2', '/camera/camera_info'}
 SENSORS = {
     '/camera/compressed': 'camera', '/camera/camera_info': 'camera_info', '/point_cloud2': 'lidar', '/imu': 'imu',

@@ -286,7 +286,7 @@ def test_a_short_demo_ends_well(tmp_path: Path) -> None:
     """With a real S3 server, the real node and the simulated robot: exit code 0, a ledger that balances, and three pictures."""
     pytest.importorskip('rclpy')
     command = [sys.executable, '-m', 'shadowhound_data_logger.sim.demo', '--no-mlflow']
-    options = ['--duration', '8', '--outage', '2', '--folder', str(tmp_path / 'demo')]
+    options = ['--duration', '6', '--outage', '2', '--folder', str(tmp_path / 'demo')]
     environ = os.environ | {'COLUMNS': '80'}
     done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=110, check=False, env=environ)
     assert done.returncode == 0, done.stdout + done.stderr
