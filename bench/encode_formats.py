@@ -1,6 +1,7 @@
-"""Prints what the encode stage costs a message, in microseconds of one core, for the messages of a Go2.
+"""Prints what the encode stage costs a message, in microseconds of CPU, for the messages of a Go2.
 
-Run it as ``python bench/encode_formats.py [--json]``; it needs no ROS and takes a few seconds.
+Run it as ``python bench/encode_formats.py``; it needs no ROS and takes some ten seconds. ``--json > before.jsonl`` keeps the
+figures, ``--against before.jsonl`` shows the change as a ratio (those of one machine only can be compared).
 """
 
 from __future__ import annotations
@@ -8,7 +9,9 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from timeit import Timer
 from typing import Any, NamedTuple
@@ -35,6 +38,8 @@ class Case(NamedTuple):
     type: str
     cdr: bytes
     messages: int = 1
+    format: str = ''
+    """Another one than the sensor's own."""
 
 
 class Row(NamedTuple):
@@ -75,6 +80,18 @@ class Messages:
     def imu(self) -> tuple[Any, ...]:
         return self.floats(4), self.floats(3), self.floats(3), self.floats(3), 31
 
+    def standard_imu(self) -> tuple[Any, ...]:
+        """sensor_msgs/msg/Imu: nested vectors and three covariances, all float64."""
+        turn = self.of('geometry_msgs/msg/Quaternion', *self.rng.normal(size=4).tolist())
+        rate, push = (self.of('geometry_msgs/msg/Vector3', *self.rng.normal(size=3).tolist()) for _ in range(2))
+        return self.header(), turn, self.rng.normal(size=9), rate, self.rng.normal(size=9), push, self.rng.normal(size=9)
+
+    def depth(self) -> Any:
+        """640 x 480 millimetres of a slanted wall, with noise and a tenth of holes."""
+        wall = np.linspace(500, 6000, 640)[None, :] + np.linspace(0, 2000, 480)[:, None]
+        noisy = (wall + self.rng.normal(0, 4, wall.shape)).astype(np.uint16)
+        return np.where(self.rng.random(wall.shape) < 0.1, np.uint16(0), noisy)
+
     def lowstate(self) -> tuple[Any, ...]:
         pair, feet, ntc = np.zeros(2, np.uint32), np.full(4, 120, np.int16), np.full(2, 30, np.int8)
         motors = [self.of('go2_interfaces/msg/MotorState', 1, *self.floats(7).tolist(), 40, 0, pair) for _ in range(20)]
@@ -100,18 +117,41 @@ class Messages:
         return self.header(), [f'joint_{index}' for index in range(12)], self.floats(12).astype(np.float64), none, none
 
     def cases(self) -> Iterator[Case]:
-        picture = self.picture()
-        jpeg = np.frombuffer(simplejpeg.encode_jpeg(picture, 85, 'BGR', '420'), np.uint8)
-        imu, joints, image = 'go2_interfaces/msg/IMU', 'sensor_msgs/msg/JointState', 'sensor_msgs/msg/Image'
-        cloud, compressed, low = 'sensor_msgs/msg/PointCloud2', 'sensor_msgs/msg/CompressedImage', 'go2_interfaces/msg/LowState'
+        """One a format, by the sensor and type that mostly use it."""
+        yield from self.numbers()
+        yield from self.images()
+        cloud = 'sensor_msgs/msg/PointCloud2'
+        packed = self.cdr(cloud, *self.cloud(20_000, 4))
+        yield Case('pcd    PointCloud2, 20,000 points', 'lidar', cloud, packed)
+        yield Case('pcd    the same with padding', 'lidar', cloud, self.cdr(cloud, *self.cloud(20_000, 8)))
+        yield Case('tar    PointCloud2, batch of 10', 'lidar', cloud, packed, 10, 'tar')
+        yield Case('cdr    PointCloud2', 'lidar', cloud, packed, 1, 'cdr')
+
+    def numbers(self) -> Iterator[Case]:
+        imu, joints, low = 'go2_interfaces/msg/IMU', 'sensor_msgs/msg/JointState', 'go2_interfaces/msg/LowState'
+        standard = 'sensor_msgs/msg/Imu'
         yield Case('json   IMU, batch of 100', 'imu', imu, self.cdr(imu, *self.imu()), 100)
+        yield Case('json   IMU, batch of 2,000', 'imu', imu, self.cdr(imu, *self.imu()), 2000)
+        yield Case('json   sensor_msgs Imu, batch of 2,000', 'imu', standard, self.cdr(standard, *self.standard_imu()), 2000)
         yield Case('json   JointState, batch of 50', 'joints', joints, self.cdr(joints, *self.joints()), 50)
         yield Case('json   LowState, batch of 10', 'lowstate', low, self.cdr(low, *self.lowstate()), 10)
-        yield Case('jpeg   CompressedImage', 'camera', compressed, self.cdr(compressed, self.header(), 'jpeg', jpeg))
-        values = (self.header(), 480, 640, 'bgr8', 0, 1920, picture.reshape(-1))
-        yield Case('jpeg   Image 640x480 bgr8', 'camera', image, self.cdr(image, *values))
-        yield Case('pcd    PointCloud2, 20,000 points', 'lidar', cloud, self.cdr(cloud, *self.cloud(20_000, 4)))
-        yield Case('pcd    the same with padding', 'lidar', cloud, self.cdr(cloud, *self.cloud(20_000, 8)))
+
+    def images(self) -> Iterator[Case]:
+        image, compressed = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
+        picture, depth = self.picture(), self.depth()
+        jpeg = np.frombuffer(simplejpeg.encode_jpeg(picture, 85, 'BGR', '420'), np.uint8)
+        published = self.cdr(compressed, self.header(), 'jpeg', jpeg)
+        raw = self.cdr(image, self.header(), 480, 640, 'bgr8', 0, 1920, picture.reshape(-1))
+        deep = self.cdr(image, self.header(), 480, 640, '16UC1', 0, 1280, depth.reshape(-1).view(np.uint8))
+        metres = (depth / 1000).astype(np.float32).reshape(-1).view(np.uint8)
+        yield Case('jpeg   CompressedImage', 'camera', compressed, published)
+        yield Case('jpeg   Image 640x480 bgr8', 'camera', image, raw)
+        yield Case('jpeg   Image 640x480 16UC1: PNG', 'camera', image, deep)
+        yield Case('jpeg   Image 640x480 32FC1: TIFF', 'camera', image,
+                   self.cdr(image, self.header(), 480, 640, '32FC1', 0, 2560, metres))  # fmt: skip
+        yield Case('png    Image 640x480 bgr8', 'camera', image, raw, 1, 'png')
+        yield Case('tar    CompressedImage, batch of 30', 'camera', compressed, published, 30, 'tar')
+        yield Case('zip    CompressedImage, batch of 30', 'camera', compressed, published, 30, 'zip')
 
 
 def measure(case: Case, sensor: SensorSettings, types: MessageTypes) -> Row:
@@ -128,7 +168,7 @@ def measure(case: Case, sensor: SensorSettings, types: MessageTypes) -> Row:
 
 
 def best_us(call: Callable[[], object]) -> float:
-    timer = Timer(call)
+    timer = Timer(call, timer=time.thread_time)  # what other processes take does not count
     number = max(1, int(timer.autorange()[0] * SECONDS_EACH / 0.2 / REPEATS))
     return min(timer.repeat(REPEATS, number)) / number * 1e6
 
@@ -141,20 +181,24 @@ def rows() -> Iterator[Row]:
         types = MessageTypes([prefix])
         sensors = {sensor.name: sensor for sensor in Settings.load({}, {}).sensors}
         for case in Messages().cases():
-            yield measure(case, sensors[case.sensor], types)
+            sensor = sensors[case.sensor]
+            yield measure(case, replace(sensor, format=case.format or sensor.format), types)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--json', action='store_true', help='print one JSON object a line')
-    as_json = parser.parse_args().json
-    if not as_json:
-        print(f'{"":36}{"decode us":>10}{"all us":>10}{"bytes in":>12}{"bytes out":>12}')
+    parser.add_argument('--against', type=argparse.FileType(), metavar='FILE', help='compare with the output of --json')
+    arguments = parser.parse_args()
+    before = {row['name']: row['encode_us'] for row in map(json.loads, arguments.against or ())}
+    if not arguments.json:
+        print(f'{"":40}{"decode us":>10}{"all us":>10}{"bytes in":>12}{"bytes out":>12}{"ratio" if before else "":>10}')
     for row in rows():
-        if as_json:
-            print(json.dumps(row._asdict()))
+        if arguments.json:
+            print(json.dumps(row._asdict()), flush=True)
         else:
-            print(f'{row.name:36}{row.decode_us:10.1f}{row.encode_us:10.1f}{row.bytes_in:12,}{row.bytes_out:12,}')
+            ratio = f'{row.encode_us / before[row.name]:10.2f}' if row.name in before else ''
+            print(f'{row.name:40}{row.decode_us:10.1f}{row.encode_us:10.1f}{row.bytes_in:12,}{row.bytes_out:12,}{ratio}')
 
 
 if __name__ == '__main__':

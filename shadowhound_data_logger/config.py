@@ -15,6 +15,8 @@ from typing import Any, Final
 from shadowhound_data_logger.errors import NameRefused, SettingError
 from shadowhound_data_logger.keys import KeyTemplate, check_name
 from shadowhound_data_logger.options import (
+    ARCHIVES,
+    BATCHED,
     DEFAULT_SENSORS,
     FORMATS,
     GROUPS,
@@ -149,9 +151,7 @@ def _sensor(name: str, given: dict[str, Any], robot: str) -> SensorSettings:
         raise SettingError(f'{name}.topics', list(sensor.topics), 'at least one topic')
     if len(sensor.types) > len(sensor.topics):
         raise SettingError(f'{name}.types', list(sensor.types), 'at most one type for each topic')
-    if sensor.batch_s and sensor.format != 'json':
-        text = f'0 with format {sensor.format!r}: only json objects hold several messages'
-        raise SettingError(f'{name}.batch_s', sensor.batch_s, text)
+    _check_batches(sensor)
     if 0 < sensor.rate_hz < MIN_RATE_HZ:
         raise SettingError(f'{name}.rate_hz', sensor.rate_hz, f'0, or at least {MIN_RATE_HZ}')
     try:
@@ -161,6 +161,18 @@ def _sensor(name: str, given: dict[str, Any], robot: str) -> SensorSettings:
     if not _BUCKET.fullmatch(sensor.bucket) or '..' in sensor.bucket:
         raise SettingError(f'{name}.bucket', sensor.bucket, 'a bucket name: 3 to 63 lower-case letters, digits, "-" and "."')
     return sensor
+
+
+def _check_batches(sensor: SensorSettings) -> None:
+    """Raises SettingError where format and batches contradict each other."""
+    text = f'0 with format {sensor.format!r}: only {", ".join(BATCHED)} objects hold several messages'
+    if sensor.batch_s and sensor.format not in BATCHED:
+        raise SettingError(f'{sensor.name}.batch_s', sensor.batch_s, text)
+    if sensor.batch_count and sensor.format not in BATCHED:
+        raise SettingError(f'{sensor.name}.batch_count', sensor.batch_count, text)
+    if sensor.format in ARCHIVES and not sensor.batched:
+        text = f'more than 0 with format {sensor.format!r}, or a batch_count: an archive holds several messages'
+        raise SettingError(f'{sensor.name}.batch_s', sensor.batch_s, text)
 
 
 def _fill(kind: type, prefix: str, given: dict[str, Any], defaults: Mapping[str, Any] | None = None) -> Any:

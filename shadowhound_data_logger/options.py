@@ -11,16 +11,20 @@ from shadowhound_data_logger.clock import SECOND
 
 MEBI: Final = 1 << 20
 GIBI: Final = 1 << 30
-FORMATS: Final = ('jpeg', 'pcd', 'json')
+FORMATS: Final = ('jpeg', 'png', 'pcd', 'json', 'cdr', 'zip', 'tar')
+ARCHIVES: Final = ('zip', 'tar')
+"""Formats that hold a file of each message; they make sense for batches alone."""
+BATCHED: Final = ('json', *ARCHIVES)
+"""Formats that can hold several messages."""
 COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
 IMAGE: Final = 'sensor_msgs/msg/Image'
 POINT_CLOUD: Final = 'sensor_msgs/msg/PointCloud2'
 
 
 def _setting(default: Any, text: str, *, low: float | None = None, high: float | None = None,
-             choices: Sequence[str] = ()) -> Any:  # fmt: skip
-    """A dataclass field that knows its help text and what values it allows."""
-    metadata = {'help': text, 'low': low, 'high': high, 'choices': tuple(choices)}
+             choices: Sequence[str] = (), live: bool = False) -> Any:  # fmt: skip
+    """A dataclass field that knows its help text, what values it allows, and whether it can be changed while the node runs."""
+    metadata = {'help': text, 'low': low, 'high': high, 'choices': tuple(choices), 'live': live}
     if isinstance(default, (tuple, list)):
         return field(default_factory=lambda: tuple(default), metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -31,21 +35,31 @@ class SensorSettings:
     """One sensor: the topic it is taken from, what is kept of it, and what becomes of that."""
 
     name: str
-    enabled: bool = _setting(True, 'Log this sensor.')
+    enabled: bool = _setting(True, 'Log this sensor.', live=True)
     topics: tuple[str, ...] = _setting((), 'Topics it can come from, the preferred one first; relative to the namespace.')
     types: tuple[str, ...] = _setting((), 'Expected type of each topic; a publisher that exists overrides it.')
-    rate_hz: float = _setting(1.0, 'Keep the first message of each whole period; 0 keeps every message.', low=0.0, high=1e6)
+    rate_hz: float = _setting(
+        1.0, 'Keep the first message of each whole period; 0 keeps every message.', low=0.0, high=1e6, live=True
+    )
     on_change: bool = _setting(False, 'Keep a message only when its content, but for its stamp, is not that of the last one.')
     batch_s: float = _setting(0.0, 'Seconds of messages an object; 0 makes one object of each message.', low=0.0, high=3600.0)
+    batch_count: int = _setting(0, 'Most messages an object, whichever comes first; 0 is no limit.', low=0, high=10_000)
     format: str = _setting('json', 'What an object is encoded as.', choices=FORMATS)
-    quality: int = _setting(85, 'JPEG quality where an image has to be encoded.', low=1, high=100)
+    quality: int = _setting(85, 'JPEG quality where an image has to be encoded.', low=1, high=100, live=True)
     bucket: str = _setting('sensor-data', 'Bucket of its objects.')
     key: str = _setting('{robot}/{sensor}/{date}/{time}_{sensor}.{ext}', 'Key of an object; {date} and {time} are UTC.')
-    priority: int = _setting(5, '0 ships first and is dropped or evicted last, 9 the other way round.', low=0, high=9)
+    priority: int = _setting(5, '0 ships first and is dropped or evicted last, 9 the other way round.', low=0, high=9, live=True)
+
+    @property
+    def batched(self) -> bool:
+        """Whether an object holds several messages."""
+        return bool(self.batch_s or self.batch_count)
 
     @property
     def period_ns(self) -> int:
-        """The time between two objects as far as their names go, ns; 0 where every message is one."""
+        """The time between two objects as far as their names go, ns; 0 where they can follow each other at any distance."""
+        if self.batch_count:
+            return 0
         if self.batch_s:
             return round(self.batch_s * 1e9)
         if self.on_change:
@@ -95,6 +109,9 @@ class UploadSettings:
     connect_timeout_s: float = _setting(5.0, 'Seconds to wait for a connection.', low=0.1, high=60.0)
     read_timeout_s: float = _setting(30.0, 'Seconds to wait for an answer.', low=0.1, high=600.0)
     backoff_s: float = _setting(60.0, 'Longest pause between two tries while the store is away.', low=0.1, high=3600.0)
+    max_mbps: float = _setting(
+        0.0, 'Most megabits of payload a second to an S3 server; 0 is no cap.', low=0.0, high=1e5, live=True
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,4 +163,8 @@ DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
         'topics': ('joint_states',), 'types': ('sensor_msgs/msg/JointState',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4,
     },
     'lowstate': {'topics': ('lowstate',), 'types': ('go2_interfaces/msg/LowState',), 'batch_s': 10.0, 'priority': 3},
+    'voxel_map': {
+        'enabled': False, 'topics': ('utlidar/voxel_map_compressed',), 'types': ('go2_interfaces/msg/VoxelMapCompressed',),
+        'format': 'cdr', 'priority': 8,
+    },
 }  # fmt: skip

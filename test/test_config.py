@@ -30,7 +30,7 @@ def test_nothing_has_to_be_set() -> None:
     assert settings.spool_path == settings.home / 'spool'
     assert (settings.store.endpoint_url, settings.store.directory) == (None, settings.home / 'store')
     assert [sensor.name for sensor in settings.sensors] == [
-        'camera', 'camera_info', 'lidar', 'imu', 'odom', 'states', 'joints', 'lowstate',
+        'camera', 'camera_info', 'lidar', 'imu', 'odom', 'states', 'joints', 'lowstate', 'voxel_map',
     ]  # fmt: skip
     assert (settings.spool.max_bytes, settings.spool.min_free_bytes) == (20 * GIBI, 2 * GIBI)
     assert settings.shutdown.drain_s == 3.0
@@ -59,10 +59,12 @@ def test_a_robot_name_that_is_no_word(value: object) -> None:
 @pytest.mark.parametrize(('name', 'value', 'allowed'), [
     ('camera.rate_hz', 'fast', 'a number'), ('camera.rate_hz', -1.0, '0 to'), ('camera.rate_hz', float('nan'), '0 to'),
     ('camera.rate_hz', True, 'a number'), ('camera.quality', 101, '1 to 100'), ('camera.quality', 80.0, 'a whole number'),
-    ('camera.enabled', 1, 'true or false'), ('camera.format', 'png', 'jpeg, pcd, json'),
+    ('camera.enabled', 1, 'true or false'), ('camera.format', 'gif', 'jpeg, png, pcd, json, cdr, zip, tar'),
     ('camera.topics', 'a', 'a list of strings'),
     ('camera.topics', [], 'at least one topic'), ('camera.topics', [''], 'at least one topic'), ('camera.topics', [5], 'a list'),
     ('imu.types', ['a', 'b'], 'at most one type'), ('camera.batch_s', 1.0, '0 with format'),
+    ('camera.batch_count', 10, '0 with format'), ('imu.batch_count', 10_001, '0 to 10000'), ('imu.batch_count', 2.0, 'a whole'),
+    ('voxel_map.batch_s', 1.0, '0 with format'),
     ('camera.bucket', '../x', 'letters'),
     ('camera.key', '{robot}/front.jpg', '{date} and {time}'), ('camera.priority', 10, '0 to 9'),
     ('spool.max_bytes', 5, 'at least'),
@@ -108,6 +110,24 @@ def test_a_sensor_of_ones_own() -> None:
     """A sensor that is no default takes any topic; whole numbers pass where fractions are allowed."""
     (sensor,) = load(sensors=['thermal'], thermal__topics=['thermal/raw'], thermal__rate_hz=2).sensors
     assert (sensor.name, sensor.topics, sensor.rate_hz, sensor.period_ns) == ('thermal', ('thermal/raw',), 2.0, 500_000_000)
+
+
+def test_an_archive_is_of_several_messages() -> None:
+    """A zip or tar without a limit in time or number is refused; either limit, or both, will do."""
+    error = refused(camera__format='zip')
+    assert (error.data['name'], error.data['value']) == ('camera.batch_s', 0.0)
+    assert 'batch_count' in error.data['allowed']
+    for limits in ({'batch_s': 1.0}, {'batch_count': 10}, {'batch_s': 1.0, 'batch_count': 10}):
+        assert load(camera__format='tar', **{f'camera__{name}': value for name, value in limits.items()}).sensors[0].batched
+
+
+def test_the_least_time_between_two_objects() -> None:
+    """Names go by the batch, else by the rate; a number of messages can be reached at any time."""
+    imu = {'imu__rate_hz': 0.0, 'imu__batch_s': 10.0}
+    assert load(**imu).sensors[3].period_ns == 10_000_000_000
+    assert load(**imu, imu__batch_count=5).sensors[3].period_ns == 0
+    assert load(imu__rate_hz=4.0, imu__batch_s=0.0).sensors[3].period_ns == 250_000_000
+    assert load(imu__rate_hz=0.0, imu__batch_s=0.0).sensors[3].period_ns == 0
 
 
 def test_parameters_of_ros_itself_are_not_ours() -> None:

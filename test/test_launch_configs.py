@@ -1,4 +1,4 @@
-"""The parameter file spells out exactly the defaults of the code."""
+"""The parameter files: one spells out exactly the defaults of the code, the other stores everything."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
+from shadowhound_data_logger.capture.gate import EveryMessage, gate_for
 from shadowhound_data_logger.config import Settings, default_parameters
 
 FOLDER = Path(__file__).parents[1] / 'launch_configs'
@@ -36,3 +37,20 @@ def test_go2_yaml_is_the_defaults() -> None:
 def test_every_parameter_file_is_valid(path: Path) -> None:
     """The node starts with each of the files."""
     assert Settings.load(parameters(path), {}).sensors
+
+
+def test_the_full_rate_keeps_every_message() -> None:
+    """With go2_full_rate.yaml every sensor of go2.yaml is logged, none leaves a message out, an object holds a second."""
+    settings = Settings.load(parameters(FOLDER / 'go2_full_rate.yaml'), {})
+    assert [sensor.name for sensor in settings.sensors] == parameters(FOLDER / 'go2.yaml')['sensors']
+    for sensor in settings.sensors:
+        assert sensor.enabled, sensor.name
+        assert sensor.batch_s == 1.0, sensor.name
+        assert isinstance(gate_for(sensor, has_header=True, last_kept_ns=0), EveryMessage), sensor.name
+
+
+def test_the_full_rate_says_only_what_differs() -> None:
+    """Each line of go2_full_rate.yaml changes a default: what it does not change is read in go2.yaml."""
+    defaults = default_parameters()
+    same = [name for name, value in parameters(FOLDER / 'go2_full_rate.yaml').items() if defaults[name] == value]
+    assert same == []

@@ -11,6 +11,8 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Batch, Sample
 
+Fact = str | int | float
+
 
 @dataclass(frozen=True, slots=True)
 class Job:
@@ -30,30 +32,46 @@ class Payload:
     kept: tuple[Sample, ...]
     ext: str
     content_type: str
-    metadata: Mapping[str, str] = field(default_factory=dict)
-    """Further S3 user metadata: lower-case names, printable ASCII values."""
+    facts: Mapping[str, Fact] = field(default_factory=dict)
+    """What is known of the content: lower-case names, numbers or printable ASCII. It becomes the object's S3 user metadata,
+    or in an archive the JSON beside the file."""
 
 
-Encoder = Callable[[Job, Counter[str]], 'Payload | None']
-"""Makes one payload of a job and adds what it could not use to the counter, by reason; None when nothing is left."""
+@dataclass(frozen=True, slots=True)
+class Rejections:
+    """The samples of a batch that are not in its object."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    details: dict[str, str] = field(default_factory=dict)
+    """Reason -> what was wrong with the first one, a sentence."""
+
+    def add(self, error: Rejected, samples: int = 1) -> None:
+        self.counts[error.reason] += samples
+        self.details.setdefault(error.reason, str(error))
 
 
-def one_message(encode: Callable[[Job, Sample], Payload]) -> Encoder:
-    """An encoder for a format that holds a single message, from a function that raises Rejected for a bad one.
+Encoder = Callable[[Job, Rejections], 'Payload | None']
+"""Makes one payload of a job and adds what it could not use to the rejections; None when nothing is left."""
+OneMessage = Callable[[Job, Sample], Payload]
+"""Makes a payload of one message, or raises Rejected."""
+
+
+def one_message(encode: OneMessage) -> Encoder:
+    """An encoder for a format that holds a single message.
 
     Settings refuse to batch such a format; should a batch come all the same, its later samples count as ``surplus``.
     """
 
-    def encoder(job: Job, rejected: Counter[str]) -> Payload | None:
+    def encoder(job: Job, rejections: Rejections) -> Payload | None:
         payload = None
         for sample in job.batch.samples:
             if payload is not None:
-                rejected['surplus'] += 1
+                rejections.add(Rejected('surplus', f'{job.sensor.format} holds one message'))
                 continue
             try:
                 payload = encode(job, sample)
             except Rejected as error:
-                rejected[error.reason] += 1
+                rejections.add(error)
         return payload
 
     return encoder

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from shadowhound_data_logger.encode.payload import Job, Payload
+from shadowhound_data_logger.encode.payload import Fact, Job, Payload
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
 from shadowhound_data_logger.options import POINT_CLOUD
@@ -64,8 +64,8 @@ def encode_cloud(job: Job, sample: Sample) -> Payload:
     fields = _fields(cloud)
     points = _points(cloud, fields, row_step)
     body = b''.join((_header(cloud, fields, sample.stamp_ns), points.data))
-    metadata = {'points': str(cloud.width * cloud.height), 'is_dense': str(bool(cloud.is_dense)).lower()}
-    return Payload(body, (sample,), 'pcd', 'application/octet-stream', metadata)
+    facts: dict[str, Fact] = {'points': cloud.width * cloud.height, 'is_dense': bool(cloud.is_dense)}
+    return Payload(body, (sample,), 'pcd', 'application/octet-stream', facts)
 
 
 def _row_step(cloud: Any) -> int:

@@ -5,6 +5,7 @@ Every sample that goes in comes out as stored or as rejected with a reason, also
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping
 from typing import Final
@@ -15,6 +16,8 @@ from shadowhound_data_logger.encode.registry import encode
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, DataObject
 from shadowhound_data_logger.worker import Worker
+
+log = logging.getLogger(__name__)
 
 WAIT_S: Final = 0.5
 Reject = Callable[[str, Mapping[str, int]], None]
@@ -31,6 +34,7 @@ class EncodePool:
         self._types = types
         self._put = put
         self._reject = reject
+        self._told: set[tuple[str, str]] = set()
         self.workers = [Worker(f'encode-{number}', self._step) for number in range(threads)]
 
     def open(self) -> None:
@@ -49,7 +53,10 @@ class EncodePool:
     def _step(self) -> None:
         batch = self._queue.get(WAIT_S)
         if batch is not None:
-            self._encode(batch)
+            try:
+                self._encode(batch)
+            finally:
+                self._queue.done(batch)
         elif self._queue.closed:
             for worker in self.workers:
                 worker.stop()
@@ -62,5 +69,13 @@ class EncodePool:
             raise
         if encoding.rejected:
             self._reject(batch.topic, encoding.rejected)
+            self._tell(batch.topic, encoding.details)
         if encoding.object is not None:
             self._put(encoding.object)
+
+    def _tell(self, topic: str, details: Mapping[str, str]) -> None:
+        """Say once for each topic and reason what is wrong; the ledger counts the rest."""
+        for reason, text in details.items():
+            if (topic, reason) not in self._told:
+                self._told.add((topic, reason))
+                log.warning('%s: a message cannot be stored: %s; more of these are only counted', topic, text)

@@ -7,78 +7,86 @@ itself gets an underscore behind it.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any, Final
 
 import orjson
 
 from shadowhound_data_logger.clock import iso
-from shadowhound_data_logger.encode.payload import Job, Payload
+from shadowhound_data_logger.encode.payload import Job, Payload, Rejections
 from shadowhound_data_logger.encode.plain import converter, widened
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
 
 ODOMETRY: Final = 'nav_msgs/msg/Odometry'
 NON_FINITE: Final = 'non_finite'
+_TAKEN: Final = frozenset({'stamp_ns', NON_FINITE})
+_AT_ONCE: Final = 100
+"""Records that are Python objects at a time: they take twenty times the bytes of the message, and ``orjson`` holds the GIL
+while it writes them."""
 _AWKWARD: Final = b'7.038531e-26'
 """The shortest decimal of a float32 that comes out as its neighbour when it is read by way of a float64, as JSON readers
 do; there is no other (and its negative) among all float32."""
+Record = Callable[[Job, Sample, Any], dict[str, Any]]
+"""From a decoded message to what is written of it."""
 
 
-def encode_records(job: Job, rejected: Counter[str]) -> Payload | None:
-    """The JSON of a batch; messages that cannot be decoded are counted as ``malformed`` or ``unknown_type``."""
-    kept, records = [], []
+def encode_records(job: Job, rejections: Rejections) -> Payload | None:
+    """The JSON of a batch; messages that cannot be decoded are rejected as ``malformed`` or ``unknown_type``."""
+    batched = job.sensor.batched or len(job.batch.samples) > 1
+    kept: list[Sample] = []
+    records = _records(job, _of_batch if batched else _alone, kept, rejections)
+    parts: list[bytes] = []
+    non_finite = 0
+    while some := list(islice(records, _AT_ONCE)):
+        part, missing = _dump(some)
+        parts.append(part[1:-1])
+        non_finite += missing
+    if not kept:
+        return None
+    body = b','.join(parts)
+    if batched:
+        body = b'%b,"samples":[%b]}' % (_head(job, kept)[:-1], body)
+    if non_finite:
+        body = b'%b,"non_finite":%d}' % (body[:-1], non_finite)
+    return Payload(body, tuple(kept), 'json', 'application/json')
+
+
+def _records(job: Job, record: Record, kept: list[Sample], rejections: Rejections) -> Iterator[dict[str, Any]]:
+    """What can be decoded of the batch, in its order; adds each such sample to ``kept``."""
     for sample in job.batch.samples:
         try:
             message = job.types.deserialize(job.batch.type, sample.cdr)
         except Rejected as error:
-            rejected[error.reason] += 1
+            rejections.add(error)
             continue
         kept.append(sample)
-        records.append(message)
-    if not kept:
-        return None
-    single = not job.sensor.batch_s and len(kept) == 1
-    document = _record(job, kept[0], records[0]) if single else _batch(job, kept, records)
-    return Payload(_dump(document), tuple(kept), 'json', 'application/json')
+        yield record(job, sample, message)
 
 
-def _record(job: Job, sample: Sample, message: Any) -> dict[str, Any]:
+def _alone(job: Job, sample: Sample, message: Any) -> dict[str, Any]:
+    """The document of a single message."""
     special = _RECORDS.get(job.batch.type)
     if special is not None:
         return special(sample, message)
     own = {**_origin(job), 'timestamp': iso(sample.stamp_ns), 'stamp_ns': sample.stamp_ns}
-    return _merged(own, converter(job.types, job.batch.type)(message))
+    return {**own, **converter(job.types, job.batch.type, frozenset((*own, NON_FINITE)))(message)}
 
 
-def _batch(job: Job, kept: list[Sample], messages: list[Any]) -> dict[str, Any]:
-    convert = converter(job.types, job.batch.type)
+def _of_batch(job: Job, sample: Sample, message: Any) -> dict[str, Any]:
+    """A message among the samples of a batch."""
+    return {'stamp_ns': sample.stamp_ns, **converter(job.types, job.batch.type, _TAKEN)(message)}
+
+
+def _head(job: Job, kept: Sequence[Sample]) -> bytes:
+    """The document of a batch without its samples."""
     stamps = [sample.stamp_ns for sample in kept]
-    return {
-        **_origin(job),
-        'count': len(kept),
-        't_start_ns': min(stamps),
-        't_end_ns': max(stamps),
-        'samples': [_merged({'stamp_ns': stamp}, convert(message)) for stamp, message in zip(stamps, messages, strict=True)],
-    }
+    return orjson.dumps({**_origin(job), 'count': len(kept), 't_start_ns': min(stamps), 't_end_ns': max(stamps)})
 
 
 def _origin(job: Job) -> dict[str, Any]:
     return {'robot': job.robot, 'sensor': job.sensor.name, 'topic': job.batch.topic, 'type': job.batch.type}
-
-
-def _merged(own: dict[str, Any], fields: dict[str, Any]) -> dict[str, Any]:
-    """The document's own entries, then the message's fields, renamed where the name is taken."""
-    if own.keys().isdisjoint(fields) and NON_FINITE not in fields:
-        own.update(fields)
-        return own
-    for name, value in fields.items():
-        key = name
-        while key in own or key == NON_FINITE or (key != name and key in fields):
-            key += '_'
-        own[key] = value
-    return own
 
 
 def _odometry(sample: Sample, message: Any) -> dict[str, Any]:
@@ -104,16 +112,13 @@ _RECORDS: Final[Mapping[str, Callable[[Sample, Any], dict[str, Any]]]] = {ODOMET
 """Types whose single record has a form of its own."""
 
 
-def _dump(document: dict[str, Any]) -> bytes:
-    body = orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
+def _dump(records: list[dict[str, Any]]) -> tuple[bytes, int]:
+    """The records as a JSON list, and how many of their numbers are not finite and so became null."""
+    body = orjson.dumps(records, option=orjson.OPT_SERIALIZE_NUMPY)
     if _AWKWARD in body:
-        document = widened(document)
-        body = orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
-    if b'null' in body:  # a message has no nulls of its own, but text may contain the word
-        missing = _nulls(orjson.loads(body))
-        if missing:
-            body = orjson.dumps({**document, NON_FINITE: missing}, option=orjson.OPT_SERIALIZE_NUMPY)
-    return body
+        body = orjson.dumps(widened(records), option=orjson.OPT_SERIALIZE_NUMPY)
+    # A message has no nulls of its own, but text may contain the word.
+    return body, _nulls(orjson.loads(body)) if b'null' in body else 0
 
 
 def _nulls(value: Any) -> int:

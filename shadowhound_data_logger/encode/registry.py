@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from shadowhound_data_logger.config import SensorSettings
-from shadowhound_data_logger.encode.image import encode_image
-from shadowhound_data_logger.encode.payload import Encoder, Job, Payload, one_message
+from shadowhound_data_logger.encode.archive import archive, pack_tar, pack_zip
+from shadowhound_data_logger.encode.image import encode_jpeg, encode_png
+from shadowhound_data_logger.encode.payload import Encoder, Fact, Job, Payload, Rejections, one_message
 from shadowhound_data_logger.encode.pointcloud import encode_cloud
+from shadowhound_data_logger.encode.raw import encode_cdr
 from shadowhound_data_logger.encode.records import encode_records
 from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.errors import NameRefused
+from shadowhound_data_logger.errors import NameRefused, Rejected
 from shadowhound_data_logger.keys import KeyTemplate
 from shadowhound_data_logger.model import Batch, DataObject
 
 ENCODERS: Final[Mapping[str, Encoder]] = {
-    'jpeg': one_message(encode_image),
+    'jpeg': one_message(encode_jpeg),
+    'png': one_message(encode_png),
     'pcd': one_message(encode_cloud),
     'json': encode_records,
+    'cdr': one_message(encode_cdr),
+    'zip': archive(pack_zip, 'zip', 'application/zip'),
+    'tar': archive(pack_tar, 'tar', 'application/x-tar'),
 }
-"""Format name of the settings -> encoder. A new format is one file and one line here (and its name in config.FORMATS)."""
+"""Format name of the settings -> encoder. A new format is one file and one line here (and its name in options.FORMATS)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,14 +38,21 @@ class Encoding:
     """None when no sample could be encoded."""
     rejected: Mapping[str, int]
     """Reason -> number of samples that are not in the object."""
+    details: Mapping[str, str] = field(default_factory=dict)
+    """Reason -> what was wrong with the first of them."""
 
 
 def encode(batch: Batch, sensor: SensorSettings, robot: str, types: MessageTypes) -> Encoding:
     """Encode a batch in the sensor's format. Thread-safe; a sample that cannot be encoded is counted, the rest goes on."""
-    rejected: Counter[str] = Counter()
-    payload = ENCODERS[sensor.format](Job(batch, sensor, robot, types), rejected)
+    rejections = Rejections()
+    made = _encode(batch, sensor, robot, types, rejections)
+    return Encoding(made, dict(rejections.counts), rejections.details)
+
+
+def _encode(batch: Batch, sensor: SensorSettings, robot: str, types: MessageTypes, rejections: Rejections) -> DataObject | None:
+    payload = ENCODERS[sensor.format](Job(batch, sensor, robot, types), rejections)
     if payload is None:
-        return Encoding(None, dict(rejected))
+        return None
     try:
         key = KeyTemplate(sensor.key).render(
             robot=robot,
@@ -49,10 +61,10 @@ def encode(batch: Batch, sensor: SensorSettings, robot: str, types: MessageTypes
             period_ns=sensor.period_ns,
             ext=payload.ext,
         )
-    except NameRefused:
-        rejected['unsafe_key'] += len(payload.kept)
-        return Encoding(None, dict(rejected))
-    return Encoding(_object(batch, sensor, robot, payload, key), dict(rejected))
+    except NameRefused as error:
+        rejections.add(Rejected('unsafe_key', str(error)), len(payload.kept))
+        return None
+    return _object(batch, sensor, robot, payload, key)
 
 
 def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, key: str) -> DataObject:
@@ -79,5 +91,9 @@ def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, 
         t_start_ns=start_ns,
         t_end_ns=end_ns,
         priority=sensor.priority,
-        metadata={**payload.metadata, **metadata},
+        metadata={**{name: _text(fact) for name, fact in payload.facts.items()}, **metadata},
     )
+
+
+def _text(fact: Fact) -> str:
+    return str(fact).lower() if isinstance(fact, bool) else str(fact)

@@ -31,16 +31,28 @@ PLACEHOLDER: Final = 'structure_needs_at_least_one_member'
 _TYPE_NAME = re.compile(r'[A-Za-z]\w*/msg/[A-Za-z]\w*', re.ASCII)
 _STAMP_LE: Final = struct.Struct('<iI')
 _STAMP_BE: Final = struct.Struct('>iI')
-_STAMP_OFFSET: Final = 4
-"""Behind the encapsulation header of CDR, where a message that begins with a std_msgs/msg/Header has its stamp."""
+_LENGTH_LE: Final = struct.Struct('<I')
+_LENGTH_BE: Final = struct.Struct('>I')
+ENCAPSULATION_BYTES: Final = 4
+"""Before the message in CDR; the second byte tells the endianness. A std_msgs/msg/Header that comes first follows at once:
+its stamp (8 bytes), then the length of its frame_id with the NUL (4), then that."""
 
 
 def header_stamp_ns(cdr: bytes | memoryview) -> int:
     """``header.stamp`` in ns of a message whose first field is a std_msgs/msg/Header; 0 where the bytes are too few."""
-    if len(cdr) < _STAMP_OFFSET + _STAMP_LE.size:
+    if len(cdr) < ENCAPSULATION_BYTES + _STAMP_LE.size:
         return 0
-    sec, nanosec = (_STAMP_LE if cdr[1] else _STAMP_BE).unpack_from(cdr, _STAMP_OFFSET)
+    sec, nanosec = (_STAMP_LE if cdr[1] else _STAMP_BE).unpack_from(cdr, ENCAPSULATION_BYTES)
     return int(sec) * SECOND + int(nanosec)
+
+
+def header_frame_id(cdr: bytes) -> str:
+    """``header.frame_id`` of such a message; empty where the bytes are too few, U+FFFD where they are no UTF-8."""
+    start = ENCAPSULATION_BYTES + _STAMP_LE.size + _LENGTH_LE.size
+    if len(cdr) < start:
+        return ''
+    (length,) = (_LENGTH_LE if cdr[1] else _LENGTH_BE).unpack_from(cdr, start - _LENGTH_LE.size)
+    return cdr[start : start + length - 1].decode('utf-8', 'replace') if 0 < length <= len(cdr) - start else ''
 
 
 class MessageTypes:

@@ -1,14 +1,24 @@
-"""Batches are whole windows of UTC, bounded in time and size."""
+"""Batches are whole windows of UTC, bounded in time, number and size."""
 
 from __future__ import annotations
 
-from shadowhound_data_logger.capture.batching import MAX_BATCH_BYTES, Batcher
+import pytest
+
+from shadowhound_data_logger.capture.batching import (
+    MAX_ARCHIVE_BYTES,
+    MAX_BATCH_BYTES,
+    MAX_BATCH_MESSAGES,
+    MAX_BATCH_S,
+    Batcher,
+)
 from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.model import Batch, Sample
 
 
-def batcher(batch_ns: int = SECOND) -> Batcher:
-    return Batcher('imu', '/imu', 'sensor_msgs/msg/Imu', batch_ns)
+def batcher(batch_s: float = 1.0, batch_count: int = 0, format_name: str = 'json') -> Batcher:
+    sensor = SensorSettings(name='imu', batch_s=batch_s, batch_count=batch_count, format=format_name)
+    return Batcher(sensor, '/imu', 'sensor_msgs/msg/Imu')
 
 
 def stamps(batch: Batch) -> list[int]:
@@ -35,18 +45,49 @@ def test_a_batch_says_what_it_is() -> None:
 
 def test_without_a_window_each_message_is_a_batch() -> None:
     """With 0 nothing is ever open."""
-    open_batch = batcher(0)
+    open_batch = batcher(batch_s=0.0)
     assert [stamps(batch) for batch in open_batch.add(Sample(7, b''), 0.0)] == [[7]]
     assert not len(open_batch)
 
 
-def test_a_large_batch_is_closed_early() -> None:
-    """Memory is bounded whatever a topic sends; a message that ends two batches closes both."""
-    open_batch = batcher()
-    assert open_batch.add(Sample(0, b''), 0.0) == []
-    large = Sample(SECOND, bytes(MAX_BATCH_BYTES))
+def test_a_number_of_messages_ends_a_batch() -> None:
+    """With batch_count the batch is closed with its last message, within a window of time as well."""
+    open_batch = batcher(batch_s=0.0, batch_count=3)
+    closed = [batch for stamp in range(7) for batch in open_batch.add(Sample(stamp * SECOND, b''), 0.0)]
+    assert [len(batch.samples) for batch in closed] == [3, 3]
+    assert len(open_batch) == 1
+    open_batch = batcher(batch_s=1.0, batch_count=3)
+    closed = [batch for stamp in range(7) for batch in open_batch.add(Sample(stamp * SECOND // 5, b''), 0.0)]
+    assert [len(batch.samples) for batch in closed] == [3, 2]
+    assert len(open_batch) == 2
+
+
+def test_a_number_alone_does_not_keep_a_batch_open_for_ever() -> None:
+    """A batch that never gets its number of messages is due after a minute, however far its stamps are apart."""
+    open_batch = batcher(batch_s=0.0, batch_count=1000)
+    assert open_batch.add(Sample(0, b''), 10.0) == []
+    assert open_batch.add(Sample(50 * SECOND, b''), 60.0) == []
+    assert not open_batch.is_due(10.0 + MAX_BATCH_S, 0.1)
+    assert open_batch.is_due(10.2 + MAX_BATCH_S, 0.1)
+
+
+@pytest.mark.parametrize(('format_name', 'most'), [('json', MAX_BATCH_BYTES), ('tar', MAX_ARCHIVE_BYTES)])
+def test_a_large_batch_is_closed_early(format_name: str, most: int) -> None:
+    """Memory is bounded whatever a topic sends, to what a format makes of it; a message that ends two batches closes both."""
+    open_batch = batcher(format_name=format_name)
+    assert open_batch.add(Sample(0, bytes(most - 1)), 0.0) == []
+    large = Sample(SECOND, bytes(most))
     assert [stamps(batch) for batch in open_batch.add(large, 0.0)] == [[0], [SECOND]]
     assert not len(open_batch)
+
+
+def test_many_small_messages_are_closed_early() -> None:
+    """However small its messages, a batch always fits into the queue that it has to pass."""
+    open_batch = batcher(batch_s=3600.0)
+    closed = [batch for stamp in range(MAX_BATCH_MESSAGES) for batch in open_batch.add(Sample(stamp, b''), 0.0)]
+    assert [len(batch.samples) for batch in closed] == [MAX_BATCH_MESSAGES]
+    assert QueueSettings().max_messages >= 4 * MAX_BATCH_MESSAGES
+    assert QueueSettings().max_bytes >= 4 * MAX_ARCHIVE_BYTES
 
 
 def test_a_batch_is_due_when_its_time_is_over() -> None:

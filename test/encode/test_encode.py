@@ -96,7 +96,7 @@ def test_nothing_left(ros: Any) -> None:
     assert encoding.rejected == {'malformed': 2}
 
 
-@pytest.mark.parametrize('format_name', ['jpeg', 'pcd'])
+@pytest.mark.parametrize('format_name', ['jpeg', 'png', 'pcd'])
 def test_a_type_the_format_is_not_for(ros: Any, format_name: str) -> None:
     """Every sample of a type that a format cannot hold is rejected as such."""
     encoding = ros.encode(IMU, ros.cdr(IMU), ros.cdr(IMU), format=format_name)
@@ -106,9 +106,30 @@ def test_a_type_the_format_is_not_for(ros: Any, format_name: str) -> None:
 
 @pytest.mark.parametrize('format_name', FORMATS)
 def test_a_type_without_a_definition(ros: Any, format_name: str) -> None:
-    """Samples of an unknown type are rejected, by all formats."""
-    reason = 'unknown_type' if format_name == 'json' else 'wrong_type'
-    assert ros.encode('nobody_msgs/msg/X', b'\0\1\0\0', sensor='imu', format=format_name).rejected == {reason: 1}
+    """Samples of an unknown type are rejected by all formats that have to read them; serialized bytes need no definition."""
+    encoding = ros.encode('nobody_msgs/msg/X', b'\0\1\0\0', sensor='imu', format=format_name)
+    reason = {'json': 'unknown_type', 'cdr': None, 'zip': None, 'tar': None}.get(format_name, 'wrong_type')
+    assert encoding.rejected == ({reason: 1} if reason else {})
+    assert (encoding.object is None) == bool(reason)
+
+
+def test_the_first_of_each_reason_is_told(ros: Any) -> None:
+    """Beside the count of a reason stands a sentence about the first sample, for people."""
+    encoding = ros.encode('sensor_msgs/msg/Image', b'', b'', ros.cdr('sensor_msgs/msg/Image', encoding='bayer_rggb8'))
+    assert encoding.rejected == {'malformed': 2, 'unsupported_encoding': 1}
+    assert list(encoding.details) == ['malformed', 'unsupported_encoding']
+    assert "'bayer_rggb8' is none of bgr8" in encoding.details['unsupported_encoding']
+
+
+@pytest.mark.parametrize('type_name', [IMU, 'go2_interfaces/msg/VoxelMapCompressed', 'nobody_msgs/msg/X'])
+def test_serialized_bytes(ros: Any, type_name: str) -> None:
+    """With format cdr the object is the message as it was taken, whatever its type; what is too short for CDR is rejected."""
+    cdr = b'\0\1\0\0' + bytes(range(40))
+    made = ros.encode(type_name, cdr, sensor='voxel_map').object
+    assert made.body == cdr
+    assert (made.key, made.content_type) == ('thor/voxel_map/20251018/120000_voxel_map.cdr', 'application/octet-stream')
+    assert (made.type, made.metadata['type']) == (type_name, type_name)
+    assert ros.encode(type_name, cdr[:3], sensor='voxel_map').rejected == {'malformed': 1}
 
 
 def test_a_batch_of_pictures_loses_none_unseen(ros: Any) -> None:
@@ -149,9 +170,11 @@ def test_hostile_bytes(ros: Any, type_name: str, data: st.DataObject) -> None:
         valid[position] = value
     noise = data.draw(st.binary(max_size=200))
     samples = (bytes(valid), noise, b'\0\1\0\0' + noise, b'\0\0\0\0' + noise, bytes(valid[: len(valid) // 2]) + noise)
-    encoding = ros.encode(type_name, *samples, sensor=SENSOR_OF.get(type_name, 'imu'))
-    kept = 0 if encoding.object is None else encoding.object.samples
-    assert kept + sum(encoding.rejected.values()) == len(samples)
+    for changes in ({}, {'format': data.draw(st.sampled_from(FORMATS))}):
+        encoding = ros.encode(type_name, *samples, sensor=SENSOR_OF.get(type_name, 'imu'), **changes)
+        kept = 0 if encoding.object is None else encoding.object.samples
+        assert kept + sum(encoding.rejected.values()) == len(samples)
+        assert encoding.details.keys() == encoding.rejected.keys()
 
 
 def test_any_standard_type(ros: Any) -> None:

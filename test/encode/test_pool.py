@@ -59,6 +59,18 @@ def test_good_and_bad_samples_are_told_apart() -> None:
     assert [item.key.split('/')[:2] for item in outcome.objects] == [['thor', 'talk']]
 
 
+def test_what_is_wrong_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    """The first rejected message of a topic and reason is told to the operator in words, the others are only counted."""
+    outcome = Outcome(threads=1)
+    outcome.queue.put(talk(b'bad', b'bad'), 5)
+    outcome.queue.put(talk(b'bad'), 5)
+    outcome.pool.open()
+    assert outcome.pool.close(10)
+    assert outcome.rejected == {'malformed': 3}
+    (record,) = caplog.records
+    assert record.getMessage().startswith('/talk: a message cannot be stored: malformed: ')
+
+
 def test_close_encodes_what_is_queued() -> None:
     """Nothing that was queued before the close is lost, and closing again is allowed."""
     outcome = Outcome(threads=1)

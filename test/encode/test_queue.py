@@ -103,3 +103,39 @@ def test_it_is_always_within_its_bounds_and_loses_nothing_silently(arrivals: lis
         assert status.batches == len(inside)
     assert sorted(taken(queue)) == sorted(inside)
     assert queue.status() == QueueStatus(0, 0, 0)
+
+
+def test_one_can_wait_for_what_is_in_it_now() -> None:
+    """All batches that were put before the call must have left, done or dropped; those that come later do not count."""
+    queue = BatchQueue(QueueSettings(max_messages=2))
+    assert queue.finished(0.0), 'an empty queue has nothing to wait for'
+    queue.put(batch('lidar'), 7)
+    queue.put(batch('imu'), 4)
+    imu = queue.get(0.0)
+    assert imu
+    assert not queue.finished(0.0)
+    queue.put(batch('odom', messages=2), 3)  # drops the lidar's
+    odom = queue.get(0.0)
+    assert odom
+    queue.done(odom)
+    assert not queue.finished(0.0), 'the oldest one is still in the making'
+    queue.done(imu)
+    assert queue.finished(0.0)
+
+
+def test_waiting_ends_with_the_last_of_them() -> None:
+    """Whoever waits goes on when the last batch of before is done, though important ones keep coming."""
+    queue = BatchQueue(QueueSettings())
+    queue.put(batch('lidar'), 7)
+    waited: list[bool] = []
+    thread = threading.Thread(target=lambda: waited.append(queue.finished(30.0)))
+    thread.start()
+    for _ in range(20):
+        queue.put(batch('imu'), 1)
+        item = queue.get(0.0)
+        assert item
+        queue.done(item)
+    while (item := queue.get(0.0)) is not None:
+        queue.done(item)
+    thread.join(10)
+    assert waited == [True]

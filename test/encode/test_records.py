@@ -84,6 +84,16 @@ def test_a_batch(ros: Any) -> None:
     assert encoding.object.key == 'thor/imu/20251018/120000_imu.json'
 
 
+def test_a_large_batch(ros: Any) -> None:
+    """However many messages a batch has, all are in it once and in order, and what is not finite is counted over all."""
+    values = {index: float(index) for index in range(251)} | {0: np.nan, 150: -np.inf, 250: np.nan}
+    cdrs = [ros.cdr(JOINTS, name=[str(index)], position=np.array([value])) for index, value in values.items()]
+    batch = document(ros.encode(JOINTS, *cdrs[:100], b'', *cdrs[100:]))
+    assert [sample['name'] for sample in batch['samples']] == [[str(index)] for index in range(251)]
+    assert [batch['samples'][index]['position'][0] for index in (0, 1, 150, 249, 250)] == [None, 1.0, None, 249.0, None]
+    assert (batch['count'], batch['non_finite']) == (251, 3)
+
+
 def test_odometry(ros: Any) -> None:
     """A single Odometry is the documented record: these names, no others."""
     pose = {'pose': {'position': {'x': 1.0, 'y': -2.5, 'z': 0.3}, 'orientation': {'w': 1.0}}}

@@ -1,0 +1,104 @@
+"""All messages of a batch in one zip or tar: a file for each message, and beside it a JSON with what is known of it.
+
+The names are WebDataset's: files of one sample share their name up to the first dot and follow each other
+(https://github.com/webdataset/webdataset). Here that name is the message's time in ns since 1970: samples are in the order of
+time, and unlike those of other objects, unless two publishers share a stamp. The same batch gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import tarfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from io import BytesIO
+from typing import Final, NamedTuple
+from zipfile import ZIP_STORED, ZipFile, ZipInfo
+
+import orjson
+
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.encode.image import encode_jpeg
+from shadowhound_data_logger.encode.payload import Encoder, Job, OneMessage, Payload, Rejections
+from shadowhound_data_logger.encode.pointcloud import encode_cloud
+from shadowhound_data_logger.encode.raw import encode_cdr
+from shadowhound_data_logger.encode.types import header_frame_id
+from shadowhound_data_logger.errors import Rejected
+from shadowhound_data_logger.model import Sample
+from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+
+_ENCODE: Final[Mapping[str, OneMessage]] = {COMPRESSED_IMAGE: encode_jpeg, IMAGE: encode_jpeg, POINT_CLOUD: encode_cloud}
+"""Type -> what makes its file; every other type is stored as CDR."""
+_MODE: Final = 0o644
+_DOS_YEARS: Final = (315_532_800, 4_354_819_198)
+"""Seconds since 1970 that a zip can express: 1980 to 2107."""
+_USTAR_SECONDS: Final = 8**11 - 1
+"""Eleven octal digits."""
+
+
+class Member(NamedTuple):
+    """One file of an archive."""
+
+    name: str
+    stamp_ns: int
+    body: bytes
+
+
+def archive(pack: Callable[[Iterable[Member]], bytes], ext: str, content_type: str) -> Encoder:
+    """An encoder that packs all messages of a batch; those that cannot be encoded are rejected, the rest goes on."""
+
+    def encoder(job: Job, rejections: Rejections) -> Payload | None:
+        encode = _ENCODE.get(job.batch.type, encode_cdr)
+        files: list[Payload] = []
+        for sample in job.batch.samples:
+            try:
+                files.append(encode(job, sample))
+            except Rejected as error:
+                rejections.add(error)
+        if not files:
+            return None
+        kept = tuple(sample for file in files for sample in file.kept)
+        return Payload(pack(_members(job, files)), kept, ext, content_type)
+
+    return encoder
+
+
+def _members(job: Job, files: Sequence[Payload]) -> Iterator[Member]:
+    """Each file and its JSON, in the order of time; a second message of the same time is numbered."""
+    same: Counter[int] = Counter()
+    has_header = job.types.has_header(job.batch.type)
+    for file in sorted(files, key=lambda file: file.kept[0].stamp_ns):
+        sample = file.kept[0]
+        stamp_ns = sample.stamp_ns
+        name = f'{stamp_ns:019d}' + (f'_{same[stamp_ns]}' if same[stamp_ns] else '')
+        same[stamp_ns] += 1
+        yield Member(f'{name}.{file.ext}', stamp_ns, file.body)
+        yield Member(f'{name}.json', stamp_ns, _description(job, sample, file, has_header=has_header))
+
+
+def _description(job: Job, sample: Sample, file: Payload, *, has_header: bool) -> bytes:
+    frame = {'frame_id': header_frame_id(sample.cdr)} if has_header else {}
+    return orjson.dumps({'stamp_ns': sample.stamp_ns, **frame, 'topic': job.batch.topic, 'type': job.batch.type, **file.facts})
+
+
+def pack_tar(members: Iterable[Member]) -> bytes:
+    """An uncompressed POSIX tar (ustar), which every reader knows; a file's time is its message's."""
+    parts: list[bytes] = []
+    for member in members:
+        entry = tarfile.TarInfo(member.name)
+        entry.size, entry.mode = len(member.body), _MODE
+        entry.mtime = min(max(member.stamp_ns // SECOND, 0), _USTAR_SECONDS)
+        parts += (entry.tobuf(tarfile.USTAR_FORMAT), member.body, bytes(-len(member.body) % tarfile.BLOCKSIZE))
+    return b''.join((*parts, bytes(2 * tarfile.BLOCKSIZE)))
+
+
+def pack_zip(members: Iterable[Member]) -> bytes:
+    """A zip without compression, which images and clouds would hardly gain by; a file's time is its message's, in UTC."""
+    file = BytesIO()
+    with ZipFile(file, 'w', ZIP_STORED, allowZip64=True) as packed:
+        for member in members:
+            first, last = _DOS_YEARS
+            when = utc(min(max(member.stamp_ns // SECOND, first), last) * SECOND)
+            entry = ZipInfo(member.name, (when.year, when.month, when.day, when.hour, when.minute, when.second))
+            entry.external_attr = _MODE << 16
+            packed.writestr(entry, member.body)
+    return file.getvalue()

@@ -1,0 +1,60 @@
+"""The examples of docs/formats.md open what the encoder makes."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import simplejpeg
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / 'docs' / 'formats.md').read_text(encoding='utf-8')
+START, *EXAMPLES = re.findall(r'^```python\n(.*?)^```', PAGE, re.DOTALL | re.MULTILINE)
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+CLOUD = 'sensor_msgs/msg/PointCloud2'
+IMAGE = 'sensor_msgs/msg/Image'
+
+
+@pytest.fixture
+def bucket(ros: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with one object of each kind under the name that the page gives it."""
+    field = [ros.make('sensor_msgs/msg/PointField', name=name, offset=4 * at, datatype=7, count=1)
+             for at, name in enumerate(('x', 'y', 'z', 'intensity'))]  # fmt: skip
+    points = np.arange(12, dtype='<f4').view(np.uint8)
+    cloud = ros.cdr(CLOUD, height=1, width=3, point_step=16, row_step=48, fields=field, data=points)
+    depth = ros.cdr(IMAGE, height=1, width=2, step=4, encoding='16UC1', data=np.array([0, 5000], '<u2').view(np.uint8))
+    jpeg = np.frombuffer(simplejpeg.encode_jpeg(np.zeros((4, 6, 3), np.uint8)), np.uint8)
+    frame = ros.cdr(COMPRESSED, header={'frame_id': 'front'}, data=jpeg)
+    imu, voxels = ros.cdr('go2_interfaces/msg/IMU'), ros.cdr('go2_interfaces/msg/VoxelMapCompressed', data=points)
+    made = {
+        '120000_front.jpg': ros.encode(COMPRESSED, frame),
+        '120000_depth.png': ros.encode(IMAGE, depth),
+        '120000_scan.pcd': ros.encode(CLOUD, cloud),
+        '120000_imu.json': ros.encode('go2_interfaces/msg/IMU', imu, imu),
+        '120000_voxel_map.cdr': ros.encode('go2_interfaces/msg/VoxelMapCompressed', voxels, sensor='voxel_map'),
+        '120000_front.tar': ros.encode(COMPRESSED, frame, frame, format='tar', batch_s=1.0),
+        '120001_front.tar': ros.encode(COMPRESSED, frame, format='tar', batch_s=1.0),
+    }
+    for name, encoding in made.items():
+        (tmp_path / name).write_bytes(encoding.object.body)
+    shutil.copy(ROOT / 'interfaces' / 'go2_interfaces' / 'msg' / 'VoxelMapCompressed.msg', tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize('example', EXAMPLES, ids=[example.splitlines()[0][:40] for example in EXAMPLES])
+def test_the_examples(bucket: Path, example: str) -> None:
+    """Each example runs as it stands there; those of libraries that are not installed here are left out."""
+    for name in re.findall(r'^(?:import|from) (\w+)', example, re.MULTILINE):
+        pytest.importorskip(name)
+    exec(f'{START}\nfrom PIL import Image\n{example}', {})  # noqa: S102
+
+
+def test_every_kind_is_shown() -> None:
+    """The page opens a file of each extension that the encoder gives."""
+    text = '\n'.join(EXAMPLES)
+    assert not [ext for ext in ('jpg', 'png', 'tiff', 'pcd', 'json', 'cdr', 'tar', 'zip') if ext not in text]
