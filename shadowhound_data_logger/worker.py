@@ -7,6 +7,8 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
+from shadowhound_data_logger.errors import DataLoggerError
+
 log = logging.getLogger(__name__)
 
 FIRST_PAUSE_S: Final = 0.1
@@ -50,18 +52,26 @@ class Worker:
 
     def _run(self) -> None:
         pause_s = FIRST_PAUSE_S
+        since = 0
         while not self._stopping.is_set():
             try:
                 self._step()
-            except Exception as error:  # the one supervised catch-all: what is in hand is accounted for by the step
-                self.failures += 1
-                self.failing = True
-                self.last_error = f'{type(error).__name__}: {error}'
-                log.exception('%s failed (%d times so far), again in %.1f s', self.name, self.failures, pause_s)
+            except Exception as error:  # noqa: BLE001 - the one supervised catch-all (D14); the step accounts for what it holds
+                self._fail(error)
                 self._stopping.wait(pause_s)
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
             else:
                 if self.failing:
-                    log.info('%s works again', self.name)
+                    log.info('%s works again after %d failures', self.name, self.failures - since)
                 self.failing = False
-                pause_s = FIRST_PAUSE_S
+                pause_s, since = FIRST_PAUSE_S, self.failures
+
+    def _fail(self, error: Exception) -> None:
+        """Count it; say it when it begins and when it becomes another one, with a traceback where it is a defect of ours."""
+        text = f'{type(error).__name__}: {error}'
+        known = self.failing and text == self.last_error
+        self.failures += 1
+        self.failing, self.last_error = True, text
+        if not known:
+            defect = None if isinstance(error, DataLoggerError) else error
+            log.error('%s failed (%d times so far) and tries again: %s', self.name, self.failures, error, exc_info=defect)

@@ -20,9 +20,12 @@ LARGE_TYPES: Final = {
 """Bytes a message of the types that are not small, for sizing the history; generous guesses, not limits."""
 LARGE_RATE_HZ: Final = 60.0
 SMALL_BYTES: Final = 4096
-DEPTH_MARGIN: Final = 4
-"""History depth is rate times poll period times this (D1)."""
+STALL_S: Final = 2.0
+"""What a subscription can hold while nobody takes from it, at least four poll periods: on a machine that is busy with other
+things the thread that polls was seen to get no turn for half a second. It costs memory only while that lasts."""
 MIN_DEPTH: Final = 10
+UNKNOWN: Final = ((True, False), (False, False))
+"""Whether it is RELIABLE, and TRANSIENT_LOCAL, of the subscriptions that together match any publisher."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,31 +59,31 @@ def plans(topic: str, publishers: Sequence[Endpoint], expected_type: str | None,
     """The subscriptions that miss nothing of what these publishers send; none while not even the type is known.
 
     A RELIABLE subscription gets nothing from a BEST_EFFORT publisher, and a BEST_EFFORT one may lose what a RELIABLE
-    publisher would have repeated. So there is one of each while both kinds of publisher exist, and while none does yet:
-    whatever comes is then matched as it should be from its first message on. What both receive is a repeat, and dropped.
+    publisher would have repeated; one that asks for the history of a TRANSIENT_LOCAL publisher gets nothing from the others.
+    So there is one for each kind of publisher that exists. While there is none yet, two match whatever comes from its first
+    message on. What two of them receive is a repeat, and dropped.
     With several types on a topic the one already heard goes on, else the most common one is heard.
     """
     counts = Counter(publisher.type for publisher in publishers)
     name = max(counts, key=lambda name: (name == current_type, counts[name], name)) if counts else expected_type
     if not name:
         return ()
-    reliable = [publisher for publisher in publishers if publisher.type == name and publisher.reliable]
-    best_effort = [publisher for publisher in publishers if publisher.type == name and not publisher.reliable]
+    offered = {(publisher.reliable, publisher.reliable and publisher.transient_local)
+               for publisher in publishers if publisher.type == name}  # fmt: skip
     size = depth(name, settings)
-    found: list[Plan] = []
-    if reliable or not best_effort:
-        latched = bool(reliable) and all(publisher.transient_local for publisher in reliable)
-        found.append(Plan(topic, name, reliable=True, transient_local=latched, depth=size))
-    if best_effort or not reliable:
-        found.append(Plan(topic, name, reliable=False, transient_local=False, depth=size))
-    return tuple(found)
+    kinds = ((True, True), (True, False), (False, False))
+    return tuple(
+        Plan(topic, name, reliable=kind[0], transient_local=kind[1], depth=size)
+        for kind in kinds
+        if kind in (offered or UNKNOWN)
+    )  # fmt: skip
 
 
 def depth(type_name: str, settings: IntakeSettings) -> int:
     """Messages a subscription must hold between two drains, bounded in bytes."""
     size = LARGE_TYPES.get(type_name, SMALL_BYTES)
     rate_hz = LARGE_RATE_HZ if type_name in LARGE_TYPES else settings.max_rate_hz
-    wanted = ceil(rate_hz * settings.poll_s * DEPTH_MARGIN)
+    wanted = ceil(rate_hz * max(STALL_S, 4 * settings.poll_s))
     return max(1, min(max(wanted, MIN_DEPTH), settings.history_bytes // size))
 
 
@@ -88,13 +91,14 @@ class Senders:
     """Who sent a message, where the middleware gives its number but not its sender's gid (Jazzy and older).
 
     With one publisher in the graph it is that one. Its successor is told from it before the graph shows the change: its
-    numbers begin anew while the time of sending goes on.
+    numbers begin anew while the time of sending goes on. When the old numbers go on as well, there are two of them.
     """
 
     def __init__(self) -> None:
         self.gids: list[str] = []
         self._successors = 0
         self._number = 0
+        self._number_before = 0
         self._sent_ns = 0
 
     def look(self, gids: list[str]) -> None:
@@ -107,8 +111,11 @@ class Senders:
         """A name for the sender of this message; None where there is more than one, or no number."""
         if number is None or len(self.gids) != 1:
             return None
+        if self._successors and self._number < self._number_before < number:
+            return None
         if number <= self._number and sent_ns > self._sent_ns:
             self._successors += 1
+            self._number_before = self._number
         if sent_ns >= self._sent_ns:
             self._number, self._sent_ns = number, sent_ns
         return f'{self.gids[0]}.{self._successors}'

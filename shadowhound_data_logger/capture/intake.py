@@ -8,14 +8,16 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from functools import partial
 from typing import Final
 
 from rclpy.node import Node
 
 from shadowhound_data_logger.capture.reader import PolledGroup
-from shadowhound_data_logger.capture.source import Source
-from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.capture.source import Source, SourceStatus
+from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch
@@ -27,71 +29,125 @@ REFRESH_S: Final = 0.25
 
 
 class Intake:
-    """New; open once; close once. Others ask the thread for something by ``post``."""
+    """New; open once; close once. ``flush``, ``pause`` and ``update`` are done by the thread, between two drains.
 
-    def __init__(self, node: Node, settings: Settings, accounts: Accounts, types: MessageTypes, queue: BatchQueue) -> None:
+    ``sensors`` are the settings in force, shared with the encoders; while it runs, this thread alone replaces its entries.
+    """
+
+    def __init__(self, node: Node, sensors: dict[str, SensorSettings], settings: IntakeSettings, accounts: Accounts,
+                 types: MessageTypes, queue: BatchQueue) -> None:  # fmt: skip
+        self._sensors = sensors
         self._settings = settings
         self._accounts = accounts
         self._queue = queue
-        self._priorities = {sensor.name: sensor.priority for sensor in settings.sensors}
         group = PolledGroup()
-        self._sources = deque(
-            Source(node, sensor, settings.intake, accounts, types, group, self._offer)
-            for sensor in settings.sensors
-            if sensor.enabled
-        )
+        self._sources = tuple(
+            Source(node, sensor, settings, accounts, types, group, self._offer) for sensor in sensors.values()
+        )  # fmt: skip
         self._requests: deque[Callable[[], None]] = deque()
         self._wake = threading.Event()
         self._next_poll_s = self._next_refresh_s = 0.0
+        self.paused = False
+        """Whether messages are counted only; set by the thread."""
         self.worker = Worker('intake', self._step)
 
     @property
     def topics(self) -> Sequence[str]:
         """The resolved topics it listens to, or would."""
-        return [source.topic for source in self._sources]
+        return [source.topic for source in self._sources if source.sensor.enabled]
+
+    def status(self) -> list[SourceStatus]:
+        return [source.status() for source in self._sources]
 
     def open(self) -> None:
         self.worker.start()
 
     def close(self, deadline_s: float) -> bool:
-        """Take what waits, close the batches and the subscriptions, end the thread; False if that took too long."""
+        """Take what waits, close the batches and the subscriptions, end the thread; False if that failed or took too long."""
         if self.worker.stopping:
             return True
-        done = threading.Event()
-        self.post(lambda: self._finish(done))
-        self._wake.set()
-        finished = done.wait(deadline_s)
+        finished = self._ask(self._finish, deadline_s)
         self.worker.stop()
         self._wake.set()
         return self.worker.join(deadline_s) and finished
 
-    def post(self, request: Callable[[], None]) -> None:
-        """Have the intake thread do something between two drains."""
-        self._requests.append(request)
+    def flush(self, deadline_s: float) -> bool:
+        """Take what waits and close the open batches; False if that failed or took too long."""
+        return self._ask(self._flush, deadline_s)
+
+    def pause(self, deadline_s: float, *, paused: bool) -> bool:
+        """From now on count and drop what comes, or store it again; False if that failed or took too long."""
+        return self._ask(partial(self._pause, paused=paused), deadline_s)
+
+    def update(self, sensors: Iterable[SensorSettings]) -> None:
+        """Go on by these settings soon; sensors that are not among them stay as they are."""
+        self._post(partial(self._update, tuple(sensors)))
+
+    # -- what the thread does --------------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        """One round: wait for the next poll, drain every source, follow the graph."""
+        """One round: wait for the next poll, follow the graph, drain every source, do what was asked for."""
+        self._wake.wait(max(0.0, self._next_poll_s - time.monotonic()))
+        self._wake.clear()
         now_s = time.monotonic()
-        self._wake.wait(max(0.0, self._next_poll_s - now_s))
-        now_s = time.monotonic()
-        self._next_poll_s = now_s + self._settings.intake.poll_s
+        self._next_poll_s = now_s + self._settings.poll_s
+        todo: list[Callable[[], None]] = [partial(source.drain, now_s) for source in self._sources]
         if now_s >= self._next_refresh_s:
             self._next_refresh_s = now_s + REFRESH_S
-            for _ in range(len(self._sources)):
-                self._sources.rotate(-1)  # should one fail, it is the turn of the next one in the next round
-                self._sources[-1].refresh(now_s)
-        for source in self._sources:
-            source.drain(now_s)
+            todo = [*(partial(source.refresh, now_s) for source in self._sources), *todo]
+        _each([*todo, self._obey])
+
+    def _obey(self) -> None:
         while self._requests:
             self._requests.popleft()()
 
-    def _finish(self, done: threading.Event) -> None:
-        for source in self._sources:
-            source.close(time.monotonic())
-        self._sources.clear()
-        self.worker.stop()
-        done.set()
+    def _flush(self) -> None:
+        now_s = time.monotonic()
+        _each([partial(source.flush, now_s) for source in self._sources])
+
+    def _pause(self, *, paused: bool) -> None:
+        now_s = time.monotonic()
+        self.paused = paused
+        _each([partial(source.pause, now_s, paused=paused) for source in self._sources])
+
+    def _update(self, sensors: Sequence[SensorSettings]) -> None:
+        now_s = time.monotonic()
+        self._sensors.update((sensor.name, sensor) for sensor in sensors)
+        _each([partial(source.update, self._sensors[source.sensor.name], now_s) for source in self._sources])
+        self._next_refresh_s = now_s
+
+    def _finish(self) -> None:
+        now_s = time.monotonic()
+        _each([*(partial(source.close, now_s) for source in self._sources), self.worker.stop])
+
+    # -- between the threads ---------------------------------------------------------------------------------------
+
+    def _post(self, request: Callable[[], None]) -> None:
+        self._requests.append(request)
+        self._wake.set()
+
+    def _ask(self, request: Callable[[], None], deadline_s: float) -> bool:
+        """Whether the thread did it in time and without a failure; it still does it when that takes longer."""
+        done = threading.Event()
+        succeeded: list[bool] = []
+
+        def answer() -> None:
+            try:
+                request()
+                succeeded.append(True)
+            finally:
+                done.set()
+
+        self._post(answer)
+        return done.wait(max(0.0, deadline_s)) and bool(succeeded)
 
     def _offer(self, batch: Batch) -> None:
-        for lost in self._queue.put(batch, self._priorities[batch.sensor]):
+        for lost in self._queue.put(batch, self._sensors[batch.sensor].priority):
             self._accounts.drop(lost.topic, 'queue_full', len(lost.samples))
+
+
+def _each(steps: Sequence[Callable[[], None]]) -> None:
+    """Do all of them in this order, whatever happens to one; what one raised is raised in the end."""
+    with ExitStack() as stack:
+        for step in reversed(steps):
+            stack.callback(step)

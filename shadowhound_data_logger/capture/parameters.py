@@ -1,34 +1,109 @@
-"""ROS parameters in, frozen settings out: the one place of the node that reads them."""
+"""ROS parameters in, frozen settings out: the one place of the node that reads them, at its start and while it runs."""
 
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import Field, fields
 from typing import Any, Final
 
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from shadowhound_data_logger.config import DEFAULT_SENSORS, FOREIGN, Settings, default_parameters
+from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.options import GROUPS
 
-FIXED: Final = 'settings are read at the start: change the parameter file and start the node again'
+FIXED: Final = 'Read at the start: change the parameter file and start the node again.'
+MAX_INT: Final = (1 << 63) - 1
+ROBOT: Final = "Leads every key; where it is empty, SHADOWHOUND_ROBOT, else the node's namespace, else thor."
+SENSORS: Final = 'The sensors there are, by name.'
 
 
-def load(node: Node) -> Settings:
-    """The node's settings; every parameter with a default is declared, so that ``ros2 param list`` shows it.
+class Parameters:
+    """The node's parameters. Those that are live may be changed; a change is checked as the start is, all of it or nothing.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides``. Raises SettingError.
+    The node must have been made with ``automatically_declare_parameters_from_overrides``.
     """
-    given = {name: _plain(parameter.value) for name, parameter in node.get_parameters_by_prefix('').items()}
-    settings = Settings.load(given, os.environ, node.get_namespace())
-    _check_topics(node, settings)
-    unused = set(DEFAULT_SENSORS) - {sensor.name for sensor in settings.sensors}
-    for name, default in default_parameters().items():
-        if name.partition('.')[0] not in unused and not node.has_parameter(name):
-            node.declare_parameter(name, default)
-    node.add_on_set_parameters_callback(_refuse)
-    return settings
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._changed = False
+
+    def load(self) -> Settings:
+        """The settings; every parameter is declared then, so that ``ros2 param list`` shows it. Raises SettingError."""
+        settings = self._read()
+        _check_topics(self._node, settings)
+        for name, value, descriptor in _declarations(settings):
+            if self._node.has_parameter(name):
+                self._node.set_descriptor(name, descriptor)
+            else:
+                self._node.declare_parameter(name, value, descriptor)
+        self._node.add_on_set_parameters_callback(self._judge)
+        return settings
+
+    def changed(self) -> Settings | None:
+        """The settings as they are now; None when nobody has set a parameter since the last call."""
+        if not self._changed:
+            return None
+        self._changed = False
+        return self._read()
+
+    def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Whether the node could have been started with these values; they are in force after ``changed``."""
+        try:
+            self._read(parameters)
+        except SettingError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self._changed = True
+        return SetParametersResult(successful=True)
+
+    def _read(self, instead: Sequence[Parameter] = ()) -> Settings:
+        parameters = {**self._node.get_parameters_by_prefix(''), **{parameter.name: parameter for parameter in instead}}
+        given = {name: _plain(parameter.value) for name, parameter in parameters.items()}
+        return Settings.load(given, os.environ, self._node.get_namespace())
+
+
+def live(settings: Settings) -> dict[str, Any]:
+    """The settings that can be changed while the node runs, by the names of their parameters."""
+    return {name: value for name, value, spec in _flat(settings) if spec.metadata['live']}
+
+
+def _flat(settings: Settings) -> Iterator[tuple[str, Any, Field[Any]]]:
+    """Name, value and field of every setting of a group or a sensor."""
+    owners: list[tuple[str, Any]] = [(name, getattr(settings, name)) for name in GROUPS]
+    owners += [(sensor.name, sensor) for sensor in settings.sensors]
+    for prefix, owner in owners:
+        yield from ((f'{prefix}.{spec.name}', getattr(owner, spec.name), spec) for spec in fields(owner) if spec.metadata)
+
+
+def _declarations(settings: Settings) -> Iterator[tuple[str, Any, ParameterDescriptor]]:
+    """Name, value and descriptor of every parameter."""
+    for name, value, text in (('robot', '', ROBOT), ('sensors', [sensor.name for sensor in settings.sensors], SENSORS)):
+        yield (
+            name,
+            value,
+            ParameterDescriptor(description=text, additional_constraints=FIXED, read_only=True, dynamic_typing=True),
+        )
+    for name, value, spec in _flat(settings):
+        yield name, list(value) if isinstance(value, tuple) else value, _descriptor(spec)
+
+
+def _descriptor(spec: Field[Any]) -> ParameterDescriptor:
+    """What ``ros2 param describe`` shows. The type is left open, so that 5 is taken for 5.0."""
+    low, high, choices, is_live = (spec.metadata[name] for name in ('low', 'high', 'choices', 'live'))
+    descriptor = ParameterDescriptor(description=spec.metadata['help'], read_only=not is_live, dynamic_typing=True)
+    if isinstance(spec.default, float) and low is not None:
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=low, to_value=sys.float_info.max if high is None else high)
+        ]
+    elif isinstance(spec.default, int) and low is not None:
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=MAX_INT if high is None else int(high))]
+    constraints = [f'One of {", ".join(choices)}.'] if choices else []
+    descriptor.additional_constraints = ' '.join(constraints if is_live else [*constraints, FIXED])
+    return descriptor
 
 
 def _check_topics(node: Node, settings: Settings) -> None:
@@ -51,8 +126,3 @@ def _check_topics(node: Node, settings: Settings) -> None:
 def _plain(value: Any) -> Any:
     """A parameter's value as plain Python: arrays as lists."""
     return list(value) if hasattr(value, '__iter__') and not isinstance(value, (str, bytes)) else value
-
-
-def _refuse(parameters: list[Parameter]) -> SetParametersResult:
-    ours = [parameter.name for parameter in parameters if parameter.name.split('.')[0] not in FOREIGN]
-    return SetParametersResult(successful=not ours, reason=FIXED if ours else '')

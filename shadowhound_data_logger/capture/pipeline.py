@@ -12,7 +12,11 @@ from typing import Any
 
 from rclpy.node import Node
 
+from shadowhound_data_logger.capture.control import Control
+from shadowhound_data_logger.capture.diagnostics import Diagnostics
 from shadowhound_data_logger.capture.intake import Intake
+from shadowhound_data_logger.capture.parameters import live
+from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.pool import EncodePool
@@ -42,6 +46,7 @@ class Pipeline:
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
         self._node = node
         self._day = self._today()
+        self._due_s = 0.0
         self._opened = ExitStack()
 
     def open(self) -> None:
@@ -61,14 +66,19 @@ class Pipeline:
             raise SpoolError(f'another sensor_logger_node logs {settings.robot} to {self.spool.root} already',
                              remedy='stop it, or give this one a robot name or SHADOWHOUND_HOME of its own')  # fmt: skip
         self.uploader = Uploader(self.spool, self._store, settings.upload, self._settle)
-        self.writer = SpoolWriter(self.spool, settings.spool.commit_s, spooled=lambda _: self.uploader.wake(),
+        self.writer = SpoolWriter(self.spool, settings.spool.commit_s, spooled=self.uploader.wake,
                                   settled=self.uploader.settled)  # fmt: skip
         types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
-        self.queue = BatchQueue(settings.queue)
+        queue = BatchQueue(settings.queue)
         sensors = {sensor.name: sensor for sensor in settings.sensors}
-        self.pool = EncodePool(self.queue, sensors, settings.robot, types, self.writer.put, self.spool.accounts.reject,
+        self.pool = EncodePool(queue, sensors, settings.robot, types, self.writer.put, self.spool.accounts.reject,
                                settings.encode.threads)  # fmt: skip
-        self.intake = Intake(self._node, settings, self.spool.accounts, types, self.queue)
+        self.intake = Intake(self._node, sensors, settings.intake, self.spool.accounts, types, queue)
+        stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader)
+        self._status = Status(stages, settings, self._clock, self._store.describe())
+        self._diagnostics = Diagnostics(self._node)
+        self.control = Control(self._node, self.intake, queue, self.writer)
+        opened.callback(self._tell, ended=True)
         self.writer.open()
         opened.callback(self.writer.close, 1.0)
         self.pool.open()
@@ -76,6 +86,10 @@ class Pipeline:
         opened.callback(self.uploader.close, 0.5)
         opened.callback(self._finish)
         self.intake.open()
+        self._diagnostics.open()
+        opened.callback(self._diagnostics.close)
+        self.control.open()
+        opened.callback(self.control.close)
         log.info('logging %s to %s, spool %s', ' '.join(self.intake.topics), self._store.describe(), self.spool.root)
 
     def close(self) -> None:
@@ -91,7 +105,7 @@ class Pipeline:
             'spool writer': self.writer.flush(end_s - time.monotonic()),
         }
         for name in (name for name, done in finished.items() if not done):
-            log.error('the %s did not finish in %.0f s', name, CLOSE_S)
+            log.error('the %s did not finish its work in %.0f s', name, CLOSE_S)
         if not all(finished.values()):
             return
         self._ship_ledger()
@@ -101,17 +115,37 @@ class Pipeline:
             log.warning('%d objects stay in the spool %s and are delivered later', self.spool.pending_count(), self.spool.root)
 
     def tick(self) -> None:
-        """Called now and then: at the turn of each UTC day the ledger goes to the store.
+        """Called several times a second: once a second what goes on is told, at the turn of each UTC day the ledger is shipped.
 
         Raises SpoolError when the spool cannot be mended while it is in use.
         """
         if self.writer.damaged:
             text = f'the index of the spool {self.spool.root} is damaged'
             raise SpoolError(text, remedy='start the node again: it is rebuilt then')
+        now_s = time.monotonic()
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + PERIOD_S
+        self._tell()
         day = self._today()
         if day != self._day:
             self._day = day
             self._ship_ledger()
+
+    def apply(self, settings: Settings) -> None:
+        """Go on by other settings, as far as they are live."""
+        before, self._settings = live(self._settings), settings
+        for name, value in live(settings).items():
+            if value != before[name]:
+                log.info('%s = %s from now on', name, value)
+        self.intake.update(settings.sensors)
+        self.uploader.set_max_mbps(settings.upload.max_mbps)
+
+    def _tell(self, *, ended: bool = False) -> None:
+        status = self._status.look(ended=ended)
+        if status is not None:
+            self._status.write(status)
+            self._diagnostics.publish(status, self._status.earlier)
 
     def _today(self) -> str:
         return f'{utc(self._clock.wall_ns()):%Y%m%d}'

@@ -19,8 +19,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from shadowhound_data_logger.capture import parameters
 from shadowhound_data_logger.capture.log_bridge import RosHandler
+from shadowhound_data_logger.capture.parameters import Parameters
 from shadowhound_data_logger.capture.pipeline import Pipeline
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
 
@@ -75,13 +75,16 @@ def main(args: list[str] | None = None) -> int:
 
 def run(node: Node, stop: StopSignals) -> None:
     """Log until a signal comes."""
-    pipeline = Pipeline(node, parameters.load(node))
+    parameters = Parameters(node)
+    pipeline = Pipeline(node, parameters.load())
     pipeline.open()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
         while not stop.received:
             executor.spin_once(timeout_sec=SPIN_S)
+            if settings := parameters.changed():
+                pipeline.apply(settings)
             pipeline.tick()
     finally:
         node.get_logger().info('closing: open batches are finished and delivered')

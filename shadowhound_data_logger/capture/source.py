@@ -1,22 +1,20 @@
-"""One sensor's way from its topic to closed batches: which topic, how to listen, what to keep. Owned by the intake thread."""
+"""One sensor's way from its topic to closed batches: which topic, and how to listen. Owned by the intake thread."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Final
-from zlib import crc32
 
 from rclpy.node import Node
 
-from shadowhound_data_logger.capture.batching import Batcher
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, plans
-from shadowhound_data_logger.capture.gate import Gate, gate_for
-from shadowhound_data_logger.capture.reader import PolledGroup, Reader, Taken, TypeUnavailable, endpoints, message_class
-from shadowhound_data_logger.clock import is_sane
+from shadowhound_data_logger.capture.reader import PolledGroup, Reader, TypeUnavailable, endpoints, message_class
+from shadowhound_data_logger.capture.stream import Offer, Stream
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
-from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
-from shadowhound_data_logger.model import Batch, Sample
+from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.accounts import Accounts
 
 log = logging.getLogger(__name__)
@@ -25,13 +23,22 @@ FALLBACK_S: Final = 1.0
 """How long the preferred topic must be without a publisher before another one is taken."""
 OVERLAP_S: Final = 0.5
 """How long the old subscription lives beside its successor, at least until that is matched."""
-MAX_RECENT: Final = 10_000
-"""Messages without numbers that are remembered, to know what a second subscription delivers again."""
-Offer = Callable[[Batch], None]
+
+
+@dataclass(frozen=True, slots=True)
+class SourceStatus:
+    """A sensor at one instant."""
+
+    sensor: str
+    topic: str
+    enabled: bool
+    publishers: int
+    received_s: float | None
+    """When the last message came, by the monotonic clock; None before the first."""
 
 
 class Source:
-    """A sensor at work. ``refresh`` follows the graph, ``drain`` takes what came, ``close_batch`` ends the open batch."""
+    """A sensor at work. ``refresh`` follows the graph, ``drain`` takes what came, ``flush`` ends the open batch as well."""
 
     def __init__(self, node: Node, sensor: SensorSettings, settings: IntakeSettings, accounts: Accounts,
                  types: MessageTypes, group: PolledGroup, offer: Offer) -> None:  # fmt: skip
@@ -46,33 +53,41 @@ class Source:
         self._types_expected = dict(zip(self._topics, sensor.types, strict=False))
         self._chosen = self._topics[0]
         self._absent_since_s: float | None = None
+        self._publishers = 0
         self._type = ''
         self._readers: list[Reader] = []
         self._retiring: dict[Reader, float] = {}
         self._heard: set[Plan] = set()
         self._senders = Senders()
-        self._has_header = False
-        self._gate: Gate | None = None
-        self._batcher: Batcher | None = None
+        self._stream: Stream | None = None
+        self._kept_ns: dict[str, int] = {}
+        self._paused = False
+        self._last_received_s: float | None = None
         self._unavailable: set[str] = set()
         self._unheard: set[str] = set()
-        self._recent: dict[tuple[int, int], None] = {}
 
     @property
     def topic(self) -> str:
         """The topic it listens to, or would."""
         return self._chosen
 
+    def status(self) -> SourceStatus:
+        """From any thread: each of its figures is replaced as a whole."""
+        return SourceStatus(self.sensor.name, self._chosen, self.sensor.enabled, self._publishers, self._last_received_s)
+
     def refresh(self, now_s: float) -> None:
         """Look at the graph and subscribe as its publishers ask for it."""
+        if not self.sensor.enabled:
+            return
         publishers = self._choose(now_s)
+        self._publishers = len(publishers)
         self._senders.look([publisher.gid for publisher in publishers])
         wanted = plans(self._chosen, publishers, self._types_expected.get(self._chosen), self._settings, self._type)
         self._warn_of_types(publishers, wanted)
         if not wanted or not self._is_available(wanted[0].type):
             return
         if wanted[0].type != self._type:
-            self._retype(wanted[0].type)
+            self._retype(wanted[0].type, now_s)
         present = {reader.plan for reader in self._readers}
         for plan in wanted:
             if plan not in present:
@@ -86,17 +101,33 @@ class Source:
         """Take all that waits; close the batch whose time is over."""
         for reader in self._readers:
             self._take(reader, now_s)
-        if self._batcher is not None and self._batcher.is_due(now_s, 2 * self._settings.poll_s):
-            self._offer(self._batcher.close())
+        if self._stream is not None:
+            self._stream.close_due(now_s, 2 * self._settings.poll_s)
 
-    def close_batch(self) -> None:
-        """End the open batch, if there is one."""
-        if self._batcher is not None and len(self._batcher):
-            self._offer(self._batcher.close())
+    def flush(self, now_s: float) -> None:
+        """Take all that waits and end the open batch."""
+        self.drain(now_s)
+        if self._stream is not None:
+            self._stream.close_batch()
+
+    def pause(self, now_s: float, *, paused: bool) -> None:
+        """While it is paused messages are counted and dropped; whatever came before is treated as before."""
+        self.flush(now_s)
+        self._paused = paused
+
+    def update(self, sensor: SensorSettings, now_s: float) -> None:
+        """Go on by other settings."""
+        before, self.sensor = self.sensor, sensor
+        if before.enabled and not sensor.enabled:
+            self._abandon(now_s)
+            self._publishers = 0
+        elif sensor.enabled and not before.enabled:
+            self._accounts.rebase(self._chosen)
+        elif self._stream is not None:
+            self._stream.update(sensor)
 
     def close(self, now_s: float) -> None:
         """Take what still waits, end the batch and the subscriptions."""
-        self.drain(now_s)
         self._leave(now_s)
 
     # -- the graph -------------------------------------------------------------------------------------------------
@@ -112,7 +143,10 @@ class Source:
         better = self._topics.index(best) < self._topics.index(self._chosen)
         waited = self._absent_since_s is not None and now_s - self._absent_since_s >= FALLBACK_S
         if best != self._chosen and (better or waited):
-            self._switch(best, now_s)
+            log.info('%s: taken from %s now instead of %s', self.sensor.name, best, self._chosen)
+            self._abandon(now_s)
+            self._chosen = best
+            self._absent_since_s = None
         return found[self._chosen]
 
     def _warn_of_types(self, publishers: Sequence[Endpoint], wanted: Sequence[Plan]) -> None:
@@ -136,27 +170,13 @@ class Source:
             return False
         return True
 
-    def _switch(self, topic: str, now_s: float) -> None:
-        """Leave the current topic for another one of the sensor's."""
-        log.info('%s: taken from %s now instead of %s', self.sensor.name, topic, self._chosen)
-        self.drain(now_s)
+    def _retype(self, type_name: str, now_s: float) -> None:
+        """Begin with a topic that is new, or of another type than before."""
         self._leave(now_s)
-        with self._accounts.entry(self._chosen) as account:
-            for span in account.publishers.values():
-                span.rebase()
-        self._chosen = topic
-        self._absent_since_s = None
-
-    def _retype(self, type_name: str) -> None:
-        """Gate and batch of a topic that is new, or of another type than before."""
-        self._leave(0.0)
         topic = self._chosen
+        kept_ns = self._kept_ns.get(topic) or self._accounts.last_kept_ns(topic)
+        self._stream = Stream(self.sensor, topic, type_name, kept_ns, self._accounts, self._types, self._offer)
         self._type = type_name
-        self._has_header = self._types.has_header(type_name)
-        self._gate = gate_for(self.sensor, has_header=self._has_header, last_kept_ns=self._accounts.last_kept_ns(topic))
-        self._batcher = Batcher(self.sensor.name, topic, type_name, round(self.sensor.batch_s * 1e9))
-        with self._accounts.entry(topic) as account:
-            account.type = type_name
 
     def _retire(self, wanted: set[Plan], now_s: float) -> None:
         """Close the subscriptions that are not wanted any more, once their successors are matched; none is missed so."""
@@ -170,12 +190,24 @@ class Source:
                 del self._retiring[reader]
                 reader.close()
 
+    def _abandon(self, now_s: float) -> None:
+        """Leave the topic on purpose: what is published there from now on is nobody's loss."""
+        self._leave(now_s)
+        self._accounts.rebase(self._chosen)
+
     def _leave(self, now_s: float) -> None:
-        """End all that belongs to the current topic and type."""
-        for reader in self._readers:
-            self._take(reader, now_s)
-            reader.close()
-        self.close_batch()
+        """End all that belongs to the current topic and type, each whatever happens to the others."""
+        with ExitStack() as leaving:
+            leaving.callback(self._forget)
+            for reader in self._readers:
+                leaving.callback(reader.close)
+                leaving.callback(self._take, reader, now_s)
+
+    def _forget(self) -> None:
+        if self._stream is not None:
+            self._stream.close_batch()
+            self._kept_ns[self._chosen] = self._stream.kept_ns
+        self._stream = None
         self._readers.clear()
         self._retiring.clear()
         self._heard = set()
@@ -185,40 +217,22 @@ class Source:
 
     def _take(self, reader: Reader, now_s: float) -> None:
         taken = list(reader.drain())
-        if taken and self._batcher is not None:
-            if taken[0].publisher is None and not self._senders.gids:
+        if not taken or self._stream is None:
+            return
+        self._last_received_s = now_s
+        lost: int | None = None
+        if taken[0].publisher is None or taken[0].number is None:
+            lost = self._lost(reader)
+            if not self._senders.gids:
                 self._senders.look([publisher.gid for publisher in endpoints(self._node, self._chosen)])
-            for sample in self._keep(reader.plan.topic, taken):
-                for batch in self._batcher.add(sample, now_s):
-                    self._offer(batch)
+        self._stream.add(taken, self._senders, lost, now_s, paused=self._paused)
 
-    def _keep(self, topic: str, taken: Sequence[Taken]) -> list[Sample]:
-        """Count the messages, drop repeats and choose those to store."""
-        kept: list[Sample] = []
-        gate = self._gate
-        if gate is None:
-            return kept
-        with self._accounts.entry(topic) as account:
-            for cdr, source_ns, gid, number in taken:
-                publisher = gid or self._senders.name(number, source_ns)
-                numbered = number is not None and publisher is not None
-                if (not numbered and self._is_repeat(source_ns, cdr)) or not account.receive(publisher, number):
-                    continue
-                stamp_ns = header_stamp_ns(cdr) if self._has_header else 0
-                if not is_sane(stamp_ns, source_ns):
-                    stamp_ns = source_ns
-                if gate.keep(stamp_ns, cdr):
-                    kept.append(Sample(stamp_ns, cdr))
-                else:
-                    account.skipped += 1
-        return kept
+    def _lost(self, reader: Reader) -> int | None:
+        """What the middleware reports to have lost; None where that cannot be known.
 
-    def _is_repeat(self, source_ns: int, cdr: bytes) -> bool:
-        """Whether a message without a number came by another of our subscriptions already: same time, same content."""
-        mark = (source_ns, crc32(cdr))
-        if mark in self._recent:
-            return True
-        self._recent[mark] = None
-        if len(self._recent) > MAX_RECENT:
-            del self._recent[next(iter(self._recent))]
-        return False
+        What one of two subscriptions lost the other one may have received. While it is not known yet which one is wanted,
+        nobody is asked: the wanted one tells it later.
+        """
+        if self._heard == {reader.plan}:
+            return reader.lost()
+        return None if len(self._heard) > 1 else 0

@@ -13,79 +13,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
-MAX_REMEMBERED: Final = 4096
-"""Single numbers remembered per publisher (the newest that may still come late): a bound, far above any history depth."""
+from shadowhound_data_logger.spool.span import Span
 
 EXACT, REPORTED, RECEIVED_ONLY = 'exact', 'reported', 'received-only'
 GRADES: Final = (EXACT, REPORTED, RECEIVED_ONLY)
 """How good a topic's accounting is, best first; over several sessions the worst counts."""
-
-
-@dataclass(slots=True)
-class Span:
-    """The numbers of one publisher on one topic, from the first one taken.
-
-    ``published`` = ``received`` + sum of ``missed``, always. A span inherited from an earlier session starts with zero
-    counts and that session's ``first`` and ``last``: the gap before its first message is then missed by ``restart``.
-    """
-
-    first: int | None = None
-    last: int | None = None
-    inherited: bool = False
-    published: int = 0
-    received: int = 0
-    missed: Counter[str] = field(default_factory=Counter)
-    _holes: dict[int, str] = field(default_factory=dict)
-    """Number below ``last`` that was not taken -> the cause it is missed by; '' where it was not listened to."""
-    _early: set[int] = field(default_factory=set)
-    _base: int | None = None
-    _rebased: bool = False
-    changed: bool = False
-    """Since the last snapshot."""
-
-    def __post_init__(self) -> None:
-        self._base = self.first
-
-    def observe(self, number: int) -> bool:
-        """Count a message by its sequence number; False if it was counted before (a repeat)."""
-        if self.first is None or self._base is None or self.last is None:
-            self.first = self._base = self.last = number
-        elif number > self.last:
-            if number > self.last + 1:
-                self._skip(self.last + 1, number)
-            self.last = number
-            self.inherited = self._rebased = False
-        elif number in self._holes:
-            cause = self._holes.pop(number)
-            if cause:
-                self.missed[cause] -= 1
-                self.published -= 1
-        elif number < self._base and number not in self._early:
-            # TRANSIENT_LOCAL delivers history from before the first number taken.
-            if len(self._early) >= MAX_REMEMBERED:
-                return False
-            self._early.add(number)
-            self.first = min(self.first, number)
-        else:
-            return False
-        self.received += 1
-        self.published += 1
-        self.changed = True
-        return True
-
-    def rebase(self) -> None:
-        """What is published until the next new message was not listened to on purpose: that gap is not missed."""
-        self._rebased = True
-
-    def _skip(self, start: int, stop: int) -> None:
-        """Count the numbers of a gap as missed, unless nobody listened, and remember them: they may come late."""
-        cause = '' if self._rebased else 'restart' if self.inherited else 'transport'
-        if cause:
-            self.missed[cause] += stop - start
-            self.published += stop - start
-        self._holes.update(dict.fromkeys(range(max(start, stop - MAX_REMEMBERED), stop), cause))
-        while len(self._holes) > MAX_REMEMBERED:
-            del self._holes[next(iter(self._holes))]
+TOPIC_WIDE: Final = ''
+"""Instead of a publisher, for the span of a topic whose losses the middleware reports without saying whose they are."""
 
 
 @dataclass(slots=True)
@@ -108,19 +42,42 @@ class TopicAccount:
         """Messages without an outcome yet: in an open batch, the queue, an encoder or before their commit."""
         return self.received - self.skipped - self.stored - self.rejected.total() - self.dropped.total()
 
-    def receive(self, publisher: str | None, number: int | None) -> bool:
-        """Count one taken message; False for a repeat. Without number or publisher it is only received."""
-        if publisher is None or number is None:
-            if self.accounting == EXACT:
-                self.accounting = RECEIVED_ONLY
-        else:
-            span = self.publishers.get(publisher)
-            if span is None:
-                span = self.publishers[publisher] = Span()
-            if not span.observe(number):
-                return False
+    @property
+    def missed(self) -> int | None:
+        """Messages that were published and never taken; None where that cannot be known."""
+        if self.accounting == RECEIVED_ONLY:
+            return None
+        return sum(span.missed.total() for span in self.publishers.values())
+
+    def receive(self, publisher: str | None, number: int | None, *, reported: bool = False) -> bool:
+        """Count one taken message; False for a repeat.
+
+        Without number or publisher, from then on, all that can be said of the topic is what the middleware itself reports to
+        have lost (``reported``: it does), or nothing.
+        """
+        if publisher is None or number is None or self.accounting != EXACT:
+            if self.accounting != RECEIVED_ONLY:
+                self.accounting = REPORTED if reported else RECEIVED_ONLY
+            if self.accounting == REPORTED:
+                self._span(TOPIC_WIDE).count()
+        elif not self._span(publisher).observe(number):
+            return False
         self.received += 1
         return True
+
+    def lose(self, count: int | None) -> None:
+        """What the middleware reports to have lost since it was last asked; None where it may have lost more without a word."""
+        if self.accounting == REPORTED:
+            if count is None:
+                self.accounting = RECEIVED_ONLY
+            elif count:
+                self._span(TOPIC_WIDE).lose(count)
+
+    def _span(self, publisher: str) -> Span:
+        span = self.publishers.get(publisher)
+        if span is None:
+            span = self.publishers[publisher] = Span()
+        return span
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +110,21 @@ class TopicRow:
     @property
     def open(self) -> int:
         return self.received - self.skipped - self.stored - sum(self.rejected.values()) - sum(self.dropped.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Totals:
+    """A topic of this session at one instant, as sums."""
+
+    type: str
+    accounting: str
+    received: int
+    stored: int
+    skipped: int
+    rejected: int
+    dropped: int
+    missed: int | None
+    open: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,6 +188,22 @@ class Accounts:
         with self._lock:
             account = self._topics.get(topic)
             return max(account.last_kept_ns if account else 0, self._last_kept.get(topic, 0))
+
+    def rebase(self, topic: str) -> None:
+        """What is published on the topic until its next message was not listened to on purpose: it is not missed."""
+        with self._lock:
+            account = self._topics.get(topic)
+            for span in (account.publishers if account else self._inherited.get(topic, {})).values():
+                span.rebase()
+
+    def totals(self) -> dict[str, Totals]:
+        """Every topic of this session as it stands now."""
+        with self._lock:
+            return {
+                topic: Totals(account.type, account.accounting, account.received, account.stored, account.skipped,
+                              account.rejected.total(), account.dropped.total(), account.missed, account.open)
+                for topic, account in self._topics.items()
+            }  # fmt: skip
 
     def snapshot(self, stored: Mapping[str, tuple[int, int]]) -> Snapshot | None:
         """The state as it will be once ``stored`` is durable; None when nothing changed since the last one."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import sqlite3
 from collections import Counter
 from dataclasses import dataclass, field
@@ -66,7 +67,7 @@ class Adoption:
         self._topics: dict[str, TopicRow] = {}
 
     def run(self) -> None:
-        for state, reason, bucket, key, path in self._tree.objects():
+        for state, reason, bucket, key, path in self._tree.objects(self._in_place):
             if not _can_be_named(bucket, key):
                 self._foreign(path)
                 continue
@@ -93,6 +94,17 @@ class Adoption:
                 if len(self._group) >= GROUP_FILES or sum(len(found.item.body) for found in self._group) >= GROUP_BYTES:
                     self._adopt()
         self._adopt()
+
+    def _in_place(self, bucket: str, prefix: str) -> frozenset[str]:
+        """Keys of objects in the spool that begin so. A query a file would make a start with 100,000 of them take seconds."""
+        if not _can_be_named(bucket, f'{prefix}x'):
+            return frozenset()
+        end = f'{prefix[:-1]}0' if prefix else '\U0010ffff'  # "0" comes after "/"
+        rows = self._index.db.execute(
+            "SELECT key FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND state IN ('pending', 'held', 'quarantined')"
+            ' AND reason IS NOT ?', (bucket, prefix, end, MISSING),
+        )  # fmt: skip
+        return frozenset(key for (key,) in rows)
 
     def _known(self, row: sqlite3.Row, sha256: str, path: Path, ready: Path) -> None:
         """A file whose object is missing or has left the spool."""
@@ -128,6 +140,16 @@ class Adoption:
             self._index.write(self._session, Snapshot(tuple(self._topics.values()), ()))
             self._index.end_session(self._session, self._now_ns)
         self._group.clear()
+
+
+def place_said(tree: Tree, part: Path) -> Path | None:
+    """Where a part belongs by its own description; None when its content is not what that says, or the place is taken."""
+    said = description_of(part)
+    bucket, key, held = _word(said, 'bucket', ''), _word(said, 'key', ''), _word(said, 'held', '')
+    if not _can_be_named(bucket, key) or hashlib.sha256(part.read_bytes()).hexdigest() != said.get('sha256'):
+        return None
+    place = tree.path(State.HELD if held else State.PENDING, held, bucket, key)
+    return None if os.path.lexists(place) else place
 
 
 def _can_be_named(bucket: str, key: str) -> bool:

@@ -12,17 +12,18 @@ a lost index can be rebuilt from the tree.
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import logging
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.model import DataObject, State
 
 log = logging.getLogger(__name__)
 
@@ -61,14 +62,16 @@ class Tree:
         reasons = () if state is State.PENDING else (_UNSAFE.sub('_', reason or '') or 'unknown',)
         return self.root.joinpath(_FOLDERS[state], *reasons, bucket, key)
 
-    def write_part(self, number: int, body: bytes, description: Mapping[str, Any]) -> None:
+    def write_part(self, number: int, body: bytes, said: Mapping[str, Any]) -> None:
         """Write and sync the bytes; raises OSError (a full disk, say) and then leaves nothing behind."""
         path = self.part(number)
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        if os.path.lexists(path):  # none of ours: no two objects have one number, and a part that failed is gone
+            self.set_aside(path)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             with os.fdopen(descriptor, 'wb') as file:
                 file.write(body)
-                describe(file.fileno(), description)
+                describe(file.fileno(), said)
                 file.flush()
                 os.fsync(file.fileno())
         except OSError:
@@ -105,12 +108,15 @@ class Tree:
             return False
         return True
 
-    def remove(self, path: Path) -> None:
-        """Unlink; never raises OSError, since recovery removes what stays."""
+    def remove(self, path: Path) -> bool:
+        """Unlink; False when nothing was there. Never raises OSError, since recovery removes what stays."""
         try:
-            path.unlink(missing_ok=True)
+            os.unlink(path)  # noqa: PTH108 - once for each object delivered
+        except FileNotFoundError:
+            return False
         except OSError as error:
             log.warning('cannot remove %s: %s', path, error)
+        return True
 
     def set_aside(self, path: Path) -> None:
         """Move a file that is none of the spool's to ``foreign/``, over no other one."""
@@ -136,18 +142,33 @@ class Tree:
             if _PART.fullmatch(path.name) and self.size(path) is not None:
                 yield int(path.stem), path
 
-    def objects(self) -> Iterator[tuple[State, str | None, str, str, Path]]:
-        """(state, reason, bucket, key, path) of every regular file that lies where objects lie."""
+    def is_ready(self, bucket: str, key: str, size: int) -> bool:
+        """Whether the file of a pending object lies whole in its place; without a Path, for a start asks it of each one."""
+        try:
+            status = os.lstat(f'{self.root}/{_FOLDERS[State.PENDING]}/{bucket}/{key}')
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return status.st_size == size and stat.S_ISREG(status.st_mode)
+
+    def objects(self, known: Callable[[str, str], Collection[str]]) -> Iterator[tuple[State, str | None, str, str, Path]]:
+        """(state, reason, bucket, key, path) of every regular file that lies where objects lie.
+
+        ``known`` gives keys to leave out, asked once a folder with the bucket and what the keys there begin with.
+        """
         for state, name in _FOLDERS.items():
             folder = self.root / name
             depth = 1 if state is State.PENDING else 2
             for parent, _, names in os.walk(folder):
                 relative = Path(parent).relative_to(folder).parts
-                for file in names:
-                    path = Path(parent, file)
-                    if len(relative) >= depth and self.size(path) is not None:
-                        reason = None if depth == 1 else relative[0]
-                        yield state, reason, relative[depth - 1], '/'.join((*relative[depth:], file)), path
+                if not names or len(relative) < depth:
+                    continue
+                reason, bucket = None if depth == 1 else relative[0], relative[depth - 1]
+                prefix = ''.join(f'{part}/' for part in relative[depth:])
+                left_out = known(bucket, prefix)
+                for key in (key for file in names if (key := prefix + file) not in left_out):
+                    path = folder.joinpath(*relative[:depth], key)
+                    if self.size(path) is not None:
+                        yield state, reason, bucket, key, path
 
     def prune(self) -> None:
         """Remove empty folders of past days."""
@@ -163,10 +184,20 @@ class Tree:
         return status.f_bavail * status.f_frsize
 
 
-def describe(target: int | Path, description: Mapping[str, Any]) -> None:
+def description(item: DataObject, key: str, sha256: str, metadata: Mapping[str, str]) -> dict[str, object]:
+    """What a file must say of itself so that its row can be made again."""
+    return {
+        'bucket': item.bucket, 'key': key, 'sha256': sha256, 'content_type': item.content_type, 'sensor': item.sensor,
+        'topic': item.topic, 'type': item.type, 'samples': item.samples, 't_start_ns': item.t_start_ns,
+        't_end_ns': item.t_end_ns, 'priority': item.priority, 'protected': item.protected, 'held': item.held,
+        'metadata': dict(metadata),
+    }  # fmt: skip
+
+
+def describe(target: int | Path, said: Mapping[str, Any]) -> None:
     """Attach a description to a file; where the file system has no attributes the index alone knows it."""
     try:
-        os.setxattr(target, ATTRIBUTE, json.dumps(description).encode())
+        os.setxattr(target, ATTRIBUTE, json.dumps(said).encode())
     except OSError as error:
         if error.errno not in _NO_ATTRIBUTES:
             raise
@@ -179,3 +210,20 @@ def description_of(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
+
+
+@contextmanager
+def flock(path: Path, *, wait: bool = True) -> Iterator[bool]:
+    """An advisory lock that dies with its process; yields whether it was had."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in {errno.EAGAIN, errno.EACCES}:
+                raise
+            yield False
+        else:
+            yield True
+    finally:
+        os.close(descriptor)

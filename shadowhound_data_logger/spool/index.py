@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -18,63 +18,13 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.spool.accounts import PublisherRow, Snapshot, TopicRow
+from shadowhound_data_logger.spool.schema import definitions, expected, prepare
 
-SCHEMA_VERSION: Final = 1
-VERSION_LIMIT: Final = 1000
-"""A version from here on is damage, not a future."""
 FORGET_STEP: Final = 10_000
 """Rows that one commit forgets at most: some 50 ms."""
 BUSY_TIMEOUT_S: Final = 10.0
 MISSING: Final = 'missing'
 """Reason of a quarantined object whose file is gone."""
-_STATES: Final = ', '.join(f"'{state.value}'" for state in State)
-_SCHEMA: Final = f"""
-CREATE TABLE objects (
-  id INTEGER PRIMARY KEY AUTOINCREMENT,
-  bucket TEXT NOT NULL, key TEXT NOT NULL,
-  state TEXT NOT NULL CHECK (state IN ({_STATES})), reason TEXT,
-  priority INTEGER NOT NULL, protected INTEGER NOT NULL,
-  sensor TEXT NOT NULL, topic TEXT, type TEXT NOT NULL,
-  samples INTEGER NOT NULL, bytes INTEGER NOT NULL, sha256 TEXT NOT NULL,
-  content_type TEXT NOT NULL, metadata TEXT NOT NULL,
-  t_start_ns INTEGER NOT NULL, t_end_ns INTEGER NOT NULL,
-  created_ns INTEGER NOT NULL, settled_ns INTEGER,
-  UNIQUE (bucket, key));
-CREATE INDEX pending ON objects (priority, id) WHERE state = 'pending';
-CREATE INDEX waiting ON objects (id) WHERE state = 'pending';
-CREATE INDEX evictable ON objects (priority DESC, id, bytes) WHERE state IN ('pending', 'held') AND NOT protected;
-CREATE INDEX quarantined ON objects (reason, bytes) WHERE state = 'quarantined';
-CREATE INDEX settled ON objects (settled_ns) WHERE state IN ('delivered', 'deduplicated', 'evicted');
-CREATE TABLE tally (
-  topic TEXT NOT NULL, state TEXT NOT NULL,
-  objects INTEGER NOT NULL DEFAULT 0, bytes INTEGER NOT NULL DEFAULT 0, samples INTEGER NOT NULL DEFAULT 0,
-  PRIMARY KEY (topic, state)) WITHOUT ROWID;
-CREATE TRIGGER spooled AFTER INSERT ON objects BEGIN
-  INSERT INTO tally VALUES (ifnull(NEW.topic, ''), 'spooled', 1, NEW.bytes, NEW.samples)
-    ON CONFLICT DO UPDATE SET objects = objects + 1, bytes = bytes + NEW.bytes, samples = samples + NEW.samples;
-  INSERT INTO tally VALUES (ifnull(NEW.topic, ''), NEW.state, 1, NEW.bytes, NEW.samples)
-    ON CONFLICT DO UPDATE SET objects = objects + 1, bytes = bytes + NEW.bytes, samples = samples + NEW.samples;
-END;
-CREATE TRIGGER moved AFTER UPDATE OF state ON objects WHEN OLD.state <> NEW.state BEGIN
-  UPDATE tally SET objects = objects - 1, bytes = bytes - OLD.bytes, samples = samples - OLD.samples
-    WHERE topic = ifnull(OLD.topic, '') AND state = OLD.state;
-  INSERT INTO tally VALUES (ifnull(NEW.topic, ''), NEW.state, 1, NEW.bytes, NEW.samples)
-    ON CONFLICT DO UPDATE SET objects = objects + 1, bytes = bytes + NEW.bytes, samples = samples + NEW.samples;
-END;
-CREATE TABLE sessions (
-  id INTEGER PRIMARY KEY AUTOINCREMENT, robot TEXT NOT NULL, boot_id TEXT NOT NULL, pid INTEGER NOT NULL,
-  started_ns INTEGER NOT NULL, ended_ns INTEGER);
-CREATE TABLE accounts (
-  session INTEGER NOT NULL, topic TEXT NOT NULL, type TEXT NOT NULL, accounting TEXT NOT NULL,
-  received INTEGER NOT NULL, skipped INTEGER NOT NULL, stored INTEGER NOT NULL,
-  rejected TEXT NOT NULL, dropped TEXT NOT NULL, last_kept_ns INTEGER NOT NULL,
-  PRIMARY KEY (session, topic)) WITHOUT ROWID;
-CREATE TABLE publishers (
-  session INTEGER NOT NULL, topic TEXT NOT NULL, publisher TEXT NOT NULL, first INTEGER, last INTEGER,
-  published INTEGER NOT NULL, received INTEGER NOT NULL, missed TEXT NOT NULL,
-  PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
-PRAGMA user_version = {SCHEMA_VERSION};
-"""  # noqa: S608 - own constants only
 _OBJECT: Final = 'id, bucket, key, bytes, sha256, content_type, metadata, priority, created_ns, state, reason'
 
 
@@ -98,25 +48,11 @@ class Index:
             raise SpoolError(f'cannot open the spool index {self._path}: {error}',
                              remedy='is the path right, and may you read it?') from error  # fmt: skip
         try:
-            self._prepare(connection)
+            prepare(connection, self._path, read_only=self._read_only)
         except BaseException:
             connection.close()
             raise
         self._connection = connection
-
-    def _prepare(self, connection: sqlite3.Connection) -> None:
-        version = connection.execute('PRAGMA user_version').fetchone()[0]
-        if not 0 <= version < VERSION_LIMIT:
-            raise sqlite3.DatabaseError(f'the version {version} is none')
-        if version > SCHEMA_VERSION:
-            raise SpoolError(f'the spool index {self._path} is of version {version}, this program knows {SCHEMA_VERSION}',
-                             remedy='update shadowhound_data_logger')  # fmt: skip
-        if self._read_only:
-            return
-        connection.execute('PRAGMA journal_mode = WAL')
-        connection.execute('PRAGMA synchronous = FULL')
-        if version == 0:
-            connection.executescript(f'BEGIN IMMEDIATE; {_SCHEMA} COMMIT;')
 
     def close(self) -> None:
         if self._connection is not None:
@@ -134,7 +70,7 @@ class Index:
 
         The longer check compares tables with their indexes as well, without which damage shows in a commit only.
         """
-        if not _definitions(self.db) >= _expected():
+        if not definitions(self.db) >= expected():
             raise sqlite3.DatabaseError('its tables are not those of this version')
         pragma = 'integrity_check' if self.sessions(ended=False) else 'quick_check'
         answer = self.db.execute(f'PRAGMA {pragma}(1)').fetchone()[0]
@@ -199,16 +135,21 @@ class Index:
         """What a full disk costs first: lowest priority, then oldest; never a protected object."""
         return self.rows("state IN ('pending', 'held') AND NOT protected ORDER BY priority DESC, id LIMIT ?", (limit,))
 
-    def evictable_bytes(self) -> int:
-        """What evicting everything that may be evicted would free."""
-        query = "SELECT ifnull(sum(bytes), 0) FROM objects WHERE state IN ('pending', 'held') AND NOT protected"
-        return int(self.db.execute(query).fetchone()[0])
+    def evictable_bytes(self) -> dict[int, int]:
+        """What evicting everything that may be evicted would free, by priority."""
+        where = "state IN ('pending', 'held') AND NOT protected"
+        return dict(self.db.execute(f'SELECT priority, sum(bytes) FROM objects WHERE {where} GROUP BY priority'))  # noqa: S608
 
     def payload_bytes(self) -> int:
         """Bytes of all payload that lies in the spool: files that went missing take no room."""
         present = "SELECT ifnull(sum(bytes), 0) FROM tally WHERE state IN ('pending', 'held', 'quarantined')"
         missing = "SELECT ifnull(sum(bytes), 0) FROM objects WHERE state = 'quarantined' AND reason = 'missing'"
         return int(self.db.execute(f'SELECT ({present}) - ({missing})').fetchone()[0])
+
+    def oldest_pending_ns(self) -> int | None:
+        """When the object that has waited for delivery for the longest was spooled; None when none waits."""
+        row = self.db.execute("SELECT created_ns FROM objects WHERE state = 'pending' ORDER BY id LIMIT 1").fetchone()
+        return None if row is None else int(row[0])
 
     def set_missing(self, ids: Iterable[int], now_ns: int) -> int:
         """The files of these objects are gone, whoever took them; returns for how many that is new."""
@@ -285,18 +226,6 @@ class Index:
     def tally(self) -> list[tuple[str, str, int, int, int]]:
         """(topic or '', state or 'spooled', objects, bytes, samples)."""
         return self.db.execute('SELECT topic, state, objects, bytes, samples FROM tally').fetchall()
-
-
-def _definitions(db: sqlite3.Connection) -> set[tuple[str, str]]:
-    """Name and text of all tables, indexes and triggers."""
-    return set(db.execute('SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL'))
-
-
-def _expected() -> set[tuple[str, str]]:
-    """The definitions of an index that is whole."""
-    with closing(sqlite3.connect(':memory:')) as db:
-        db.executescript(_SCHEMA)
-        return _definitions(db)
 
 
 def spooled(row: sqlite3.Row, path: Path) -> SpooledObject:

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool.accounts import EXACT, GRADES, RECEIVED_ONLY
+from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.index import Index
 
 STATES: Final = tuple(state.value for state in State)
@@ -78,14 +78,14 @@ def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tup
     missed_by: Counter[str] = Counter()
     for span in spans:
         missed_by.update(span.missed)
-    exact = accounting == EXACT
+    known = accounting != RECEIVED_ONLY
     return {
         'type': rows[-1].type if rows else '',
         'accounting': accounting,
-        'published': sum(span.published for span in spans) if exact else None,
+        'published': sum(span.published for span in spans) if known else None,
         'received': sum(row.received for row in rows),
-        'missed': missed_by.total() if exact else None,
-        'missed_by': dict(missed_by) if exact else {},
+        'missed': missed_by.total() if known else None,
+        'missed_by': dict(missed_by) if known else {},
         'skipped': sum(row.skipped for row in rows),
         'rejected': _sum(row.rejected for row in rows),
         'dropped': _sum(row.dropped for row in rows),

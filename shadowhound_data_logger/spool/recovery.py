@@ -7,6 +7,7 @@ are settled: what they had received without an outcome is dropped with the reaso
 from __future__ import annotations
 
 import fcntl
+import json
 import logging
 import os
 import sqlite3
@@ -16,10 +17,11 @@ from typing import Final
 
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.accounts import Snapshot, TopicRow
-from shadowhound_data_logger.spool.adoption import Adoption, Recovery
+from shadowhound_data_logger.spool.adoption import Adoption, Recovery, place_said
+from shadowhound_data_logger.spool.ballast import says_full
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import MISSING, Index
-from shadowhound_data_logger.spool.ledger import of_index
+from shadowhound_data_logger.spool.ledger import imbalances, of_index
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +66,8 @@ def _is_damage(path: Path, error: Exception) -> bool:
     """
     if not isinstance(error, sqlite3.OperationalError):
         return True
+    if says_full(error, path.parent):
+        return False
     if 'readonly' in str(error):  # a flipped bit of the header says so as well
         return os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)
     return any(word in str(error) for word in _DAMAGED)
@@ -87,7 +91,9 @@ def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
         if _is_dead(tree, session):
             _settle_session(index, session, now_ns, report)
             tree.remove(tree.session(session))
-    of_index(index, '')  # a value in it that is none shows here
+    for sentence in imbalances(of_index(index, '')):  # a value in it that is none shows here
+        log.error('the ledger of %s does not close, its index was damaged: %s', tree.root, sentence)
+        report.counts['sums of the ledger that do not close'] += 1
     tree.prune()
 
 
@@ -99,8 +105,10 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
         state = State(row['state'])
         if state is State.QUARANTINED and row['reason'] == MISSING:
             continue
-        path = tree.path(state, row['reason'], row['bucket'], row['key'])
-        where = path
+        json.loads(row['metadata'])  # damage that SQLite does not see; later it would stop all delivery
+        if state is State.PENDING and tree.is_ready(row['bucket'], row['key'], row['bytes']):
+            continue
+        path = where = tree.path(state, row['reason'], row['bucket'], row['key'])
         if tree.size(path) is None:
             # Last its own place again: another process may just have moved it there.
             places = (tree.part(row['id']), tree.path(State.PENDING, None, row['bucket'], row['key']), path)
@@ -109,7 +117,7 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
                 missing.append(row['id'])
                 continue
             where = found
-            if state is State.QUARANTINED and found == places[1]:
+            if state is State.QUARANTINED and found == places[1] and tree.size(found) == row['bytes']:
                 # Moved there by hand, to be tried again; or quarantined when the power went, and then a try costs nothing.
                 with index.transaction():
                     index.set_found(row['id'])
@@ -129,11 +137,15 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
 
 
 def _remove_parts(tree: Tree, index: Index, report: Recovery) -> None:
-    """Parts without a row were never committed."""
+    """Parts without a row were never committed; but a new index cannot know that, and what they say of themselves counts."""
+    is_new = not index.sessions(ended=True) and not index.sessions(ended=False)
     # Inside a transaction: another process that is about to commit a part of its own holds the write lock.
     with index.transaction():
         for number, part in tree.parts():
-            if not index.rows(f'id = ? AND {_IN_SPOOL}', (number,)):
+            if index.rows(f'id = ? AND {_IN_SPOOL}', (number,)):
+                continue
+            place = place_said(tree, part) if is_new else None
+            if place is None or not tree.place(part, place):
                 tree.remove(part)
                 report.counts['uncommitted parts removed'] += 1
 

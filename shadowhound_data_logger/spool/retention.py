@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.model import DataObject, State
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 
@@ -17,22 +21,48 @@ EVICTION_STEP: Final = 64
 OVERHEAD_BYTES: Final = 8192
 """What an object costs on disk beyond its bytes: a block's rounding and its share of the index."""
 NO_ROOM: Final = 'no_room'
+TELL_EVERY_NS: Final = 60 * SECOND
 
 
-def make_room(index: Index, tree: Tree, settings: SpoolSettings, needed: int, now_ns: int) -> bool:
-    """Evict the least important until ``needed`` bytes fit; False when they cannot, and then nothing is evicted for them.
+@dataclass(frozen=True, slots=True)
+class Room:
+    """What a group of new objects costs."""
 
-    The caller holds the spool's lock and is in no transaction: the evictions are one of their own for each round.
+    given_up: frozenset[int] = frozenset()
+    """Places in the group of those that are not taken in."""
+    evicted: int = 0
+
+
+def make_room(index: Index, tree: Tree, settings: SpoolSettings, objects: Sequence[DataObject], leaving: int,
+              now_ns: int) -> Room:  # fmt: skip
+    """Take in as many of the objects as fit, the most important first, and evict what is not more important for them.
+
+    Of what is equally important the oldest goes. Protected objects are always taken in, and nothing is evicted in vain.
+    ``leaving`` bytes are about to be freed. The caller holds the spool's lock and is in no transaction: the evictions are
+    one of their own for each round.
     """
+    needed = sum(map(_cost, objects))
+    if needed <= leaving or (over := _over(index, tree, settings, needed - leaving)) <= 0:
+        return Room()
+    free, evictable = needed - over, index.evictable_bytes()
+    taken, given_up = 0, set[int]()
+    for place in sorted(range(len(objects)), key=lambda place: (not objects[place].protected, objects[place].priority, -place)):
+        item = objects[place]
+        room = free + sum(size for priority, size in evictable.items() if priority >= item.priority)
+        if item.protected or taken + _cost(item) <= room:
+            taken += _cost(item)
+        else:
+            given_up.add(place)
     evicted = 0
-    while (over := _over(index, tree, settings, needed)) > 0:
-        if not evicted and index.evictable_bytes() < over:
-            log.error('the spool %s has no room: %d bytes too many, more than may be evicted', tree.root, over)
-            return False
-        rows = index.evictable(EVICTION_STEP)
-        if not rows:
-            log.error('the spool %s has no room: %d bytes too many and nothing left that may be evicted', tree.root, over)
-            return False
+    if taken and taken - free <= sum(evictable.values()):
+        evicted = _evict(index, tree, settings, taken - leaving, now_ns)
+    return Room(frozenset(given_up), evicted)
+
+
+def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, now_ns: int) -> int:
+    """Evict the least important, of these the oldest, until ``needed`` bytes fit; returns how many objects that took."""
+    evicted = 0
+    while (over := _over(index, tree, settings, needed)) > 0 and (rows := index.evictable(EVICTION_STEP)):
         count = 0
         while count < len(rows) and over > 0:
             over -= rows[count]['bytes']
@@ -43,11 +73,37 @@ def make_room(index: Index, tree: Tree, settings: SpoolSettings, needed: int, no
             tree.remove(tree.path(State(row['state']), row['reason'], row['bucket'], row['key']))
             tree.remove(tree.part(row['id']))
         evicted += count
-    if evicted:
-        log.warning('the spool %s evicted %d objects to make room', tree.root, evicted)
-    return True
+    return evicted
+
+
+def _cost(item: DataObject) -> int:
+    return len(item.body) + OVERHEAD_BYTES
 
 
 def _over(index: Index, tree: Tree, settings: SpoolSettings, needed: int) -> int:
     """Bytes too many with ``needed`` more, by the quota or by the file system, whichever is worse."""
     return max(index.payload_bytes() + needed - settings.max_bytes, settings.min_free_bytes + needed - tree.free_bytes())
+
+
+class Shortage:
+    """Says that objects had to go: when that begins, once a minute while it lasts, and when it is over."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._lost = 0
+        self._lost_ns = self._told_ns = 0
+
+    def note(self, room: Room, now_ns: int) -> None:
+        """What one commit cost."""
+        lost = room.evicted + len(room.given_up)
+        if lost:
+            self._lost += lost
+            self._lost_ns = now_ns
+            if not 0 <= now_ns - self._told_ns < TELL_EVERY_NS:
+                self._told_ns = now_ns
+                log.warning(
+                    'the spool %s is full: %d objects had to go so far, the least important first', self._root, self._lost
+                )
+        elif self._lost and not 0 <= now_ns - self._lost_ns < TELL_EVERY_NS:
+            log.info('the spool %s has had room for a minute; %d objects had to go', self._root, self._lost)
+            self._lost = self._told_ns = 0

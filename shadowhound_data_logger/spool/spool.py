@@ -7,14 +7,13 @@ is the only commit point, so objects and ledger cannot disagree; a rename that d
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import hashlib
 import logging
 import os
 import sqlite3
 import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -25,16 +24,21 @@ from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.keys import check_key, unique
 from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
-from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.accounts import Accounts, Snapshot
 from shadowhound_data_logger.spool.adoption import Recovery
-from shadowhound_data_logger.spool.files import Tree
+from shadowhound_data_logger.spool.ballast import Ballast
+from shadowhound_data_logger.spool.files import Tree, description, flock
 from shadowhound_data_logger.spool.index import Index, spooled
+from shadowhound_data_logger.spool.piles import Piles, look
 from shadowhound_data_logger.spool.recovery import open_recovered
-from shadowhound_data_logger.spool.retention import NO_ROOM, OVERHEAD_BYTES, make_room
+from shadowhound_data_logger.spool.retention import NO_ROOM, OVERHEAD_BYTES, Shortage, make_room
 
 log = logging.getLogger(__name__)
 
+CLOSE_S: Final = 10.0
+"""For a commit that is under way when the spool is closed."""
 DAY_NS: Final = 24 * 3600 * SECOND
+_LEFT: Final = frozenset({State.DELIVERED, State.DEDUPLICATED, State.EVICTED})
 
 
 class Spool:
@@ -53,19 +57,18 @@ class Spool:
         self._tree = Tree(root)
         self._lock = threading.Lock()
         self._index = Index(root / 'index.db')
+        self._view = Index(root / 'index.db', read_only=True)
         self._session = 0
         self._session_lock: int | None = None
         self._forgot_ns = 0
+        self._shortage = Shortage(root)
+        self._ballast = Ballast(root / 'ballast')
 
     def open(self) -> None:
         """Create or recover the spool and begin a session. Raises SpoolError naming the folder and what to do."""
         try:
-            self._tree.create()
-            with _flock(self.root / 'recovery.lock'):
-                self._index = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
-                self._begin()
+            self._ballast.work(self._open)
         except (OSError, sqlite3.Error) as error:
-            self._index.close()
             reason = getattr(error, 'strerror', None) or error
             remedy = 'set SHADOWHOUND_HOME to a folder that this user may write, with space on it'
             raise SpoolError(f'the spool {self.root} cannot be used: {reason}', remedy=remedy) from error
@@ -73,22 +76,20 @@ class Spool:
             log.warning('spool %s: %s', self.root, self.recovery.describe())
 
     def close(self) -> None:
-        """Commit the last accounts and end the session; idempotent."""
+        """Commit the last accounts and end the session; idempotent. Raises SpoolError when the disk does not take them."""
         if not self._session:
             return
-        with self._lock:
+        with self._had_within(CLOSE_S):
             lost = self.accounts.drop_open('shutdown')
             if lost:
                 log.error('%d messages were still in memory when the spool %s was closed', lost, self.root)
             snapshot = self.accounts.snapshot({})
             try:
-                with self._index.transaction():
-                    if snapshot:
-                        self._index.write(self._session, snapshot)
-                    self._index.end_session(self._session, self._clock.wall_ns())
-            except BaseException:
+                self._ballast.work(lambda: self._end(snapshot))
+            except (OSError, sqlite3.Error) as error:
                 self.accounts.mark_dirty()
-                raise
+                raise self.unwritable(error) from error
+            self._view.close()
             self._index.close()
             self._tree.remove(self._tree.session(self._session))
             self._session = 0
@@ -102,32 +103,16 @@ class Spool:
         Raises OSError or sqlite3.OperationalError when nothing of it became durable; the caller tries again. Objects
         for which there is no room at all are recorded as evicted (D9).
         """
-        now_ns = self._clock.wall_ns()
         with self._lock:
-            leaving = sum(outcome.item.size + OVERHEAD_BYTES for outcome in outcomes if outcome.state is not State.QUARANTINED)
-            needed = sum(len(item.body) + OVERHEAD_BYTES for item in objects) - leaving
-            fits = needed <= 0 or make_room(self._index, self._tree, self._settings, needed, now_ns)
-            stored = _count(objects)
-            snapshot = self.accounts.snapshot(stored)
-            added: list[tuple[SpooledObject, State]] = []
-            try:
-                with self._index.transaction(undo=lambda: self._discard(added)):
-                    for item in objects:
-                        added.append(self._add(item, now_ns, fits))  # noqa: PERF401 - undo needs those before a failure
-                    if added:
-                        self._tree.sync_incoming()
-                    for outcome in outcomes:
-                        self._index.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
-                    if snapshot is not None:
-                        self._index.write(self._session, snapshot)
-                    self._forget(now_ns)
-            except BaseException:
-                self.accounts.mark_dirty()
-                raise
-            self.accounts.store(stored)
-            placed = self._place(added)
-            self._settle(outcomes)
+            placed = self._ballast.work(lambda: self._commit(objects, outcomes))
+            self._ballast.keep(self._tree.free_bytes, self._settings.min_free_bytes)
+        self._settle(outcomes)
         return placed
+
+    def unwritable(self, error: OSError | sqlite3.Error) -> SpoolError:
+        """What a failed commit means to an operator."""
+        reason = getattr(error, 'strerror', None) or error
+        return SpoolError(f'the spool {self.root} cannot be written: {reason}', remedy='is its disk full, read-only or broken?')
 
     def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
                 without: Sequence[str] = ()) -> list[SpooledObject]:  # fmt: skip
@@ -144,22 +129,48 @@ class Spool:
         return found
 
     def pending_count(self) -> int:
-        with self._lock:
-            return sum(row[2] for row in self._index.tally() if row[1] == State.PENDING.value)
+        """Waits for no commit."""
+        return sum(row[2] for row in self._view.tally() if row[1] == State.PENDING.value)
+
+    def piles(self) -> Piles:
+        """What lies here now; waits for no commit. Raises OSError or sqlite3.Error."""
+        return look(self._view, self.root, self._clock.wall_ns())
 
     @contextmanager
     def drain_lock(self) -> Iterator[bool]:
         """Held by the one process that ships (D6); yields False when another one has it."""
-        with _flock(self.root / 'drain.lock', wait=False) as mine:
+        with flock(self.root / 'drain.lock', wait=False) as mine:
             yield mine
 
     @contextmanager
     def node_lock(self) -> Iterator[bool]:
         """Held by the one node that takes this robot's messages: a second one would count and store them again."""
-        with _flock(self.root / f'node-{self._robot}.lock', wait=False) as mine:
+        with flock(self.root / f'node-{self._robot}.lock', wait=False) as mine:
             yield mine
 
+    @contextmanager
+    def _had_within(self, seconds: float) -> Iterator[None]:
+        """The lock, unless a commit hangs in the disk: the next start then ends the session."""
+        if not self._lock.acquire(timeout=seconds):
+            raise SpoolError(f'the spool {self.root} cannot be closed: its disk does not answer', remedy='is it broken?')
+        try:
+            yield
+        finally:
+            self._lock.release()
+
     # -- under the lock --------------------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        try:
+            self._tree.create()
+            with flock(self.root / 'recovery.lock'):
+                self._index = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
+                self._view.open()
+                self._begin()
+        except (OSError, sqlite3.Error):
+            self._index.close()
+            self._view.close()
+            raise
 
     def _begin(self) -> None:
         now_ns = self._clock.wall_ns()
@@ -167,11 +178,38 @@ class Spool:
             self._session = self._index.begin_session(self._robot, self._clock.boot_id, os.getpid(), now_ns)
         self._session_lock = os.open(self._tree.session(self._session), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._session_lock, fcntl.LOCK_EX)
-        last = {(row.topic, row.publisher): row for row in self._index.publishers()}
-        kept: dict[str, int] = {}
-        for row in self._index.topics():
-            kept[row.topic] = max(kept.get(row.topic, 0), row.last_kept_ns)
-        self.accounts = Accounts(last.values(), kept)
+        self.accounts = _continued(self._index)
+
+    def _end(self, snapshot: Snapshot | None) -> None:
+        with self._index.transaction():
+            if snapshot:
+                self._index.write(self._session, snapshot)
+            self._index.end_session(self._session, self._clock.wall_ns())
+
+    def _commit(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> list[SpooledObject]:
+        now_ns = self._clock.wall_ns()
+        leaving = sum(outcome.item.size + OVERHEAD_BYTES for outcome in outcomes if outcome.state is not State.QUARANTINED)
+        room = make_room(self._index, self._tree, self._settings, objects, leaving, now_ns)
+        self._shortage.note(room, now_ns)
+        stored = _count(objects)
+        snapshot = self.accounts.snapshot(stored)
+        added: list[tuple[SpooledObject, State]] = []
+        try:
+            with self._index.transaction(undo=lambda: self._discard(added)):
+                for place, item in enumerate(objects):
+                    added += [self._add(item, now_ns, place not in room.given_up)]  # undo needs those before a failure
+                if added:
+                    self._tree.sync_incoming()
+                for outcome in outcomes:
+                    self._index.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
+                if snapshot is not None:
+                    self._index.write(self._session, snapshot)
+                self._forget(now_ns)
+        except BaseException:
+            self.accounts.mark_dirty()
+            raise
+        self.accounts.store(stored)
+        return self._place(added)
 
     def _add(self, item: DataObject, now_ns: int, fits: bool) -> tuple[SpooledObject, State]:
         """Row and part of one object, inside the transaction."""
@@ -184,7 +222,7 @@ class Spool:
         number = self._index.insert(item, key, sha256, state, reason, metadata, now_ns)
         path = self._tree.part(number)
         if state is not State.EVICTED:
-            self._tree.write_part(number, item.body, _description(item, key, sha256, metadata))
+            self._tree.write_part(number, item.body, description(item, key, sha256, metadata))
             path = self._tree.path(state, reason, item.bucket, key)
         return SpooledObject(number, item.bucket, key, path, len(item.body), sha256, item.content_type, metadata,
                              item.priority, now_ns), state  # fmt: skip
@@ -225,7 +263,7 @@ class Spool:
             if outcome.state is State.QUARANTINED:
                 source = self._where(item.id, item.bucket, item.key)
                 self._tree.place(source, self._tree.path(outcome.state, outcome.reason, item.bucket, item.key))
-            elif outcome.state in {State.DELIVERED, State.DEDUPLICATED, State.EVICTED}:
+            elif outcome.state in _LEFT and not self._tree.remove(item.path):
                 self._tree.remove(self._where(item.id, item.bucket, item.key))
 
     def _forget(self, now_ns: int) -> None:
@@ -235,13 +273,13 @@ class Spool:
             self._forgot_ns = now_ns if done else 0
 
 
-def _description(item: DataObject, key: str, sha256: str, metadata: Mapping[str, str]) -> dict[str, object]:
-    """What a file must say of itself so that its row can be made again."""
-    return {
-        'bucket': item.bucket, 'key': key, 'sha256': sha256, 'content_type': item.content_type, 'sensor': item.sensor,
-        'topic': item.topic, 'type': item.type, 'samples': item.samples, 't_start_ns': item.t_start_ns,
-        't_end_ns': item.t_end_ns, 'priority': item.priority, 'protected': item.protected, 'metadata': dict(metadata),
-    }  # fmt: skip
+def _continued(index: Index) -> Accounts:
+    """Accounts of a session that goes on where the earlier ones ended."""
+    last = {(row.topic, row.publisher): row for row in index.publishers()}
+    kept: dict[str, int] = {}
+    for row in index.topics():
+        kept[row.topic] = max(kept.get(row.topic, 0), row.last_kept_ns)
+    return Accounts(last.values(), kept)
 
 
 def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, int]]:
@@ -252,20 +290,3 @@ def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, int]]:
             count, newest_ns = counts.get(item.topic, (0, 0))
             counts[item.topic] = (count + item.samples, max(newest_ns, item.t_end_ns))
     return counts
-
-
-@contextmanager
-def _flock(path: Path, *, wait: bool = True) -> Iterator[bool]:
-    """An advisory lock that dies with its process; yields whether it was had."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno not in {errno.EAGAIN, errno.EACCES}:
-                raise
-            yield False
-        else:
-            yield True
-    finally:
-        os.close(descriptor)

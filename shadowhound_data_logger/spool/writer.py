@@ -9,7 +9,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Sequence
 from typing import Final
 
@@ -38,6 +38,7 @@ class SpoolWriter:
         self._outcomes: deque[Outcome] = deque()
         self._bytes = 0
         self._added = self._done = 0
+        self._written = Counter[str]()
         self._urgent = False
         self._last_commit = -HEARTBEAT_S
         self.damaged = False
@@ -61,9 +62,15 @@ class SpoolWriter:
     def settle(self, outcomes: Sequence[Outcome]) -> None:
         """Queue outcomes of deliveries for the next commit; never waits."""
         with self._changed:
+            if not self._objects and not self._outcomes:  # else it is awake, and one wake an outcome would only cost
+                self._changed.notify_all()
             self._outcomes.extend(outcomes)
             self._added += len(outcomes)
-            self._changed.notify_all()
+
+    def written(self) -> tuple[int, int]:
+        """Objects that became durable since it was opened, and the messages in them."""
+        with self._changed:
+            return self._written['objects'], self._written['messages']
 
     def flush(self, deadline_s: float) -> bool:
         """Whether everything put and settled before this call became durable in time."""
@@ -92,8 +99,10 @@ class SpoolWriter:
         self._last_commit = time.monotonic()
         try:
             spooled = self._spool.commit(objects, outcomes)
-        except sqlite3.DatabaseError as error:
-            self.damaged = not isinstance(error, sqlite3.OperationalError)
+        except (OSError, sqlite3.OperationalError) as error:
+            raise self._spool.unwritable(error) from error
+        except sqlite3.DatabaseError:
+            self.damaged = True
             raise
         with self._changed:
             for _ in objects:
@@ -101,6 +110,7 @@ class SpoolWriter:
             for _ in outcomes:
                 self._outcomes.popleft()
             self._done += len(objects) + len(outcomes)
+            self._written.update(objects=len(objects), messages=sum(item.samples for item in objects))
             self._urgent = self._urgent and bool(self._objects or self._outcomes)
             self._changed.notify_all()
         if outcomes:

@@ -25,7 +25,8 @@ def planned(*publishers: tuple[bool, bool], expected: str | None = None) -> list
         ([BEST_EFFORT], [BEST_EFFORT]),
         ([LATCHED], [LATCHED]),
         ([BEST_EFFORT, RELIABLE], [RELIABLE, BEST_EFFORT]),
-        ([LATCHED, RELIABLE], [RELIABLE]),  # one that asks for TRANSIENT_LOCAL would not hear the other
+        ([LATCHED, RELIABLE], [LATCHED, RELIABLE]),  # one that asks for TRANSIENT_LOCAL does not hear the other
+        ([LATCHED, RELIABLE, BEST_EFFORT], [LATCHED, RELIABLE, BEST_EFFORT]),
         ([LATCHED, BEST_EFFORT], [LATCHED, BEST_EFFORT]),
         ([(False, True)], [BEST_EFFORT]),  # there is nothing to repeat a history with
     ],
@@ -55,16 +56,18 @@ def test_the_publisher_overrides_the_expected_type() -> None:
 @pytest.mark.parametrize(
     ('type_name', 'settings', 'messages'),
     [
-        (TYPE, IntakeSettings(), 400),  # 2000 Hz for 50 ms, four times
-        (TYPE, IntakeSettings(max_rate_hz=10.0), 10),
-        ('sensor_msgs/msg/Image', IntakeSettings(), 12),
+        (TYPE, IntakeSettings(), 4000),  # 2000 Hz for two seconds
+        (TYPE, IntakeSettings(max_rate_hz=1.0), 10),
+        ('sensor_msgs/msg/CompressedImage', IntakeSettings(), 120),
+        ('sensor_msgs/msg/Image', IntakeSettings(), 16),
+        ('sensor_msgs/msg/CompressedImage', IntakeSettings(poll_s=1.0, history_bytes=128 << 20), 240),  # four polls
         ('sensor_msgs/msg/Image', IntakeSettings(history_bytes=4 << 20), 2),
         ('sensor_msgs/msg/Image', IntakeSettings(history_bytes=1 << 20), 1),
         (TYPE, IntakeSettings(poll_s=1.0, max_rate_hz=1e5), (32 << 20) // 4096),
     ],
 )
-def test_the_history_covers_four_polls(type_name: str, settings: IntakeSettings, messages: int) -> None:
-    """Rate times poll period with a margin of four, within the bytes allowed, never 0."""
+def test_the_history_covers_a_stall(type_name: str, settings: IntakeSettings, messages: int) -> None:
+    """Two seconds of messages, at least four polls, within the bytes allowed, never 0."""
     assert depth(type_name, settings) == messages
 
 
@@ -97,3 +100,23 @@ def test_a_successor_is_told_from_its_predecessor() -> None:
     second = [senders.name(number, 100 + number) for number in (1, 2)]
     assert len({*first}) == len({*second}) == 1
     assert first[0] != second[0]
+
+
+def test_two_that_the_graph_does_not_show_yet_are_not_taken_for_a_gap() -> None:
+    """Numbers that begin anew and then go on where the old ones were come from two publishers: nobody's, and no loss of one."""
+    senders = Senders()
+    senders.look(['a'])
+    assert None not in {senders.name(number, number * 10) for number in (1, 2, 3, 4, 5)}
+    assert None not in {senders.name(number, 100 + number) for number in (1, 2)}
+    assert senders.name(6, 200) is None
+
+
+def test_a_successor_that_overtakes_its_predecessor_is_one() -> None:
+    """It is told apart for as long as it publishes, also when it loses a message after that."""
+    senders = Senders()
+    senders.look(['a'])
+    first = {senders.name(number, number * 10) for number in (1, 2, 3)}
+    second = {senders.name(number, 100 + number) for number in (1, 2, 3, 4, 5, 8)}
+    assert len(first) == len(second) == 1
+    assert None not in first | second
+    assert not first & second

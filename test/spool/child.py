@@ -16,9 +16,7 @@ from typing import Any
 from spool.making import make, new_spool, put, receive
 
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool.files import Tree
-from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.spool import Outcome, Spool
+from shadowhound_data_logger.spool.spool import Outcome
 
 TEST = Path(__file__).parents[1]
 
@@ -76,60 +74,7 @@ def load(root: Path) -> None:
         say(settled=[outcome.item.key for outcome in outcomes])
 
 
-def die(*_: Any, **__: Any) -> None:
-    """End as a power cut does: at once."""
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def after(times: int, original: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, with death at the end of its ``times``-th call."""
-    calls = count(1)
-
-    def called(*arguments: Any, **named: Any) -> Any:
-        result = original(*arguments, **named)
-        if next(calls) >= times:
-            die()
-        return result
-
-    return called
-
-
-def crash(root: Path, step: str) -> None:
-    """Commit ``old``, and die at a step of a commit of three objects and the delivery of ``old``."""
-    spool = new_spool(root)
-    spool.open()
-    old, refused = put(spool, make('old', b'old'), make('refused', b'refused'))
-    receive(spool, 4)
-    say(committed=True)
-    if step == 'after two parts':
-        Tree.write_part = after(2, Tree.write_part)  # type: ignore[method-assign]
-    elif step == 'before the transaction':
-        Tree.sync_incoming = die  # type: ignore[method-assign]
-    elif step == 'after the accounts':
-        Index.write = after(1, Index.write)  # type: ignore[method-assign]
-    elif step == 'before the renames':
-        Spool._place = die  # type: ignore[method-assign, assignment]
-    elif step == 'after two renames':
-        Tree.place = after(2, Tree.place)  # type: ignore[method-assign]
-    elif step == 'before the outcomes':
-        Spool._settle = die  # type: ignore[method-assign]
-    elif step == 'after one outcome':
-        Tree.remove = after(1, Tree.remove)  # type: ignore[method-assign]
-    spool.commit([make(f'new/{number}', b'new') for number in range(3)],
-                 [Outcome(old, State.DELIVERED), Outcome(refused, State.QUARANTINED, 'refused')])  # fmt: skip
-
-
-def evict(root: Path) -> None:
-    """Die after an eviction is committed and before its files go."""
-    spool = new_spool(root, max_bytes=1 << 20)
-    spool.open()
-    put(spool, *(make(f'{number}', bytes(200_000)) for number in range(4)))
-    say(committed=True)
-    Tree.remove = die  # type: ignore[method-assign]
-    put(spool, make('more', bytes(500_000)))
-
-
-VERBS: dict[str, Callable[..., None]] = {'hold': hold, 'add': add, 'load': load, 'crash': crash, 'evict': evict}
+VERBS: dict[str, Callable[..., None]] = {'hold': hold, 'add': add, 'load': load}
 
 if __name__ == '__main__':
     VERBS[sys.argv[1]](Path(sys.argv[2]), *sys.argv[3:])

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from spool.making import FakeClock, new_spool
+from spool.making import FakeClock, files, make, new_spool, put, settle
 
+from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.spool import Spool
 
 Open = Callable[..., Spool]
@@ -45,3 +46,15 @@ def opened(root: Path, clock: FakeClock) -> Iterator[Open]:
 def spool(opened: Open) -> Spool:
     """An open spool, empty."""
     return opened()
+
+
+@pytest.fixture
+def used(opened: Open, root: Path) -> dict[str, bytes]:
+    """A closed spool with objects in every state; returns its files."""
+    spool = opened()
+    items = put(spool, *(make(f'thor/a/{number}.jpg', b'%d' % number, samples=2, priority=number) for number in range(6)))
+    put(spool, make('thor/held.jpg', b'held', held='clock'), make('thor/book.json', b'{}', topic=None, protected=True))
+    settle(spool, items[0], State.DELIVERED)
+    settle(spool, items[1], State.QUARANTINED, 'refused')
+    spool.close()
+    return files(root)

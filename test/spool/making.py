@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import sqlite3
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from shadowhound_data_logger.spool.spool import Outcome, Spool
 
 NOON_NS = 1_760_788_800 * SECOND
 BUCKET = 'sensor-data'
+READY = f'ready/{BUCKET}'
 KEY = 'thor/camera/20251018/120000_front.jpg'
 IN_SPOOL = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine'}
 
@@ -109,3 +112,25 @@ def assert_whole(root: Path) -> dict[str, Any]:
     assert ledger.imbalances(found) == []
     assert found['balanced']
     return found
+
+
+def reopened(opened: Callable[[], Spool], root: Path) -> dict[str, int]:
+    """Open, check that all is whole and that a commit and a delivery work, close; returns what recovery did."""
+    spool = opened()
+    assert_whole(root)
+    (item,) = put(spool, make('thor/after.jpg'))
+    assert item in spool.pending(99)
+    settle(spool, item, State.DELIVERED)
+    assert_whole(root)
+    spool.close()
+    again = opened()
+    assert not set(again.recovery.counts) - {'unreadable files left alone'}, 'what was repaired stays repaired'
+    again.close()
+    return dict(+spool.recovery.counts)
+
+
+def abandon(spool: Spool) -> None:
+    """Leave a spool as a process that dies does."""
+    spool._index.close()
+    assert spool._session_lock is not None
+    os.close(spool._session_lock)

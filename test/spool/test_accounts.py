@@ -4,8 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowhound_data_logger.spool import accounts as module
-from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts, PublisherRow, Span, TopicAccount
+from shadowhound_data_logger.spool import span as module
+from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts, PublisherRow, TopicAccount
+from shadowhound_data_logger.spool.span import Span
 
 
 def taken(span: Span, *numbers: int) -> list[bool]:

@@ -5,63 +5,194 @@ from __future__ import annotations
 import hashlib
 import json
 import random
+import shutil
+import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytest
 from spool.child import started
 from spool.conftest import Open
-from spool.making import assert_whole, files, make, put, rows, settle
+from spool.making import BUCKET, abandon, assert_whole, files, make, new_spool, put, receive, rows, settle
 
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.model import Outcome, State
+from shadowhound_data_logger.spool.spool import Spool
 
-SOONER = ('after two parts', 'before the transaction', 'after the accounts')
-LATER = ('before the renames', 'after two renames', 'before the outcomes', 'after one outcome')
+CALLS = frozenset({
+    'open', 'write', 'flush', 'fsync', 'replace', 'unlink', 'mkdir', 'rmdir', 'setxattr', 'flock', 'close', 'execute',
+    'executemany', 'executescript',
+})  # fmt: skip
+"""Built-in functions that change a spool, or stand between two that do."""
+Moments = Callable[[Callable[[], None]], list[Path]]
 
 
-@pytest.mark.parametrize('step', SOONER + LATER)
-def test_death_at_a_step_of_a_commit(opened: Open, root: Path, step: str) -> None:
-    """A commit is there as a whole (from its transaction on) or not at all, deliveries and accounts included."""
-    with started('crash', root, step) as child:
-        output, _ = child.communicate(timeout=20)
-    assert (child.returncode, output.count('\n')) == (-9, 1)
-    spool = opened()
-    topic = assert_whole(root)['topics']['/camera']
-    new = {row['key']: row['state'] for row in rows(root)}
-    if step in SOONER:
-        assert new == {'old': 'pending', 'refused': 'pending'}
-        assert (topic['received'], topic['stored'], topic['dropped']) == (2, 2, {})
-    else:
-        # The refused one was not moved to quarantine yet: it is tried once more.
-        assert new == {'old': 'delivered', 'refused': 'pending', **{f'new/{number}': 'pending' for number in range(3)}}
-        assert (topic['received'], topic['stored'], topic['dropped']) == (6, 5, {'restart': 1})
-    assert topic['open'] == 0
+@pytest.fixture
+def moments(root: Path, tmp_path: Path) -> Moments:
+    """Copies of the spool as a kill at each moment of a work would leave it: before each call to the system that changes it.
+
+    What the kernel has been told survives a killed process, and nothing else; so the copies are made while it works. The last
+    one is that of a process that lived to the end.
+    """
+
+    def copies(work: Callable[[], None]) -> list[Path]:
+        out = tmp_path / 'moments'
+        made: list[Path] = []
+        before: dict[str, bytes] = {}
+
+        def look() -> None:
+            nonlocal before
+            now = {str(path): path.read_bytes() for path in root.rglob('*') if path.is_file() and path.suffix != '.db-shm'}
+            if now != before:
+                before = now
+                made.append(Path(shutil.copytree(root, out / f'{len(made):03d}')))
+
+        def watch(_: FrameType, event: str, called: Any) -> None:
+            if event == 'c_call' and called.__name__ in CALLS:
+                look()
+
+        sys.setprofile(watch)
+        try:
+            work()
+        finally:
+            sys.setprofile(None)
+        look()
+        assert len(made) > 12
+        return made
+
+    return copies
+
+
+def reopened(root: Path) -> Spool:
+    spool = new_spool(root)
+    spool.open()
+    return spool
+
+
+def test_death_at_any_moment_of_a_commit(root: Path, moments: Moments) -> None:
+    """Objects, deliveries and accounts are there as a whole (from the transaction on) or not at all, and can be used."""
+    spool = reopened(root)
+    put(spool, make('old', b'old'), make('refused', b'refused'))
+    spool.close()
+
+    def work() -> None:
+        spool = reopened(root)
+        old, refused = sorted(spool.pending(9), key=lambda item: item.key)
+        receive(spool, 4)
+        spool.commit([make('new/0', b'new'), make('new/1', b'new'), make('new/held', b'new', held='clock')],
+                     [Outcome(old, State.DELIVERED), Outcome(refused, State.QUARANTINED, 'refused')])  # fmt: skip
+        spool.close()
+
+    seen: list[tuple[bool, str]] = []
+    for copy in moments(work):
+        spool = reopened(copy)
+        topic = assert_whole(copy)['topics']['/camera']
+        state = {row['key']: row['state'] for row in rows(copy)}
+        committed = 'new/0' in state
+        if committed:
+            assert state['old'] == 'delivered'
+            assert state['refused'] in {'quarantined', 'pending'}, 'at the worst it is tried once more'
+            assert (state['new/0'], state['new/1'], state['new/held']) == ('pending', 'pending', 'held')
+            assert (topic['received'], topic['stored'], sum(topic['dropped'].values())) == (6, 5, 1)
+        else:
+            assert state == {'old': 'pending', 'refused': 'pending'}
+            assert (topic['received'], topic['stored'], topic['dropped']) == (2, 2, {})
+        assert topic['open'] == 0
+        seen.append((committed, next(iter(topic['dropped']), '')))
+        goes_on(spool, copy, committed=committed)
+        spool.close()
+    assert [committed for committed, _ in seen] == sorted(committed for committed, _ in seen)
+    assert set(seen) == {(False, ''), (True, 'restart'), (True, 'shutdown')}
+
+
+def goes_on(spool: Spool, root: Path, *, committed: bool) -> None:
+    """What is left can be delivered, new objects get keys of their own, and a gap in the numbers is the restart's."""
     for item in spool.pending(9):
         assert hashlib.sha256(item.path.read_bytes()).hexdigest() == item.sha256
         settle(spool, item, State.DELIVERED)
     with spool.accounts.entry('/camera') as account:
         account.receive('p', 10)
-    put_key = spool.commit([make('new/0')])[0].key
-    assert put_key == ('new/0' if step in SOONER else 'new/0_1')
-    missed = assert_whole(root)['topics']['/camera']['missed_by']
-    assert missed == {'restart': 7 if step in SOONER else 3}
+    assert spool.commit([make('new/0')])[0].key == ('new/0_1' if committed else 'new/0')
+    assert assert_whole(root)['topics']['/camera']['missed_by'] == {'restart': 3 if committed else 7}
 
 
-def test_death_between_an_eviction_and_its_files(opened: Open, root: Path) -> None:
-    """Files of evicted objects that were not removed in time are removed at the next start."""
-    with started('evict', root) as child:
-        child.communicate(timeout=20)
-    assert child.returncode == -9
-    assert opened().recovery.counts['delivered files removed'] > 0
-    assert assert_whole(root)['objects']['evicted'] > 0
+def test_death_at_any_moment_of_an_eviction(root: Path, moments: Moments) -> None:
+    """Whatever was evicted is so in the ledger and has no file; the object that needed the room is there or not."""
+    spool = new_spool(root, max_bytes=1 << 20)
+    spool.open()
+    put(spool, *(make(f'{number}', bytes(200_000)) for number in range(4)))
+    spool.close()
+
+    def work() -> None:
+        spool = new_spool(root, max_bytes=1 << 20)
+        spool.open()
+        put(spool, make('more', bytes(500_000)))
+        spool.close()
+
+    seen = set()
+    for copy in moments(work):
+        spool = reopened(copy)
+        assert_whole(copy)
+        states = {row['key']: row['state'] for row in rows(copy)}
+        evicted = sum(state == 'evicted' for state in states.values())
+        assert evicted in {0, 2}
+        assert 'more' not in states or evicted == 2
+        seen.add((evicted, 'more' in states, spool.recovery.counts['delivered files removed']))
+        spool.close()
+    assert {(0, False, 0), (2, False, 2), (2, False, 1), (2, False, 0), (2, True, 0)} <= seen
 
 
-def test_death_at_any_moment(opened: Open, root: Path) -> None:
+def leave_a_mess(root: Path) -> None:
+    """A spool of a process that died, with all that a start has to repair."""
+    spool = reopened(root)
+    items = put(spool, *(make(f'a/{number}', b'%d' % number) for number in range(7)))
+    settle(spool, items[0], State.DELIVERED)
+    settle(spool, items[1], State.QUARANTINED, 'refused')
+    receive(spool, 3)
+    spool.commit()
+    abandon(spool)
+    ready = root / 'ready' / BUCKET / 'a'
+    (ready / '0').write_bytes(b'0')  # delivered, not removed
+    (root / f'quarantine/refused/{BUCKET}/a/1').rename(ready / '1')  # quarantined by the index, the file not there yet
+    (ready / '2').rename(root / f'incoming/{items[2].id}.part')
+    (ready / '3').unlink()
+    (ready / '4').write_bytes(b'cut')
+    (root / 'incoming/99.part').write_bytes(b'never committed')
+    (ready / 'a b').write_bytes(b'foreign')
+    (ready / 'copied').write_bytes(b'copied')
+
+
+def settled(root: Path) -> dict[str, Any]:
+    """What a spool comes to at the end of a start."""
+    found = assert_whole(root)
+    return {'rows': {(row['key'], row['state'], row['reason'], row['sha256']) for row in rows(root)}, 'files': files(root),
+            'topics': found['topics'], 'objects': found['objects']}  # fmt: skip
+
+
+@pytest.mark.parametrize('index', ['whole', 'lost'])
+def test_death_at_any_moment_of_a_start(root: Path, moments: Moments, index: str) -> None:
+    """A start that died half-way is completed by the next one, as if it had been the first, also when it rebuilt the index."""
+    leave_a_mess(root)
+    if index == 'lost':
+        for name in ('index.db-wal', 'index.db-shm'):
+            (root / name).unlink(missing_ok=True)
+        (root / 'index.db').write_bytes(b'garbage' * 1000)
+    *died, lived = moments(lambda: reopened(root).close())
+    reopened(lived).close()
+    expected = settled(lived)
+    assert {name.split('/')[0] for name in expected['files']} >= {'ready', 'foreign'}
+    for copy in died:
+        reopened(copy).close()
+        assert settled(copy) == expected, copy.name
+
+
+def test_death_at_any_time(opened: Open, root: Path) -> None:
     """Killed at random moments again and again: what was told as durable is there, whole, once, and the ledger closes."""
     rng = random.Random(11)
     durable: dict[str, str] = {}
-    settled: set[str] = set()
+    delivered: set[str] = set()
     for _ in range(12):
         with started('load', root) as child:
             assert child.stdout is not None
@@ -71,9 +202,9 @@ def test_death_at_any_moment(opened: Open, root: Path) -> None:
             lines += child.stdout.readlines()
         for said in map(json.loads, lines):
             durable.update(said.get('committed', []))
-            settled.update(said.get('settled', []))
+            delivered.update(said.get('settled', []))
         spool = opened()
-        check(root, durable, settled)
+        check(root, durable, delivered)
         spool.close()
     assert len(durable) > 50
     topic = assert_whole(root)['topics']['/camera']
@@ -81,12 +212,12 @@ def test_death_at_any_moment(opened: Open, root: Path) -> None:
     assert topic['accounting'] == 'exact'
 
 
-def check(root: Path, durable: dict[str, str], settled: set[str]) -> None:
+def check(root: Path, durable: dict[str, str], delivered: set[str]) -> None:
     """What was told is true, and the spool whole."""
     assert_whole(root)
     table: dict[str, dict[str, Any]] = {row['key']: row for row in rows(root)}
     assert {key: table[key]['sha256'] for key in durable} == durable
-    assert {table[key]['state'] for key in settled} <= {'delivered', 'quarantined'}
+    assert {table[key]['state'] for key in delivered} <= {'delivered', 'quarantined'}
 
 
 def test_a_live_session_is_not_settled(opened: Open, root: Path) -> None:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
+import re
 import sqlite3
 from pathlib import Path
 from typing import Any
 
 import pytest
 from spool.conftest import Open
-from spool.making import assert_whole, files, make, put, rows, settle
+from spool.making import FakeClock, assert_whole, files, make, put, rows, settle
 
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
@@ -40,6 +44,45 @@ def test_the_least_important_and_oldest_goes_first(opened: Open, root: Path) -> 
         'e5': 'pending', 'f5': 'pending',
     }  # fmt: skip
     assert assert_whole(root)['objects']['evicted'] == 3
+
+
+def test_what_is_new_does_not_cost_what_is_more_important(opened: Open, root: Path) -> None:
+    """Where only what is more important could make room, the new object is the one that goes; of equals the oldest."""
+    spool = opened(max_bytes=MEBI)
+    put(spool, *(make(f'a{number}', BODY, priority=3) for number in range(5)))
+    assert put(spool, make('cloud', BODY, priority=7), make('pose', b'x', priority=3))[0].key == 'pose'
+    assert {key for key, state in states(root).items() if state == 'evicted'} == {'cloud'}
+    put(spool, make('b3', BODY, priority=3))
+    assert {key for key, state in states(root).items() if state == 'evicted'} == {'cloud', 'a0'}
+    assert_whole(root)
+
+
+def test_a_group_that_is_too_large(opened: Open, root: Path) -> None:
+    """Of a group that cannot be taken in as a whole the important ones are, and of equals the newest."""
+    spool = opened(max_bytes=MEBI)
+    put(
+        spool,
+        *(make(f'{number}', BODY, priority=number // 4) for number in range(8)),
+        make('p', BODY, priority=9, protected=True),
+    )
+    assert {key for key, state in states(root).items() if state == 'pending'} == {'p', '0', '1', '2', '3'}
+    assert assert_whole(root)['objects']['evicted'] == 4
+
+
+def test_a_shortage_is_told_when_it_begins_and_ends(opened: Open, clock: FakeClock, caplog: pytest.LogCaptureFixture) -> None:
+    """A spool that is full for an hour says so once a minute, and when it is over, not with every commit."""
+    caplog.set_level(logging.INFO)
+    spool = opened(max_bytes=MEBI)
+    for number in range(100):
+        clock.now_ns += SECOND
+        put(spool, make(f'{number}', BODY))
+    clock.now_ns += 61 * SECOND
+    settle(spool, spool.pending(1)[0], State.DELIVERED)
+    settle(spool, spool.pending(1)[0], State.DELIVERED)
+    told = [re.split('[:;] ', record.getMessage())[-1] for record in caplog.records]
+    assert told == [f'{count} objects had to go so far, the least important first' for count in (1, 61)] + [
+        '95 objects had to go'
+    ]
 
 
 def test_protected_objects_stay(opened: Open, root: Path) -> None:
@@ -227,7 +270,7 @@ def test_a_failed_close_can_be_repeated(opened: Open, root: Path, monkeypatch: p
         account.skipped += 1
     with monkeypatch.context() as patch:
         patch.setattr(Index, 'end_session', full)
-        with pytest.raises(OSError, match='No space'):
+        with pytest.raises(SpoolError, match='cannot be written: No space'):
             spool.close()
     spool.close()
     assert assert_whole(root)['topics']['/camera']['skipped'] == 1

@@ -56,6 +56,7 @@ def test_what_was_put_is_durable_after_a_flush(opened: Callable[..., SpoolWriter
         writing.put(make(f'{number}'))
     assert writing.flush(10)
     assert assert_whole(root)['objects']['pending'] == 20
+    assert writing.written() == (20, 20)
     assert sorted(item.key for item in told) == sorted(str(number) for number in range(20))
 
 

@@ -1,0 +1,137 @@
+"""The status as ``/diagnostics``: one entry for each topic, the spool, the store, the workers and the node itself.
+
+Levels: WARN for what needs a look (messages missed, dropped or rejected lately, a silent topic, the store away, a spool that
+fills up), ERROR for what needs a hand (a failing worker, objects in quarantine lately, credentials that are refused), STALE
+for a topic that nobody publishes. Nothing is made, and nothing sent, unless somebody listens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+TOPIC: Final = '/diagnostics'
+FULL: Final = 0.8
+"""Share of its limit from which on the spool is worth a look."""
+SILENT_PERIODS: Final = 10
+"""A topic is silent after so many of its usual periods ..."""
+SILENT_S: Final = 2.0
+"""... but not before this."""
+LEARNING: Final = 0.1
+"""Weight of the newest rate in the usual one."""
+OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+Entry = tuple[str, Any, str, Mapping[str, Any]]
+"""Name, level, what is to be said, and figures."""
+
+
+class Diagnostics:
+    """New; open once; ``publish`` once a second; close once."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._prefix = f'{node.get_namespace()}/sensor_logger: '.lstrip('/')
+        self._usual: dict[str, float] = {}
+        self._publisher: Any = None
+
+    def open(self) -> None:
+        self._publisher = self._node.create_publisher(DiagnosticArray, TOPIC, 1)
+
+    def close(self) -> None:
+        if self._publisher is not None:
+            self._node.destroy_publisher(self._publisher)
+            self._publisher = None
+
+    def publish(self, status: Mapping[str, Any], earlier: Mapping[str, Any] | None) -> None:
+        """``earlier`` is a status of a few seconds before: what grew since then is new."""
+        learn(self._usual, status)
+        if self._publisher is None or not self._publisher.get_subscription_count():
+            return
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        for name, level, text, figures in entries(status, earlier or status, self._usual):
+            values = [KeyValue(key=key, value=_text(value)) for key, value in figures.items()]
+            entry = DiagnosticStatus(
+                name=self._prefix + name, level=level, message=text, hardware_id=status['robot'], values=values
+            )
+            message.status.append(entry)
+        self._publisher.publish(message)
+
+
+def learn(usual: dict[str, float], status: Mapping[str, Any]) -> None:
+    """Follow the usual rate of each topic that is heard, Hz; one that has fallen silent keeps its."""
+    for topic, row in status['topics'].items():
+        if row['rate_hz'] and row['age_s'] is not None and row['age_s'] < SILENT_S:
+            before = usual.get(topic, row['rate_hz'])
+            usual[topic] = before + LEARNING * (row['rate_hz'] - before)
+
+
+def entries(status: Mapping[str, Any], earlier: Mapping[str, Any], usual: Mapping[str, float]) -> Iterator[Entry]:
+    """All that is to be said of a status."""
+    yield _node(status)
+    for topic, row in status['topics'].items():
+        level, text = _topic(row, earlier['topics'].get(topic, row), usual.get(topic, 0.0), paused=status['paused'])
+        yield topic, level, text, row
+    yield _spool(status['spool'])
+    yield _store(status['store'], earlier['store'])
+    yield _workers(status['workers'])
+
+
+def _node(status: Mapping[str, Any]) -> Entry:
+    figures = {name: status[name] for name in ('version', 'pid', 'uptime_s', 'paused')}
+    figures |= {f'queue {name}': value for name, value in status['queue'].items()}
+    if status['paused']:
+        return 'node', WARN, 'paused: messages are counted and not stored', figures
+    return 'node', OK, 'logging', figures
+
+
+def _topic(row: Mapping[str, Any], before: Mapping[str, Any], usual_hz: float, *, paused: bool) -> tuple[Any, str]:
+    if not row['enabled']:
+        return OK, 'not enabled'
+    lost = {what: (row[what] or 0) - (before[what] or 0) for what in ('missed', 'dropped', 'rejected')}
+    if paused:
+        del lost['dropped']
+    grown = [f'{count} {what}' for what, count in lost.items() if count > 0]
+    if grown:
+        return WARN, f'{", ".join(grown)} lately'
+    if not row['publishers']:
+        return STALE, 'nobody publishes it'
+    age_s = row['age_s']
+    if age_s is not None and usual_hz and age_s > max(SILENT_S, SILENT_PERIODS / usual_hz):
+        return WARN, f'silent for {age_s:.1f} s, it came at {usual_hz:.3g} Hz'
+    return OK, f'{row["rate_hz"]:g} Hz'
+
+
+def _spool(spool: Mapping[str, Any]) -> Entry:
+    share = spool['bytes'] / spool['max_bytes']
+    text = f'{spool["pending"]} objects wait for delivery, {share:.0%} of its limit is used'
+    return 'spool', WARN if share > FULL else OK, text, spool
+
+
+def _store(store: Mapping[str, Any], before: Mapping[str, Any]) -> Entry:
+    state = str(store['state']).replace('_', ' ')
+    quarantined = store['quarantined'] - before['quarantined']
+    if quarantined > 0:
+        return 'store', ERROR, f'{quarantined} objects went to quarantine lately: {store["last_error"]}', store
+    if store['state'] == 'paused':
+        return 'store', ERROR, f'{state}: {store["last_error"]}', store
+    if store['state'] == 'store_down':
+        return 'store', WARN, f'{state}: {store["last_error"]}', store
+    if store['blocked_buckets']:
+        return 'store', WARN, f'{state}; buckets that take nothing: {", ".join(store["blocked_buckets"])}', store
+    return 'store', OK, state, store
+
+
+def _workers(workers: Mapping[str, Mapping[str, Any]]) -> Entry:
+    failing = [f'{name} fails: {row["last_error"]}' for name, row in workers.items() if row['failing']]
+    figures = {f'{name} failures': row['failures'] for name, row in workers.items()}
+    return 'workers', ERROR if failing else OK, '; '.join(failing) or 'all work', figures
+
+
+def _text(value: Any) -> str:
+    """A figure as people read it; what is not known is empty."""
+    if isinstance(value, Mapping):
+        return ', '.join(f'{key}: {part}' for key, part in value.items())
+    return '' if value is None else f'{value:g}' if isinstance(value, float) else str(value)

@@ -1,0 +1,160 @@
+"""What goes on, once a second: one dict, built on the main thread from what the stages tell of themselves.
+
+``shadowhound-data status`` reads it from ``spool/status-<robot>.json``; ``diagnostics`` makes a message of it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sqlite3
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Final
+
+from shadowhound_data_logger.capture.intake import Intake
+from shadowhound_data_logger.capture.source import SourceStatus
+from shadowhound_data_logger.clock import SECOND, Clock, iso
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.encode.pool import EncodePool
+from shadowhound_data_logger.encode.queue import BatchQueue
+from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
+from shadowhound_data_logger.spool.accounts import Totals
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.status import file
+from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.worker import Worker
+
+log = logging.getLogger(__name__)
+
+PERIOD_S: Final = 1.0
+WINDOW_S: Final = 5.0
+"""Rates are over so long, and what is new is new for so long."""
+_NOTHING: Final = Totals('', 'received-only', 0, 0, 0, 0, 0, None, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """What is asked."""
+
+    spool: Spool
+    intake: Intake
+    queue: BatchQueue
+    pool: EncodePool
+    writer: SpoolWriter
+    uploader: Uploader
+
+
+class Status:
+    """New; ``look`` once a second, ``write`` what it found. ``earlier`` is the status of up to ``WINDOW_S`` before the last."""
+
+    def __init__(self, stages: Stages, settings: Settings, clock: Clock, target: str,
+                 monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
+        self._stages = stages
+        self._settings = settings
+        self._clock = clock
+        self._target = target
+        self._monotonic = monotonic
+        self._path = file(settings.spool_path, settings.robot)
+        self._began_ns = clock.boot_ns()
+        self._version = _version()
+        self._past: deque[tuple[float, int, dict[str, Any]]] = deque()  # monotonic time, bytes sent, status
+        self._complained = ''
+
+    @property
+    def earlier(self) -> Mapping[str, Any] | None:
+        return self._past[0][2] if len(self._past) > 1 else None
+
+    def look(self, *, ended: bool = False) -> dict[str, Any] | None:
+        """The status of now; None where the spool cannot be read, which is said once."""
+        now_s = self._monotonic()
+        try:
+            piles = self._stages.spool.piles()
+        except (OSError, sqlite3.Error) as error:
+            self._complain(f'the status cannot be told: {error}')
+            return None
+        while self._past and self._past[0][0] < now_s - WINDOW_S:
+            self._past.popleft()
+        boot_ns, upload = self._clock.boot_ns(), self._stages.uploader.status()
+        status = {
+            'robot': self._settings.robot, 'version': self._version, 'pid': os.getpid(), 'boot_id': self._clock.boot_id,
+            'boot_ns': boot_ns, 'time': iso(self._clock.wall_ns()), 'uptime_s': round((boot_ns - self._began_ns) / SECOND, 1),
+            'paused': self._stages.intake.paused, 'ended': ended, 'topics': self._topics(now_s),
+            'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
+            'spool': {'path': str(self._stages.spool.root), **asdict(piles), 'max_bytes': self._settings.spool.max_bytes},
+            'store': self._store(upload, now_s), 'workers': self._workers(upload),
+        }  # fmt: skip
+        self._past.append((now_s, upload.sent_bytes, status))
+        return status
+
+    def write(self, status: Mapping[str, Any]) -> None:
+        """For whoever reads the file meanwhile, it is the old status or the new one. A disk that refuses it is said once."""
+        part = self._path.with_name(self._path.name + '.part')
+        try:
+            part.touch(mode=0o600)
+            part.write_text(json.dumps(status), encoding='utf-8')
+            part.replace(self._path)
+        except OSError as error:
+            self._complain(f'the status cannot be written: {error}')
+
+    def _complain(self, text: str) -> None:
+        if text != self._complained:
+            self._complained = text
+            log.warning('%s', text)
+
+    # -- the parts -------------------------------------------------------------------------------------------------
+
+    def _topics(self, now_s: float) -> dict[str, dict[str, Any]]:
+        totals = self._stages.spool.accounts.totals()
+        sources = {source.topic: source for source in self._stages.intake.status()}
+        topics = dict.fromkeys((*sources, *totals))
+        return {topic: self._topic(topic, sources.get(topic), totals.get(topic, _NOTHING), now_s) for topic in topics}
+
+    def _topic(self, topic: str, source: SourceStatus | None, totals: Totals, now_s: float) -> dict[str, Any]:
+        received_s = source.received_s if source else None
+        row = {
+            'sensor': source.sensor if source else '', 'enabled': source.enabled if source else False,
+            'publishers': source.publishers if source else 0, 'rate_hz': 0.0,
+            'age_s': None if received_s is None else round(max(0.0, now_s - received_s), 3),
+        }  # fmt: skip
+        for then_s, _, status in self._past:
+            before = status['topics'].get(topic)
+            if before:
+                row['rate_hz'] = round(_slope(totals.received - before['received'], now_s - then_s), 2)
+                break
+        return row | asdict(totals)
+
+    def _store(self, upload: UploadStatus, now_s: float) -> dict[str, Any]:
+        then_s, sent_bytes, _ = self._past[0] if self._past else (now_s, upload.sent_bytes, {})
+        mbps = 8e-6 * _slope(upload.sent_bytes - sent_bytes, now_s - then_s)
+        figures = asdict(upload)
+        del figures['sent_bytes'], figures['worker_failures']
+        return {'target': self._target, **figures, 'mbps': round(mbps, 3)}
+
+    def _workers(self, upload: UploadStatus) -> dict[str, dict[str, Any]]:
+        stages = self._stages
+        workers = (stages.intake.worker, *stages.pool.workers, stages.writer.worker)
+        before = self._past[-1][2]['workers']['upload']['failures'] if self._past else 0
+        failing = upload.worker_failures > before
+        last_error = upload.last_error if failing else ''
+        rows = {worker.name: _worker(worker) for worker in workers}
+        return rows | {'upload': {'failing': failing, 'failures': upload.worker_failures, 'last_error': last_error}}
+
+
+def _worker(worker: Worker) -> dict[str, Any]:
+    return {'failing': worker.failing, 'failures': worker.failures, 'last_error': worker.last_error}
+
+
+def _slope(rise: float, run: float) -> float:
+    return rise / run if run > 0 else 0.0
+
+
+def _version() -> str:
+    try:
+        return version('shadowhound_data_logger')
+    except PackageNotFoundError:
+        return ''

@@ -1,0 +1,94 @@
+"""The tables of the spool's index: objects, their totals (kept by triggers), sessions and accounts; and that they are there."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.model import State
+
+SCHEMA_VERSION: Final = 1
+VERSION_LIMIT: Final = 1000
+"""A version from here on is damage, not a future."""
+_STATES: Final = ', '.join(f"'{state.value}'" for state in State)
+SCHEMA: Final = f"""
+CREATE TABLE objects (
+  id INTEGER PRIMARY KEY AUTOINCREMENT,
+  bucket TEXT NOT NULL, key TEXT NOT NULL,
+  state TEXT NOT NULL CHECK (state IN ({_STATES})), reason TEXT,
+  priority INTEGER NOT NULL, protected INTEGER NOT NULL,
+  sensor TEXT NOT NULL, topic TEXT, type TEXT NOT NULL,
+  samples INTEGER NOT NULL, bytes INTEGER NOT NULL, sha256 TEXT NOT NULL,
+  content_type TEXT NOT NULL, metadata TEXT NOT NULL,
+  t_start_ns INTEGER NOT NULL, t_end_ns INTEGER NOT NULL,
+  created_ns INTEGER NOT NULL, settled_ns INTEGER,
+  UNIQUE (bucket, key));
+CREATE INDEX pending ON objects (priority, id) WHERE state = 'pending';
+CREATE INDEX waiting ON objects (id) WHERE state = 'pending';
+CREATE INDEX evictable ON objects (priority DESC, id, bytes) WHERE state IN ('pending', 'held') AND NOT protected;
+CREATE INDEX quarantined ON objects (reason, bytes) WHERE state = 'quarantined';
+CREATE INDEX settled ON objects (settled_ns) WHERE state IN ('delivered', 'deduplicated', 'evicted');
+CREATE TABLE tally (
+  topic TEXT NOT NULL, state TEXT NOT NULL,
+  objects INTEGER NOT NULL DEFAULT 0, bytes INTEGER NOT NULL DEFAULT 0, samples INTEGER NOT NULL DEFAULT 0,
+  PRIMARY KEY (topic, state)) WITHOUT ROWID;
+CREATE TRIGGER spooled AFTER INSERT ON objects BEGIN
+  INSERT INTO tally VALUES (ifnull(NEW.topic, ''), 'spooled', 1, NEW.bytes, NEW.samples)
+    ON CONFLICT DO UPDATE SET objects = objects + 1, bytes = bytes + NEW.bytes, samples = samples + NEW.samples;
+  INSERT INTO tally VALUES (ifnull(NEW.topic, ''), NEW.state, 1, NEW.bytes, NEW.samples)
+    ON CONFLICT DO UPDATE SET objects = objects + 1, bytes = bytes + NEW.bytes, samples = samples + NEW.samples;
+END;
+CREATE TRIGGER moved AFTER UPDATE OF state ON objects WHEN OLD.state <> NEW.state BEGIN
+  UPDATE tally SET objects = objects - 1, bytes = bytes - OLD.bytes, samples = samples - OLD.samples
+    WHERE topic = ifnull(OLD.topic, '') AND state = OLD.state;
+  INSERT INTO tally VALUES (ifnull(NEW.topic, ''), NEW.state, 1, NEW.bytes, NEW.samples)
+    ON CONFLICT DO UPDATE SET objects = objects + 1, bytes = bytes + NEW.bytes, samples = samples + NEW.samples;
+END;
+CREATE TABLE sessions (
+  id INTEGER PRIMARY KEY AUTOINCREMENT, robot TEXT NOT NULL, boot_id TEXT NOT NULL, pid INTEGER NOT NULL,
+  started_ns INTEGER NOT NULL, ended_ns INTEGER);
+CREATE TABLE accounts (
+  session INTEGER NOT NULL, topic TEXT NOT NULL, type TEXT NOT NULL, accounting TEXT NOT NULL,
+  received INTEGER NOT NULL, skipped INTEGER NOT NULL, stored INTEGER NOT NULL,
+  rejected TEXT NOT NULL, dropped TEXT NOT NULL, last_kept_ns INTEGER NOT NULL,
+  PRIMARY KEY (session, topic)) WITHOUT ROWID;
+CREATE TABLE publishers (
+  session INTEGER NOT NULL, topic TEXT NOT NULL, publisher TEXT NOT NULL, first INTEGER, last INTEGER,
+  published INTEGER NOT NULL, received INTEGER NOT NULL, missed TEXT NOT NULL,
+  PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
+PRAGMA user_version = {SCHEMA_VERSION};
+"""  # noqa: S608 - own constants only
+
+
+def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> None:
+    """Make the tables where there are none, and have commits be durable.
+
+    Raises sqlite3.DatabaseError for a version that is none, SpoolError for a newer one.
+    """
+    version = connection.execute('PRAGMA user_version').fetchone()[0]
+    if not 0 <= version < VERSION_LIMIT:
+        raise sqlite3.DatabaseError(f'the version {version} is none')
+    if version > SCHEMA_VERSION:
+        raise SpoolError(f'the spool index {path} is of version {version}, this program knows {SCHEMA_VERSION}',
+                         remedy='update shadowhound_data_logger')  # fmt: skip
+    if read_only:
+        return
+    connection.execute('PRAGMA journal_mode = WAL')
+    connection.execute('PRAGMA synchronous = FULL')
+    if version == 0:
+        connection.executescript(f'BEGIN IMMEDIATE; {SCHEMA} COMMIT;')
+
+
+def definitions(db: sqlite3.Connection) -> set[tuple[str, str]]:
+    """Name and text of all tables, indexes and triggers."""
+    return set(db.execute('SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL'))
+
+
+def expected() -> set[tuple[str, str]]:
+    """The definitions of an index that is whole."""
+    with closing(sqlite3.connect(':memory:')) as db:
+        db.executescript(SCHEMA)
+        return definitions(db)

@@ -1,0 +1,160 @@
+"""What goes on now: the status that a running node writes once a second; where none runs, what its spool tells.
+
+``read`` waits for nobody and changes nothing. That no node runs, and even that there is no spool, is an answer and no
+error. Whether a node runs is decided by the boot clock, because a robot's wall clock may step.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.clock import SECOND, Clock, iso
+from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.piles import look
+
+FRESH_NS: Final = 5 * SECOND
+"""A node writes once a second: one that is silent for longer hangs, or is no more."""
+RUNNING, NOT_ANSWERING, NOT_RUNNING = 'running', 'not_answering', 'not_running'
+NOT_RUNNING_TEXT: Final = 'the node is not running'
+FINE_STORE: Final = frozenset({'idle', 'shipping', 'not_draining'})
+"""States of delivery that are no finding; ``not_draining``: another process delivers."""
+NAMED: Final = 3
+"""Topics that a finding names; the figures of the others stand in the table."""
+_TOPIC: Final[dict[str, Any]] = {
+    'sensor': '', 'type': '', 'enabled': True, 'publishers': 0, 'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
+    'skipped': 0, 'rejected': 0, 'dropped': 0, 'missed': None, 'open': 0, 'accounting': 'received-only',
+}  # fmt: skip
+_SECTIONS: Final[dict[str, dict[str, Any]]] = {
+    'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'max_messages': 0, 'max_bytes': 0},
+    'spool': {'path': '', 'pending': 0, 'held': 0, 'quarantined': 0, 'bytes': 0, 'max_bytes': None, 'free_bytes': None,
+              'oldest_age_s': None},
+    'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
+              'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
+}  # fmt: skip
+_WORKER: Final[dict[str, Any]] = {'failing': False, 'failures': 0, 'last_error': ''}
+_HEAD: Final[dict[str, Any]] = {
+    'version': '', 'pid': 0, 'boot_id': '', 'boot_ns': 0, 'time': '', 'uptime_s': 0.0, 'paused': False, 'ended': False,
+}  # fmt: skip
+
+
+def file(spool: Path, robot: str) -> Path:
+    """Where the node of a robot writes its status."""
+    return spool / f'status-{robot}.json'
+
+
+def robots(spool: Path) -> list[str]:
+    """The robots whose nodes have written a status here."""
+    return sorted(path.stem.removeprefix('status-') for path in spool.glob('status-*.json'))
+
+
+def read(spool: Path, robot: str, clock: Clock) -> dict[str, Any]:
+    """The status of a robot's node, as ``shadowhound-data status --json`` prints it.
+
+    ``state`` is running, not_answering (its process is there and silent) or not_running, ``age_s`` the time since the node
+    wrote its status (None where that is not known), ``session`` the last one as the index has it, ``findings`` one sentence
+    for each thing that somebody should look at. What only a running node can know (topics, queue, store, workers, ...) is
+    left out where none runs; ``spool`` is always of now, and None where there is none.
+    """
+    written = _load(file(spool, robot))
+    silent_ns = clock.boot_ns() - written['boot_ns'] if written and written['boot_id'] == clock.boot_id else None
+    state = _state(written, silent_ns)
+    age_s = None if silent_ns is None else round(silent_ns / SECOND, 3)
+    found: dict[str, Any] = {'robot': robot, 'state': state, 'running': state == RUNNING, 'age_s': age_s}
+    if written and state != NOT_RUNNING:
+        found |= {name: value for name, value in written.items() if name not in found}
+    if state != RUNNING:
+        found |= _of_index(spool, robot, clock.wall_ns(), written)
+    found['findings'] = list(_findings(found))
+    return found
+
+
+def _load(path: Path) -> dict[str, Any] | None:
+    """The file with every figure in its place; None without one, or where a power cut left half of it."""
+    try:
+        given = json.loads(path.read_bytes())
+        sections = {name: {**rest, **given.get(name, {})} for name, rest in _SECTIONS.items()}
+        topics = {name: {**_TOPIC, **row} for name, row in given.get('topics', {}).items()}
+        workers = {name: {**_WORKER, **row} for name, row in given.get('workers', {}).items()}
+        return {**_HEAD, **given, **sections, 'topics': topics, 'workers': workers}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return None
+
+
+def _state(written: Mapping[str, Any] | None, silent_ns: int | None) -> str:
+    if written is None or silent_ns is None or written['ended']:
+        return NOT_RUNNING
+    if silent_ns < FRESH_NS:
+        return RUNNING
+    return NOT_ANSWERING if _lives(written['pid'], written['boot_ns']) else NOT_RUNNING
+
+
+def _lives(pid: int, boot_ns: int) -> bool:
+    """Whether the process that wrote the status is there: one of its number, begun before (proc(5), stat, field 22)."""
+    try:
+        fields = Path(f'/proc/{pid}/stat').read_text(encoding='utf-8', errors='replace').rpartition(')')[2].split()
+    except OSError:
+        return False
+    return fields[0] not in 'ZX' and int(fields[19]) * SECOND // os.sysconf('SC_CLK_TCK') <= boot_ns
+
+
+def _of_index(spool: Path, robot: str, now_ns: int, written: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What the spool itself tells: what lies in it, and its last session."""
+    path = spool / 'index.db'
+    if not path.is_file():
+        text = f'there is no spool in {spool}: has the node run here? SHADOWHOUND_HOME names its folder'
+        return {'spool': None, 'session': None, 'problem': text}
+    index = Index(path, read_only=True)
+    try:
+        index.open()
+        limit = written['spool']['max_bytes'] if written else None
+        piles = {'path': str(spool), **asdict(look(index, spool, now_ns)), 'max_bytes': limit}
+        return {'spool': piles, 'session': _session(index, robot)}
+    except (OSError, sqlite3.Error, SpoolError) as error:
+        return {'spool': None, 'session': None, 'problem': f'the spool index {path} cannot be read: {error}'}
+    finally:
+        index.close()
+
+
+def _session(index: Index, robot: str) -> dict[str, Any] | None:
+    """The last session: when it began and ended by the wall clock; ``ended`` is None where it was cut off."""
+    query = 'SELECT started_ns, ended_ns FROM sessions WHERE robot = ? ORDER BY id DESC LIMIT 1'
+    row = index.db.execute(query, (robot,)).fetchone()
+    return {'started': iso(row[0]), 'ended': iso(row[1]) if row[1] is not None else None} if row else None
+
+
+def _findings(found: Mapping[str, Any]) -> Iterator[str]:
+    if found['state'] == NOT_RUNNING:
+        yield NOT_RUNNING_TEXT
+    elif found['state'] == NOT_ANSWERING:
+        yield f'the node (process {found["pid"]}) has written no status for {found["age_s"]:.0f} s'
+    if 'problem' in found:
+        yield found['problem']
+    if 'store' not in found:
+        return
+    store = found['store']
+    if found['paused']:
+        yield 'the node is paused: nothing is logged'
+    if store['state'] not in FINE_STORE:
+        yield f'delivery: {str(store["state"]).replace("_", " ")}'
+    yield from (f'bucket {name} takes nothing: {reason}' for name, reason in store['blocked_buckets'].items())
+    yield from (f'{name} fails: {row["last_error"]}' for name, row in found['workers'].items() if row['failing'])
+    for what in ('missed', 'dropped', 'rejected'):
+        lost = {topic: row[what] for topic, row in found['topics'].items() if row[what]}
+        if lost:
+            yield f'{what} in this session: {_most(lost)}'
+    if store['quarantined']:
+        yield f'quarantined in this session: {store["quarantined"]:,} objects'
+
+
+def _most(counts: Mapping[str, int]) -> str:
+    """``/imu 340, /odom 170, /lowstate 68 and 5 more``."""
+    first = sorted(counts, key=lambda topic: (-counts[topic], topic))[:NAMED]
+    more = f' and {len(counts) - NAMED} more' if len(counts) > NAMED else ''
+    return ', '.join(f'{topic} {counts[topic]:,}' for topic in first) + more

@@ -1,0 +1,132 @@
+"""Which level each state of the node has on ``/diagnostics``, and in which words."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from shadowhound_data_logger.capture.diagnostics import ERROR, OK, STALE, WARN, _text, entries, learn
+
+TOPIC = {
+    'sensor': 'imu', 'type': 'go2_interfaces/msg/IMU', 'enabled': True, 'publishers': 1, 'rate_hz': 100.0, 'age_s': 0.02,
+    'received': 1200, 'stored': 1100, 'skipped': 0, 'rejected': 2, 'dropped': 3, 'missed': 4, 'open': 91, 'accounting': 'exact',
+}  # fmt: skip
+STATUS: dict[str, Any] = {
+    'robot': 'thor', 'version': '0.1.0', 'pid': 7, 'uptime_s': 12.3, 'paused': False, 'topics': {'/imu': TOPIC},
+    'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'max_messages': 10, 'max_bytes': 100},
+    'spool': {'path': '/s', 'pending': 3, 'held': 0, 'quarantined': 1, 'bytes': 10, 'max_bytes': 100, 'free_bytes': 5,
+              'oldest_age_s': None},
+    'store': {'target': 'the S3 server', 'state': 'idle', 'last_error': 'refused', 'delivered': 5, 'in_flight': 0, 'deferred': 0,
+              'retries': 0, 'quarantined': 1, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
+    'workers': {'intake': {'failing': False, 'failures': 1, 'last_error': 'ValueError: x'}},
+}  # fmt: skip
+
+
+def changed(**values: Any) -> dict[str, Any]:
+    """The status with other values: ``section__name``, or of the one topic ``topic__name``."""
+    status = deepcopy(STATUS)
+    for name, value in values.items():
+        section, _, key = name.partition('__')
+        if section == 'topic':
+            status['topics']['/imu'][key] = value
+        elif key:
+            status[section][key] = value
+        else:
+            status[section] = value
+    return status
+
+
+def told(name: str, usual_hz: float = 100.0, **values: Any) -> tuple[Any, str]:
+    """Level and words of an entry, after a while in which everything was fine."""
+    found = {entry[0]: entry for entry in entries(changed(**values), STATUS, {'/imu': usual_hz})}
+    return found[name][1], found[name][2]
+
+
+def test_all_is_fine() -> None:
+    """There is an entry for each topic, the spool, the store, the workers and the node; old losses are not told for ever."""
+    found = list(entries(STATUS, STATUS, {'/imu': 100.0}))
+    assert [entry[0] for entry in found] == ['node', '/imu', 'spool', 'store', 'workers']
+    assert {entry[1] for entry in found} == {OK}
+    assert told('/imu')[1] == '100 Hz'
+
+
+@pytest.mark.parametrize(
+    ('values', 'level', 'words'),
+    [
+        ({'topic__missed': 6}, WARN, '2 missed lately'),
+        ({'topic__dropped': 4, 'topic__rejected': 7}, WARN, '1 dropped, 5 rejected lately'),
+        ({'topic__dropped': 9, 'paused': True}, OK, '100 Hz'),
+        ({'topic__missed': 6, 'paused': True}, WARN, '2 missed lately'),
+        ({'topic__missed': None}, OK, '100 Hz'),
+        ({'topic__publishers': 0}, STALE, 'nobody publishes it'),
+        ({'topic__publishers': 0, 'topic__missed': 5}, WARN, '1 missed lately'),
+        ({'topic__enabled': False, 'topic__publishers': 0}, OK, 'not enabled'),
+        ({'topic__age_s': 1.9}, OK, '100 Hz'),
+        ({'topic__age_s': 2.1}, WARN, 'silent for 2.1 s, it came at 100 Hz'),
+        ({'topic__age_s': None}, OK, '100 Hz'),
+    ],
+)  # fmt: skip
+def test_a_topic(values: dict[str, Any], level: Any, words: str) -> None:
+    """Losses since a moment ago and silence need a look; one that nobody publishes is stale, one that is off is fine."""
+    assert told('/imu', **values) == (level, words)
+
+
+@pytest.mark.parametrize(('age_s', 'level'), [(19.0, OK), (21.0, WARN)])
+def test_a_slow_topic_is_given_its_time(age_s: float, level: Any) -> None:
+    """Silence begins after ten of its usual periods."""
+    assert told('/imu', usual_hz=0.5, topic__age_s=age_s)[0] == level
+
+
+def test_a_topic_of_which_little_came_is_not_silent() -> None:
+    """A map that is published once has no usual rate."""
+    assert told('/imu', usual_hz=0.0, topic__age_s=9999.0)[0] == OK
+
+
+@pytest.mark.parametrize(
+    ('name', 'values', 'level', 'words'),
+    [
+        ('node', {'paused': True}, WARN, 'paused'),
+        ('spool', {'spool__bytes': 80}, OK, '80%'),
+        ('spool', {'spool__bytes': 81}, WARN, '81% of its limit'),
+        ('store', {'store__state': 'not_draining'}, OK, 'not draining'),
+        ('store', {'store__state': 'store_down'}, WARN, 'store down: refused'),
+        ('store', {'store__state': 'paused'}, ERROR, 'paused: refused'),
+        ('store', {'store__quarantined': 3}, ERROR, '2 objects went to quarantine lately: refused'),
+        ('store', {'store__blocked_buckets': {'trajectories': 'no'}}, WARN, 'trajectories'),
+        ('workers', {'workers__intake': {'failing': True, 'failures': 2, 'last_error': 'KeyError: y'}}, ERROR,
+         'intake fails: KeyError: y'),
+    ],
+)  # fmt: skip
+def test_the_rest(name: str, values: dict[str, Any], level: Any, words: str) -> None:
+    """A store that is away and a spool that fills up need a look; refused credentials, quarantine and defects need a hand."""
+    found = told(name, **values)
+    assert found[0] == level
+    assert words in found[1]
+
+
+def test_the_usual_rate_is_learned_while_a_topic_is_heard() -> None:
+    """It follows slowly, and the last seconds of one that fell silent do not change it."""
+    usual: dict[str, float] = {}
+    learn(usual, changed(topic__rate_hz=50.0))
+    assert usual == {'/imu': 50.0}
+    learn(usual, changed(topic__rate_hz=100.0))
+    assert usual == {'/imu': 55.0}
+    learn(usual, changed(topic__rate_hz=1.0, topic__age_s=2.5))
+    learn(usual, changed(topic__rate_hz=0.0))
+    assert usual == {'/imu': 55.0}
+
+
+def test_every_figure_fits_its_message() -> None:
+    """What rclpy refuses in a message would end the node: levels are bytes, values text, and what is unknown is empty."""
+    for name, level, text, figures in entries(changed(store__blocked_buckets={'b': 'why'}), STATUS, {}):
+        values = [KeyValue(key=key, value=_text(value)) for key, value in figures.items()]
+        message = DiagnosticStatus(name=name, level=level, message=text, values=values)
+        assert message.level in {OK, WARN, ERROR, STALE}
+    assert _text(None) == ''
+    assert _text({'b': 'why'}) == 'b: why'

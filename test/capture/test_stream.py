@@ -1,0 +1,172 @@
+"""What becomes of the messages of a topic between the take and the batch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import count
+
+import pytest
+
+from shadowhound_data_logger.capture.endpoints import Senders
+from shadowhound_data_logger.capture.stream import Stream, Taken
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.model import Batch
+from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, REPORTED, Accounts, TopicAccount
+
+TOPIC, TYPE = '/talk', 'std_msgs/msg/String'
+NOON_NS = 1_760_788_800 * SECOND
+UNNUMBERED: dict[str, None] = {'publisher': None, 'number': None}
+
+
+class Talk:
+    """A stream of Strings that are sent every 100 ms."""
+
+    def __init__(self, last_kept_ns: int = 0, **settings: float) -> None:
+        self.sensor = SensorSettings(name='talk', **{'rate_hz': 0.0, 'batch_s': 3600.0, **settings})  # type: ignore[arg-type]
+        self.accounts = Accounts()
+        self.batches: list[Batch] = []
+        self.senders = Senders()
+        self.numbers = count(1)
+        self.stream = Stream(self.sensor, TOPIC, TYPE, last_kept_ns, self.accounts, MessageTypes(), self.batches.append)
+
+    def messages(self, how_many: int, **fields: object) -> list[Taken]:
+        """The next ones, of a publisher that is known unless ``fields`` say otherwise."""
+        taken = [next(self.numbers) for _ in range(how_many)]
+        made = [Taken(b'%d' % number, NOON_NS + number * SECOND // 10, 'p', number) for number in taken]
+        return [one._replace(**fields) for one in made]  # type: ignore[arg-type]
+
+    def add(self, taken: list[Taken], lost: int | None = None, *, paused: bool = False) -> None:
+        self.stream.add(taken, self.senders, lost, 0.0, paused=paused)
+
+    def update(self, **settings: float) -> None:
+        self.sensor = replace(self.sensor, **settings)  # type: ignore[arg-type]
+        self.stream.update(self.sensor)
+
+    def kept(self) -> list[int]:
+        """The numbers of what was kept, the open batch among it."""
+        self.stream.close_batch()
+        return [int(sample.cdr) for batch in self.batches for sample in batch.samples]
+
+    @property
+    def account(self) -> TopicAccount:
+        with self.accounts.entry(TOPIC) as account:
+            return account
+
+
+def test_a_pause_counts_and_drops() -> None:
+    """What comes during a pause is received and dropped as paused; before and after it everything is kept."""
+    talk = Talk()
+    for paused in (False, True, False):
+        talk.add(talk.messages(3), paused=paused)
+    assert talk.kept() == [1, 2, 3, 7, 8, 9]
+    assert (talk.account.received, talk.account.dropped, talk.account.missed) == (9, {'paused': 3}, 0)
+
+
+def test_a_pause_wins_over_the_rate() -> None:
+    """During a pause nothing is skipped, and the first message after it is that of its period."""
+    talk = Talk(rate_hz=1.0)
+    talk.add(talk.messages(9), paused=True)
+    talk.add(talk.messages(5))
+    assert (talk.account.dropped, talk.account.skipped) == ({'paused': 9}, 4)
+    assert talk.kept() == [10]
+
+
+def test_another_rate_leaves_the_open_batch() -> None:
+    """The rate changes from one message to the next, and what is in the open batch stays in it."""
+    talk = Talk(rate_hz=1.0)
+    talk.add(talk.messages(15))
+    talk.update(rate_hz=0.0)
+    talk.add(talk.messages(3))
+    assert not talk.batches
+    assert talk.kept() == [1, 10, 16, 17, 18]
+
+
+@pytest.mark.parametrize(('rate_hz', 'kept'), [(5.0, [1, 4, 6, 8]), (0.5, [1]), (1.0, [1])])
+def test_another_rate_keeps_nothing_of_a_period_twice(rate_hz: float, kept: list[int]) -> None:
+    """A slower or faster rate goes on after the last message that was kept."""
+    talk = Talk(rate_hz=1.0)
+    talk.add(talk.messages(3))
+    talk.update(rate_hz=rate_hz, quality=50)
+    talk.add(talk.messages(6))
+    assert talk.kept() == kept
+
+
+def test_what_was_kept_before_the_stream_began_is_not_kept_again() -> None:
+    """A stream that begins anew within a period (a sensor that is switched off and on) waits for the next one."""
+    talk = Talk(rate_hz=1.0, last_kept_ns=NOON_NS + 1)
+    talk.add(talk.messages(12))
+    assert talk.kept() == [10]
+    assert talk.stream.kept_ns == NOON_NS + SECOND
+
+
+def test_other_settings_do_not_repeat_what_has_not_changed() -> None:
+    """A sensor that keeps changes remembers the last one through a change of its settings."""
+    talk = Talk(on_change=True)
+    talk.add(talk.messages(2, cdr=b'0000same'))
+    talk.update(priority=1)
+    talk.add(talk.messages(2, cdr=b'0000same'))
+    assert (talk.account.received, talk.account.skipped) == (4, 3)
+
+
+# -- without numbers ---------------------------------------------------------------------------------------------------
+
+
+def test_numbers_make_it_exact_whatever_is_reported() -> None:
+    """Where the middleware numbers messages, gaps are counted by their numbers alone."""
+    talk = Talk()
+    first, _, third = talk.messages(3)
+    talk.add([first, third], lost=7)
+    assert (talk.account.accounting, talk.account.missed, talk.account.received) == (EXACT, 1, 2)
+
+
+def test_without_numbers_losses_are_those_reported() -> None:
+    """Losses that the middleware reports are missed, and with what was received they are what was published."""
+    talk = Talk()
+    talk.add(talk.messages(3, **UNNUMBERED), lost=0)
+    talk.add(talk.messages(2, **UNNUMBERED), lost=5)
+    account = talk.account
+    assert (account.accounting, account.missed, account.received) == (REPORTED, 5, 5)
+    (span,) = account.publishers.values()
+    assert (span.published, span.received, span.missed) == (10, 5, {'transport': 5})
+
+
+def test_without_numbers_and_reports_nothing_is_claimed() -> None:
+    """What is not known is None, never 0."""
+    talk = Talk()
+    talk.add(talk.messages(3, **UNNUMBERED))
+    assert (talk.account.accounting, talk.account.missed) == (RECEIVED_ONLY, None)
+
+
+def test_one_time_without_a_report_is_for_ever() -> None:
+    """Once messages may have been lost without a word the session stays received-only, whatever is reported later."""
+    talk = Talk()
+    for lost in (1, None, 2):
+        talk.add(talk.messages(2, **UNNUMBERED), lost=lost)
+    assert (talk.account.accounting, talk.account.missed, talk.account.received) == (RECEIVED_ONLY, None, 6)
+
+
+def test_a_second_sender_makes_numbers_useless() -> None:
+    """From the first message of an unknown sender on the reports count; a gap in the numbers after it is not a second loss."""
+    talk = Talk()
+    talk.senders.look(['a'])
+    talk.add(talk.messages(3, publisher=None), lost=0)
+    talk.senders.look(['a', 'b'])
+    talk.add(talk.messages(3, publisher=None), lost=1)
+    talk.senders.look(['a'])
+    talk.add(talk.messages(3, publisher=None), lost=0)
+    account = talk.account
+    assert (account.accounting, account.received, account.missed) == (REPORTED, 9, 1)
+    assert sum(span.published for span in account.publishers.values()) == 10
+
+
+def test_what_two_subscriptions_deliver_is_counted_once() -> None:
+    """A repeat is known by its number, or by time and content where it has none."""
+    for fields in ({}, UNNUMBERED):
+        talk = Talk()
+        taken = talk.messages(3, **fields)
+        for part in (taken[:2], taken):
+            talk.add(part, lost=0)
+        assert talk.account.received == 3
+        assert talk.kept() == [1, 2, 3]

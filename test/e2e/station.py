@@ -1,0 +1,83 @@
+"""Somebody who operates a running node by ROS's own means: services, parameters and ``/diagnostics``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from e2e.processes import WAIT_S
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
+
+NODE = '/sensor_logger_node'
+
+
+class Station:
+    """New with the environment of the node's processes; close once."""
+
+    def __init__(self, environ: Mapping[str, str]) -> None:
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=int(environ['ROS_DOMAIN_ID']))
+        self.node = Node('station', context=self._context, start_parameter_services=False, enable_rosout=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def flush(self) -> str:
+        """What ``~/flush`` answers; it must succeed."""
+        answer = self._call(Trigger, '/flush', Trigger.Request())
+        assert answer.success, answer.message
+        return str(answer.message)
+
+    def pause(self, *, paused: bool) -> str:
+        """What ``~/pause`` answers; it must succeed."""
+        answer = self._call(SetBool, '/pause', SetBool.Request(data=paused))
+        assert answer.success, answer.message
+        return str(answer.message)
+
+    def set(self, **values: Any) -> str:
+        """Set parameters (``sensor__name``) together; why they were refused, empty where they were not."""
+        parameters = [Parameter(name.replace('__', '.'), value=value).to_parameter_msg() for name, value in values.items()]
+        answer = self._call(SetParametersAtomically, '/set_parameters_atomically',
+                            SetParametersAtomically.Request(parameters=parameters))  # fmt: skip
+        assert bool(answer.result.reason) is not answer.result.successful
+        return str(answer.result.reason)
+
+    def get(self, name: str) -> Any:
+        (value,) = self._call(GetParameters, '/get_parameters', GetParameters.Request(names=[name])).values
+        return Parameter.from_parameter_msg(ParameterMessage(name=name, value=value)).value
+
+    def diagnostics(self) -> dict[str, Any]:
+        """The next message on ``/diagnostics``: its entries by name."""
+        heard: list[DiagnosticArray] = []
+        subscription = self.node.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 1)
+        try:
+            end_ns = self.node.get_clock().now().nanoseconds + round(WAIT_S * 1e9)
+            while not heard:
+                self._executor.spin_once(timeout_sec=0.5)
+                assert self.node.get_clock().now().nanoseconds < end_ns, 'there are no diagnostics'
+        finally:
+            self.node.destroy_subscription(subscription)
+        return {entry.name: entry for entry in heard[0].status}
+
+    def _call(self, kind: Any, name: str, request: Any) -> Any:
+        client = self.node.create_client(kind, NODE + name)
+        try:
+            assert client.wait_for_service(WAIT_S), f'there is no {NODE + name}'
+            future = client.call_async(request)
+            self._executor.spin_until_future_complete(future, WAIT_S)
+            assert future.done(), f'{NODE + name} does not answer'
+            return future.result()
+        finally:
+            self.node.destroy_client(client)

@@ -1,0 +1,204 @@
+"""Operating a running node: flush, pause, settings changed while it runs, diagnostics, several robots on one machine."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from e2e.processes import Node, Processes, Publisher, until
+from e2e.reading import STRING, Objects, texts
+from e2e.station import Station
+
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.spool import status
+
+COUNT = 50
+NEVER_S = 3600.0
+SENSORS = ['flushed', 'repeated', 'paused', 'switched', 'dormant', 'sampled', 'told']
+
+
+@dataclass(frozen=True, slots=True)
+class Operated:
+    """A node whose batches close when they are told to, somebody who publishes, and somebody who operates it."""
+
+    node: Node
+    publisher: Publisher
+    station: Station
+    stored: Callable[..., Objects]
+
+    def publish(self, name: str, numbers: range) -> None:
+        """Messages that the node has received on return."""
+        before = self.node.topic(f'/{name}').get('received', 0)
+        self.publisher.publish(f'/{name}', texts(numbers))
+        self.node.received(f'/{name}', before + len(numbers))
+
+    def numbers(self, name: str) -> list[int]:
+        """Those in the store, once all that is spooled is there."""
+        until(lambda: not self.node.topic(f'/{name}')['stored_in']['pending'], f'{name} is delivered')
+        return self.stored(f'{self.node.robot}/{name}').numbers(name)
+
+
+@pytest.fixture(scope='module')
+def operated(shared: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> Iterator[Operated]:
+    parameters: dict[str, Any] = {'sensors': SENSORS, 'dormant.enabled': False, 'sampled.rate_hz': 0.001}
+    for name in SENSORS:
+        parameters |= {f'{name}.topics': [name], f'{name}.types': [STRING], f'{name}.batch_s': NEVER_S}
+        parameters.setdefault(f'{name}.rate_hz', 0.0)
+    node, publisher = shared.node(seaweed.environment(), parameters), shared.publisher()
+    for name in SENSORS:
+        publisher.create(f'/{name}', STRING)
+    station = Station(shared.environ)
+    yield Operated(node, publisher, station, stored)
+    station.close()
+
+
+def test_a_flush_spools_all_that_was_published_before(operated: Operated) -> None:
+    """With its answer everything is durable, the messages that nobody had taken yet among it."""
+    operated.publisher.matched('/flushed')
+    operated.publisher.publish('/flushed', texts(range(COUNT)), 0.0)
+    answer = operated.station.flush()
+    row = operated.node.topic('/flushed')
+    assert (row['received'], row['stored'], row['open']) == (COUNT, COUNT, 0)
+    assert answer == f'1 object with {COUNT} messages spooled'
+    assert operated.station.flush() == '0 objects with 0 messages spooled'
+    assert operated.numbers('flushed') == list(range(COUNT))
+
+
+def test_flushes_inside_a_second_overwrite_nothing(operated: Operated) -> None:
+    """Objects of the same period have names of their own."""
+    operated.publisher.matched('/repeated')
+    for number in range(5):
+        operated.publisher.publish('/repeated', texts([number]), 0.0)
+        assert operated.station.flush() == '1 object with 1 message spooled'
+    assert operated.numbers('repeated') == list(range(5))
+    assert len(operated.stored(f'{operated.node.robot}/repeated').contents) == 5
+
+
+def test_a_pause_counts_what_it_does_not_store(operated: Operated) -> None:
+    """What came before it is spooled, what comes during it is listed as lost by it, what comes after it is stored."""
+    operated.publisher.matched('/paused')
+    operated.publish('paused', range(COUNT))
+    assert f'1 object with {COUNT} messages spooled' in operated.station.pause(paused=True)
+    operated.publish('paused', range(COUNT, 2 * COUNT))
+    assert operated.node.topic('/paused')['dropped'] == {'paused': COUNT}
+    until(lambda: operated.station.diagnostics()['sensor_logger: node'].level == DiagnosticStatus.WARN, 'the pause is told')
+    assert operated.station.pause(paused=False) == 'messages are stored again'
+    operated.publish('paused', range(2 * COUNT, 3 * COUNT))
+    operated.station.flush()
+    assert operated.numbers('paused') == [*range(COUNT), *range(2 * COUNT, 3 * COUNT)]
+    assert operated.node.topic('/paused')['missed'] == 0
+
+
+def test_a_sensor_is_switched_off_and_on(operated: Operated) -> None:
+    """While it is off its messages are not ours, so nothing was missed when it is on again."""
+    operated.publisher.matched('/switched')
+    operated.publish('switched', range(COUNT))
+    assert operated.station.set(switched__enabled=False) == ''
+    until(lambda: operated.node.topic('/switched')['stored'] == COUNT, 'its open batch is spooled')
+    until(lambda: not operated.station.node.count_subscribers('/switched'), 'nobody listens')
+    operated.publisher.publish('/switched', texts(range(COUNT, 2 * COUNT)))
+    assert operated.station.set(switched__enabled=True) == ''
+    operated.publisher.heard('/switched', operated.node, texts(['again'])[0])
+    operated.publish('switched', range(2 * COUNT, 3 * COUNT))
+    operated.station.flush()
+    row = operated.node.topic('/switched')
+    assert (row['published'], row['missed'], row['accounting']) == (row['received'], 0, 'exact')
+    assert operated.numbers('switched') == [*range(COUNT), *range(2 * COUNT, 3 * COUNT)]
+
+
+def test_a_sensor_that_is_off_in_the_file_is_switched_on(operated: Operated) -> None:
+    """It is there, and listened to once it is enabled."""
+    assert not operated.station.node.count_subscribers('/dormant')
+    assert operated.station.set(dormant__enabled=True) == ''
+    operated.publisher.matched('/dormant')
+    operated.publish('dormant', range(COUNT))
+    operated.station.flush()
+    assert operated.numbers('dormant') == list(range(COUNT))
+
+
+def test_another_rate_is_in_force_at_once(operated: Operated) -> None:
+    """A message in a thousand seconds becomes every message; the number may be given without a fraction."""
+    operated.publisher.matched('/sampled')
+    operated.publish('sampled', range(COUNT))
+    assert operated.node.topic('/sampled')['skipped'] == COUNT - 1
+    assert operated.station.set(sampled__rate_hz=0) == ''
+    operated.node.said('sampled.rate_hz = 0.0 from now on')
+    operated.station.flush()  # the intake has done what was asked of it before
+    operated.publish('sampled', range(COUNT, 2 * COUNT))
+    operated.station.flush()
+    assert operated.numbers('sampled') == [0, *range(COUNT, 2 * COUNT)]
+
+
+def test_a_wrong_setting_changes_nothing(operated: Operated) -> None:
+    """It is refused by name, value and what is allowed, with all that was to be set with it; what is not live as well."""
+    reason = operated.station.set(told__priority=1, told__rate_hz=1e-9)
+    assert all(words in reason for words in ('told.rate_hz', '1e-09', 'at least 0.0001'))
+    assert 'read-only' in operated.station.set(told__batch_s=1.0)
+    assert operated.station.get('told.priority') == 5
+    assert operated.station.get('told.batch_s') == NEVER_S
+
+
+def test_diagnostics_tell_each_part(operated: Operated) -> None:
+    """There is an entry for each topic and stage, with the robot as hardware, while somebody listens."""
+    operated.publisher.matched('/told')
+    operated.publish('told', range(COUNT))
+    found = operated.station.diagnostics()
+    parts = [f'/{name}' for name in SENSORS] + ['node', 'spool', 'store', 'workers']
+    assert set(found) == {f'sensor_logger: {part}' for part in parts}
+    assert {entry.hardware_id for entry in found.values()} == {operated.node.robot}
+    assert found['sensor_logger: /told'].level == DiagnosticStatus.OK
+    assert found['sensor_logger: workers'].message == 'all work'
+    assert int({pair.key: pair.value for pair in found['sensor_logger: /told'].values}['received']) >= COUNT
+    operated.publisher.destroy('/told')
+    stale = DiagnosticStatus.STALE
+    until(lambda: operated.station.diagnostics()['sensor_logger: /told'].level == stale, 'nobody publishes it any more')
+
+
+def test_the_status_file_tells_what_the_ledger_tells(operated: Operated) -> None:
+    """The command line finds a running node, and after the last object an account of every topic like that of the ledger."""
+    node, clock = operated.node, SystemClock.of_this_machine()
+    operated.station.flush()
+    rows = node.ledger()['topics']
+
+    def told() -> bool:
+        found = status.read(node.home / 'spool', node.robot, clock)
+        assert found['state'] == 'running'
+        return all(found['topics'][name]['stored'] == row['stored'] and not found['topics'][name]['open']
+                   and found['topics'][name]['missed'] == row['missed'] for name, row in rows.items())  # fmt: skip
+
+    until(told, 'the status is that of the ledger')
+
+
+# -- several robots ----------------------------------------------------------------------------------------------------
+
+
+def test_two_robots_on_one_machine(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+    """Two nodes in namespaces of their own share a spool: both log, one of them delivers for both, both accounts balance."""
+    robots = [f'{processes.robot}_{number}' for number in range(2)]
+    parameters = {'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 0.2}
+    nodes = [processes.node(seaweed.environment(), parameters, '-r', f'__ns:=/{robot}', robot='') for robot in robots]
+    publisher = processes.publisher()
+    for robot, node in zip(robots, nodes, strict=True):
+        node.robot = robot
+        publisher.create(f'/{robot}/talk', STRING)
+        publisher.matched(f'/{robot}/talk')
+        publisher.publish(f'/{robot}/talk', texts(range(COUNT)))
+    for robot, node in zip(robots, nodes, strict=True):
+        row = node.settled(f'/{robot}/talk', COUNT)
+        assert (row['published'], row['received'], row['missed']) == (COUNT, COUNT, 0)
+        assert row['stored_in']['delivered'] == COUNT
+        assert stored(robot).numbers('talk') == list(range(COUNT))
+
+    def states() -> list[str]:
+        files = [status.file(node.home / 'spool', node.robot) for node in nodes]
+        return sorted(json.loads(path.read_text())['store']['state'] for path in files)
+
+    until(lambda: states() == ['idle', 'not_draining'], 'exactly one of them delivers')
+    for node in nodes:
+        node.stop()
+        assert json.loads(status.file(node.home / 'spool', node.robot).read_text())['ended']

@@ -1,0 +1,178 @@
+"""What a status file, the boot clock, the process table and the spool's index together say of a node."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from spool.making import NOON_NS, FakeClock, make, new_spool, put, settle
+
+from shadowhound_data_logger.clock import SECOND, SystemClock
+from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool.status import file, read, robots
+
+
+def written(root: Path, **changes: Any) -> None:
+    """A status as the node writes it, of the time and boot of FakeClock."""
+    root.mkdir(exist_ok=True)
+    head = {'robot': 'thor', 'pid': os.getpid(), 'boot_id': 'a-boot', 'boot_ns': NOON_NS, 'uptime_s': 12.0, 'ended': False}
+    file(root, changes.get('robot', 'thor')).write_text(json.dumps({**head, 'spool': {'max_bytes': 1000}, **changes}))
+
+
+@pytest.fixture(scope='module')
+def child() -> Iterator[int]:
+    """The id of a process that is there."""
+    with subprocess.Popen([sys.executable, '-c', 'input()'], stdin=subprocess.PIPE) as process:
+        yield process.pid
+        process.communicate(b'\n')
+
+
+def state(root: Path, now_ns: int = NOON_NS) -> str:
+    return str(read(root, 'thor', FakeClock(now_ns))['state'])
+
+
+def test_a_fresh_status_is_that_of_a_running_node(tmp_path: Path) -> None:
+    """Younger than five seconds by the boot clock, whatever the wall clock says; its figures are handed on as they are."""
+    written(tmp_path, topics={'/imu': {'received': 7}}, time='1970-01-01T00:00:00Z')
+    found = read(tmp_path, 'thor', FakeClock(NOON_NS + 4 * SECOND))
+    assert (found['state'], found['running'], found['age_s']) == ('running', True, 4.0)
+    assert found['topics']['/imu']['received'] == 7
+    assert found['findings'] == []
+
+
+@pytest.mark.parametrize(
+    'changes', [{'boot_id': 'another'}, {'ended': True}, {'pid': 2**22 + 1, 'boot_ns': NOON_NS - 6 * SECOND}]
+)
+def test_a_status_of_a_node_that_is_no_more(tmp_path: Path, changes: dict[str, Any]) -> None:
+    """Of another boot, of a clean end, or old and of a process that is gone: not running, and its figures are not shown."""
+    written(tmp_path, topics={'/imu': {}}, **changes)
+    found = read(tmp_path, 'thor', FakeClock())
+    assert (found['state'], found['running']) == ('not_running', False)
+    assert 'topics' not in found
+    assert 'the node is not running' in found['findings']
+
+
+def test_a_process_that_is_silent_is_not_answering(tmp_path: Path, child: int) -> None:
+    """It was there when the status was written and still is, but wrote nothing for five seconds."""
+    clock = SystemClock.of_this_machine()
+    written(tmp_path, pid=child, boot_id=clock.boot_id, boot_ns=clock.boot_ns())
+    found = read(tmp_path, 'thor', Ahead(clock.boot_id))
+    assert (found['state'], found['running'], found['pid']) == ('not_answering', False, child)
+    assert any(f'process {child}' in line for line in found['findings'])
+
+
+def test_a_later_process_of_the_same_number_is_not_the_node(tmp_path: Path, child: int) -> None:
+    """Process ids are given out again: one that began after the status was written did not write it."""
+    clock = SystemClock.of_this_machine()
+    written(tmp_path, pid=child, boot_id=clock.boot_id, boot_ns=clock.boot_ns() - 3600 * SECOND)
+    assert read(tmp_path, 'thor', clock)['state'] == 'not_running'
+
+
+class Ahead(SystemClock):
+    """Six seconds from now."""
+
+    def boot_ns(self) -> int:
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 6 * SECOND
+
+
+@pytest.mark.parametrize('content', ['', '{"robot": "th', '[]', '{"topics": 3}', '{"store": null, "queue": []}', '\x00\x00'])
+def test_half_a_file_is_none(tmp_path: Path, content: str) -> None:
+    """A power cut may leave anything of a file that is never synced: that is no error."""
+    file(tmp_path, 'thor').write_text(content)
+    assert state(tmp_path) == 'not_running'
+
+
+def test_figures_that_another_version_does_not_write_have_defaults(tmp_path: Path) -> None:
+    """A program that is newer than the node that runs can still show its status."""
+    written(tmp_path, topics={'/imu': {}}, workers={'intake': {}})
+    found = read(tmp_path, 'thor', FakeClock())
+    assert found['topics']['/imu']['missed'] is None
+    assert found['store']['blocked_buckets'] == {}
+    assert found['workers']['intake']['failing'] is False
+
+
+def test_without_a_node_the_index_tells(tmp_path: Path) -> None:
+    """What lies in the spool, how old the oldest object is, and when the last session began and ended."""
+    clock = FakeClock()
+    spool = new_spool(tmp_path / 'spool', clock)
+    spool.open()
+    done, _, bad = put(spool, make('a', b'12345'), make('b', b'123'), make('c', b'1'))
+    put(spool, make('d', b'22', held='clock'))
+    settle(spool, done, State.DELIVERED)
+    settle(spool, bad, State.QUARANTINED, 'denied')
+    clock.now_ns += 90 * SECOND
+    spool.close()
+    written(tmp_path / 'spool', ended=True, boot_ns=clock.now_ns)
+    found = read(tmp_path / 'spool', 'thor', clock)
+    assert found['session'] == {'started': '2025-10-18T12:00:00.000000Z', 'ended': '2025-10-18T12:01:30.000000Z'}
+    pile = found['spool']
+    assert (pile['pending'], pile['held'], pile['quarantined'], pile['bytes']) == (1, 1, 1, 6)
+    assert (pile['oldest_age_s'], pile['max_bytes']) == (90.0, 1000)
+    assert pile['free_bytes'] > 0
+
+
+def test_a_session_that_was_cut_off_has_no_end(tmp_path: Path) -> None:
+    """A node that was killed leaves a session without an end, and nothing of it is taken for one."""
+    spool = new_spool(tmp_path / 'spool')
+    spool.open()
+    found = read(tmp_path / 'spool', 'thor', FakeClock())
+    spool.close()
+    assert found['session'] == {'started': '2025-10-18T12:00:00.000000Z', 'ended': None}
+
+
+def test_no_spool_and_a_damaged_one_are_answers(tmp_path: Path) -> None:
+    """Both are told among the findings, and leave the spool unknown."""
+    found = read(tmp_path, 'thor', FakeClock())
+    assert found['spool'] is None
+    assert any(str(tmp_path) in line for line in found['findings'])
+    (tmp_path / 'index.db').write_bytes(b'no database' * 1000)
+    found = read(tmp_path, 'thor', FakeClock())
+    assert found['spool'] is None
+    assert any('cannot be read' in line for line in found['findings'])
+
+
+MANY = {'/a': {'missed': 1}, '/b': {'missed': 4_000}, '/c': {'missed': 1}, '/d': {'missed': 2}, '/e': {'missed': 0}}
+TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected': 1, 'missed': 0}}
+
+
+@pytest.mark.parametrize(
+    ('changes', 'finding'),
+    [
+        ({'topics': TOPICS}, 'dropped in this session: /imu 2'),
+        ({'topics': TOPICS}, 'missed in this session: /odom 3'),
+        ({'topics': TOPICS}, 'rejected in this session: /camera 1'),
+        ({'topics': MANY}, 'missed in this session: /b 4,000, /d 2, /a 1 and 1 more'),
+        ({'store': {'quarantined': 4}}, 'quarantined in this session: 4 objects'),
+        ({'store': {'state': 'store_down'}}, 'delivery: store down'),
+        ({'store': {'state': 'paused'}}, 'delivery: paused'),
+        ({'store': {'blocked_buckets': {'maps': 'there is none'}}}, 'bucket maps takes nothing: there is none'),
+        ({'workers': {'intake': {'failing': True, 'last_error': 'OSError: 5'}}}, 'intake fails: OSError: 5'),
+        ({'paused': True}, 'the node is paused: nothing is logged'),
+    ],
+)
+def test_what_somebody_should_look_at(tmp_path: Path, changes: dict[str, Any], finding: str) -> None:
+    """Each loss and each fault of a running node is a finding."""
+    written(tmp_path, **changes)
+    assert finding in read(tmp_path, 'thor', FakeClock())['findings']
+
+
+@pytest.mark.parametrize('name', ['idle', 'shipping', 'not_draining'])
+def test_a_store_that_works_is_no_finding(tmp_path: Path, name: str) -> None:
+    """Nor is one that another process delivers to, nor what lies in quarantine from before."""
+    written(tmp_path, store={'state': name}, spool={'quarantined': 5}, topics={'/imu': {'skipped': 9, 'open': 3}})
+    assert read(tmp_path, 'thor', FakeClock())['findings'] == []
+
+
+def test_the_robots_that_have_written_here(tmp_path: Path) -> None:
+    """Known by their files; other files are nobody's."""
+    written(tmp_path, robot='thor')
+    written(tmp_path, robot='robot_1.a')
+    (tmp_path / 'status.json').touch()
+    assert robots(tmp_path) == ['robot_1.a', 'thor']
