@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import click
-from rich.console import Console, Group, RenderableType
-from rich.measure import Measurement
-from rich.table import Table
+from rich.console import Console, RenderableType
 from rich.text import Text
 
+from shadowhound_data_logger.cli.tables import number, plain, plain_table, show_whole, volume
 from shadowhound_data_logger.config import home
 from shadowhound_data_logger.spool.ledger import imbalances, read
 
@@ -48,20 +47,6 @@ def show(found: Mapping[str, Any], console: Console) -> None:
     show_whole([topics_table(found), '', objects_table(found), *_section(notes(found)), '', verdict(found)], console)
 
 
-def show_whole(parts: Sequence[RenderableType], console: Console) -> None:
-    """Print, with tables two columns apart where there is room; without a terminal no table is cut or broken."""
-    tables = [part for part in parts if isinstance(part, Table)]
-    for table in tables:
-        table.padding = (0, 2, 0, 0)
-        if _width(table, console) > console.width:
-            table.padding = (0, 1, 0, 0)
-    width = console.width
-    if not console.is_terminal:
-        console.width = max(width, *(_width(table, console) for table in tables))
-    console.print(Group(*parts))
-    console.width = width
-
-
 def topics_table(found: Mapping[str, Any]) -> RenderableType:
     """One row a topic; a dash is a figure that the middleware does not tell."""
     rows = {topic: _figures(row) for topic, row in found['topics'].items()}
@@ -70,7 +55,7 @@ def topics_table(found: Mapping[str, Any]) -> RenderableType:
     columns = [name for name in COLUMNS if name in ALWAYS or any(row[name] for row in rows.values())]
     table = plain_table(f'Messages of {found["robot"]}', ('topic', *columns))
     for topic, row in rows.items():
-        table.add_row(topic, *(_lossy(name, row[name]) for name in columns))
+        table.add_row(plain(topic), *(_lossy(name, row[name]) for name in columns))
     if len(rows) > 1:
         table.add_section()
         table.add_row('all', *(_lossy(name, _sum(row[name] for row in rows.values())) for name in columns), style='bold')
@@ -109,33 +94,6 @@ def verdict(found: Mapping[str, Any]) -> Text:
     return Text('\n').join(Text.assemble(('Does not balance', 'red'), f': {line}') for line in imbalances(dict(found)))
 
 
-def plain_table(title: str, columns: Iterable[str], left: Iterable[str] = ('topic', '')) -> Table:
-    """Without lines, numbers to the right, nothing cut: a topic is broken across lines before it loses a letter."""
-    table = Table(title=title, title_justify='left', title_style='bold', header_style='dim', box=None, pad_edge=False)
-    for name in columns:
-        is_left = name in left
-        table.add_column(name, justify='left' if is_left else 'right', overflow='fold', no_wrap=not is_left)
-    return table
-
-
-def number(value: int | None) -> str:
-    """With separators; a dash for what is not known."""
-    return '-' if value is None else f'{value:,}'
-
-
-def volume(count: float) -> str:
-    """Bytes in decimal units, as disks and networks are sold."""
-    for unit in ('B', 'KB', 'MB'):
-        if count < 1000:
-            return f'{count:.0f} {unit}' if unit == 'B' else f'{count:.1f} {unit}'
-        count /= 1000
-    return f'{count:.1f} GB'
-
-
-def _width(table: Table, console: Console) -> int:
-    return Measurement.get(console, console.options.update(max_width=1000), table).maximum
-
-
 def _figures(row: Mapping[str, Any]) -> dict[str, int | None]:
     return {name: sum(row[name].values()) if isinstance(row[name], Mapping) else row[name] for name in COLUMNS}
 
@@ -156,4 +114,4 @@ def _listed(counts: Mapping[str, int]) -> str:
 
 
 def _section(lines: list[str]) -> list[RenderableType]:
-    return ['', *(Text(line) for line in lines)] if lines else []
+    return ['', *(plain(line) for line in lines)] if lines else []

@@ -7,6 +7,7 @@ import sys
 import click
 
 from shadowhound_data_logger.cli.ledger import ledger
+from shadowhound_data_logger.cli.status import status
 from shadowhound_data_logger.errors import DataLoggerError
 
 
@@ -20,6 +21,7 @@ def cli() -> None:
 
 
 cli.add_command(ledger)
+cli.add_command(status)
 
 
 def main() -> None:

@@ -14,7 +14,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from shadowhound_data_logger.cli.ledger import number, plain_table, show_whole, verdict, volume
+from shadowhound_data_logger.cli.ledger import verdict
+from shadowhound_data_logger.cli.tables import number, plain_table, show_whole, volume
 from shadowhound_data_logger.sim.demo_audit import BUCKET, Audit
 from shadowhound_data_logger.sim.demo_processes import OUR_VARIABLE
 from shadowhound_data_logger.sim.demo_run import Reading, Record, Show

@@ -1,0 +1,206 @@
+"""``shadowhound-data status``: what the node does now, once, as a live view, or as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from shadowhound_data_logger.cli.tables import bar, duration, fit, number, plain, plain_table, show_whole, volume
+from shadowhound_data_logger.clock import Clock, SystemClock
+from shadowhound_data_logger.config import home
+from shadowhound_data_logger.errors import NameRefused
+from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, read, robots
+
+LOSSES: Final = ('dropped', 'rejected')
+"""Columns that appear once there is something in them."""
+HEADS: Final = {'running': ('running', 'green'), 'not_answering': ('NOT ANSWERING', 'red'), 'not_running': ('not running', 'red')}
+
+
+def _robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str | None:
+    try:
+        return check_name(name, 'the robot name') if name else None
+    except NameRefused as error:
+        raise click.BadParameter(str(error)) from error
+
+
+@click.command()
+@click.option('--watch', is_flag=True, help='Go on until Ctrl-C: a live view, or with --json one line each time.')
+@click.option(
+    '--interval', type=click.FloatRange(0.05, 3600.0), default=1.0, show_default=True, help='Seconds between two looks.'
+)
+@click.option('--json', 'as_json', is_flag=True, help='Print the status as JSON.')
+@click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=_robot_name, help='Whose node  [default: the one that runs here]')
+@click.option('--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool  [default: $SHADOWHOUND_HOME/spool]')
+def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, spool: Path | None) -> int:
+    """Rates and ages of the topics, queue, spool, store and workers of the node that runs on this machine.
+
+    Without one: what lies in its spool. Exit code 1 when something needs a look: the node does not run, the store is away,
+    messages were lost. With --watch it is 0.
+    """
+    folder, clock = spool or home(os.environ) / 'spool', SystemClock.of_this_machine()
+
+    def look() -> dict[str, Any]:
+        return _look(folder, robot, clock)
+
+    console = Console(highlight=False)
+    if watch:
+        _watch(look, console, interval, as_json=as_json)
+        return 0
+    found = look()
+    if as_json:
+        click.echo(json.dumps(found, indent=2))
+    else:
+        show_whole(view(found, console), console)
+    return 1 if found['findings'] else 0
+
+
+def _look(spool: Path, robot: str | None, clock: Clock) -> dict[str, Any]:
+    """The robot asked for, else the first that runs, else the first there is; ``others`` are those that run as well."""
+    names = [robot] if robot else robots(spool) or ['thor']
+    found = [read(spool, name, clock) for name in names]
+    chosen = next((each for each in found if each['running']), found[0])
+    return {**chosen, 'others': [each['robot'] for each in found if each['running'] and each is not chosen]}
+
+
+def _watch(look: Callable[[], dict[str, Any]], console: Console, interval: float, *, as_json: bool) -> None:
+    """Until Ctrl-C; on a terminal the last view stays on the screen."""
+    try:
+        if as_json or not console.is_terminal or console.is_dumb_terminal:
+            while True:
+                found = look()
+                if as_json:
+                    click.echo(json.dumps(found))
+                else:
+                    show_whole([*view(found, console), ''], console)
+                time.sleep(interval)
+        with Live(console=console, auto_refresh=False, screen=True) as live:
+            while True:
+                parts = view(look(), console)
+                fit(parts, console)
+                live.update(Group(*parts), refresh=True)
+                time.sleep(interval)
+    except KeyboardInterrupt:
+        if console.is_terminal and not as_json:
+            show_whole(view(look(), console), console)
+
+
+def view(found: Mapping[str, Any], console: Console) -> list[RenderableType]:
+    """All there is to say, top down: who, topics, the way to the store, findings."""
+    live = found['state'] != NOT_RUNNING
+    parts: list[RenderableType] = [_head(found), '']
+    if live:
+        parts += [*_topics(found['topics']), '']
+    if live or found['spool']:
+        parts += [_way(found, console, live=live), '']
+    if not live and found['spool']:
+        parts.append(Text('What became of every message: shadowhound-data ledger', 'dim'))
+    parts += [plain(line, 'yellow') for line in found['findings'] if live or line != NOT_RUNNING_TEXT]
+    if not found['findings']:
+        parts.append(Text('Fine: nothing was missed, dropped, rejected or quarantined in this session.', 'green'))
+    if found['others']:
+        parts.append(plain(f'Also running here: {", ".join(found["others"])} (--robot NAME)', 'dim'))
+    return parts
+
+
+def _head(found: Mapping[str, Any]) -> Text:
+    state, style = HEADS[found['state']]
+    head = Text.assemble(plain(found['robot'], 'bold'), '  ', (state, style))
+    if found['state'] == NOT_RUNNING:
+        return head.append_text(plain(_ended(found['session'])))
+    since = found['uptime_s'] if found['running'] else found['age_s']
+    head.append_text(plain(f' for {duration(since)}, process {found["pid"]}, version {found["version"]}'))
+    if found['paused']:
+        head.append('  PAUSED', 'yellow')
+    return head
+
+
+def _ended(session: Mapping[str, Any] | None) -> str:
+    if session is None:
+        return '; it has not run here yet'
+    began, ended = (stamp and f'{stamp[:10]} {stamp[11:19]}' for stamp in (session['started'], session['ended']))
+    if ended:
+        return f'; last session {began} to {ended} UTC'
+    return f'; session of {began} UTC cut off, or just beginning'
+
+
+def _topics(topics: Mapping[str, Any]) -> Iterator[RenderableType]:
+    """The table of what arrives, and the names of what does not."""
+    unheard = {topic: row for topic, row in topics.items() if not row['received']}
+    silent = [topic for topic, row in unheard.items() if row['enabled'] and not row['publishers']]
+    off = [topic for topic, row in unheard.items() if not row['enabled']]
+    rows = {topic: row for topic, row in topics.items() if topic not in (*silent, *off)}
+    losses = [name for name in LOSSES if any(row[name] for row in rows.values())]
+    table = plain_table('Messages of this session', ('topic', 'Hz', 'age', 'received', 'stored', 'missed', *losses))
+    for topic, row in rows.items():
+        rate = f'{row["rate_hz"]:,.1f}' if row['enabled'] else 'off'
+        age = '-' if row['age_s'] is None else duration(row['age_s'])
+        counts = (number(row[name]) for name in ('received', 'stored'))
+        lost = (Text(number(row[name]), 'yellow' if row[name] else '') for name in ('missed', *losses))
+        table.add_row(plain(topic), rate, age, *counts, *lost)
+    if rows:
+        yield table
+    for what, names in (('Nobody publishes', silent), ('Off:', off)):
+        if names:
+            yield plain(f'{what} {", ".join(names)}', 'dim')
+
+
+def _way(found: Mapping[str, Any], console: Console, *, live: bool) -> Table:
+    """Queue, spool, store, and the workers that fail, as lines under one another."""
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_column(style='bold', no_wrap=True)
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow='fold')
+    if live:
+        queue = found['queue']
+        share = max(_share(queue['messages'], queue['max_messages']), _share(queue['bytes'], queue['max_bytes']))
+        text = f'{queue["messages"]:,} of {queue["max_messages"]:,} messages, {volume(queue["bytes"])}'
+        grid.add_row('queue', bar(share, console), text)
+    if found['spool']:
+        spool = found['spool']
+        grid.add_row('spool', bar(_share(spool['bytes'], spool['max_bytes']), console), _disk(spool))
+        grid.add_row('', '', _piles(spool))
+    if live:
+        _add_store(grid, found)
+        for name, row in found['workers'].items():
+            if row['failing']:
+                grid.add_row(plain(name), Text('fails', 'red'), plain(f'{row["failures"]:,} times so far: {row["last_error"]}'))
+    return grid
+
+
+def _disk(spool: Mapping[str, Any]) -> str:
+    """``123.5 KB of 21.5 GB, 50.0 GB free``; the limit is a setting, which only a node tells."""
+    limit = f' of {volume(spool["max_bytes"])}' if spool['max_bytes'] else ''
+    free = '' if spool['free_bytes'] is None else f', the disk has {volume(spool["free_bytes"])} free'
+    return f'{volume(spool["bytes"])}{limit}{free}'
+
+
+def _piles(spool: Mapping[str, Any]) -> str:
+    """``3 objects wait (oldest 0.4 s), 1 quarantined``."""
+    oldest = '' if spool['oldest_age_s'] is None else f' (oldest {duration(spool["oldest_age_s"])})'
+    piles = ''.join(f', {spool[name]:,} {name}' for name in ('held', 'quarantined') if spool[name])
+    return f'{spool["pending"]:,} objects wait{oldest}{piles}'
+
+
+def _add_store(grid: Table, found: Mapping[str, Any]) -> None:
+    store = found['store']
+    fine = store['state'] in FINE_STORE
+    cap = f' of {store["max_mbps"]:g}' if store['max_mbps'] else ''
+    grid.add_row('store', plain(str(store['state']).replace('_', ' '), 'green' if fine else 'red'), plain(store['target']))
+    grid.add_row('', '', f'{store["delivered"]:,} delivered, {store["mbps"]:.1f}{cap} Mbit/s')
+    if store['last_error'] and (not fine or store['blocked_buckets']):
+        grid.add_row('', '', plain(store['last_error'], 'yellow'))
+
+
+def _share(part: float, whole: float | None) -> float:
+    return part / whole if whole else 0.0

@@ -1,0 +1,90 @@
+"""What the verbs print with: tables without lines, figures, bars, and text that can hurt neither layout nor terminal."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from rich.console import Console, Group, RenderableType
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
+
+UNSEEN: Final = frozenset({'Cc', 'Cf', 'Cs', 'Zl', 'Zp'})
+"""Unicode categories that move the cursor, turn the direction or break lines; https://www.unicode.org/reports/tr44/"""
+BAR_COLUMNS: Final = 10
+WIDEST: Final = 1000
+UNITS: Final = ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min'), (60, 'min', 1, 's'))
+
+
+def plain(text: object, style: str = '') -> Text:
+    """Text from outside, as it is: no markup in it is obeyed, and a control character becomes a question mark."""
+    return Text(''.join('?' if unicodedata.category(letter) in UNSEEN else letter for letter in str(text)), style)
+
+
+def plain_table(title: str, columns: Iterable[str], left: Iterable[str] = ('topic', '')) -> Table:
+    """Without lines, numbers to the right, nothing cut: a topic is broken across lines before it loses a letter."""
+    table = Table(title=title, title_justify='left', title_style='bold', header_style='dim', box=None, pad_edge=False)
+    for name in columns:
+        is_left = name in left
+        table.add_column(name, justify='left' if is_left else 'right', overflow='fold', no_wrap=not is_left)
+    return table
+
+
+def show_whole(parts: Sequence[RenderableType], console: Console) -> None:
+    """Print, with tables two columns apart where there is room; without a terminal no table is cut or broken."""
+    width = console.width
+    widest = fit(parts, console)
+    if not console.is_terminal:
+        console.width = max(width, widest)
+    console.print(Group(*parts))
+    console.width = width
+
+
+def fit(parts: Sequence[RenderableType], console: Console) -> int:
+    """Set the columns of all tables with a header two apart, or one where that is too wide; the width of the widest."""
+    widest = 0
+    for table in (part for part in parts if isinstance(part, Table) and part.show_header):
+        table.padding = (0, 2, 0, 0)
+        if _width(table, console) > console.width:
+            table.padding = (0, 1, 0, 0)
+        widest = max(widest, _width(table, console))
+    return widest
+
+
+def bar(share: float, console: Console) -> Text:
+    """How full something is, 0 to 1, in ten columns: yellow from a half, red from nine tenths, never empty above 0."""
+    full, empty = ('#', '.') if console.options.ascii_only else ('█', '░')
+    share = min(max(share, 0.0), 1.0)
+    count = max(round(share * BAR_COLUMNS), 1 if share > 0 else 0)
+    style = 'red' if share >= 0.9 else 'yellow' if share >= 0.5 else 'green'
+    return Text.assemble((full * count, style), (empty * (BAR_COLUMNS - count), 'dim'))
+
+
+def number(value: int | None) -> str:
+    """With separators; a dash for what is not known."""
+    return '-' if value is None else f'{value:,}'
+
+
+def volume(count: float) -> str:
+    """Bytes in decimal units, as disks and networks are sold."""
+    for unit in ('B', 'KB', 'MB'):
+        if count < 1000:
+            return f'{count:.0f} {unit}' if unit == 'B' else f'{count:.1f} {unit}'
+        count /= 1000
+    return f'{count:.1f} GB'
+
+
+def duration(seconds: float) -> str:
+    """In the two largest units, such as ``0.4 s``, ``12 s``, ``3 min 5 s``, ``2 h 10 min``, ``4 d 3 h``."""
+    if seconds < 60:
+        return f'{seconds:.1f} s' if seconds < 10 else f'{seconds:.0f} s'
+    left = round(seconds)
+    size, unit, part, smaller = next(units for units in UNITS if left >= units[0])
+    rest = left % size // part
+    return f'{left // size} {unit} {rest} {smaller}' if rest else f'{left // size} {unit}'
+
+
+def _width(table: Table, console: Console) -> int:
+    return Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum

@@ -1,0 +1,51 @@
+"""docs/parameters.md says what the code says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from click.testing import CliRunner
+
+from shadowhound_data_logger.cli.parameters import PAGE, VARIABLES, main, page
+from shadowhound_data_logger.config import default_parameters
+
+PACKAGE = Path(__file__).parents[2] / 'shadowhound_data_logger'
+
+
+def test_the_page_is_the_one_that_the_code_makes() -> None:
+    """Whoever changes a setting runs `make docs`."""
+    assert PAGE.read_text(encoding='utf-8') == page()
+
+
+def test_every_parameter_is_on_it() -> None:
+    """Each parameter that the node declares has a row of its own, or one that all sensors share."""
+    rows = {row.split('|')[1].strip() for row in page().splitlines() if row.startswith('|')}
+    names = [name.rpartition('.') for name in default_parameters()]
+    missing = [(group, field) for group, dot, field in names
+               if f'`{group}{dot}{field}`' not in rows and not {f'*sensor*.`{field}`', f'`{group}`'} <= rows]  # fmt: skip
+    assert len(names) > 100
+    assert not missing
+
+
+def test_live_parameters_are_marked() -> None:
+    """Those that `ros2 param set` can change, and no others."""
+    live = {row.split('|')[1].strip() for row in page().splitlines() if '| yes |' in row}
+    assert live == {'*sensor*.`enabled`', '*sensor*.`rate_hz`', '*sensor*.`quality`', '*sensor*.`priority`', '`upload.max_mbps`'}
+
+
+def test_every_environment_variable_is_on_it() -> None:
+    """The page tells the variables that config.py reads, all of them and no others."""
+    read = set(re.findall(r"environ\.get\('(\w+)'\)", (PACKAGE / 'config.py').read_text(encoding='utf-8')))
+    assert read == {name for name, _, _ in VARIABLES}
+
+
+def test_every_table_is_whole() -> None:
+    """The rows of a table have as many cells as its head."""
+    for table in re.findall(r'(?:^\|.*\n)+', page(), re.MULTILINE):
+        assert len({len(re.findall(r'(?<!\\)\|', row)) for row in table.splitlines()}) == 1, table
+
+
+def test_the_command_prints_it() -> None:
+    """Without --write nothing is written."""
+    assert CliRunner().invoke(main, []).stdout == page()

@@ -1,0 +1,273 @@
+"""``shadowhound-data status`` on status files made here: what it prints, how wide, its exit codes, and the live view."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+from rich.console import Console
+from spool.making import make, new_spool, put
+
+from shadowhound_data_logger.cli.status import status, view
+from shadowhound_data_logger.cli.tables import show_whole
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.spool.status import file
+
+ERROR = 'Tower at http://192.168.10.20:9000 refused the connection (is it on, and the WiFi up? it is tried again until it works)'
+
+
+def a_topic(**figures: Any) -> dict[str, Any]:
+    row = {
+        'sensor': 'imu', 'type': 'x/msg/Y', 'enabled': True, 'publishers': 1, 'rate_hz': 99.84, 'age_s': 0.02, 'received': 1200,
+        'stored': 1100, 'skipped': 0, 'rejected': 0, 'dropped': 0, 'missed': 0, 'open': 100, 'accounting': 'exact',
+    }  # fmt: skip
+    return row | figures
+
+
+def a_status(**changes: Any) -> dict[str, Any]:
+    """As the node writes it; a mapping among the changes is laid over the one that is there."""
+    found: dict[str, Any] = {
+        'robot': 'thor', 'version': '0.1.0', 'pid': 12345, 'boot_id': 'b', 'boot_ns': 0, 'time': '2026-11-21T06:39:05.123Z',
+        'uptime_s': 7412.3, 'paused': False, 'ended': False,
+        'topics': {'/camera/camera_info': a_topic(received=1_234_567), '/imu': a_topic()},
+        'queue': {'batches': 1, 'messages': 12_345, 'bytes': 1_234_567, 'max_messages': 50_000, 'max_bytes': 67_108_864},
+        'spool': {'path': '/home/go2/.shadowhound/spool', 'pending': 3, 'held': 0, 'quarantined': 0, 'bytes': 123_456_789,
+                  'max_bytes': 21_474_836_480, 'free_bytes': 50_000_000_000, 'oldest_age_s': 725.0},
+        'store': {'target': 'the S3 server at http://192.168.10.20:9000', 'state': 'shipping', 'last_error': '',
+                  'delivered': 1234, 'in_flight': 0, 'deferred': 0, 'retries': 0, 'quarantined': 0, 'blocked_buckets': {},
+                  'mbps': 1.23, 'max_mbps': 8.0},
+        'workers': {'intake': {'failing': False, 'failures': 2, 'last_error': 'once'}},
+    }  # fmt: skip
+    for name, value in changes.items():
+        found[name] = found[name] | value if isinstance(value, dict) and name != 'topics' else value
+    return found
+
+
+def shown(width: int = 80, *, terminal: bool = True, encoding: str = 'utf-8', **changes: Any) -> str:
+    """The view of a running node."""
+    told = {'state': 'running', 'running': True, 'age_s': 0.5, 'findings': [], 'others': []}
+    output = io.TextIOWrapper(io.BytesIO(), encoding)
+    console = Console(file=output, width=width, highlight=False, force_terminal=terminal, color_system=None)
+    show_whole(
+        view({**a_status(**changes), **{name: changes.get(name, value) for name, value in told.items()}}, console), console
+    )
+    output.flush()
+    output.seek(0)
+    return output.read()
+
+
+def write(root: Path, **changes: Any) -> None:
+    """A status of this very moment."""
+    clock = SystemClock.of_this_machine()
+    root.mkdir(exist_ok=True)
+    given = a_status(boot_id=clock.boot_id, boot_ns=clock.boot_ns(), **changes)
+    file(root, given['robot']).write_text(json.dumps(given))
+
+
+def run(spool: Path, *arguments: str, **environ: str | None) -> Result:
+    return CliRunner(env={'SHADOWHOUND_ROBOT': None, **environ}).invoke(
+        status, ['--spool', str(spool), *arguments], standalone_mode=False
+    )
+
+
+def line(text: str, start: str) -> str:
+    return next(each.rstrip() for each in text.splitlines() if each.startswith(start))
+
+
+def test_it_fits_into_80_columns() -> None:
+    """A robot that works has no line that is longer, and none that is broken."""
+    text = shown()
+    assert max(len(each.rstrip()) for each in text.splitlines()) <= 80
+    assert line(text, 'thor') == 'thor  running for 2 h 3 min, process 12345, version 0.1.0'
+    assert line(text, '/camera').split() == ['/camera/camera_info', '99.8', '0.0', 's', '1,234,567', '1,100', '0']
+    assert line(text, 'queue') == 'queue  ██░░░░░░░░  12,345 of 50,000 messages, 1.2 MB'
+    assert line(text, 'spool') == 'spool  █░░░░░░░░░  123.5 MB of 21.5 GB, the disk has 50.0 GB free'
+    assert line(text, 'store') == 'store  shipping    the S3 server at http://192.168.10.20:9000'
+    assert '3 objects wait (oldest 12 min 5 s)' in text
+    assert '1,234 delivered, 1.2 of 8 Mbit/s' in text
+    assert text.rstrip().splitlines()[-1].startswith('Fine')
+
+
+@pytest.mark.parametrize('width', [52, 60])
+def test_a_narrow_terminal_loses_no_letter(width: int) -> None:
+    """What is longer goes on in the next line, under its own column."""
+    topics = {'/tachi/front_camera/image_raw/compressed': a_topic(dropped=1_000)}
+    text = shown(width, topics=topics, store={'state': 'store_down', 'last_error': ERROR})
+    assert max(map(len, text.splitlines())) <= width
+    assert '/tachi/front_camera/image_raw/compressed' in ''.join(each.split()[0] for each in text.splitlines() if each.strip())
+    assert ERROR.replace(' ', '') in ''.join(text.split('store  ')[1].split())
+
+
+def test_a_pipe_gets_every_topic_on_one_line() -> None:
+    """Without a terminal the table is as wide as it must be."""
+    name = '/tachi/a_camera_with_a_long_name/at_the_front/image_raw/compressed'
+    text = shown(terminal=False, topics={name: a_topic(received=10**9, stored=10**9)})
+    assert line(text, name).split()[-3:] == ['1,000,000,000', '1,000,000,000', '0']
+
+
+def test_a_terminal_that_knows_only_ascii_gets_ascii() -> None:
+    """The bars are drawn with what can be printed there."""
+    assert line(shown(encoding='ascii'), 'queue').startswith('queue  ##........  12,345')
+
+
+def test_losses_have_columns_only_where_there_are_any() -> None:
+    """Dropped and rejected appear with their first figure; what is not known is a dash, never 0."""
+    assert not {'dropped', 'rejected'} & set(shown().split('queue')[0].split())
+    text = shown(topics={'/imu': a_topic(dropped=5, missed=None)})
+    assert 'dropped' in text
+    assert 'rejected' not in text.split('queue')[0]
+    assert line(text, '/imu').split()[-2:] == ['-', '5']
+
+
+def test_topics_that_were_never_heard_are_one_line() -> None:
+    """Those that nobody publishes and those that are off are named and take no row; one that was heard before keeps it."""
+    gone = a_topic(publishers=0, rate_hz=0.0)
+    silent = a_topic(publishers=0, received=0, age_s=None)
+    text = shown(topics={'/a': silent, '/b': silent, '/c': gone, '/d': a_topic(enabled=False, rate_hz=0.0),
+                         '/e': silent | {'enabled': False}})  # fmt: skip
+    assert 'Nobody publishes /a, /b\nOff: /e\n' in text
+    assert line(text, '/c').split()[1] == '0.0'
+    assert line(text, '/d').split()[1] == 'off'
+
+
+def test_trouble_is_told_with_its_remedy() -> None:
+    """The store's last error while it is not fine, each worker that fails, and that the node is paused."""
+    text = shown(store={'state': 'store_down', 'last_error': 'refused (is it on?)'}, paused=True,
+                 findings=['delivery: store down'],
+                 workers={'upload': {'failing': True, 'failures': 12, 'last_error': 'OSError: no space'}})  # fmt: skip
+    assert 'refused (is it on?)' in text
+    assert line(text, 'upload').split() == ['upload', 'fails', '12', 'times', 'so', 'far:', 'OSError:', 'no', 'space']
+    assert 'intake' not in text
+    assert 'PAUSED' in text
+    assert 'delivery: store down' in text
+    assert 'Fine' not in text
+    assert 'refused' not in shown(store={'state': 'shipping', 'last_error': 'refused (is it on?)'})
+
+
+def test_text_of_others_is_shown_and_not_obeyed() -> None:
+    """Neither markup nor control characters in names and errors have an effect."""
+    text = shown(topics={'/[red]a[/red]\x1b[31m': a_topic()}, findings=['[bold]x\r\x07\u202e'],
+                 store={'state': 'paused', 'target': '[link=x]y', 'last_error': 'a[/]\nb'})  # fmt: skip
+    for each in ('/[red]a[/red]?[31m', '[bold]x???', '[link=x]y', 'a[/]?b'):
+        assert each in text
+    assert not {'\x1b', '\r', '\x07', '\u202e'} & set(text)
+
+
+def test_a_node_that_hangs_shows_when_its_figures_were_true() -> None:
+    """Not answering: for how long, and its last figures."""
+    text = shown(state='not_answering', running=False, age_s=80.0, findings=['the node has written no status'])
+    assert line(text, 'thor') == 'thor  NOT ANSWERING for 1 min 20 s, process 12345, version 0.1.0'
+    assert line(text, '/imu')
+    assert 'the node has written no status' in text
+
+
+def test_exit_codes_and_json(tmp_path: Path) -> None:
+    """0 for a node that works, 1 with a finding; --json has what the file has, and the verdict."""
+    write(tmp_path)
+    text, as_json = run(tmp_path), run(tmp_path, '--json')
+    assert (text.return_value, as_json.return_value) == (0, 0)
+    assert 'thor  running' in text.stdout
+    found = json.loads(as_json.stdout)
+    assert (found['running'], found['state'], found['findings']) == (True, 'running', [])
+    assert found['topics'] == a_status()['topics']
+    write(tmp_path, topics={'/imu': a_topic(missed=1)})
+    assert (run(tmp_path).return_value, run(tmp_path, '--json').return_value) == (1, 1)
+
+
+def test_without_a_node_the_spool_is_shown(tmp_path: Path) -> None:
+    """Exit code 1, what waits, and when it last ran; no figures of a node that is not there."""
+    spool = new_spool(tmp_path / 'spool')
+    spool.open()
+    put(spool, make('a', b'12345'))
+    spool.close()
+    result = run(tmp_path / 'spool')
+    assert result.return_value == 1
+    assert 'thor  not running; last session 2025-10-18 12:00:00 to 2025-10-18 12:00:00 UTC' in result.stdout
+    assert '1 objects wait' in result.stdout
+    assert 'queue' not in result.stdout
+    none = run(tmp_path / 'none')
+    assert none.return_value == 1
+    assert 'SHADOWHOUND_HOME' in none.stdout
+
+
+def test_whose_node(tmp_path: Path) -> None:
+    """The one that runs, unless one is asked for by option or environment; others that run are named."""
+    write(tmp_path, robot='rex', ended=True)
+    write(tmp_path, robot='tachi')
+    write(tmp_path, robot='thor')
+    text = run(tmp_path).stdout
+    assert text.startswith('tachi  running')
+    assert 'Also running here: thor' in text
+    assert run(tmp_path, '--robot', 'rex').stdout.startswith('rex  not running')
+    assert run(tmp_path, SHADOWHOUND_ROBOT='thor').stdout.startswith('thor  running')
+
+
+@pytest.mark.parametrize('arguments', [['--robot', '../x'], ['--interval', '0'], ['--nonsense']])
+def test_bad_usage_is_exit_code_2(tmp_path: Path, arguments: list[str]) -> None:
+    """A name that is none, an interval without length and an unknown option are refused."""
+    command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'status', '--spool', str(tmp_path), *arguments]
+    assert subprocess.run(command, capture_output=True, check=False).returncode == 2
+
+
+@pytest.mark.parametrize('as_json', [False, True])
+def test_watch_goes_on_until_ctrl_c(tmp_path: Path, as_json: bool) -> None:
+    """Into a pipe: a status each time, with --json one line each; Ctrl-C ends it with exit code 0."""
+    write(tmp_path)
+    command = [sys.executable, '-u', '-m', 'shadowhound_data_logger.cli.main', 'status', '--watch', '--interval', '0.05']
+    options = ['--spool', str(tmp_path), *(['--json'] if as_json else [])]
+    with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        heads = [json.loads(each)['robot'] if as_json else each for each in read_heads(process, 3, as_json)]
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=20)
+    assert process.returncode == 0, error
+    assert error == ''
+    assert all(each.startswith('thor') for each in heads)
+
+
+def read_heads(process: subprocess.Popen[str], count: int, as_json: bool) -> list[str]:
+    """The first line of each of so many looks."""
+    assert process.stdout is not None
+    heads: list[str] = []
+    for each in process.stdout:
+        if each.startswith('{' if as_json else 'thor'):
+            heads.append(each)
+        if len(heads) == count:
+            break
+    return heads
+
+
+def test_the_live_view_leaves_the_terminal_as_it_was(tmp_path: Path) -> None:
+    """On a terminal the screen is switched and given back, and the last view stays; exit code 0."""
+    write(tmp_path)
+    ours, theirs = os.openpty()
+    command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'status', '--watch', '--interval', '0.05']
+    environ = {**os.environ, 'TERM': 'xterm', 'COLUMNS': '80', 'LINES': '30'}
+    with subprocess.Popen(
+        [*command, '--spool', str(tmp_path)], stdin=theirs, stdout=theirs, stderr=theirs, env=environ
+    ) as process:
+        os.close(theirs)
+        text, deadline = '', time.monotonic() + 20
+        while text.count('thor') < 2:
+            assert time.monotonic() < deadline
+            text += os.read(ours, 65536).decode(errors='replace')
+        process.send_signal(signal.SIGINT)
+        try:
+            while part := os.read(ours, 65536):
+                text += part.decode(errors='replace')
+        except OSError:  # Linux: the other side is closed
+            pass
+    os.close(ours)
+    assert process.returncode == 0
+    assert text.index('\x1b[?1049h') < text.index('\x1b[?1049l')
+    assert 'thor' in text.partition('\x1b[?1049l')[2]
+    assert text.count('\x1b[?25h') >= text.count('\x1b[?25l') > 0
