@@ -72,7 +72,7 @@ def entries(status: Mapping[str, Any], earlier: Mapping[str, Any], usual: Mappin
     """All that is to be said of a status."""
     yield _node(status)
     for topic, row in status['topics'].items():
-        level, text = _topic(row, earlier['topics'].get(topic, row), usual.get(topic, 0.0), paused=status['paused'])
+        level, text = _topic(row, earlier['topics'].get(topic, row), usual.get(topic, 0.0))
         yield topic, level, text, row
     yield _spool(status['spool'])
     yield _store(status['store'], earlier['store'])
@@ -87,12 +87,10 @@ def _node(status: Mapping[str, Any]) -> Entry:
     return 'node', OK, 'logging', figures
 
 
-def _topic(row: Mapping[str, Any], before: Mapping[str, Any], usual_hz: float, *, paused: bool) -> tuple[Any, str]:
+def _topic(row: Mapping[str, Any], before: Mapping[str, Any], usual_hz: float) -> tuple[Any, str]:
     if not row['enabled']:
         return OK, 'not enabled'
     lost = {what: (row[what] or 0) - (before[what] or 0) for what in ('missed', 'dropped', 'rejected')}
-    if paused:
-        del lost['dropped']
     grown = [f'{count} {what}' for what, count in lost.items() if count > 0]
     if grown:
         return WARN, f'{", ".join(grown)} lately'

@@ -13,12 +13,10 @@ from shadowhound_data_logger.clock import is_sane
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.model import Batch, Sample
-from shadowhound_data_logger.spool.accounts import EXACT, Accounts
+from shadowhound_data_logger.spool.accounts import EXACT, PAUSED, Accounts
 
 MAX_RECENT: Final = 10_000
 """Messages without numbers that are remembered, to know what a second subscription delivers again."""
-PAUSED: Final = 'paused'
-"""Why messages are dropped that come during a pause."""
 Offer = Callable[[Batch], None]
 
 

@@ -15,6 +15,8 @@ from typing import Final
 
 from shadowhound_data_logger.spool.span import Span
 
+PAUSED: Final = 'paused'
+"""Why messages are dropped that come during a pause."""
 EXACT, REPORTED, RECEIVED_ONLY = 'exact', 'reported', 'received-only'
 GRADES: Final = (EXACT, REPORTED, RECEIVED_ONLY)
 """How good a topic's accounting is, best first; over several sessions the worst counts."""
@@ -123,6 +125,8 @@ class Totals:
     skipped: int
     rejected: int
     dropped: int
+    """Without those of a pause, which somebody asked for."""
+    paused: int
     missed: int | None
     open: int
 
@@ -201,7 +205,8 @@ class Accounts:
         with self._lock:
             return {
                 topic: Totals(account.type, account.accounting, account.received, account.stored, account.skipped,
-                              account.rejected.total(), account.dropped.total(), account.missed, account.open)
+                              account.rejected.total(), account.dropped.total() - (paused := account.dropped[PAUSED]), paused,
+                              account.missed, account.open)
                 for topic, account in self._topics.items()
             }  # fmt: skip
 

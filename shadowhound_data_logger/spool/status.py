@@ -29,7 +29,7 @@ NAMED: Final = 3
 """Topics that a finding names; the figures of the others stand in the table."""
 _TOPIC: Final[dict[str, Any]] = {
     'sensor': '', 'type': '', 'enabled': True, 'publishers': 0, 'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
-    'skipped': 0, 'rejected': 0, 'dropped': 0, 'missed': None, 'open': 0, 'accounting': 'received-only',
+    'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': None, 'open': 0, 'accounting': 'received-only',
 }  # fmt: skip
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'max_messages': 0, 'max_bytes': 0},

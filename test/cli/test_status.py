@@ -28,7 +28,7 @@ ERROR = 'Tower at http://192.168.10.20:9000 refused the connection (is it on, an
 def a_topic(**figures: Any) -> dict[str, Any]:
     row = {
         'sensor': 'imu', 'type': 'x/msg/Y', 'enabled': True, 'publishers': 1, 'rate_hz': 99.84, 'age_s': 0.02, 'received': 1200,
-        'stored': 1100, 'skipped': 0, 'rejected': 0, 'dropped': 0, 'missed': 0, 'open': 100, 'accounting': 'exact',
+        'stored': 1100, 'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': 0, 'open': 100, 'accounting': 'exact',
     }  # fmt: skip
     return row | figures
 
