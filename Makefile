@@ -1,18 +1,22 @@
 # Every target makes the environment first (see scripts/setup); with nothing to do that takes milliseconds.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format demo bench lock clean
+.PHONY: help setup test test-matrix check format demo bench docs lock clean
 
 PYTEST_ARGS ?=
+BENCH_ARGS ?=
 
 help: ## this list
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 13
 
 setup: ## make the environment (.venv, go2_interfaces); PYTHON=... names the interpreter
 	@PYTHON="$(PYTHON)" scripts/setup
 
 test: setup ## run all tests; PYTEST_ARGS="-k spool -x" is handed on
-	scripts/with-env pytest $(PYTEST_ARGS)
+	scripts/with-env pytest -n auto --no-loadscope-reorder $(PYTEST_ARGS)
+
+test-matrix: ## run all tests on other Pythons, numpys and ROS distributions; CELLS=... names some
+	@PYTEST_ARGS="$(PYTEST_ARGS)" scripts/test-matrix $(CELLS)
 
 check: setup ## lint, format and types
 	scripts/with-env ruff check .
@@ -26,8 +30,11 @@ format: setup ## let ruff repair and format what it can
 demo: setup ## a simulated Go2, an embedded Tower and one patrol mission, about a minute
 	scripts/with-env python -m shadowhound_data_logger.sim.demo
 
-bench: setup ## benchmarks against the baseline, as ratios
-	@for file in bench/[a-z]*.py; do echo "$$file"; scripts/with-env python "$$file" || exit 1; done
+bench: setup ## benchmarks against the baseline, as ratios, into docs/performance.md; BENCH_ARGS=--quick is shorter
+	scripts/with-env python bench/run.py $(BENCH_ARGS)
+
+docs: setup ## write docs/parameters.md anew from the code
+	scripts/with-env python -m shadowhound_data_logger.cli.parameters --write
 
 lock: setup ## write requirements/*.txt anew from requirements/*.in; LOCK_ARGS=--upgrade renews the pins
 	scripts/lock $(LOCK_ARGS)

@@ -30,6 +30,7 @@ setup(
         'click>=8.1',
         'numpy>=1.21',
         'orjson>=3.9',
+        'pillow>=9',
         'rich>=13',
         'rosbags>=0.11.9',
         'simplejpeg>=1.7',

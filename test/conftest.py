@@ -1,22 +1,78 @@
-"""What tests of several folders share: the embedded Tower, started once."""
+"""What tests of several folders share: the embedded Tower, ROS domains, and which tests may run at the same time."""
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from domains import free_domain
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.sim.tower import Tower
 
 
-ENDING_S = 2.0
-"""For threads that were told to end and are not waited for."""
+ENDING_S = 20.0
+"""More than enough for threads that were told to end and are not waited for."""
 SERVERS = ('process_request_thread', '_server_entry')
 """Threads of the stand-in servers (http.server, moto), which end with their clients or the session."""
+MOST_WORKERS = 6
+"""Each starts servers of its own; beyond that the longest group of tests decides how long all takes."""
+ONE_ROBOT_AT_A_TIME = (
+    'test/e2e/test_go2_profile.py', 'test/e2e/test_killed.py', 'test/e2e/test_raw_camera.py', 'test/sim/test_demo.py',
+    'test/sim/test_sim_go2_node.py',
+)  # fmt: skip
+"""Files with robots at full rate, of which nothing may be missed. They come first, after one another, and others make way."""
+MAKE_WAY = 10
+"""How nice the other workers are."""
+
+
+def pytest_configure() -> None:
+    """What is started in the background of a shell ignores SIGINT, and so would the programs that tests end by it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(optionalhook=True)  # pytest-xdist's, which need not be there
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """One more than there are cores, because most tests wait; none for files by name, which are there sooner without."""
+    names = [Path(argument.partition('::')[0]) for argument in config.args]
+    if config.args_source is pytest.Config.ArgsSource.ARGS and all(name.is_file() for name in names):
+        return 0
+    return min(len(os.sched_getaffinity(0)) + 1, MOST_WORKERS)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
+    """A worker takes whole files, because tests of a file share what is dear to start."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return 'robots' if has_robot(nodeid) else str(super()._split_scope(nodeid))
+
+    return Scheduling(config, log)
+
+
+def has_robot(nodeid: str) -> bool:
+    return nodeid.startswith(ONE_ROBOT_AT_A_TIME)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """The longest group first; with it a worker of its own that is not nice yet."""
+    if hasattr(config, 'workerinput'):
+        items.sort(key=lambda item: not has_robot(item.nodeid))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """What runs beside a robot leaves it the core, servers and children included."""
+    if hasattr(item.config, 'workerinput') and not has_robot(item.nodeid) and os.nice(0) < MAKE_WAY:
+        os.nice(MAKE_WAY)
 
 
 @pytest.fixture(autouse=True)
@@ -49,3 +105,10 @@ def tower(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tower]:
 
     with Tower(tmp_path_factory.mktemp('tower'), mlflow=True) as tower:
         yield tower
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    """A ROS domain that nobody uses, and no other test takes meanwhile."""
+    with free_domain() as number:
+        yield number

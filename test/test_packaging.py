@@ -14,6 +14,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 REQUIREMENTS = ROOT / 'requirements'
@@ -100,6 +101,7 @@ def test_every_dependency_has_its_reason(name: str) -> None:
         ('robot.txt', ['runtime.in']),
         ('wheels.txt', ['runtime.in', 'ros.in', 'dev.in']),
         ('sourced.txt', ['runtime.in', 'dev.in']),
+        ('jazzy.txt', ['jazzy.in']),
     ],
 )
 def test_a_lock_file_holds_what_it_is_made_from(lock: str, sources: list[str]) -> None:
@@ -111,7 +113,7 @@ def test_a_lock_file_holds_what_it_is_made_from(lock: str, sources: list[str]) -
     assert len(pins) == len(re.findall(r'^[a-z0-9_.-]+==', text, re.MULTILINE))
 
 
-@pytest.mark.parametrize('lock', ['robot.txt', 'sourced.txt'])
+@pytest.mark.parametrize('lock', ['robot.txt', 'sourced.txt', 'jazzy.txt'])
 def test_beside_a_sourced_ros_numpy_stays_at_1(lock: str) -> None:
     """The message packages of Humble and Jazzy were compiled against numpy 1 and crash on numpy 2."""
     assert set(re.findall(r'^numpy==(\d+)\.', (REQUIREMENTS / lock).read_text(), re.MULTILINE)) == {'1'}
@@ -151,12 +153,22 @@ def test_no_file_names_a_package_index() -> None:
     assert found.returncode == 1, found.stdout + found.stderr
 
 
-@pytest.mark.parametrize('script', ['setup', 'with-env', 'lock'])
+@pytest.mark.parametrize('script', sorted(path.name for path in (ROOT / 'scripts').iterdir()))
 def test_a_script_is_executable_and_parses(script: str) -> None:
     """The scripts are plain sh: dash and bash both read them."""
     path = ROOT / 'scripts' / script
     assert path.stat().st_mode & 0o111
     assert subprocess.run(['sh', '-n', str(path)], check=False, capture_output=True).returncode == 0
+
+
+def test_a_commit_is_checked_as_make_check_does() -> None:
+    """The hooks of pre-commit are the commands of `make check`, in its order."""
+    makefile = (ROOT / 'Makefile').read_text()
+    rule = re.search(r'^check:.*\n((?:\t.+\n)+)', makefile, re.MULTILINE)
+    assert rule is not None
+    (repository,) = yaml.safe_load((ROOT / '.pre-commit-config.yaml').read_text())['repos']
+    assert repository['repo'] == 'local'
+    assert [hook['entry'] for hook in repository['hooks']] == [line.strip() for line in rule[1].splitlines()]
 
 
 def test_with_env_says_what_to_do_when_there_is_no_environment(tmp_path: Path) -> None:

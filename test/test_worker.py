@@ -49,8 +49,9 @@ def test_a_failure_is_counted_said_and_survived(caplog: pytest.LogCaptureFixture
     worker.stop()
     assert worker.join(10)
     assert (worker.failures, worker.failing, worker.last_error) == (2, False, 'ZeroDivisionError: by nothing')
-    assert 'faulty failed (2 times so far)' in caplog.text
-    assert 'faulty works again' in caplog.text
+    assert caplog.text.count('faulty failed (1 times so far) and tries again: by nothing') == 1
+    assert 'faulty failed (2' not in caplog.text, 'the same failure is said once'
+    assert 'faulty works again after 2 failures' in caplog.text
 
 
 def test_a_stop_ends_the_pause(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
-import random
 import secrets
-import socket
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from domains import free_domain
 from e2e.processes import Processes
 from e2e.reading import Objects
 
@@ -24,8 +20,6 @@ pytest.importorskip('rclpy')
 
 LIVE: list[Processes] = []
 """Whose logs are shown when a test fails."""
-DOMAINS = range(1, 102)
-"""Those whose ports lie below the ephemeral ones on Linux; https://docs.ros.org/en/rolling/Concepts/About-Domain-ID.html"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -43,26 +37,6 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:  # type: ign
     if report.failed:
         report.sections += [section for started in LIVE for section in started.logs()]
     return report  # type: ignore[return-value]
-
-
-@contextmanager
-def free_domain() -> Iterator[int]:
-    """A ROS domain that nobody uses, and no other run of these tests takes meanwhile."""
-    for domain in random.sample(DOMAINS, len(DOMAINS)):
-        lock = os.open(Path(tempfile.gettempdir()) / f'shadowhound-test-domain-{domain}.lock', os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as discovery:
-                discovery.bind(('', 7400 + 250 * domain))  # where every participant of the domain listens
-        except OSError:
-            os.close(lock)
-            continue
-        try:
-            yield domain
-        finally:
-            os.close(lock)
-        return
-    pytest.fail('no ROS domain is free')
 
 
 @contextmanager

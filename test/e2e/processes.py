@@ -19,16 +19,16 @@ NODE = 'shadowhound_data_logger.capture.sensor_logger_node'
 SIM = 'shadowhound_data_logger.sim.sim_go2_node'
 LONG = bool(os.environ.get('SHADOWHOUND_TEST_LONG'))
 """``SHADOWHOUND_TEST_LONG=1 make test PYTEST_ARGS=test/e2e`` runs the minutes that are promised, instead of seconds."""
-START_S = 20.0
-"""A node takes two seconds to start on an idle machine."""
+WAIT_S = 60.0
+"""Longer than anything takes that works, on a machine that does other things as well; a node starts in two when it is idle."""
 T = TypeVar('T')
 
 
-def until(condition: Callable[[], T], what: str, seconds: float = 15.0) -> T:
+def until(condition: Callable[[], T], what: str | Callable[[], str], seconds: float = WAIT_S) -> T:
     """The first true answer of ``condition``; fails with ``what`` it waited for when that takes too long."""
     end = time.monotonic() + seconds
     while not (answer := condition()):
-        assert time.monotonic() < end, f'within {seconds:g} s: {what}'
+        assert time.monotonic() < end, f'within {seconds:g} s: {what if isinstance(what, str) else what()}'
         time.sleep(0.02)
     return answer
 
@@ -48,7 +48,7 @@ class Process:
     def log(self) -> str:
         return self.log_path.read_text(encoding='utf-8', errors='replace')
 
-    def said(self, words: str, seconds: float = START_S) -> None:
+    def said(self, words: str, seconds: float = WAIT_S) -> None:
         """Wait until the words are in the log."""
 
         def looked() -> bool:
@@ -60,7 +60,7 @@ class Process:
     def signal(self, number: int) -> None:
         self.popen.send_signal(number)
 
-    def wait(self, seconds: float = 20.0) -> int:
+    def wait(self, seconds: float = WAIT_S) -> int:
         return self.popen.wait(seconds)
 
     def kill(self) -> None:
@@ -89,30 +89,34 @@ class Node(Process):
         row: dict[str, Any] = self.ledger()['topics'].get(name, {})
         return row
 
-    def received(self, name: str, count: int, seconds: float = 15.0) -> None:
+    def received(self, name: str, count: int, seconds: float = WAIT_S) -> None:
         """Wait until that many messages of the topic are durably accounted for."""
-        until(lambda: self.topic(name).get('received', 0) >= count, f'{count} of {name} received: {self.topic(name)}', seconds)
+        until(
+            lambda: self.topic(name).get('received', 0) >= count,
+            lambda: f'{count} of {name} received: {self.topic(name)}',
+            seconds,
+        )
 
-    def settled(self, name: str, count: int, seconds: float = 20.0) -> dict[str, Any]:
+    def settled(self, name: str, count: int, seconds: float = WAIT_S) -> dict[str, Any]:
         """Wait until so many of the topic are received and none of them is open or waits for delivery; its row."""
 
         def done() -> bool:
             row = self.topic(name)
             return bool(row and row['received'] >= count and not row['open'] and not row['stored_in']['pending'])
 
-        until(done, f'{count} of {name} delivered: {self.topic(name)}', seconds)
+        until(done, lambda: f'{count} of {name} delivered: {self.topic(name)}', seconds)
         return self.topic(name)
 
-    def delivered(self, at_least: int = 1, seconds: float = 20.0) -> None:
+    def delivered(self, at_least: int = 1, seconds: float = WAIT_S) -> None:
         """Wait until so many objects are delivered and none waits."""
 
         def done() -> bool:
             objects = self.ledger()['objects']
             return bool(objects['delivered'] >= at_least and not objects['pending'])
 
-        until(done, f'{at_least} objects delivered: {self.ledger()["objects"]}', seconds)
+        until(done, lambda: f'{at_least} objects delivered: {self.ledger()["objects"]}', seconds)
 
-    def stop(self, number: int = signal.SIGINT, seconds: float = 20.0) -> dict[str, Any]:
+    def stop(self, number: int = signal.SIGINT, seconds: float = WAIT_S) -> dict[str, Any]:
         """Ask it to end, and see that it does so with exit code 0; its last ledger."""
         self.signal(number)
         assert self.wait(seconds) == 0, self.log
@@ -233,7 +237,7 @@ class Processes:
         return f'{kind}-{len(self.started)}'
 
 
-def published(sim: Process, seconds: float = 60.0) -> dict[str, int]:
+def published(sim: Process, seconds: float = WAIT_S) -> dict[str, int]:
     """Wait for the end of a simulated Go2; topic -> messages, as it counted them itself."""
     assert sim.wait(seconds) == 0, sim.log
     line = next(line for line in reversed(sim.log.splitlines()) if line.startswith('{"published"'))

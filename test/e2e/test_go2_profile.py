@@ -108,7 +108,9 @@ def test_default_profile_keys(session: Session, shared: Processes) -> None:
     """Objects have the documented keys, in the UTC second of their first sample, and a type and hash."""
     for key, info in session.objects.infos.items():
         sensor = key.split('/')[1]
-        assert re.fullmatch(f'{shared.robot}/{KEYS[sensor]}', key)
+        first = re.sub(r'_\d(?=\.\w+$)', '', key)  # what a stalled machine delivers after its batch gets a key of its own
+        assert first == key or first in session.objects.infos
+        assert re.fullmatch(f'{shared.robot}/{KEYS[sensor]}', first)
         when = datetime.fromtimestamp(int(info.metadata['t_start_ns']) // SECOND, timezone.utc)
         assert f'{when:%Y%m%d}/{when:%H%M%S}_' in key
         assert info.metadata['sha256']

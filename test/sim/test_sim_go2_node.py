@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -10,160 +9,42 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+import simplejpeg
+from domains import free_domain
 
-rclpy = pytest.importorskip('rclpy')
+pytest.importorskip('rclpy')
 
-from shadowhound_data_logger.errors import SettingError  # noqa: E402
-from shadowhound_data_logger.sim.sim_go2_node import SimSettings, run  # noqa: E402
+from rclpy.serialization import deserialize_message
+from sim.listening import (
+    BEST_EFFORT,
+    COMMON,
+    MODULE,
+    RATES,
+    SECONDS,
+    Listener,
+    Run,
+    command,
+    environment,
+    published,
+)
 
 pytestmark = pytest.mark.ros
-
-MODULE = 'shadowhound_data_logger.sim.sim_go2_node'
-COMMON = {
-    'odom': 50, 'joint_states': 50, 'camera/image_raw': 30, 'camera/camera_info': 30, 'camera/compressed': 30, 'point_cloud2': 10,
-}  # fmt: skip
-GO2 = {'imu': 100, 'go2_states': 20, 'lowstate': 20}
-BEST_EFFORT = {'camera/image_raw', 'camera/camera_info', 'point_cloud2'}
-SECONDS = 5
-"""Long enough for Fast DDS to find the publisher by its second announcement, 3 s after a first one that went amiss."""
-DOMAIN = '87'
-"""A ROS domain of these tests' own."""
-
-
-def _has_go2_interfaces() -> bool:
-    try:
-        import go2_interfaces.msg  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
-RATES = {**COMMON, **GO2} if _has_go2_interfaces() else COMMON
-
-
-def _environment(**more: str) -> dict[str, str]:
-    return {**os.environ, 'ROS_DOMAIN_ID': DOMAIN, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **more}
-
-
-def _command(*parameters: str, namespace: str = '/tachi') -> list[str]:
-    given = [word for parameter in parameters for word in ('-p', parameter)]
-    return [sys.executable, '-m', MODULE, '--ros-args', '-r', f'__ns:={namespace}', *given]
-
-
-def _run(*parameters: str, **more: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        _command(*parameters), capture_output=True, text=True, timeout=60, check=False, env=_environment(**more)
-    )
-
-
-def _published(output: str) -> dict[str, int]:
-    """The one line on standard output."""
-    lines = output.splitlines()
-    assert len(lines) == 1, output
-    counts: dict[str, int] = json.loads(lines[0])['published']
-    return counts
-
-
-def _message_types() -> dict[str, Any]:
-    from nav_msgs.msg import Odometry
-    from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, PointCloud2
-
-    types: dict[str, Any] = {
-        'odom': Odometry, 'joint_states': JointState, 'camera/image_raw': Image, 'camera/camera_info': CameraInfo,
-        'camera/compressed': CompressedImage, 'point_cloud2': PointCloud2,
-    }  # fmt: skip
-    if 'imu' in RATES:
-        from go2_interfaces.msg import IMU, Go2State, LowState
-
-        types |= {'imu': IMU, 'go2_states': Go2State, 'lowstate': LowState}
-    return types
-
-
-class Listener:
-    """Polled raw subscriptions to all topics under ``/tachi``; ``taken`` holds what each one got, with its message info."""
-
-    def __init__(self) -> None:
-        from rclpy.context import Context
-        from rclpy.node import Node
-        from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-
-        self._context = Context()
-        rclpy.init(context=self._context, domain_id=int(DOMAIN))
-        self.node = Node('listener', namespace='/tachi', context=self._context, start_parameter_services=False)
-        self.types = _message_types()
-        self.taken: dict[str, list[tuple[bytes, Any]]] = {name: [] for name in self.types}
-        policy = QoSReliabilityPolicy
-        self._subscriptions = {
-            name: self.node.create_subscription(
-                kind,
-                name,
-                lambda _message: None,
-                QoSProfile(depth=200, reliability=policy.BEST_EFFORT if name in BEST_EFFORT else policy.RELIABLE),
-            )
-            for name, kind in self.types.items()
-        }
-
-    def poll(self) -> None:
-        for name, subscription in self._subscriptions.items():
-            with subscription.handle:
-                while (taken := subscription.handle.take_message(self.types[name], True)) is not None:
-                    self.taken[name].append((bytes(taken[0]), taken[1]))
-
-    def last(self, name: str) -> Any:
-        """The last message of a topic, deserialized."""
-        from rclpy.serialization import deserialize_message
-
-        return deserialize_message(self.taken[name][-1][0], self.types[name])
-
-    def close(self) -> None:
-        self.node.destroy_node()
-        rclpy.shutdown(context=self._context)
-
-
-class Run:
-    """Some seconds of the simulated Go2 as /tachi: what it said, what a listener got, what the graph showed."""
-
-    def __init__(self) -> None:
-        listener = Listener()
-        try:
-            process = subprocess.Popen(
-                _command(f'duration_s:={SECONDS}.0'),
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                env=_environment(),
-            )
-            self.endpoints: dict[str, Any] = {}
-            end = time.monotonic() + 60
-            while process.poll() is None and time.monotonic() < end:
-                listener.poll()
-                if len(self.endpoints) < len(RATES):
-                    self._look(listener)
-                time.sleep(0.02)
-            output, self.errors = process.communicate(timeout=10)
-            listener.poll()
-        finally:
-            process.kill()
-            listener.close()
-        self.ended_ns = time.time_ns()
-        self.listener, self.published, self.returncode = listener, _published(output), process.returncode
-
-    def _look(self, listener: Listener) -> None:
-        for name in RATES:
-            found = listener.node.get_publishers_info_by_topic(f'/tachi/{name}')
-            if found:
-                self.endpoints[name] = found[0]
 
 
 @pytest.fixture(scope='module')
 def some_seconds() -> Iterator[Run]:
-    with pytest.MonkeyPatch.context() as patch:
+    with free_domain() as domain, pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        yield Run()
+        yield Run(domain)
+
+
+def finished(domain: int, *parameters: str, **more: str) -> subprocess.CompletedProcess[str]:
+    """A run of the robot to its end."""
+    own = environment(domain, **more)
+    return subprocess.run(command(*parameters), capture_output=True, text=True, timeout=100, check=False, env=own)
 
 
 def test_it_publishes_exactly_rate_times_duration(some_seconds: Run) -> None:
@@ -192,9 +73,6 @@ def test_quality_of_service_is_the_drivers(some_seconds: Run, name: str) -> None
 
 def test_image_and_jpeg_are_one_frame(some_seconds: Run) -> None:
     """Both have the same stamp, and the JPEG decodes to the image."""
-    simplejpeg = pytest.importorskip('simplejpeg')
-    from rclpy.serialization import deserialize_message
-
     listener = some_seconds.listener
     jpeg = listener.last('camera/compressed')
     assert jpeg.format == 'bgr8; jpeg compressed bgr8'
@@ -216,8 +94,6 @@ def test_image_and_jpeg_are_one_frame(some_seconds: Run) -> None:
 
 def test_stamps_are_the_time_of_the_sample_in_utc(some_seconds: Run) -> None:
     """Odometry is stamped every 20 ms, the last 20 ms before the time is over."""
-    from rclpy.serialization import deserialize_message
-
     listener = some_seconds.listener
     odometry = [deserialize_message(cdr, listener.types['odom']).header.stamp for cdr, _ in listener.taken['odom']]
     stamps = [stamp.sec * 10**9 + stamp.nanosec for stamp in odometry]
@@ -257,32 +133,30 @@ def test_the_go2_messages_belong_together(some_seconds: Run) -> None:
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_with_its_account(number: signal.Signals) -> None:
+def test_a_signal_ends_it_with_its_account(number: signal.Signals, domain: int) -> None:
     """SIGINT and SIGTERM both lead to the line of JSON and exit code 0, soon."""
     process = subprocess.Popen(
-        _command('image_raw:=false', 'compressed:=false', 'rate_scale:=0.5'),
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=_environment(),
+        command('image_raw:=false', 'compressed:=false', 'rate_scale:=0.5'),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(domain),
     )  # fmt: skip
     try:
-        assert _wait_for_publisher(process), 'it never published'
+        assert _wait_for_publisher(process, domain), 'it never published'
         process.send_signal(number)
-        sent = time.monotonic()
-        output, _ = process.communicate(timeout=20)
+        output, _ = process.communicate(timeout=30)
     finally:
         process.kill()
     assert process.returncode == 0
-    assert time.monotonic() - sent < 5
-    published = _published(output)
-    assert '/tachi/camera/image_raw' not in published
-    assert '/tachi/camera/compressed' not in published
-    assert published['/tachi/odom'] > published['/tachi/point_cloud2'] >= 3
+    counts = published(output)
+    assert '/tachi/camera/image_raw' not in counts
+    assert '/tachi/camera/compressed' not in counts
+    assert counts['/tachi/odom'] > counts['/tachi/point_cloud2'] >= 3
 
 
-def _wait_for_publisher(process: subprocess.Popen[str]) -> bool:
-    """Whether three point clouds arrived within 30 s."""
-    listener = Listener()
+def _wait_for_publisher(process: subprocess.Popen[str], domain: int) -> bool:
+    """Whether three point clouds arrive within a minute."""
+    listener = Listener(domain)
     try:
-        end = time.monotonic() + 30
+        end = time.monotonic() + 60
         while time.monotonic() < end and process.poll() is None:
             listener.poll()
             if len(listener.taken['point_cloud2']) >= 3:
@@ -293,77 +167,35 @@ def _wait_for_publisher(process: subprocess.Popen[str]) -> bool:
     return False
 
 
-def test_without_go2_interfaces_it_runs_with_the_rest(tmp_path: Path) -> None:
+def test_without_go2_interfaces_it_runs_with_the_rest(tmp_path: Path, domain: int) -> None:
     """The topics of go2_interfaces are missing, all others are there, and one line on stderr says so."""
     missing = tmp_path / 'go2_interfaces'
     missing.mkdir()
     (missing / '__init__.py').write_text('raise ImportError("not installed here")')
     path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get('PYTHONPATH'))))
-    done = _run('duration_s:=0.2', PYTHONPATH=path)
-    assert set(_published(done.stdout)) == {f'/tachi/{name}' for name in COMMON}
+    done = finished(domain, 'duration_s:=0.2', PYTHONPATH=path)
+    assert set(published(done.stdout)) == {f'/tachi/{name}' for name in COMMON}
     assert sum('go2_interfaces' in line for line in done.stderr.splitlines()) == 1
 
 
-def test_an_unknown_parameter_refuses_the_start() -> None:
+def test_an_unknown_parameter_refuses_the_start(domain: int) -> None:
     """Exit code 2, the parameter's name and the known ones on stderr, nothing on stdout."""
-    done = _run('duration:=1.0')
+    done = finished(domain, 'duration:=1.0')
     assert done.returncode == 2
     assert done.stdout == ''
     assert 'duration = 1.0' in done.stderr
     assert 'duration_s' in done.stderr
 
 
-def test_a_stray_argument_refuses_the_start() -> None:
+def test_a_stray_argument_refuses_the_start(domain: int) -> None:
     """A parameter given without --ros-args is not silently ignored."""
     done = subprocess.run(
-        [sys.executable, '-m', MODULE, 'seed:=2'], capture_output=True, text=True, timeout=60, check=False, env=_environment()
+        [sys.executable, '-m', MODULE, 'seed:=2'],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        env=environment(domain),
     )
     assert done.returncode == 2
     assert 'seed:=2' in done.stderr
-
-
-@pytest.mark.parametrize(
-    ('name', 'value'),
-    [('seed', -1), ('seed', 1.5), ('duration_s', 'long'), ('rate_scale', 0.0), ('rate_scale', float('nan')), ('image_raw', 1)],
-)
-def test_a_wrong_value_is_named(name: str, value: object) -> None:
-    """The error has the name, the value and what is allowed."""
-    with pytest.raises(SettingError) as caught:
-        SimSettings.load({name: value})
-    assert caught.value.data['name'] == name
-    assert str(caught.value).startswith(f'{name} = {value!r} is refused; allowed is')
-
-
-def test_whole_numbers_and_the_parameters_of_rclpy_are_taken() -> None:
-    """``duration_s:=5`` is five seconds, and what rclpy declares by itself is nobody's mistake."""
-    settings = SimSettings.load({'duration_s': 5, 'use_sim_time': False, 'start_type_description_service': True})
-    assert settings == SimSettings(duration_s=5.0)
-
-
-class SlowRobot:
-    """Takes a tenth of a second for its first message, longer than all others should take together."""
-
-    rates_hz = {'a': 1000.0}  # noqa: RUF012
-
-    def __init__(self) -> None:
-        self.samples: list[tuple[float, int]] = []
-
-    def publish(self, name: str, t: float, stamp_ns: int) -> None:
-        if not self.samples:
-            time.sleep(0.1)
-        self.samples.append((t, stamp_ns))
-
-
-def test_a_late_robot_catches_up_and_leaves_nothing_out() -> None:
-    """After a stall everything that was due is published, each with the time at which it was due."""
-    robot = SlowRobot()
-    run(robot, SimSettings(duration_s=0.05), lambda: False)  # type: ignore[arg-type]
-    assert [t for t, _ in robot.samples] == [k / 1000 for k in range(50)]
-    assert [stamp - robot.samples[0][1] for _, stamp in robot.samples] == [k * 1_000_000 for k in range(50)]
-
-
-def test_a_stop_is_heeded_before_the_next_message() -> None:
-    """Nothing more is published once it is to stop."""
-    robot = SlowRobot()
-    run(robot, SimSettings(), lambda: len(robot.samples) == 3)  # type: ignore[arg-type]
-    assert len(robot.samples) == 3

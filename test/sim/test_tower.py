@@ -32,11 +32,11 @@ REPOSITORY = Path(__file__).parents[2]
 QUICK = UploadSettings(connect_timeout_s=1.0, read_timeout_s=5.0)
 
 
-def _until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> None:
+def _comes_true(condition: Callable[[], bool], timeout_s: float = 20.0) -> bool:
     deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, f'{what} did not happen within {timeout_s} s'
+    while not (answer := condition()) and time.monotonic() < deadline:
         time.sleep(0.02)
+    return answer
 
 
 def _processes(mark: Path) -> set[str]:
@@ -155,11 +155,11 @@ def test_no_orphan_survives_a_killed_owner(tmp_path: Path) -> None:
         return any('weed mini' in command for command in commands) and any('mlflow' in command for command in commands)
 
     try:
-        _until(are_up, 'the start of both servers')
+        assert _comes_true(are_up)
     finally:
         owner.kill()
         owner.communicate()
-    _until(lambda: not _processes(tmp_path), 'the end of all its processes')
+    assert _comes_true(lambda: not _processes(tmp_path))
 
 
 def test_a_guard_ends_the_grandchildren_as_well(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_a_guard_ends_the_grandchildren_as_well(tmp_path: Path) -> None:
     server = Server('a stubborn server', ['bash', '-c', script, 'server', str(tmp_path)], log=log, environ=os.environ)
     server.start()
     server.wait(lambda: 'up' in log.read_text(), 10.0)
-    _until(lambda: any('grandchild' in command for command in _processes(tmp_path)), 'the start of the grandchild')
+    assert _comes_true(lambda: any('grandchild' in command for command in _processes(tmp_path)))
     server.stop()
     assert not _processes(tmp_path)
 
@@ -180,10 +180,10 @@ def test_a_server_dies_with_its_guard(tmp_path: Path) -> None:
     script = f'exec -a {tmp_path}/server sleep 1000'
     server = Server('a server', ['bash', '-c', script], log=log, environ=os.environ)
     server.start()
-    _until(lambda: f'{tmp_path}/server 1000 ' in _processes(tmp_path), 'the start')
+    assert _comes_true(lambda: f'{tmp_path}/server 1000 ' in _processes(tmp_path))
     guard = next(int(path.parent.name) for path in _guards(tmp_path))
     os.kill(guard, signal.SIGKILL)
-    _until(lambda: not _processes(tmp_path), 'the end of the server')
+    assert _comes_true(lambda: not _processes(tmp_path))
     server.stop()
 
 

@@ -16,10 +16,10 @@ from spool.making import FakeClock, assert_whole, files, make, put, rows, settle
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.model import Outcome, State
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.spool import Outcome, Spool
+from shadowhound_data_logger.spool.spool import Spool
 
 MEBI = 1 << 20
 BODY = bytes(200_000)

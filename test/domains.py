@@ -1,0 +1,39 @@
+"""ROS domains for tests: each is used by one test at a time on this machine."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import socket
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from segments import free_orphans
+
+DOMAINS = range(1, 102)
+"""Those whose ports lie below the ephemeral ones on Linux; https://docs.ros.org/en/rolling/Concepts/About-Domain-ID.html"""
+
+
+@contextmanager
+def free_domain() -> Iterator[int]:
+    """A ROS domain that nobody uses, and no other run of these tests takes meanwhile."""
+    for domain in random.sample(DOMAINS, len(DOMAINS)):
+        lock = os.open(Path(tempfile.gettempdir()) / f'shadowhound-test-domain-{domain}.lock', os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as discovery:
+                discovery.bind(('', 7400 + 250 * domain))  # where every participant of the domain listens
+        except OSError:
+            os.close(lock)
+            continue
+        try:
+            yield domain
+        finally:
+            os.close(lock)
+            free_orphans()
+        return
+    pytest.fail('no ROS domain is free')

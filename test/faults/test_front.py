@@ -1,0 +1,185 @@
+"""Each fault alone, by the front over a real server: what the store says, and that nothing is lost, doubled or overwritten."""
+
+from __future__ import annotations
+
+import random
+import uuid
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from faults.front import STATUS_LINE, Front
+from faults.kinds import FAULTS, STORING, Condition, Fault, Script
+from ship.fakes import until
+from stores.spooled import Spool
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import AccessDenied, CredentialsRejected, ForeignObject, StoreError, StoreUnavailable
+from shadowhound_data_logger.model import Put, SpooledObject
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.s3 import S3Store
+
+pytestmark = pytest.mark.seaweedfs
+
+IMPATIENT = UploadSettings(connect_timeout_s=1.0, read_timeout_s=0.3)
+KINDS: dict[Fault, type[StoreError]] = {Fault.DENIED: AccessDenied, Fault.SKEWED: CredentialsRejected}
+SAID = {
+    Fault.REFUSED: 'broke the connection off', Fault.RESET: 'broke the connection off', Fault.HUNG: 'gave no answer within 0.3 s',
+    Fault.SLOW: 'gave no answer within 0.3 s', Fault.ERROR_500: '500 InternalError', Fault.SLOW_DOWN: '503 SlowDown',
+    Fault.DENIED: 'denies these credentials', Fault.SKEWED: 'differ too much', Fault.PORTAL: 'does not answer like an S3 server',
+    Fault.CUT: 'does not answer like an S3 server', Fault.ACK_LOST: 'broke the connection off',
+}  # fmt: skip
+BUCKET = 'faults'
+CONTENT = b'content' * 100
+
+
+@pytest.fixture
+def front(seaweed: Tower) -> Iterator[Front]:
+    with Front(seaweed.endpoint_url, secret=seaweed.store_settings().secret_access_key or '') as standing:
+        yield standing
+
+
+@pytest.fixture
+def direct(seaweed: Tower) -> Iterator[S3Store]:
+    """The server without the front."""
+    store = S3Store(seaweed.store_settings(), UploadSettings())
+    store.open()
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def opened(request: pytest.FixtureRequest, seaweed: Tower, front: Front) -> Iterator[S3Store]:
+    """The server behind the front; only where no answer comes in time is there no time for one."""
+    fault = getattr(request.node, 'callspec', None) and request.node.callspec.params.get('fault')
+    patience = IMPATIENT if fault in {Fault.HUNG, Fault.SLOW} else UploadSettings()
+    store = S3Store(replace(seaweed.store_settings(), endpoint_url=front.url), patience)
+    store.open()
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def key() -> str:
+    """One that no other test has used: they share a bucket, which takes the server some time to make."""
+    return uuid.uuid4().hex
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Spool:
+    return Spool(tmp_path, BUCKET)
+
+
+@pytest.fixture
+def proved(opened: S3Store, spool: Spool) -> S3Store:
+    """The store knows what it needs of its server: each put is one request from here on."""
+    again(opened, spool(uuid.uuid4().hex, b'proof'))
+    return opened
+
+
+def again(store: S3Store, item: SpooledObject) -> Put:
+    """Put until it works."""
+    ends: list[Put] = []
+
+    def works() -> bool:
+        try:
+            ends.append(store.put(item))
+        except StoreUnavailable:
+            return False
+        return True
+
+    until(works)
+    return ends[0]
+
+
+@pytest.mark.parametrize('fault', [fault for fault in FAULTS if fault is not Fault.NO_CONDITION])
+def test_one_fault(fault: Fault, proved: S3Store, direct: S3Store, front: Front, spool: Spool, key: str) -> None:
+    """It is told from the others, the object is there or not as the fault has it, and the next put makes it so, once."""
+    item = spool(key, CONTENT)
+    front.cut = lambda _: STATUS_LINE
+    front.script = Script([fault])
+    with pytest.raises(KINDS.get(fault, StoreUnavailable), match=SAID[fault]):
+        proved.put(item)
+    until(lambda: front.is_quiet)
+    there = direct.head(BUCKET, key) is not None
+    assert there is (fault in STORING)
+    assert again(proved, item) is (Put.IDENTICAL if there else Put.CREATED)
+    assert direct.get(BUCKET, key) == CONTENT
+    assert front.stored[f'/{BUCKET}/{key}'] == [item.sha256]
+
+
+def test_refused(proved: S3Store, front: Front, spool: Spool, key: str) -> None:
+    """For a while there is no connection at all, and then there is."""
+    front.refuse()
+
+    def refused() -> bool:
+        try:
+            proved.put(spool(uuid.uuid4().hex, CONTENT))
+        except StoreUnavailable as error:
+            return 'refused the connection' in str(error)
+        return False
+
+    until(refused)
+    assert again(proved, spool(key, CONTENT)) is Put.CREATED
+
+
+@pytest.mark.parametrize('condition', [Condition.NOT_IMPLEMENTED, Condition.OVERWRITES])
+def test_a_server_without_the_condition(
+    condition: Condition, opened: S3Store, direct: S3Store, front: Front, spool: Spool, key: str
+) -> None:
+    """From the first put on nothing is overwritten, whether it admits that or not."""
+    front.condition = condition
+    direct.put(spool(key, b'theirs'))
+    for content in (b'other', b'others'):
+        with pytest.raises(ForeignObject):
+            opened.put(spool(key, content))
+    assert opened.put(spool(f'{key}-other', b'ours')) is Put.CREATED
+    assert opened.put(spool(f'{key}-other', b'ours')) is Put.IDENTICAL
+    assert direct.get(BUCKET, key) == b'theirs'
+    assert direct.get(BUCKET, f'{key}-other') == b'ours'
+
+
+def test_a_server_that_forgets_the_condition(proved: S3Store, direct: S3Store, front: Front, spool: Spool, key: str) -> None:
+    """One that honoured it until now and says 501 then, once, is asked what it holds before anything is sent without it."""
+    direct.put(spool(key, b'theirs'))
+    front.script = Script([Fault.NO_CONDITION])
+    with pytest.raises(ForeignObject):
+        proved.put(spool(key, b'ours'))
+    assert direct.get(BUCKET, key) == b'theirs'
+
+
+@pytest.mark.parametrize(('there', 'content'), [(False, CONTENT), (True, CONTENT), (True, b'')])
+@pytest.mark.parametrize('fault', [Fault.ERROR_500, Fault.SLOW_DOWN, Fault.DENIED, Fault.SKEWED])
+def test_a_look_that_fails_for_a_moment_condemns_nobody(
+    there: bool, content: bytes, fault: Fault, opened: S3Store, direct: S3Store, front: Front, spool: Spool
+) -> None:
+    """What asks for the reason may find that all is well by then, with or without the object."""
+    item = spool(uuid.uuid4().hex, content)
+    direct.put(item if there else spool(uuid.uuid4().hex, content))
+    front.script = Script([fault])
+    assert again(opened, item) is (Put.IDENTICAL if there else Put.CREATED)
+
+
+@pytest.mark.filterwarnings('ignore:tzname')  # of half a date
+def test_an_answer_that_breaks_off_condemns_nobody(proved: S3Store, front: Front, spool: Spool, key: str) -> None:
+    """Wherever the answer about a key that is taken ends, the object is known again, or it is tried again."""
+    item = spool(key, CONTENT)
+    proved.put(item)
+    lengths = [0]
+
+    def cut(answer: bytes) -> int:
+        lengths[0] = len(answer)
+        return place
+
+    front.cut = cut
+    place = STATUS_LINE
+    ends: set[Put | None] = set()
+    while place <= lengths[0] or not lengths[0]:
+        front.script = Script([Fault.NONE, Fault.CUT])  # 412, and the look at what is there
+        try:
+            ends.add(proved.put(item))
+        except StoreUnavailable:
+            ends.add(None)
+        place += random.Random(place).randint(1, 7)
+    assert ends == {Put.IDENTICAL, None}

@@ -1,0 +1,222 @@
+"""Kills the node with SIGKILL at random points under full load, again and again, with the store up and down.
+
+The simulated Go2 publishes at its full rates, all of it is stored, a witness writes down what was published. Afterwards
+every object of the store is compared with it, and what is missing must belong to a kill and be as little as promised.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import random
+import re
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from domains import free_domain
+from e2e.processes import Node, Process, Processes, published, until
+from e2e.reading import TYPES
+from e2e.wire import HANG, PASS, REFUSE, Wire
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.stores.s3 import S3Store
+from torture._command import Bar, parser, progress, verdict, workshop
+from torture._kill_audit import CALIBRATION, CLOUDS, Audit, Heard, Kill, audit
+
+KILLS: Final = 100
+SHORT_KILLS: Final = 5
+ROBOT: Final = 'torture'
+AT_THE_START: Final = 0.2
+"""Share of the nodes that are killed before they listen or soon after: in their imports, recovery, discovery."""
+START_S: Final = (0.1, 2.5)
+UP_S: Final = (0.3, 4.0)
+STORE_CHANGES: Final = 0.4
+"""How often the store changes from one kill to the next; half of the time it is there."""
+DELIVER_S: Final = 300.0
+PARAMETERS: Final[dict[str, Any]] = {
+    **{f'{name}.rate_hz': 0.0 for name in ('camera', 'lidar', 'odom', 'lowstate')},
+    'odom.batch_s': 1.0, 'lowstate.batch_s': 1.0,
+    'upload.connect_timeout_s': 1.0, 'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
+}  # fmt: skip
+"""Every message is stored; and a store that is back is noticed within the life of a node."""
+READY: Final = re.compile(r'\[(\d+\.\d+)\].*: logging ')
+SHARED_MEMORY: Final = Path('/dev/shm')  # noqa: S108 - where Fast DDS keeps its segments is fixed
+
+
+@dataclass(slots=True)
+class Run:
+    """What happened, before anybody looked at the data."""
+
+    kills: list[Kill]
+    said: dict[str, int]
+    ledger: dict[str, Any]
+    unbalanced: list[str]
+    index: Path
+    recording: Path
+
+
+class Killer:
+    """One robot, one witness, one node after the other. Life: New; run once."""
+
+    def __init__(self, processes: Processes, wire: Wire, environ: dict[str, str], rng: random.Random) -> None:
+        self._processes, self._wire, self._environ, self._rng = processes, wire, environ, rng
+        self._kills: list[Kill] = []
+        self._nodes: list[Node] = []
+        self._unbalanced: list[str] = []
+
+    def run(self, kills: int) -> Run:
+        recording = self._processes.folder / 'witness'
+        self._start().said('logging ')
+        witness = self._processes.witness(TYPES, recording, best_effort=(CLOUDS, CALIBRATION))
+        sim = self._processes.sim('image_raw:=false')
+        until(lambda: self._nodes[0].topic('/imu').get('received'), 'the first messages are received')
+        began = time.monotonic()
+        for number in range(1, kills + 1):
+            self._turn_store()
+            self._live()
+            self._kill()
+            self._start()
+            if number % 10 == 0:
+                progress(f'{number} kills in {time.monotonic() - began:.0f} s')
+        self._wire.set(PASS)
+        return self._finish(sim, witness, recording)
+
+    def _finish(self, sim: Process, witness: Process, recording: Path) -> Run:
+        """The last node lives, delivers all and stops."""
+        node = self._nodes[-1]
+        node.said('logging ')
+        before = node.topic('/imu')['received']
+        node.received('/imu', before + 200, 30.0)
+        sim.signal(signal.SIGINT)
+        said = published(sim)
+        progress('all that is left is delivered')
+        node.delivered(1, DELIVER_S)
+        said_last = node.stop(seconds=60.0)
+        witness.signal(signal.SIGTERM)
+        witness.wait()
+        ready = [_ready(node) for node in self._nodes[1:]]
+        kills = [Kill(kill.at, when) for kill, when in zip(self._kills, ready, strict=True)]
+        return Run(kills, said, said_last, self._unbalanced, node.home / 'spool' / 'index.db', recording)
+
+    def _start(self) -> Node:
+        self._nodes.append(self._processes.node(self._environ, PARAMETERS, ready=False))
+        return self._nodes[-1]
+
+    def _live(self) -> None:
+        """Let the node come as far as chance has it."""
+        node, rng = self._nodes[-1], self._rng
+        if rng.random() < AT_THE_START and self._kills:
+            time.sleep(rng.uniform(*START_S))  # the moment of death, not a wait for anything
+        else:
+            node.said('logging ')
+            time.sleep(rng.uniform(*UP_S))
+
+    def _kill(self) -> None:
+        node = self._nodes[-1]
+        segments = _segments(node.popen.pid)
+        self._kills.append(Kill(time.time(), float('inf')))
+        node.kill()
+        _remove_dead(segments)
+        found = ledger.imbalances(ledger.read(node.home / 'spool', ROBOT))
+        self._unbalanced += [f'after kill {len(self._kills)}: {line}' for line in found]
+
+    def _turn_store(self) -> None:
+        if self._rng.random() < STORE_CHANGES:
+            self._wire.set(self._rng.choice((PASS, PASS, REFUSE, HANG)))
+
+
+def _ready(node: Node) -> float:
+    """When the node listened, by its own log, s since 1970."""
+    found = READY.search(node.log)
+    return float(found[1]) if found else float('inf')
+
+
+def _segments(pid: int) -> set[str]:
+    """The segments of shared memory that a process uses, its own and others'."""
+    maps = Path(f'/proc/{pid}/maps').read_text()
+    return set(re.findall(rf'{SHARED_MEMORY}/(fastdds_[0-9a-f]{{16}})\b', maps))
+
+
+def _remove_dead(segments: set[str]) -> None:
+    """What ``fastdds shm clean`` does: a killed process leaves 33 MB of memory, whose lock nobody holds any more."""
+    for name in segments:
+        lock = SHARED_MEMORY / f'{name}_el'
+        try:
+            with lock.open('rb') as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            continue
+        for path in (SHARED_MEMORY / name, lock, SHARED_MEMORY / f'sem.{name}_mutex'):
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def running(folder: Path) -> Iterator[Processes]:
+    """Processes in a domain of their own; whatever happens, none of them stays."""
+    with free_domain() as domain:
+        processes = Processes(folder, domain, ROBOT)
+        try:
+            yield processes
+        finally:
+            processes.end()
+
+
+def campaign(folder: Path, kills: int, seed: int) -> tuple[Run, Audit]:
+    """Run and judge; ``folder`` needs some 10 MB a second."""
+    with Tower(folder / 'tower') as tower:
+        with Wire(tower.endpoint_url) as wire, running(folder) as processes:
+            environ = tower.environment() | {'AWS_ENDPOINT_URL': wire.url}
+            run = Killer(processes, wire, environ, random.Random(seed)).run(kills)
+        progress('every object is read back')
+        store = S3Store(tower.store_settings(), UploadSettings())
+        store.open()
+        try:
+            found = audit(Heard(run.recording), run.said, run.ledger, run.index, store, ROBOT, run.kills)
+        finally:
+            store.close()
+    found.wrong['unbalanced'] += run.unbalanced
+    return run, found
+
+
+def print_losses(table: dict[str, dict[str, float]]) -> None:
+    """A line for each topic."""
+    print('lost per kill      gaps   of what was received: median  worst     with the restart: median  worst')
+    for topic, row in table.items():
+        cells = [
+            f'{row[f"{what}_samples_{word}"]:6g} {row[f"{what}_ms_{word}"]:6g} ms'
+            for what in ('received', 'all')
+            for word in ('median', 'worst')
+        ]
+        print(f'{topic:18} {row["gaps"]:4g}  ', '   '.join(cells))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The campaign; 0 when everything held."""
+    options = parser('kills', __doc__ or '')
+    options.add_argument('--kills', type=int, default=0, help=f'how many, {KILLS} unless told')
+    given = options.parse_args(argv)
+    kills = given.kills or (SHORT_KILLS if given.short else KILLS)
+    progress(f'{kills} kills, seed {given.seed}')
+    began = time.monotonic()
+    with workshop(given) as shop:
+        run, found = campaign(shop.folder, kills, given.seed)
+        bars = [Bar('kills', len(run.kills) == kills, str(kills)), *found.bars()]
+        shop.passed = all(bar.holds for bar in bars)
+    losses = found.losses()
+    if not given.json:
+        print(f'{kills} kills in {time.monotonic() - began:.0f} s, seed {given.seed}:', found.objects, 'objects,',
+              found.samples, 'samples')  # fmt: skip
+        print_losses(losses)
+    figures = {'seed': given.seed, 'kills': kills, 'objects': found.objects, 'samples': found.samples, 'losses': losses}
+    return verdict(figures, bars, as_json=given.json)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
