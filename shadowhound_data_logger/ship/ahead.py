@@ -7,22 +7,27 @@ from typing import Final
 
 from shadowhound_data_logger.model import SpooledObject
 
-IMPORTANT: Final = 64
+IMPORTANT: Final = 128
 """Objects asked for by importance at a time."""
-OLDEST: Final = 16
+FEW: Final = 32
+"""From here on more are asked for: a look waits for the disk behind a commit, and meanwhile the others have these."""
+OLDEST: Final = 32
 """Objects asked for by age at a time; a fourth, as they are claimed."""
-OLDEST_EVERY: Final = 4
-"""Each fourth object is the oldest of all, so that neither the backlog nor what is live starves."""
+NEWEST: Final = 32
+"""Objects remembered that have just been spooled: some seconds of the default profile."""
+TURNS: Final = ('important', 'important', 'important', 'oldest', 'important', 'newest', 'important', 'oldest')
+"""Whose turn it is, over and over: neither the end of a long backlog starves, nor what is live behind it."""
 LOOK_EVERY_S: Final = 1.0
 """Other processes spool too (D6) and wake nobody here: an idle drain looks this often."""
 
 
 class Ahead:
-    """Two orders over the same objects, and when to ask for more. Guarded by the lock of the Schedule it belongs to."""
+    """Three orders over the same objects, and when to ask for more. Guarded by the lock of the Schedule it belongs to."""
 
     def __init__(self) -> None:
         self._important: dict[int, SpooledObject] = {}
         self._oldest: dict[int, SpooledObject] = {}
+        self._newest: dict[int, SpooledObject] = {}
         self._taken = 0
         self._stale = True
         self._more = False
@@ -44,13 +49,19 @@ class Ahead:
         """The spool may hold others by now."""
         self._stale = True
 
-    def wants_look(self, now: float, low: int, since: Iterable[float]) -> bool:
-        """Whether to look now: something changed, fewer than ``low`` are left, or not yet looked since one of those times."""
+    def add(self, new: Iterable[SpooledObject]) -> None:
+        """These have just been spooled."""
+        self._newest.update((item.id, item) for item in new)
+        while len(self._newest) > NEWEST:
+            del self._newest[next(iter(self._newest))]
+
+    def wants_look(self, now: float, since: Iterable[float]) -> bool:
+        """Whether to look now: something changed, few are left, or not yet looked since one of those times."""
         if self._looking:
             return False
         if self._stale or any(self._looked_at < moment <= now for moment in since):
             return True
-        return len(self) < low and (self._more or now - self._looked_at >= LOOK_EVERY_S)
+        return len(self) < FEW and (self._more or now - self._looked_at >= LOOK_EVERY_S)
 
     def has_looked_since(self, moment: float) -> bool:
         return self._looked_at >= moment and not self._looking
@@ -80,24 +91,26 @@ class Ahead:
     # -- claiming --------------------------------------------------------------------------------------------------
 
     def take(self, allowed: Callable[[SpooledObject], bool]) -> SpooledObject | None:
-        """Remove and return the first one that is allowed now."""
-        queues = [self._important, self._oldest]
-        if self._taken % OLDEST_EVERY == OLDEST_EVERY - 1:
-            queues.reverse()
-        for queue in queues:
-            item = next((item for item in queue.values() if allowed(item)), None)
-            if item is not None:
-                self._important.pop(item.id, None)
-                self._oldest.pop(item.id, None)
-                self._taken += 1
-                return item
-        return None
+        """Remove and return the first one that is allowed now; of the newest it is the most important one."""
+        turn = TURNS[self._taken % len(TURNS)]
+        newest = sorted(self._newest.values(), key=lambda item: (item.priority, -item.id)) if turn == 'newest' else ()
+        important, oldest = self._important.values(), self._oldest.values()
+        queues = (oldest, important) if turn == 'oldest' else (newest, important, oldest)
+        item = next((item for queue in queues for item in queue if allowed(item)), None)
+        if item is not None:
+            for known in self._all():
+                known.pop(item.id, None)
+            self._taken += 1
+        return item
 
     def holds(self, bucket: str) -> bool:
-        return any(item.bucket == bucket for queue in (self._important, self._oldest) for item in queue.values())
+        return any(item.bucket == bucket for queue in self._all() for item in queue.values())
 
     def drop(self, bucket: str) -> None:
         """Forget the objects of a bucket; a later look finds them again."""
-        for queue in (self._important, self._oldest):
+        for queue in self._all():
             for number in [item.id for item in queue.values() if item.bucket == bucket]:
                 del queue[number]
+
+    def _all(self) -> tuple[dict[int, SpooledObject], ...]:
+        return self._important, self._oldest, self._newest

@@ -23,15 +23,19 @@ from shadowhound_data_logger.ship.steps import Look, Rest, Ruling, Ship, Snapsho
 MANY_DEFERRED: Final = 64
 """From here on most probes are objects that failed before: a long outage does not touch ever more objects."""
 FRESH_PROBE_EVERY: Final = 16
+ENOUGH_S: Final = 0.5
+"""Bodies under way for so long at the cap: another one would only make them slower, for round trips are shorter."""
 SHORTEST_REST_S: Final = 0.01
 
 
 class Schedule:
     """Thread-safe; ``_changed`` is the one lock over all of it. Times are seconds of the clock that is handed in."""
 
-    def __init__(self, threads: int, backoff_s: float, monotonic: Callable[[], float], rng: random.Random) -> None:
+    def __init__(self, threads: int, backoff_s: float, monotonic: Callable[[], float], rng: random.Random,
+                 bytes_in: Callable[[float], float] = lambda _: float('inf')) -> None:  # fmt: skip
         self._threads = threads
         self._now = monotonic
+        self._bytes_in = bytes_in
         self._changed = threading.Condition()
         self._version = 0
         self._active: bool | None = None
@@ -39,7 +43,7 @@ class Schedule:
         self._ahead = Ahead()
         self._breakers = Breakers(backoff_s, rng)
         self._history = History(backoff_s, rng)
-        self._in_flight: dict[int, int] = {}  # id -> deliveries when it was claimed
+        self._in_flight: dict[int, tuple[SpooledObject, int]] = {}  # by id; deliveries when it was claimed
         self._unsettled: set[int] = set()
         self._retries = 0
         self._last_error = ''
@@ -55,7 +59,7 @@ class Schedule:
             store = self._breakers.store
             if not self._active or (store and not store.may_probe(now)):
                 return self._rest(now)
-            if self._ahead.wants_look(now, self._threads, self._breakers.open_since(now)):
+            if self._ahead.wants_look(now, self._breakers.open_since(now)):
                 self._ahead.begin_look(now)
                 return Look(self._taken(), self._breakers.without(now))
             item = self._claim(now)
@@ -105,7 +109,7 @@ class Schedule:
                 self._let_go(item)
                 self._unsettled.add(item.id)
                 return Ruling(quarantine_reason(error))
-            alone = verdict is Verdict.RETRY and self._history.fails_alone(item, self._in_flight[item.id])
+            alone = verdict is Verdict.RETRY and self._history.fails_alone(item, self._in_flight[item.id][1])
             if verdict in {Verdict.RETRY, Verdict.DENIED}:
                 self._history.defer(item, verdict, now)
             notices = [] if alone else self._breakers.fail(item, verdict, error, now)
@@ -133,9 +137,11 @@ class Schedule:
 
     # -- from outside ----------------------------------------------------------------------------------------------
 
-    def wake(self) -> None:
-        """The spool has new objects, or has given some up."""
+    def wake(self, new: Sequence[SpooledObject] = ()) -> None:
+        """The spool has new objects (``new``, where they are known), or has given some up."""
         with self._changed:
+            taken = self._taken()
+            self._ahead.add(item for item in new if item.id not in taken)
             self._ahead.outdate()
             self._notify()
 
@@ -192,7 +198,7 @@ class Schedule:
     def _claim(self, now: float) -> SpooledObject | None:
         item = self._take(now)
         if item is not None:
-            self._in_flight[item.id] = self._history.delivered
+            self._in_flight[item.id] = item, self._history.delivered
             self._breakers.claim(item)
             if item.bucket in self._breakers.buckets:  # one probe at a time; the others would only hide what can go
                 self._ahead.drop(item.bucket)
@@ -202,7 +208,7 @@ class Schedule:
         """An object whose own wait is over goes first; a probe is rather one that has not failed yet."""
 
         def fresh() -> SpooledObject | None:
-            return self._ahead.take(lambda item: self._breakers.lets(item.bucket, now))
+            return self._ahead.take(lambda item: self._breakers.lets(item.bucket, now) and self._has_room(item))
 
         def may_retry(item: SpooledObject) -> bool:
             return self._may_retry(item, now)
@@ -214,10 +220,17 @@ class Schedule:
 
     def _may_retry(self, item: SpooledObject, now: float) -> bool:
         """Where a bucket is out, an object that failed there is its probe only if the spool has no other of that bucket."""
-        if item.id in self._in_flight or not self._breakers.lets(item.bucket, now):
+        if item.id in self._in_flight or not self._breakers.lets(item.bucket, now) or not self._has_room(item):
             return False
         outage = self._breakers.buckets.get(item.bucket)
         return not outage or (self._ahead.has_looked_since(outage.retry_at) and not self._ahead.holds(item.bucket))
+
+    def _has_room(self, item: SpooledObject) -> bool:
+        """Where a cap has enough to do, one thread is kept for what is more important than all that is under way."""
+        ours = [each for each, _ in self._in_flight.values()]
+        if not ours or len(ours) + 1 < self._threads or sum(each.size for each in ours) <= self._bytes_in(ENOUGH_S):
+            return True
+        return item.priority < min(each.priority for each in ours)
 
     def _rest(self, now: float) -> Rest:
         until = [now + LOOK_EVERY_S, self._history.next_due(now)]

@@ -24,11 +24,14 @@ from shadowhound_data_logger.ship.outage import Notice
 from shadowhound_data_logger.ship.retry import Verdict, backoff
 from shadowhound_data_logger.ship.schedule import Schedule
 from shadowhound_data_logger.ship.steps import Look, Rest, Ship, Step
+from shadowhound_data_logger.stores.pace import Pace
 
 log = logging.getLogger(__name__)
 
 LOCK_EVERY_S: Final = 1.0
 """How often a drain that another process has is asked for."""
+DRAINED_EVERY_S: Final = 0.02
+"""How often ``drain`` looks: a wake for each object delivered would cost more."""
 CRASH_CAP_S: Final = 60.0
 
 
@@ -45,6 +48,9 @@ class Source(Protocol):
 
 class Target(Protocol):
     """What delivery asks of a store (stores/base.py)."""
+
+    @property
+    def pace(self) -> Pace: ...
 
     def put(self, item: SpooledObject) -> Put: ...
 
@@ -69,6 +75,10 @@ class UploadStatus:
     """Bucket -> why it gets nothing."""
     worker_failures: int = 0
     """Defects that the supervision of the threads caught; 0 in a healthy program."""
+    sent_bytes: int = 0
+    """Payload bytes that left in this session, repeats included; it grows while a body leaves, so its slope is the rate."""
+    max_mbps: float = 0.0
+    """The cap that is set, megabits a second; 0 is none. It holds for an S3 server: a folder is behind no radio."""
 
 
 class Uploader:
@@ -87,7 +97,7 @@ class Uploader:
         self._settle = settle
         self._monotonic = monotonic
         self._rng = rng or random.Random()
-        self._schedule = Schedule(settings.threads, settings.backoff_s, monotonic, self._rng)
+        self._schedule = Schedule(settings.threads, settings.backoff_s, monotonic, self._rng, store.pace.bytes_in)
         self._workers = [threading.Thread(target=self._work, name=f'upload-{n}', daemon=True) for n in range(settings.threads)]
         self._keeper = threading.Thread(target=self._keep_lock, name='upload-lock', daemon=True)
         self._stopping = threading.Event()
@@ -102,13 +112,17 @@ class Uploader:
         for thread in (self._keeper, *self._workers):
             thread.start()
 
-    def wake(self) -> None:
-        """The spool has new objects; cheap, from any thread."""
-        self._schedule.wake()
+    def wake(self, new: Sequence[SpooledObject] = ()) -> None:
+        """The spool has new objects; those that are told need not wait behind a backlog. Cheap, from any thread."""
+        self._schedule.wake(new)
 
     def settled(self, ids: Iterable[int]) -> None:
         """Outcomes of these objects are durable in the spool."""
         self._schedule.settled(ids)
+
+    def set_max_mbps(self, max_mbps: float) -> None:
+        """Another cap (megabits of payload a second, 0 for none), at once. Raises ValueError for one below 0."""
+        self._store.pace.set(max_mbps)
 
     def drain(self, deadline_s: float) -> bool:
         """Wait until nothing is pending and every outcome is durable; whether that is so.
@@ -122,7 +136,7 @@ class Uploader:
             left = end - self._monotonic()
             if left <= 0:
                 return False
-            self._schedule.rest(Rest(min(left, answer.seconds), answer.version))
+            self._ended.wait(min(left, answer.seconds, DRAINED_EVERY_S))
         return answer
 
     def close(self, deadline_s: float) -> None:
@@ -140,6 +154,7 @@ class Uploader:
         if hung and not self._ended.is_set():
             log.warning('%d uploads did not end within %g s; what they send is sent again next time', len(hung), deadline_s)
         self._ended.set()
+        self._store.pace.abandon()  # a body that waits for the cap would go on for minutes
         if self._keeper.ident is not None:
             self._keeper.join(max(end - self._monotonic(), 0.1))
 
@@ -156,7 +171,7 @@ class Uploader:
         with self._lock:
             failures, quarantined = self._worker_failures, self._quarantined.total()
         return UploadStatus(state, now.last_error, now.delivered, now.in_flight, now.deferred, now.retries, quarantined,
-                            now.blocked, failures)  # fmt: skip
+                            now.blocked, failures, self._store.pace.sent_bytes, self._store.pace.max_mbps)  # fmt: skip
 
     # -- the threads -----------------------------------------------------------------------------------------------
 
@@ -204,7 +219,7 @@ class Uploader:
             gone = not item.path.exists()
             self._settle((Outcome(item, State.QUARANTINED, 'missing' if gone else ruling.quarantine),))
             if gone:  # evicted since it was looked up, as a rule: the index then leaves it as it is
-                log.info('%s/%s is not in the spool any more', item.bucket, item.key)
+                log.debug('%s/%s is not in the spool any more', item.bucket, item.key)
             else:
                 self._announce_quarantine(item, ruling.quarantine, error)
         self._announce(ruling.notices)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Protocol
 
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.stores.pace import Pace
 
 
 class ObjectStore(Protocol):
@@ -14,6 +15,10 @@ class ObjectStore(Protocol):
     Errors are those of ``shadowhound_data_logger.errors``: StoreUnavailable (transient), CredentialsRejected,
     BucketMissing, AccessDenied, ObjectRefused, ForeignObject. No other exception leaves a store.
     """
+
+    @property
+    def pace(self) -> Pace:
+        """What its puts send: counted, and over a network kept to the cap."""
 
     def open(self) -> None:
         """Acquire clients and sockets. Does not talk to the network: a store that is away is no error yet."""

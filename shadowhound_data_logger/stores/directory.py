@@ -20,6 +20,7 @@ from typing import Any, Final
 from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_target, chunks, identical_or_foreign, object_metadata
+from shadowhound_data_logger.stores.pace import Pace
 
 METADATA: Final = '.metadata'
 PARTS: Final = '.part'
@@ -36,6 +37,8 @@ class DirectoryStore:
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
+        self.pace = Pace()
+        """It only counts: a disk is no radio."""
 
     def __repr__(self) -> str:
         return f'DirectoryStore({str(self._directory)!r})'
@@ -56,6 +59,7 @@ class DirectoryStore:
             if not target.exists():
                 with self._part() as part:
                     _write(part, chunks(item))
+                    self.pace.count(item.size)
                     if _appear(part, target):
                         self._write_metadata(item)
                         return Put.CREATED

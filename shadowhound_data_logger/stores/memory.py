@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.content import check_target, chunks, identical_or_foreign, object_metadata
+from shadowhound_data_logger.stores.pace import Pace
 
 
 class MemoryStore:
@@ -19,6 +20,7 @@ class MemoryStore:
 
     def __init__(self, fail: Callable[[SpooledObject | None], Exception | None] | None = None) -> None:
         self.fail = fail
+        self.pace = Pace()
         self._lock = threading.Lock()
         self._objects: dict[tuple[str, str], tuple[ObjectInfo, bytes]] = {}
 
@@ -41,6 +43,7 @@ class MemoryStore:
         with self._lock:
             held, body = self._objects.setdefault((item.bucket, item.key), ours)
         if held is ours[0]:
+            self.pace.count(item.size)
             return Put.CREATED
         return identical_or_foreign(item, held, lambda: hashlib.sha256(body).hexdigest())
 

@@ -18,9 +18,10 @@ from enum import Enum
 from typing import IO, Final
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ForeignObject, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.content import check_target, chunks, identical_or_foreign
+from shadowhound_data_logger.stores.pace import Pace
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 
 STREAM_BYTES: Final = 64 << 20
@@ -52,6 +53,10 @@ class S3Store:
 
     def __repr__(self) -> str:
         return f'S3Store({self._s3.endpoint!r})'
+
+    @property
+    def pace(self) -> Pace:
+        return self._s3.pace
 
     def open(self) -> None:
         """Raises SettingError for an endpoint no request can be sent to, or a botocore that is too old."""
@@ -97,11 +102,11 @@ class S3Store:
         sent = self._s3.put(item, body, crc32, conditional=conditional)
         if sent is Sent.NOT_IMPLEMENTED:
             self._learn(_Condition.IGNORED, 'does not know')
-            self._s3.put(item, body, crc32, conditional=False)
-        elif sent is Sent.TAKEN:
+            return self._put(item, body, crc32)  # which looks first now: it may have honoured the condition until this one
+        if sent is Sent.TAKEN:
             self._learn(_Condition.HONOURED)
             return self._judge(item, self._s3.head(item.bucket, item.key))
-        elif self._condition is _Condition.UNPROVED:
+        if self._condition is _Condition.UNPROVED:
             self._prove(item, body, crc32)
         return Put.CREATED
 
@@ -136,12 +141,17 @@ class S3Store:
             )  # fmt: skip
 
     def _judge(self, item: SpooledObject, held: ObjectInfo | None) -> Put:
+        what = f'{item.bucket}/{item.key} on {self._s3.endpoint}'
+        where = {'endpoint': self._s3.endpoint, 'bucket': item.bucket, 'key': item.key}
         if held is not None:
             if held.sha256 is None:  # nobody of ours wrote it: be sure that it is an S3 server that says so
                 self._s3.probe()
-            return identical_or_foreign(item, held, lambda: self._sha256(item))
-        what = f'{item.bucket}/{item.key} on {self._s3.endpoint}'
-        where = {'endpoint': self._s3.endpoint, 'bucket': item.bucket, 'key': item.key}
+            try:
+                return identical_or_foreign(item, held, lambda: self._sha256(item))
+            except ForeignObject:
+                if self._s3.head(item.bucket, item.key) == held:
+                    raise
+            raise StoreUnavailable(f'{what} is not described twice the same: an answer broke off', **where)
         if next(self._s3.list(item.bucket, f'{item.key}/'), None):  # SeaweedFS answers 412 to the name of a folder
             raise ObjectRefused(f'{what} is a folder', **where, reason='name')
         raise StoreUnavailable(f'{what} was there and is gone again', **where)

@@ -25,8 +25,8 @@ from shadowhound_data_logger.errors import (
     StoreUnavailable,
 )
 
-REQUEST_ERRORS: Final = (boto.BotoCoreError, boto.ClientError, ResponseParserError, OSError)
-"""Everything a request through botocore can raise."""
+REQUEST_ERRORS: Final = (boto.BotoCoreError, boto.ClientError, ResponseParserError, OSError, ValueError)
+"""Everything a request through botocore can raise; ValueError comes of a header that broke off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +125,7 @@ _FAILURES: Final[tuple[tuple[type[BaseException] | tuple[type[BaseException], ..
     (socket.gaierror, (StoreUnavailable, 'the name of Tower at {endpoint} cannot be resolved',
                        'use its IP address in AWS_ENDPOINT_URL')),
     (_BROKEN, (StoreUnavailable, 'Tower at {endpoint} broke the connection off', _AGAIN)),
+    (ValueError, (StoreUnavailable, '{endpoint} does not answer like an S3 server', _NOT_S3)),  # last: an SSL error is one, too
 )  # fmt: skip
 """Failures without an answer; the first row of which the error or one of its causes is an instance."""
 

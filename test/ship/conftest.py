@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from ship.drive import Drive
 from ship.fakes import FakeSpool, Time, until
 
 
@@ -25,4 +26,10 @@ def clock() -> Time:
 @pytest.fixture(autouse=True)
 def no_thread_is_left() -> Iterator[None]:
     yield
-    until(lambda: not [thread for thread in threading.enumerate() if thread.name.startswith('upload-')], seconds=2.0)
+    until(lambda: not [thread for thread in threading.enumerate() if thread.name.startswith('upload-')], seconds=20.0)
+
+
+@pytest.fixture
+def drive(spool: FakeSpool, clock: Time) -> Drive:
+    """A schedule with a spool and a clock by hand."""
+    return Drive(spool, clock)

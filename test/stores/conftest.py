@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from moto.server import ThreadedMotoServer
+from stores.asking import settings_for
 from stores.spooled import QUICK, Spool
 
-from shadowhound_data_logger.config import StoreSettings
+from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.memory import MemoryStore
+from shadowhound_data_logger.stores.s3 import S3Store
 
 STORES = ('memory', 'directory', 'moto', pytest.param('seaweed', marks=pytest.mark.seaweedfs))
 
@@ -54,3 +56,18 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ObjectStor
         opened = open_store(tower.store_settings(), QUICK)
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def opened() -> Iterator[Callable[..., S3Store]]:
+    """Opens stores and closes them afterwards."""
+    stores: list[S3Store] = []
+
+    def make(settings: StoreSettings | str, upload: UploadSettings = QUICK) -> S3Store:
+        stores.append(S3Store(settings_for(settings) if isinstance(settings, str) else settings, upload))
+        stores[-1].open()
+        return stores[-1]
+
+    yield make
+    for store in stores:
+        store.close()

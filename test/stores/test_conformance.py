@@ -167,17 +167,23 @@ def test_a_damaged_file_is_refused(store: ObjectStore, spool: Spool, bucket: str
     assert store.head(bucket, 'a') is None
 
 
-def test_a_probe_of_a_store_that_is_there_says_nothing(store: ObjectStore) -> None:
-    """Neither a bucket nor an object is needed."""
+def test_a_probe_of_a_store_that_is_there_is_no_error(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """Neither a bucket nor an object is needed, and none is left behind, with other objects there or without."""
     store.probe()
+    assert list(store.list(bucket)) == []
+    store.put(spool('a', b'x'))
+    store.probe()
+    assert [info.key for info in store.list(bucket)] == ['a']
 
 
-def test_open_and_close_may_be_repeated(store: ObjectStore, spool: Spool) -> None:
-    """Opening twice is one opening; closing twice is no error."""
+def test_open_and_close_may_be_repeated(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """Opening twice is one opening, closing twice is no error, and what was stored is there at the next opening."""
     store.open()
     store.put(spool('a', b'x'))
     store.close()
     store.close()
+    store.open()
+    assert store.get(bucket, 'a') == b'x'
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -86,6 +86,7 @@ FAILURES: tuple[tuple[Exception, type[StoreError], str], ...] = (
     (boto.ParamValidationError(report='Non ascii characters found in S3 metadata'), ObjectRefused, 'no plain text'),
     (boto.ParamValidationError(report='Invalid bucket name "A"'), BucketMissing, 'lower-case'),
     (ResponseParserError('x'), StoreUnavailable, 'like an S3 server'),
+    (ValueError("invalid literal for int() with base 10: ''"), StoreUnavailable, 'like an S3 server'),
     (OSError(5, 'Input/output error'), StoreUnavailable, 'Input/output error'),
 )
 

@@ -1,0 +1,141 @@
+"""How fast payload leaves: one bucket of tokens for all puts of a store, so that the radio stays free for the robot.
+
+Under a cap a body leaves in small pieces, each when its time has come: never at line rate with silence afterwards. The most
+important body goes first, but each fourth piece is of the one that waited longest: none starves, and no server gives up on one.
+"""
+
+from __future__ import annotations
+
+import io
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import IO, Final
+
+PIECE_S: Final = 0.02
+"""Time on the radio that one piece takes at the cap: what a control message may have to wait for."""
+SMALLEST_PIECE: Final = 1 << 10
+LARGEST_PIECE: Final = 1 << 16
+"""Without a cap, too: a socket's timeout is over one piece, so the slowest link that works carries 64 KiB in that time."""
+LATE_S: Final = 0.05
+"""So much of the cap a thread that woke late may catch up with."""
+LONGEST_EVERY: Final = 4
+BYTES_PER_MEGABIT: Final = 125_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Waiter:
+    """One body that wants to send its next piece."""
+
+    priority: int
+    order: int
+    turn: threading.Condition
+
+
+class Pace:
+    """Thread-safe: ``_lock`` guards all of it, and each waiter's condition is one of this lock."""
+
+    def __init__(self, max_mbps: float = 0.0, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._now = monotonic
+        self._lock = threading.Lock()
+        self._waiting: list[_Waiter] = []  # who waits longest first
+        self._max_mbps = 0.0
+        self._free_at = 0.0  # when the next piece may leave
+        self._bodies = self._pieces = self._sent_bytes = self._abandoned = 0
+        self.set(max_mbps)
+
+    def __repr__(self) -> str:
+        return f'Pace({self._max_mbps:g} Mbit/s)' if self._max_mbps else 'Pace(no cap)'
+
+    def set(self, max_mbps: float) -> None:
+        """The cap in megabits a second of payload, 0 for none; at once, for bodies under way as well."""
+        if not 0.0 <= max_mbps < float('inf'):
+            raise ValueError(f'{max_mbps} Mbit/s is no cap')
+        with self._lock:
+            self._max_mbps = max_mbps
+            self._free_at = self._now()
+            self._wake_all()
+
+    @property
+    def max_mbps(self) -> float:
+        return self._max_mbps
+
+    @property
+    def sent_bytes(self) -> int:
+        """Payload bytes that left since this was made: repeats among them, headers not."""
+        return self._sent_bytes
+
+    def bytes_in(self, seconds: float) -> float:
+        """What the cap lets leave in that time; infinite without one."""
+        return self._max_mbps * BYTES_PER_MEGABIT * seconds or float('inf')
+
+    def count(self, size: int) -> None:
+        """So many bytes left by a way that knows no cap."""
+        with self._lock:
+            self._sent_bytes += size
+
+    def pieces(self, body: bytes | IO[bytes], priority: int) -> Iterator[bytes]:
+        """The whole body, each piece when it may leave. Raises ConnectionAbortedError after a later ``abandon``."""
+        with self._lock:
+            self._bodies += 1
+            return self._leave(body, priority, self._bodies, self._abandoned)
+
+    def abandon(self) -> None:
+        """No piece leaves any more of the bodies that are under way."""
+        with self._lock:
+            self._abandoned += 1
+            self._wake_all()
+
+    def _leave(self, body: bytes | IO[bytes], priority: int, order: int, abandoned: int) -> Iterator[bytes]:
+        file = io.BytesIO(body) if isinstance(body, bytes) else body
+        file.seek(0)
+        while piece := file.read(self._piece_bytes()):
+            self._take(len(piece), priority, order, abandoned)
+            yield piece
+
+    def _take(self, size: int, priority: int, order: int, abandoned: int) -> None:
+        """Wait until so many bytes of the body may leave."""
+        with self._lock:
+            waiter = _Waiter(priority, order, threading.Condition(self._lock))
+            self._waiting.append(waiter)
+            try:
+                while self._abandoned == abandoned:
+                    pause_s = self._pause(waiter)
+                    if pause_s is not None and pause_s <= 0.0:
+                        self._grant(size)
+                        return
+                    waiter.turn.wait(pause_s)
+                raise ConnectionAbortedError('the upload was given up')
+            finally:
+                self._waiting.remove(waiter)
+                if self._waiting:
+                    self._next().turn.notify()
+
+    # -- under the lock --------------------------------------------------------------------------------------------
+
+    def _pause(self, waiter: _Waiter) -> float | None:
+        """How long the waiter has to wait; None when it is another one's turn."""
+        if not self._max_mbps:
+            return 0.0
+        return self._free_at - self._now() if self._next() is waiter else None
+
+    def _next(self) -> _Waiter:
+        if self._pieces % LONGEST_EVERY == LONGEST_EVERY - 1:
+            return self._waiting[0]
+        return min(self._waiting, key=lambda waiter: (waiter.priority, waiter.order))
+
+    def _grant(self, size: int) -> None:
+        self._sent_bytes += size
+        self._pieces += 1
+        if self._max_mbps:
+            self._free_at = max(self._free_at, self._now() - LATE_S) + size / (self._max_mbps * BYTES_PER_MEGABIT)
+
+    def _wake_all(self) -> None:
+        for waiter in self._waiting:
+            waiter.turn.notify()
+
+    def _piece_bytes(self) -> int:
+        if not self._max_mbps:
+            return LARGEST_PIECE
+        return min(max(round(self._max_mbps * BYTES_PER_MEGABIT * PIECE_S), SMALLEST_PIECE), LARGEST_PIECE)

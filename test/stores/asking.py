@@ -1,0 +1,28 @@
+"""S3 stores with a secret of their own, and what they say when something is wrong."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+
+import pytest
+
+from shadowhound_data_logger.config import StoreSettings
+from shadowhound_data_logger.errors import DataLoggerError, ObjectRefused
+
+SECRET = 'a-Secret-that-nobody-may-see'
+
+
+def settings_for(url: str) -> StoreSettings:
+    return StoreSettings(endpoint_url=url, access_key_id='KEYID', secret_access_key=SECRET)
+
+
+def error_of(kind: type[DataLoggerError], ask: Callable[[], object], secret: str = SECRET) -> str:
+    """The error's sentence, once it is certain that nothing of it holds the secret."""
+    with pytest.raises(kind) as caught:
+        ask()
+    assert type(caught.value) is kind
+    whole = ''.join(traceback.format_exception(caught.value)) + repr(caught.value) + repr(caught.value.data)
+    assert secret not in whole
+    assert caught.value.remedy or kind is ObjectRefused
+    return str(caught.value)

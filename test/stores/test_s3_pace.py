@@ -1,0 +1,209 @@
+"""What of a PUT leaves when: the cap over a real connection, and what is asked of the server before."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+from ship.fakes import until
+from stores.fake_s3 import error, etag
+from stores.spooled import Spool
+
+from shadowhound_data_logger.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.errors import ForeignObject, StoreUnavailable
+from shadowhound_data_logger.model import Put
+from shadowhound_data_logger.stores.pace import BYTES_PER_MEGABIT, LATE_S
+from shadowhound_data_logger.stores.s3 import S3Store
+from shadowhound_data_logger.stores.s3_requests import UNASKED_BYTES
+
+SLACK_S = 0.25
+"""What a busy machine may add to an arrival."""
+
+
+class Wire(ThreadingHTTPServer):
+    """An S3 look-alike that notes when how much of a body arrives."""
+
+    daemon_threads = True
+
+    def __init__(self) -> None:
+        super().__init__(('127.0.0.1', 0), _Handler)
+        self.arrivals: list[tuple[float, int]] = []
+        self.asked: list[bool] = []
+        """For each PUT whether the client waited for leave to send its body."""
+        self.broken = 0
+        self.answers: list[int] = []
+        """Statuses of the next PUTs; then 200, or 412 for a key that is there."""
+        self.refuse_early = False
+        """Whether it holds other content under every key and says so before it has read a body."""
+        self.keys: set[str] = set()
+
+    def handle_error(self, *_: object) -> None:
+        """A client that went away is no error of ours."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = 'HTTP/1.1'
+    server: Wire
+
+    def handle_expect_100(self) -> bool:
+        self.server.asked[-1:] = [True]
+        if self.server.refuse_early:
+            self._answer(412, error('PreconditionFailed'))
+            return False
+        return super().handle_expect_100()
+
+    def parse_request(self) -> bool:
+        if self.raw_requestline.startswith(b'PUT'):
+            self.server.asked.append(False)
+        return super().parse_request()
+
+    def do_PUT(self) -> None:
+        left = int(self.headers['Content-Length'])
+        while left:
+            data = self.rfile.read1(min(left, 1 << 16))
+            if not data:
+                self.server.broken += 1
+                self.close_connection = True
+                return
+            self.server.arrivals.append((time.monotonic(), len(data)))
+            left -= len(data)
+        status = self.server.answers.pop(0) if self.server.answers else 412 if self.path in self.server.keys else 200
+        if status == 200:
+            self.server.keys.add(self.path)
+            self._answer(200, b'', etag(b''))
+        else:
+            self._answer(status, error('PreconditionFailed' if status == 412 else 'SlowDown'))
+
+    def do_HEAD(self) -> None:
+        if self.server.refuse_early:
+            self._answer(200, b'', {**etag(b''), 'x-amz-meta-sha256': 'another'})
+        else:
+            self._answer(404, b'')
+
+    def _answer(self, status: int, body: bytes, headers: dict[str, str] | None = None) -> None:
+        self.send_response(status)
+        for name, value in {'Content-Length': str(len(body)), **(headers or {})}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command != 'HEAD':
+            self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Quiet."""
+
+
+@pytest.fixture
+def wire() -> Iterator[Wire]:
+    server = Wire()
+    thread = threading.Thread(target=server.serve_forever, kwargs={'poll_interval': 0.01})
+    thread.start()
+    yield server
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def opened(wire: Wire, max_mbps: float = 0.0, timeout_s: float = 5.0) -> S3Store:
+    url = f'http://127.0.0.1:{wire.server_port}'
+    upload = UploadSettings(connect_timeout_s=timeout_s, read_timeout_s=timeout_s, max_mbps=max_mbps)
+    store = S3Store(StoreSettings(endpoint_url=url, access_key_id='a', secret_access_key='b'), upload)
+    store.open()
+    return store
+
+
+@pytest.fixture
+def proved(wire: Wire, spool: Spool) -> Iterator[S3Store]:
+    """A store that knows its server, with nothing on record yet."""
+    store = opened(wire)
+    store.put(spool('first', b'first'))
+    wire.arrivals.clear()
+    wire.asked.clear()
+    yield store
+    store.close()
+
+
+def test_a_body_arrives_evenly_and_outlasts_every_timeout(wire: Wire, spool: Spool, proved: S3Store) -> None:
+    """Timeouts are over single pieces; nothing arrives sooner than the cap allows, neither at the beginning nor after a pause."""
+    proved.close()
+    store = opened(wire, 2.0, timeout_s=0.5)
+    size, rate = 300_000, 2.0 * BYTES_PER_MEGABIT
+    store.put(spool('large', bytes(size)))
+    store.close()
+    began = wire.arrivals[0][0]
+    arrived = 0
+    for moment, count in wire.arrivals[: len(wire.arrivals) // 2]:  # the rest is the proof: the same again
+        arrived += count
+        assert arrived <= rate * (moment - began + LATE_S + SLACK_S)
+    assert wire.arrivals[-1][0] - began > 2 * 0.5
+    assert store.pace.sent_bytes == 2 * size
+
+
+def test_what_is_counted_is_what_left(wire: Wire, spool: Spool, proved: S3Store) -> None:
+    """Bodies of every try, no reading for a checksum or a signature, nothing of a server that was never reached."""
+    counted = proved.pace.sent_bytes
+    assert counted == 2 * len(b'first')  # the put, and the proof that it cannot be repeated
+    wire.answers = [503]
+    item = spool('again', bytes(100_000))
+    with pytest.raises(StoreUnavailable):
+        proved.put(item)
+    assert proved.put(item) is Put.CREATED
+    assert proved.pace.sent_bytes - counted == sum(count for _, count in wire.arrivals) == 200_000
+    away = S3Store(StoreSettings(endpoint_url='http://127.0.0.1:9', access_key_id='a', secret_access_key='b'), UploadSettings())
+    away.open()
+    with pytest.raises(StoreUnavailable):
+        away.put(item)
+    assert away.pace.sent_bytes == 0
+    away.close()
+
+
+@pytest.mark.parametrize(('size', 'asks'), [(0, False), (1, False), (UNASKED_BYTES, False), (UNASKED_BYTES + 1, True)])
+def test_only_a_large_body_waits_for_leave(wire: Wire, spool: Spool, proved: S3Store, size: int, asks: bool) -> None:
+    """It costs a round trip, which a small body is not worth."""
+    assert proved.put(spool(f'{size}', bytes(size))) is Put.CREATED
+    assert wire.asked == [asks]
+    assert sum(count for _, count in wire.arrivals) == size
+
+
+def test_a_large_body_that_is_refused_stays_here(wire: Wire, spool: Spool, proved: S3Store) -> None:
+    """The server says so before anything of it left."""
+    wire.refuse_early = True
+    with pytest.raises(ForeignObject):
+        proved.put(spool('there', bytes(4 * UNASKED_BYTES)))
+    assert wire.arrivals == []
+
+
+def test_a_put_that_is_given_up_breaks_off(wire: Wire, spool: Spool, proved: S3Store) -> None:
+    """At once, and the server sees it: no half body can be taken for a whole one."""
+    proved.pace.set(0.01)
+    failed: list[Exception] = []
+
+    def put() -> None:
+        try:
+            proved.put(spool('slow', bytes(200_000)))
+        except StoreUnavailable as problem:
+            failed.append(problem)
+
+    thread = threading.Thread(target=put)
+    thread.start()
+    until(lambda: wire.arrivals)
+    proved.close()
+    thread.join(5.0)
+    assert failed
+    until(lambda: wire.broken)
+    assert sum(count for _, count in wire.arrivals) < 100_000
+    assert not any(key.endswith('slow') for key in wire.keys)
+
+
+def test_a_new_cap_holds_for_the_body_under_way(wire: Wire, spool: Spool, proved: S3Store) -> None:
+    """An operator who gives the radio free sees it at once."""
+    proved.pace.set(0.01)
+    thread = threading.Thread(target=proved.put, args=(spool('slow', bytes(500_000)),))
+    thread.start()
+    until(lambda: wire.arrivals)
+    proved.pace.set(0.0)
+    thread.join(5.0)
+    assert not thread.is_alive()
+    assert sum(count for _, count in wire.arrivals) == 500_000
