@@ -1,0 +1,178 @@
+"""Writes what the benchmarks found into docs/performance.md: tables between its markers, and the pictures.
+
+``python bench/_page.py`` does so from docs/performance.json, without measuring. No figure of the page is typed by hand.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import _pictures
+from _report import show, spread
+
+DOCS: Final = Path(__file__).resolve().parents[1] / 'docs'
+_BLOCK: Final = re.compile(r'(<!-- bench (\w+) -->\n).*?(<!-- end \2 -->)', re.DOTALL)
+_MACHINE: Final = {
+    'when': 'measured', 'processor': 'processor', 'cores': 'cores', 'memory': 'memory', 'kernel': 'kernel', 'python': 'Python',
+    'ros': 'ROS 2', 'middleware': 'middleware', 'commit': 'commit', 'load_before': 'load average before',
+}  # fmt: skip
+_YES, _NO = 'yes', '**no**'
+Figures = Mapping[str, Any]
+
+
+def write(results: Figures, template: Path, output: Path) -> None:
+    """The page and its pictures; a block whose benchmark was not run says so."""
+
+    def block(match: re.Match[str]) -> str:
+        return f'{match[1]}{_block(match[2], results)}\n{match[3]}'
+
+    text = _BLOCK.sub(block, template.read_text(encoding='utf-8'))
+    (output / 'performance.md').write_text(text, encoding='utf-8')
+    _pictures.draw({name: found['figures'] for name, found in results['benches'].items()}, output / 'images')
+
+
+def dump(results: Figures) -> str:
+    """JSON with a line a benchmark."""
+    benches = ',\n'.join(f'{json.dumps(name)}: {json.dumps(found)}' for name, found in results['benches'].items())
+    rest = json.dumps({name: value for name, value in results.items() if name != 'benches'})
+    return f'{rest[:-1]}, "benches": {{\n{benches}\n}}}}\n'
+
+
+def _block(name: str, results: Figures) -> str:
+    if name in _WHOLE:
+        return _WHOLE[name](results)
+    bench, make = _PARTS[name]
+    found = results['benches'].get(bench)
+    return make(found['figures']) if found else '*not measured*'
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    lines = [head, ['---'] * len(head), *rows]
+    return '\n'.join('| ' + ' | '.join(str(cell) for cell in line) + ' |' for line in lines)
+
+
+def _bars(results: Figures) -> str:
+    rows = [
+        (bar['what'], bar['bar'], f'{show(bar["value"])} {bar["unit"]}', spread(bar['rounds']), _YES if bar['holds'] else _NO)
+        for found in results['benches'].values()
+        for bar in found['bars']
+    ]
+    return _table(('what', 'bar', 'measured', 'spread', 'holds'), rows)
+
+
+def _machine(results: Figures) -> str:
+    return _table(('', ''), [(_MACHINE[name], value) for name, value in results['machine'].items() if name in _MACHINE])
+
+
+def _commands(results: Figures) -> str:
+    total = f'All of it took {results["took_s"] / 60:.1f} minutes.'
+    return _table(('command', 'took'), [(f'`{found["command"]}`', f'{found["took_s"]:.0f} s')
+                                        for found in results['benches'].values()]) + '\n\n' + total  # fmt: skip
+
+
+def _node_cpu(figures: Figures) -> str:
+    words = {'guide': "the guide's sketch", 'kinder': 'the same, odometry at 1 Hz'}
+    rows = []
+    for name, found in figures.items():
+        seconds = found['round_s'] * len(found['cpu_s']['node'])
+        core = {who: 100 * sum(used) / seconds for who, used in found['cpu_s'].items()}
+        heard, plain = sum(found['baseline']['received'].values()), found['baseline']
+        rows.append((words[name], f'{core["baseline"]:.1f} %', f'{core["node"]:.1f} %', f'**{found["ratio"]:.2f}**',
+                     f'{min(found["ratios"]):.2f} to {max(found["ratios"]):.2f}', f'{core["sim"]:.0f} %',
+                     f'{heard:,} / {found["node"]["received"]:,}', f'{plain["puts"]:,}, {found["baseline_objects"]:,} left',
+                     f'{found["node"]["objects"]["delivered"]:,}'))  # fmt: skip
+    head = ('baseline', 'its CPU', 'node', 'ratio', 'spread', 'simulator', 'messages received, baseline / node',
+            'objects put by the baseline', 'by the node')  # fmt: skip
+    return _table(head, rows)
+
+
+def _intake(figures: Figures) -> str:
+    def row(words: str, values: Sequence[float], lost: object) -> tuple[str, str, str, object]:
+        return words, f'{sum(values) / len(values):.0f} us', f'{min(values):.0f} to {max(values):.0f} us', lost
+
+    return _table(('', 'CPU a message', 'spread', 'messages lost'), [
+        row('raw callback, SingleThreadedExecutor', figures['callback_us'], figures['callback_lost']),
+        row('the node', figures['node_us'], figures['node_lost']),
+        row('(the publisher)', figures['publisher_us'], ''),
+    ])  # fmt: skip
+
+
+def _small(figures: Figures) -> str:
+    return _table(
+        ('asked for', 'reached', 'for', 'lost', 'ledger', 'node', 'publisher', 'cores busy'),
+        [(f'{run["asked_hz"]:,}/s', f'{run["reached_hz"]:,.0f}/s', f'{run["seconds"]:.0f} s', run['lost'],
+          f'{"balanced" if run["balanced"] else "not balanced"}, {run["accounting"]}', f'{run["node_us"]:.0f} us a message',
+          f'{run["publisher_us"]:.0f} us a message', f'{run["cores_busy"]:.1f}') for run in figures['runs']],
+    )  # fmt: skip
+
+
+def _full_rate(figures: Figures) -> str:
+    topics = [(f'`{name}`', row['published'], row['received'], row['stored'], row['missed'], row['dropped'], row['accounting'])
+              for name, row in figures['topics'].items() if row['published']]  # fmt: skip
+    words = {'there': 'store there', 'away': 'store away', 'back': 'store back, backlog leaving'}
+    phases = [(words[name], f'{phase["span"][1] - phase["span"][0]:.0f} s', f'{100 * phase["cores"]["node"]:.1f} %',
+               f'{100 * phase["cores"]["sim"]:.0f} %', f'{phase["cores_busy"]:.2f}')
+              for name, phase in figures['phases'].items()]  # fmt: skip
+    volume = f'{figures["bytes"]["spooled"] / 1e9:.2f} GB went through the spool.'
+    return '\n\n'.join((
+        _table(('topic', 'published', 'received', 'stored', 'missed', 'dropped', 'accounting'), topics),
+        _table(('phase', 'length', 'node, of a core', 'simulator', 'cores busy, all processes'), phases), volume,
+    ))  # fmt: skip
+
+
+def _memory(figures: Figures) -> str:
+    if 'memory' not in figures:
+        return '*not measured*'
+    found, samples = figures['memory'], figures['samples']
+    last = {name: samples[name][-1] for name in ('anon', 'file', 'shmem')}
+    return _table(('resident memory, MB', ''), [
+        ('store away: median', show(found['median_mb'])), ('store away: greatest', show(found['peak_mb'])),
+        ('store away: rise of a line through its last four fifths', f'{found["rise_mb_per_min"]:.2f} a minute'),
+        ('store back: greatest', show(found['peak_after_mb'])),
+        ('at the end: own / files (libraries) / shared memory (the middleware)', ' / '.join(map(show, last.values()))),
+    ])  # fmt: skip
+
+
+def _latency(figures: Figures) -> str:
+    words = {'durable': 'durable: the group commit returned', 'confirmed': 'confirmed: the put returned',
+             'created_ns': 'index: `created_ns`', 'settled_ns': 'index: `settled_ns`'}  # fmt: skip
+    names = ('p50', 'p90', 'p99', 'max')
+    rows = [(words[name], *(f'{row[each]:.0f} ms' for each in names)) for name, row in figures['ms'].items()]
+    return _table(('from the stamp until', *names), rows)
+
+
+def _encode(figures: Figures) -> str:
+    times = [(row['name'], f'{row["decode_us"]:.1f} us', f'{row["encode_us"]:.1f} us') for row in figures['rows']]
+    sizes = [(f'{row["bytes_in"]:,}', f'{row["bytes_out"]:,}') for row in figures['rows']]
+    rows = [(*time, *size) for time, size in zip(times, sizes, strict=True)]
+    return _table(('format and message', 'decode', 'all', 'bytes in', 'bytes out'), rows)
+
+
+def _spool(figures: Figures) -> str:
+    def words(row: Figures) -> str:
+        return ', '.join(f'{what.replace("_", " ")} {show(value)}' for what, value in row.items())
+
+    return _table(('', 'figures'), [(name, words(row)) for name, row in figures.items()])
+
+
+def _drain(figures: Figures) -> str:
+    return _table(('backlog', 'drain', 'boto3', 'speed, drain : boto3', 'spread', 'CPU an object, drain / boto3'), [
+        (f'{row["objects"]} x {row["bytes"] / 1000:g} KB', f'{row["drain_per_s"]:.0f}/s', f'{row["bare_per_s"]:.0f}/s',
+         f'{row["speed_ratio"]:.2f}', spread(row['speed_ratios']), f'{row["drain_cpu_ms"]:.2f} / {row["bare_cpu_ms"]:.2f} ms')
+        for row in figures['drain']
+    ])  # fmt: skip
+
+
+_WHOLE: Final[Mapping[str, Callable[[Figures], str]]] = {'bars': _bars, 'machine': _machine, 'commands': _commands}
+_PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
+    'node_cpu': ('node_cpu', _node_cpu), 'intake': ('intake', _intake), 'small_messages': ('small_messages', _small),
+    'full_rate': ('full_rate', _full_rate), 'memory': ('full_rate', _memory), 'latency': ('latency', _latency),
+    'encode_formats': ('encode_formats', _encode), 'spool_commits': ('spool_commits', _spool), 'drain': ('drain', _drain),
+}  # fmt: skip
+
+if __name__ == '__main__':
+    write(json.loads((DOCS / 'performance.json').read_text(encoding='utf-8')), DOCS / 'performance.md', DOCS)

@@ -1,0 +1,95 @@
+"""CPU of the node at its default profile against a plain node, at the same time, on the same simulated robot and S3 server.
+
+The whole process tree of each counts, user and system time. Two runs: the plain node once as the guide sketches it, once
+with odometry at 1 Hz as the node stores it by default. Each run is cut into rounds for the spread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import _proc
+from _report import Bar, Report, main, progress, ratio
+from _world import Program, World, until
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.stores import open_store
+
+WARM_S = 5.0
+ROUNDS = 6
+VARIANTS = {'guide': 1, 'kinder': 50}
+"""Every how many odometry messages the plain node uploads one."""
+
+
+def run(folder: Path, odom_skip: int, seconds: float) -> dict[str, Any]:
+    """CPU seconds of each program in each round, and what became of the messages."""
+    with World(folder) as world:
+        node = world.node()
+        plain = world.program('baseline_node', 'baseline_node.py', '--odom-skip', str(odom_skip))
+        sim = world.sim()
+        until(lambda: len(world.ledger()['topics']) > 1, 'the node to hear the robot', node, plain, sim)
+        time.sleep(WARM_S)
+        programs = {'node': node, 'baseline': plain, 'sim': sim}
+        busy, rounds = _proc.busy_s(), _rounds(programs, seconds)
+        machine = (_proc.busy_s() - busy) / seconds
+        published = json.loads(sim.stop().splitlines()[-1])['published']
+        baseline = json.loads(plain.stop().splitlines()[-1])
+        node.stop()
+        return {
+            'round_s': seconds / ROUNDS, 'cpu_s': rounds, 'cores_busy': machine, 'published': published, 'baseline': baseline,
+            'baseline_objects': _objects(world), 'node': _node(world),
+        }  # fmt: skip
+
+
+def _rounds(programs: dict[str, Program], seconds: float) -> dict[str, list[float]]:
+    used: dict[str, list[float]] = {name: [] for name in programs}
+    before = {name: program.cpu_s() for name, program in programs.items()}
+    for _ in range(ROUNDS):
+        time.sleep(seconds / ROUNDS)
+        now = {name: program.cpu_s() for name, program in programs.items()}
+        for name in programs:
+            used[name].append(now[name] - before[name])
+        before = now
+    return used
+
+
+def _objects(world: World) -> int:
+    """What is left in the bucket of all that the plain node put there."""
+    assert world.tower is not None
+    store = open_store(world.tower.store_settings(), UploadSettings())
+    try:
+        return sum(1 for _ in store.list('sensor-data', 'baseline/'))
+    finally:
+        store.close()
+
+
+def _node(world: World) -> dict[str, Any]:
+    """The node's own account of the run."""
+    found = world.ledger()
+    rows = found['topics'].values()
+    return {
+        'received': sum(row['received'] for row in rows), 'missed': sum(row['missed'] or 0 for row in rows),
+        'dropped': sum(sum(row['dropped'].values()) for row in rows), 'objects': found['objects'],
+    }  # fmt: skip
+
+
+def measure(options: argparse.Namespace) -> Report:
+    figures: dict[str, Any] = {}
+    bars: list[Bar] = []
+    for name, odom_skip in VARIANTS.items():
+        progress(f'node CPU beside the {name} baseline, {options.seconds:g} s')
+        figures[name] = found = run(options.folder, odom_skip, options.seconds)
+        value, rounds = ratio(found['cpu_s']['node'], found['cpu_s']['baseline'])
+        found['ratio'], found['ratios'] = value, rounds
+        if name == 'guide':
+            what = 'CPU of the node at the default profile, whole process tree, against the baseline node'
+            bars.append(Bar(what, 'at most 0.2 (aim: 0.1)', value, 'of the baseline', value <= 0.2, rounds))
+    return Report(tuple(bars), figures)
+
+
+if __name__ == '__main__':
+    main(__doc__, measure, seconds=30.0)

@@ -1,0 +1,44 @@
+"""The node, which besides writes down when each object became durable and when the store confirmed it.
+
+It is ``sensor_logger_node`` with two of its calls timed: ``Spool.commit`` (what it returned is durable) and ``S3Store.put``
+(what it returned for is confirmed). At its end it prints ``{"durable": {id: ns}, "confirmed": {id: ns}}``, wall clock. For
+``latency.py``: the index's own times say less. ``created_ns`` is taken as a commit begins, before its syncs, and
+``settled_ns`` as the commit begins that records the outcome of a delivery, up to a commit period after the store's answer.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+
+from shadowhound_data_logger.capture.sensor_logger_node import main
+from shadowhound_data_logger.model import DataObject, Outcome, Put, SpooledObject
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.stores.s3 import S3Store
+
+durable: dict[int, int] = {}
+confirmed: dict[int, int] = {}
+_commit, _put = Spool.commit, S3Store.put
+
+
+def timed_commit(spool: Spool, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = ()) -> list[SpooledObject]:
+    placed = _commit(spool, objects, outcomes)
+    now_ns = time.time_ns()
+    durable.update((item.id, now_ns) for item in placed)
+    return placed
+
+
+def timed_put(store: S3Store, item: SpooledObject) -> Put:
+    answer = _put(store, item)
+    confirmed[item.id] = time.time_ns()
+    return answer
+
+
+if __name__ == '__main__':
+    setattr(Spool, 'commit', timed_commit)  # noqa: B010 - a plain assignment is no method to mypy
+    setattr(S3Store, 'put', timed_put)  # noqa: B010
+    code = main()
+    print(json.dumps({'durable': durable, 'confirmed': confirmed}), flush=True)
+    sys.exit(code)
