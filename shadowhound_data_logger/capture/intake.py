@@ -24,8 +24,8 @@ from shadowhound_data_logger.model import Batch
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.worker import Worker
 
-REFRESH_S: Final = 0.25
-"""How often the graph is looked at."""
+REFRESH_S: Final = 0.5
+"""How often the graph is looked at: some 80 us a topic."""
 
 
 class Intake:

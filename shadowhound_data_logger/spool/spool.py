@@ -13,7 +13,7 @@ import logging
 import os
 import sqlite3
 import threading
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -97,15 +97,18 @@ class Spool:
             os.close(self._session_lock)
             self._session_lock = None
 
-    def commit(self, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = ()) -> list[SpooledObject]:
+    def commit(self, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (), *,
+               durable: Callable[[list[SpooledObject]], None] = lambda _: None) -> list[SpooledObject]:  # fmt: skip
         """One group commit. Returns the objects that may be shipped now, under their final keys.
 
+        ``durable`` gets them as well, before the files of delivered objects are removed: that may take as long as the commit.
         Raises OSError or sqlite3.OperationalError when nothing of it became durable; the caller tries again. Objects
         for which there is no room at all are recorded as evicted (D9).
         """
         with self._lock:
             placed = self._ballast.work(lambda: self._commit(objects, outcomes))
             self._ballast.keep(self._tree.free_bytes, self._settings.min_free_bytes)
+        durable(placed)
         self._settle(outcomes)
         return placed
 

@@ -98,12 +98,15 @@ class SpoolWriter:
             objects, outcomes = list(self._objects), list(self._outcomes)
         self._last_commit = time.monotonic()
         try:
-            spooled = self._spool.commit(objects, outcomes)
+            self._spool.commit(objects, outcomes, durable=lambda spooled: self._committed(objects, outcomes, spooled))
         except (OSError, sqlite3.OperationalError) as error:
             raise self._spool.unwritable(error) from error
         except sqlite3.DatabaseError:
             self.damaged = True
             raise
+
+    def _committed(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome], spooled: Sequence[SpooledObject]) -> None:
+        """All of it is durable: let it go and tell who waits for that."""
         with self._changed:
             for _ in objects:
                 self._bytes -= len(self._objects.popleft().body)
