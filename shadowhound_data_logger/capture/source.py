@@ -221,10 +221,10 @@ class Source:
             return
         self._last_received_s = now_s
         lost: int | None = None
-        if taken[0].publisher is None or taken[0].number is None:
+        if taken[0].number is None:
             lost = self._lost(reader)
-            if not self._senders.gids:
-                self._senders.look([publisher.gid for publisher in endpoints(self._node, self._chosen)])
+        elif taken[0].publisher is None and not self._senders.gids:
+            self._senders.look([publisher.gid for publisher in endpoints(self._node, self._chosen)])
         self._stream.add(taken, self._senders, lost, now_s, paused=self._paused)
 
     def _lost(self, reader: Reader) -> int | None:

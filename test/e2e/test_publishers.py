@@ -98,7 +98,8 @@ def test_a_history_beside_a_publisher_that_has_none(listening: Listening) -> Non
     listening.early.publish('/both', texts(range(HISTORY)))
     for publisher, first in ((listening.early, HISTORY), (listening.late, COUNT)):
         publisher.publish('/both', texts(range(first, first + COUNT - HISTORY)))
-    assert listening.numbers('both', 2 * (COUNT - HISTORY) + HISTORY + 1) == [*range(COUNT), *range(COUNT, 2 * COUNT - HISTORY)]
+    numbers = listening.numbers('both', 2 * (COUNT - HISTORY) + HISTORY + 1, publishers=2)
+    assert numbers == [*range(COUNT), *range(COUNT, 2 * COUNT - HISTORY)]
 
 
 @pytest.mark.parametrize('kind', ['late', 'expected'])
