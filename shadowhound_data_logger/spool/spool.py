@@ -125,10 +125,14 @@ class Spool:
         """
         with self._lock:
             rows = self._index.pending(limit + len(exclude), oldest=oldest, without=without)
+        parts = frozenset(self._tree.incoming.iterdir())  # one question for all, because nearly none is there
         found: list[SpooledObject] = []
         for row in rows:
             if row['id'] not in exclude and len(found) < limit:
-                found.append(spooled(row, self._where(row['id'], row['bucket'], row['key'])))
+                number, bucket, key = row['id'], row['bucket'], row['key']
+                placed = self._tree.part(number) not in parts
+                path = self._tree.path(State.PENDING, None, bucket, key) if placed else self._where(number, bucket, key)
+                found.append(spooled(row, path))
         return found
 
     def pending_count(self) -> int:
