@@ -1,7 +1,7 @@
 # Every target makes the environment first (see scripts/setup); with nothing to do that takes milliseconds.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-matrix check format demo bench docs lock clean
+.PHONY: help setup test test-matrix torture check format demo bench docs lock clean
 
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
@@ -17,6 +17,9 @@ test: setup ## run all tests; PYTEST_ARGS="-k spool -x" is handed on
 
 test-matrix: ## run all tests on other Pythons, numpys and ROS distributions; CELLS=... names some
 	@PYTEST_ARGS="$(PYTEST_ARGS)" scripts/test-matrix $(CELLS)
+
+torture: setup ## campaigns of faults, kills, full disks, rot and long outages; TORTURE_ARGS=--short is shorter
+	scripts/with-env python -m torture $(TORTURE_ARGS)
 
 check: setup ## lint, format and types
 	scripts/with-env ruff check .

@@ -11,23 +11,28 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from shadowhound_data_logger.capture.sensor_logger_node import main
 from shadowhound_data_logger.model import DataObject, Outcome, Put, SpooledObject
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.s3 import S3Store
 
-durable: dict[int, int] = {}
+durable_ns: dict[int, int] = {}
 confirmed: dict[int, int] = {}
 _commit, _put = Spool.commit, S3Store.put
 
 
-def timed_commit(spool: Spool, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = ()) -> list[SpooledObject]:
-    placed = _commit(spool, objects, outcomes)
-    now_ns = time.time_ns()
-    durable.update((item.id, now_ns) for item in placed)
-    return placed
+def timed_commit(
+    spool: Spool, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (), *,
+    durable: Callable[[list[SpooledObject]], None] = lambda _: None,
+) -> list[SpooledObject]:  # fmt: skip
+    def told(placed: list[SpooledObject]) -> None:
+        now_ns = time.time_ns()
+        durable_ns.update((item.id, now_ns) for item in placed)
+        durable(placed)
+
+    return _commit(spool, objects, outcomes, durable=told)
 
 
 def timed_put(store: S3Store, item: SpooledObject) -> Put:
@@ -40,5 +45,5 @@ if __name__ == '__main__':
     setattr(Spool, 'commit', timed_commit)  # noqa: B010 - a plain assignment is no method to mypy
     setattr(S3Store, 'put', timed_put)  # noqa: B010
     code = main()
-    print(json.dumps({'durable': durable, 'confirmed': confirmed}), flush=True)
+    print(json.dumps({'durable': durable_ns, 'confirmed': confirmed}), flush=True)
     sys.exit(code)
