@@ -145,8 +145,8 @@ def refused() -> Iterator[str]:
 
 
 @contextmanager
-def resetting(answer: bytes) -> Iterator[str]:
-    """A server that resets every connection after the first bytes of an answer."""
+def resetting(answer: bytes, *, reset: bool = True) -> Iterator[str]:
+    """A server that resets, or just ends, every connection after the first bytes of an answer."""
     listening = socket.create_server(('127.0.0.1', 0))
 
     def serve() -> None:
@@ -158,7 +158,8 @@ def resetting(answer: bytes) -> Iterator[str]:
             with connection:
                 connection.recv(65536)
                 connection.sendall(answer)
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
+                if reset:
+                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
 
     thread = threading.Thread(target=serve)
     thread.start()

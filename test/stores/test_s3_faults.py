@@ -9,6 +9,7 @@ import ipaddress
 import time
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 
 import pytest
@@ -26,6 +27,7 @@ from shadowhound_data_logger.model import Put
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import s3
 from shadowhound_data_logger.stores.s3 import S3Store
+from shadowhound_data_logger.stores.s3_put import UNASKED_BYTES
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 
 IMPATIENT = UploadSettings(connect_timeout_s=1.0, read_timeout_s=0.3)
@@ -51,6 +53,13 @@ def test_no_answer(fault: str, opened: Callable[..., S3Store], spool: Spool) -> 
             said = error_of(StoreUnavailable, ask)
             assert words in said
             assert url in said
+
+
+def test_no_more_after_leave_to_send(opened: Callable[..., S3Store], spool: Spool) -> None:
+    """A connection that ends within ``100 Continue`` is a Tower that is away, and the thread comes back."""
+    with fake_s3.resetting(b'HTTP/1.1 100 Continue\r\n', reset=False) as url, ThreadPoolExecutor(1) as pool:
+        put = pool.submit(opened(url, QUICK).put, spool('large', bytes(UNASKED_BYTES + 1)))
+        assert isinstance(put.exception(timeout=10.0), StoreUnavailable)
 
 
 def test_an_unknown_name(opened: Callable[..., S3Store], spool: Spool) -> None:
