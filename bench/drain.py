@@ -84,6 +84,7 @@ def drain(folder: Path, settings: StoreSettings, threads: int, objects: Sequence
 
         uploader = Uploader(spool, store, upload, settle)
         writer = SpoolWriter(spool, SpoolSettings().commit_s, settled=uploader.settled)
+        writer.prompt = True
 
         def send() -> None:
             writer.open()

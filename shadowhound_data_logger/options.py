@@ -71,7 +71,7 @@ class SensorSettings:
 class IntakeSettings:
     """The polled reader (D1)."""
 
-    poll_s: float = _setting(0.05, 'Seconds between two drains of the subscriptions.', low=0.005, high=1.0)
+    poll_s: float = _setting(0.1, 'Seconds between two drains of the subscriptions.', low=0.005, high=1.0)
     history_bytes: int = _setting(32 * MEBI, 'Most bytes one subscription may hold between two drains.', low=MEBI)
     max_rate_hz: float = _setting(2000.0, 'Rate for which the history of small messages is sized.', low=1.0, high=1e5)
 
@@ -95,7 +95,7 @@ class EncodeSettings:
 class SpoolSettings:
     """The durable spool (D5, D9)."""
 
-    commit_s: float = _setting(0.25, 'Longest time between an encoded object and its group commit.', low=0.01, high=10.0)
+    commit_s: float = _setting(0.2, 'Longest time between an encoded object and its group commit.', low=0.01, high=10.0)
     max_bytes: int = _setting(20 * GIBI, 'Most payload bytes in the spool; beyond it the least important is evicted.', low=MEBI)
     min_free_bytes: int = _setting(2 * GIBI, 'Free space of the file system that is never used.', low=0)
     remember_days: float = _setting(3.0, 'Days for which delivered keys are remembered.', low=1.0, high=3650.0)
@@ -122,6 +122,15 @@ class ShutdownSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ClockSettings:
+    """What becomes of objects that are taken before the clock of this machine was set."""
+
+    hold_s: float = _setting(
+        600.0, 'Seconds to wait for a clock that was not set; then objects go without a date.', low=0.0, high=1e6
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StoreSettings:
     """Where objects go: an S3 server, or without an endpoint a folder of the same layout (D13)."""
 
@@ -140,6 +149,7 @@ GROUPS: Final[dict[str, type]] = {
     'spool': SpoolSettings,
     'upload': UploadSettings,
     'shutdown': ShutdownSettings,
+    'clock': ClockSettings,
 }
 DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
     'camera': {

@@ -1,8 +1,14 @@
-"""The next objects to ship, looked up some at a time, so that a claim costs the same whatever the backlog."""
+"""The next objects to ship, looked up some at a time, so that a claim costs the same whatever the backlog.
+
+While what has just been spooled waits beside a backlog, each gets every second turn, whatever lies in the other. The turns go
+to the most important objects, but each fourth of the backlog to its oldest, and each second of what is live to the priority
+that was served least lately. So nothing starves, and a store that is twice as fast as the robot keeps up with all that is live.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
+from itertools import chain
 from typing import Final
 
 from shadowhound_data_logger.model import SpooledObject
@@ -13,22 +19,25 @@ FEW: Final = 32
 """From here on more are asked for: a look waits for the disk behind a commit, and meanwhile the others have these."""
 OLDEST: Final = 32
 """Objects asked for by age at a time; a fourth, as they are claimed."""
-NEWEST: Final = 32
-"""Objects remembered that have just been spooled: some seconds of the default profile."""
-TURNS: Final = ('important', 'important', 'important', 'oldest', 'important', 'newest', 'important', 'oldest')
-"""Whose turn it is, over and over: neither the end of a long backlog starves, nor what is live behind it."""
+LIVE: Final = 64
+"""Objects remembered that have just been spooled, ten seconds of the default profile; older ones are backlog."""
+OLDEST_OF_BACKLOG: Final = 4
+"""Of so many turns of the backlog one is that of the oldest."""
 LOOK_EVERY_S: Final = 1.0
 """Other processes spool too (D6) and wake nobody here: an idle drain looks this often."""
 
 
 class Ahead:
-    """Three orders over the same objects, and when to ask for more. Guarded by the lock of the Schedule it belongs to."""
+    """The backlog in two orders, what is live, and when to ask for more. Guarded by the lock of the Schedule it belongs to."""
 
     def __init__(self) -> None:
         self._important: dict[int, SpooledObject] = {}
         self._oldest: dict[int, SpooledObject] = {}
-        self._newest: dict[int, SpooledObject] = {}
-        self._taken = 0
+        self._live: dict[int, SpooledObject] = {}
+        self._backlog_turns = 0
+        self._live_turns = 0
+        self._served: dict[int, int] = {}  # priority -> the last turn of what is live that went to it
+        self._live_is_next = False
         self._stale = True
         self._more = False
         self._looking = False
@@ -51,9 +60,9 @@ class Ahead:
 
     def add(self, new: Iterable[SpooledObject]) -> None:
         """These have just been spooled."""
-        self._newest.update((item.id, item) for item in new)
-        while len(self._newest) > NEWEST:
-            del self._newest[next(iter(self._newest))]
+        self._live.update((item.id, item) for item in new)
+        while len(self._live) > LIVE:
+            del self._live[next(iter(self._live))]
 
     def wants_look(self, now: float, since: Iterable[float]) -> bool:
         """Whether to look now: something changed, few are left, or not yet looked since one of those times."""
@@ -91,16 +100,32 @@ class Ahead:
     # -- claiming --------------------------------------------------------------------------------------------------
 
     def take(self, allowed: Callable[[SpooledObject], bool]) -> SpooledObject | None:
-        """Remove and return the first one that is allowed now; of the newest it is the most important one."""
-        turn = TURNS[self._taken % len(TURNS)]
-        newest = sorted(self._newest.values(), key=lambda item: (item.priority, -item.id)) if turn == 'newest' else ()
-        important, oldest = self._important.values(), self._oldest.values()
-        queues = (oldest, important) if turn == 'oldest' else (newest, important, oldest)
-        item = next((item for queue in queues for item in queue if allowed(item)), None)
+        """Remove and return the first one that is allowed now."""
+        turns = (self._take_live, self._take_backlog) if self._live_is_next else (self._take_backlog, self._take_live)
+        item = turns[0](allowed) or turns[1](allowed)
         if item is not None:
+            self._live_is_next = item.id not in self._live
             for known in self._all():
                 known.pop(item.id, None)
-            self._taken += 1
+        return item
+
+    def _take_live(self, allowed: Callable[[SpooledObject], bool]) -> SpooledObject | None:
+        queue = list(self._live.values())
+        if self._live_turns % 2:
+            queue.sort(key=lambda item: self._served.get(item.priority, -1))
+        else:
+            queue.sort(key=lambda item: item.priority)
+        item = next(filter(allowed, queue), None)
+        if item is not None:
+            self._served[item.priority] = self._live_turns
+            self._live_turns += 1
+        return item
+
+    def _take_backlog(self, allowed: Callable[[SpooledObject], bool]) -> SpooledObject | None:
+        important, oldest = self._important.values(), self._oldest.values()
+        queues = (important, oldest) if (self._backlog_turns + 1) % OLDEST_OF_BACKLOG else (oldest, important)
+        item = next((item for item in chain(*queues) if item.id not in self._live and allowed(item)), None)
+        self._backlog_turns += item is not None
         return item
 
     def holds(self, bucket: str) -> bool:
@@ -113,4 +138,4 @@ class Ahead:
                 del queue[number]
 
     def _all(self) -> tuple[dict[int, SpooledObject], ...]:
-        return self._important, self._oldest, self._newest
+        return self._important, self._oldest, self._live

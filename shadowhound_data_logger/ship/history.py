@@ -6,9 +6,17 @@ import random
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Final
 
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.ship.retry import Verdict, backoff
+
+DENIALS: Final = 8
+"""An object denied so often, its bucket having taken others between each two of these times, is to blame itself.
+
+By then it was tried for half a minute. Rights that come and go deny any object, but not the same one eight times: it goes
+as soon as it is tried at a better moment.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +26,8 @@ class _Failure:
     item: SpooledObject
     failures: int
     not_before: float
-    verdict: Verdict | None
+    denials: int
+    """How often it was denied; all the times between two deliveries to its bucket are one."""
     delivered: int
     """What the store had taken when it failed."""
     delivered_to_bucket: int
@@ -58,7 +67,11 @@ class History:
         before = self._failures.get(item.id)
         failures = before.failures + 1 if before else 1
         not_before = now + backoff(failures, self._cap_s, self._rng)
-        self._failures[item.id] = _Failure(item, failures, not_before, verdict, self.delivered, self._delivered[item.bucket])
+        denials = before.denials if before else 0
+        if verdict is Verdict.DENIED and (not denials or self.is_denied_alone(item)):
+            denials += 1
+        counts = self.delivered, self._delivered[item.bucket]
+        self._failures[item.id] = _Failure(item, failures, not_before, denials, *counts)
 
     def fails_alone(self, item: SpooledObject, delivered: int) -> bool:
         """Whether anything was delivered since it was claimed (``delivered`` then), or since it failed last."""
@@ -68,12 +81,14 @@ class History:
     def is_denied_alone(self, item: SpooledObject) -> bool:
         """Whether its bucket took something since it was denied the last time.
 
-        One denial is not enough: the rights may have been taken away while a put that began earlier still succeeded.
+        The first denial is not: the rights may have been taken away while a put that began earlier still succeeded.
         """
         before = self._failures.get(item.id)
-        if before is None or before.verdict is not Verdict.DENIED:
-            return False
-        return self._delivered[item.bucket] > before.delivered_to_bucket
+        return before is not None and before.denials > 0 and self._delivered[item.bucket] > before.delivered_to_bucket
+
+    def is_to_blame(self, item: SpooledObject) -> bool:
+        """Whether the denial just now is the last one that is needed to tell that the object will never be taken."""
+        return self.is_denied_alone(item) and self._failures[item.id].denials + 1 >= DENIALS
 
     def due(self, now: float, allowed: Callable[[SpooledObject], bool]) -> SpooledObject | None:
         """One whose wait is over and that is allowed now."""

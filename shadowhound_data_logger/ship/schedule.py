@@ -2,7 +2,7 @@
 
 A thread asks ``step`` what to do, does it outside the lock, and reports back with ``found``, ``delivered``, ``failed`` or
 ``crashed``. A failure is held against the store, or the bucket, unless a delivery since tells that it is the object's
-own: then the object alone waits (or, denied twice while its bucket takes others, goes to quarantine).
+own: then the object alone waits (or, denied again and again while its bucket takes others, goes to quarantine).
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ class Schedule:
             now = self._now()
             closed = self._breakers.without(now)
             self._ahead.end_look(important, oldest, taken=self._taken(), without=closed)
-            self._notify()
+            self._notify(len(self._ahead))
 
-    def look_failed(self, error: Exception) -> None:
+    def look_failed(self, error: BaseException) -> None:
         """The spool could not be asked; it is asked again."""
         with self._changed:
             self._last_error = f'{type(error).__name__}: {error}'
@@ -94,9 +94,11 @@ class Schedule:
             if any(True for _ in self._breakers):
                 self._ahead.outdate()
             self._history.deliver(item)
+            held_back = any(True for _ in self._breakers) or self._bytes_in(ENOUGH_S) < float('inf')
             notices = self._breakers.succeed(item, self._now())
             self._let_go(item)
             self._unsettled.add(item.id)
+            self._notify(self._threads if held_back else 0)
             return notices
 
     def failed(self, item: SpooledObject, error: StoreError) -> Ruling:
@@ -104,21 +106,24 @@ class Schedule:
         with self._changed:
             now, verdict = self._now(), decide(error)
             self._last_error = str(error)
-            if verdict is Verdict.QUARANTINE or (verdict is Verdict.DENIED and self._history.is_denied_alone(item)):
+            if verdict is Verdict.QUARANTINE or (verdict is Verdict.DENIED and self._history.is_to_blame(item)):
                 self._history.forget(item)
                 self._let_go(item)
                 self._unsettled.add(item.id)
+                self._notify()
                 return Ruling(quarantine_reason(error))
-            alone = verdict is Verdict.RETRY and self._history.fails_alone(item, self._in_flight[item.id][1])
+            alone = verdict is Verdict.DENIED and self._history.is_denied_alone(item)
+            alone |= verdict is Verdict.RETRY and self._history.fails_alone(item, self._in_flight[item.id][1])
             if verdict in {Verdict.RETRY, Verdict.DENIED}:
                 self._history.defer(item, verdict, now)
             notices = [] if alone else self._breakers.fail(item, verdict, error, now)
             self._retries += 1
             self._ahead.outdate()
             self._let_go(item)
+            self._notify()
             return Ruling(notices=notices)
 
-    def crashed(self, item: SpooledObject, error: Exception) -> None:
+    def crashed(self, item: SpooledObject, error: BaseException) -> None:
         """This program failed on it, not the store: that object alone waits."""
         with self._changed:
             self._last_error = f'{type(error).__name__}: {error}'
@@ -126,6 +131,7 @@ class Schedule:
             self._retries += 1
             self._unsettled.discard(item.id)
             self._let_go(item)
+            self._notify()
 
     def settled(self, ids: Iterable[int]) -> None:
         """Their outcomes are durable: the spool does not call them pending any more."""
@@ -133,7 +139,6 @@ class Schedule:
             durable = frozenset(ids)
             self._unsettled -= durable
             self._ahead.settled(durable)
-            self._notify()
 
     # -- from outside ----------------------------------------------------------------------------------------------
 
@@ -143,7 +148,7 @@ class Schedule:
             taken = self._taken()
             self._ahead.add(item for item in new if item.id not in taken)
             self._ahead.outdate()
-            self._notify()
+            self._notify(max(len(new), 1))
 
     def activate(self, active: bool) -> None:
         """Whether this process drains; while it does not, every step is a Rest."""
@@ -182,9 +187,10 @@ class Schedule:
 
     # -- under the lock --------------------------------------------------------------------------------------------
 
-    def _notify(self) -> None:
+    def _notify(self, threads: int | None = None) -> None:
+        """Let so many resting threads look again, all by default. A wake for nothing costs as much as one for an object."""
         self._version += 1
-        self._changed.notify_all()
+        self._changed.notify(self._threads if threads is None else threads)
 
     def _taken(self) -> frozenset[int]:
         """What the spool calls pending and we have in hand."""
@@ -193,7 +199,6 @@ class Schedule:
     def _let_go(self, item: SpooledObject) -> None:
         self._in_flight.pop(item.id, None)
         self._breakers.release(item)
-        self._notify()
 
     def _claim(self, now: float) -> SpooledObject | None:
         item = self._take(now)

@@ -21,10 +21,11 @@ from shadowhound_data_logger.errors import StoreError
 from shadowhound_data_logger.model import Outcome, Put, SpooledObject, State
 from shadowhound_data_logger.ship.ahead import IMPORTANT, OLDEST
 from shadowhound_data_logger.ship.outage import Notice
-from shadowhound_data_logger.ship.retry import Verdict, backoff
+from shadowhound_data_logger.ship.retry import Verdict
 from shadowhound_data_logger.ship.schedule import Schedule
 from shadowhound_data_logger.ship.steps import Look, Rest, Ship, Step
 from shadowhound_data_logger.stores.pace import Pace
+from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +33,6 @@ LOCK_EVERY_S: Final = 1.0
 """How often a drain that another process has is asked for."""
 DRAINED_EVERY_S: Final = 0.02
 """How often ``drain`` looks: a wake for each object delivered would cost more."""
-CRASH_CAP_S: Final = 60.0
 
 
 class Source(Protocol):
@@ -98,19 +98,22 @@ class Uploader:
         self._monotonic = monotonic
         self._rng = rng or random.Random()
         self._schedule = Schedule(settings.threads, settings.backoff_s, monotonic, self._rng, store.pace.bytes_in)
-        self._workers = [threading.Thread(target=self._work, name=f'upload-{n}', daemon=True) for n in range(settings.threads)]
-        self._keeper = threading.Thread(target=self._keep_lock, name='upload-lock', daemon=True)
-        self._stopping = threading.Event()
+        told: set[str] = set()
+        self._threads = [Worker(f'upload-{n}', self._round, told=told) for n in range(settings.threads)]
+        self._keeper = Worker('upload-lock', self._keep_lock, told=told)
         self._ended = threading.Event()
-        self._lock = threading.Lock()  # guards the three below
-        self._worker_failures = 0
+        self._lock = threading.Lock()  # guards the counter below
         self._quarantined: Counter[tuple[str, str]] = Counter()
-        self._tracebacks: set[tuple[str, int]] = set()
 
     def open(self) -> None:
         """Begin to deliver."""
-        for thread in (self._keeper, *self._workers):
-            thread.start()
+        for worker in self.workers:
+            worker.start()
+
+    @property
+    def workers(self) -> Sequence[Worker]:
+        """Its threads, for who supervises them."""
+        return self._keeper, *self._threads
 
     def wake(self, new: Sequence[SpooledObject] = ()) -> None:
         """The spool has new objects; those that are told need not wait behind a backlog. Cheap, from any thread."""
@@ -144,19 +147,16 @@ class Uploader:
 
         What is still under way then is left to its daemon thread and reported to nobody: it is pending, and sent again.
         """
+        for worker in self.workers:
+            worker.stop()
         self._schedule.stop()
-        self._stopping.set()
         end = self._monotonic() + deadline_s
-        for thread in self._workers:
-            if thread.ident is not None:
-                thread.join(max(end - self._monotonic(), 0.0))
-        hung = [thread.name for thread in self._workers if thread.is_alive()]
+        hung = [worker.name for worker in self._threads if not worker.join(end - self._monotonic())]
         if hung and not self._ended.is_set():
             log.warning('%d uploads did not end within %g s; what they send is sent again next time', len(hung), deadline_s)
         self._ended.set()
         self._store.pace.abandon()  # a body that waits for the cap would go on for minutes
-        if self._keeper.ident is not None:
-            self._keeper.join(max(end - self._monotonic(), 0.1))
+        self._keeper.join(max(end - self._monotonic(), 0.1))
 
     def status(self) -> UploadStatus:
         now = self._schedule.snapshot()
@@ -169,25 +169,27 @@ class Uploader:
         else:
             state = 'paused' if now.blocked else 'shipping' if now.deferred else 'idle'
         with self._lock:
-            failures, quarantined = self._worker_failures, self._quarantined.total()
+            quarantined = self._quarantined.total()
+        failures = sum(worker.failures for worker in self.workers)
         return UploadStatus(state, now.last_error, now.delivered, now.in_flight, now.deferred, now.retries, quarantined,
                             now.blocked, failures, self._store.pace.sent_bytes, self._store.pace.max_mbps)  # fmt: skip
 
     # -- the threads -----------------------------------------------------------------------------------------------
 
-    def _work(self) -> None:
-        failures = 0
-        while not self._ended.is_set():
-            step: Step | None = None
-            try:
-                step = self._schedule.step()
-                if step is None:
-                    return
+    def _round(self) -> None:
+        """One step; whatever ends it, what it was about is accounted for."""
+        step: Step | None = None
+        try:
+            step = self._schedule.step()
+            if step is not None:
                 self._do(step)
-                failures = 0
-            except Exception as error:  # noqa: BLE001 - the one supervised catch-all of this loop (D14)
-                failures += 1
-                self._crashed(step, error, failures)
+        except BaseException as error:
+            if isinstance(step, Ship):
+                self._schedule.crashed(step.item, error)
+            elif isinstance(step, Look):
+                self._schedule.look_failed(error)
+            if not (self._ended.is_set() and isinstance(error, Exception)):  # the spool is closed under a thread that hung
+                raise
 
     def _do(self, step: Step) -> None:
         if isinstance(step, Rest):
@@ -224,36 +226,17 @@ class Uploader:
                 self._announce_quarantine(item, ruling.quarantine, error)
         self._announce(ruling.notices)
 
-    def _crashed(self, step: Step | None, error: Exception, failures: int) -> None:
-        """Count it, say it once a kind, and give the thread a pause that grows."""
-        if isinstance(step, Ship):
-            self._schedule.crashed(step.item, error)
-        elif isinstance(step, Look):
-            self._schedule.look_failed(error)
-        self._count(error)
-        self._stopping.wait(backoff(failures, CRASH_CAP_S, self._rng))
-
-    def _count(self, error: Exception) -> None:
-        place = (type(error).__name__, _line(error))
-        with self._lock:
-            self._worker_failures += 1
-            known = place in self._tracebacks
-            self._tracebacks.add(place)
-        if not known and not self._ended.is_set():  # afterwards the spool and the store are closed under a thread that hung
-            log.error('an upload thread failed and goes on after a pause', exc_info=error)
-
     def _keep_lock(self) -> None:
         """Drain while the lock is ours; until then, ask for it every second."""
-        while not self._ended.is_set():
-            try:
-                with self._spool.drain_lock() as mine:
-                    self._schedule.activate(mine)
-                    if mine:
-                        self._ended.wait()
-            except Exception as error:  # noqa: BLE001 - the one supervised catch-all of this loop (D14)
-                self._schedule.activate(False)
-                self._count(error)
-            self._ended.wait(LOCK_EVERY_S)
+        try:
+            with self._spool.drain_lock() as mine:
+                self._schedule.activate(mine)
+                if mine:
+                    self._ended.wait()
+        except BaseException:
+            self._schedule.activate(False)
+            raise
+        self._ended.wait(LOCK_EVERY_S)
 
     # -- words -----------------------------------------------------------------------------------------------------
 
@@ -268,11 +251,3 @@ class Uploader:
             count = self._quarantined[item.bucket, reason]
         if str(count).strip('0') == '1':
             log.error('quarantined (%s, number %d in bucket %s): %s', reason, count, item.bucket, error)
-
-
-def _line(error: BaseException) -> int:
-    """Where it was raised."""
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    return trace.tb_lineno if trace is not None else 0

@@ -11,6 +11,9 @@ import json
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from heapq import merge
+from itertools import islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Final
 
@@ -120,10 +123,22 @@ class Index:
         )
 
     def pending(self, limit: int, *, oldest: bool, without: Sequence[str] = ()) -> list[sqlite3.Row]:
-        """Objects to ship: most important first or oldest first, none of the buckets ``without``."""
-        order = 'id' if oldest else 'priority, id'
-        blocked = f' AND bucket NOT IN ({",".join("?" * len(without))})' if without else ''
-        return self.rows(f"state = 'pending'{blocked} ORDER BY {order} LIMIT ?", (*without, limit))
+        """Objects to ship: most important first or oldest first, none of the buckets ``without``.
+
+        Each bucket is asked by itself, so that what waits for those that are left out costs nothing.
+        """
+        order = ('id',) if oldest else ('priority', 'id')
+        condition = f"state = 'pending' AND bucket = ? ORDER BY {', '.join(order)} LIMIT ?"
+        found = [self.rows(condition, (bucket, limit)) for bucket in self._waited_for() if bucket not in without]
+        return list(islice(merge(*found, key=itemgetter(*order)), limit))
+
+    def _waited_for(self) -> Iterator[str]:
+        """The buckets of all pending objects: one step in the index for each."""
+        query = "SELECT bucket FROM objects WHERE state = 'pending' AND bucket > ? ORDER BY bucket LIMIT 1"
+        bucket = ''
+        while row := self.db.execute(query, (bucket,)).fetchone():
+            bucket = row[0]
+            yield bucket
 
     def rows(self, where: str, values: Sequence[object] = ()) -> list[sqlite3.Row]:
         """Object rows by a condition of this package's own (never of a user's)."""
@@ -148,8 +163,7 @@ class Index:
 
     def oldest_pending_ns(self) -> int | None:
         """When the object that has waited for delivery for the longest was spooled; None when none waits."""
-        row = self.db.execute("SELECT created_ns FROM objects WHERE state = 'pending' ORDER BY id LIMIT 1").fetchone()
-        return None if row is None else int(row[0])
+        return next((row['created_ns'] for row in self.pending(1, oldest=True)), None)
 
     def set_missing(self, ids: Iterable[int], now_ns: int) -> int:
         """The files of these objects are gone, whoever took them; returns for how many that is new."""

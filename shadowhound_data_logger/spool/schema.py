@@ -10,10 +10,16 @@ from typing import Final
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 
-SCHEMA_VERSION: Final = 1
+SCHEMA_VERSION: Final = 2
 VERSION_LIMIT: Final = 1000
 """A version from here on is damage, not a future."""
 _STATES: Final = ', '.join(f"'{state.value}'" for state in State)
+_BY_BUCKET: Final = """
+CREATE INDEX pending ON objects (bucket, priority, id) WHERE state = 'pending';
+CREATE INDEX waiting ON objects (bucket, id) WHERE state = 'pending';
+"""
+"""Each bucket in both orders: while one takes nothing, however much waits for it, the others are found as fast."""
+_BY_REASON: Final = "CREATE INDEX held ON objects (reason, id) WHERE state = 'held';"
 SCHEMA: Final = f"""
 CREATE TABLE objects (
   id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -26,8 +32,8 @@ CREATE TABLE objects (
   t_start_ns INTEGER NOT NULL, t_end_ns INTEGER NOT NULL,
   created_ns INTEGER NOT NULL, settled_ns INTEGER,
   UNIQUE (bucket, key));
-CREATE INDEX pending ON objects (priority, id) WHERE state = 'pending';
-CREATE INDEX waiting ON objects (id) WHERE state = 'pending';
+{_BY_BUCKET}
+{_BY_REASON}
 CREATE INDEX evictable ON objects (priority DESC, id, bytes) WHERE state IN ('pending', 'held') AND NOT protected;
 CREATE INDEX quarantined ON objects (reason, bytes) WHERE state = 'quarantined';
 CREATE INDEX settled ON objects (settled_ns) WHERE state IN ('delivered', 'deduplicated', 'evicted');
@@ -61,15 +67,17 @@ CREATE TABLE publishers (
   PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
 PRAGMA user_version = {SCHEMA_VERSION};
 """  # noqa: S608 - own constants only
+MIGRATIONS: Final = {1: f'DROP INDEX pending; DROP INDEX waiting; {_BY_BUCKET} {_BY_REASON}'}
+"""Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
 
 
 def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> None:
-    """Make the tables where there are none, and have commits be durable.
+    """Make the tables where there are none, bring older ones up to date, and have commits be durable.
 
-    Raises sqlite3.DatabaseError for a version that is none, SpoolError for a newer one.
+    Raises sqlite3.DatabaseError for a version that is none, SpoolError for a newer one, which has other tables than ours.
     """
     version = connection.execute('PRAGMA user_version').fetchone()[0]
-    if not 0 <= version < VERSION_LIMIT:
+    if not 0 <= version < VERSION_LIMIT or (version > SCHEMA_VERSION and definitions(connection) == expected()):
         raise sqlite3.DatabaseError(f'the version {version} is none')
     if version > SCHEMA_VERSION:
         raise SpoolError(f'the spool index {path} is of version {version}, this program knows {SCHEMA_VERSION}',
@@ -80,6 +88,9 @@ def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> N
     connection.execute('PRAGMA synchronous = FULL')
     if version == 0:
         connection.executescript(f'BEGIN IMMEDIATE; {SCHEMA} COMMIT;')
+    elif version < SCHEMA_VERSION:
+        steps = ''.join(MIGRATIONS[older] for older in range(version, SCHEMA_VERSION))
+        connection.executescript(f'BEGIN IMMEDIATE; {steps} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;')
 
 
 def definitions(db: sqlite3.Connection) -> set[tuple[str, str]]:

@@ -21,7 +21,11 @@ from shadowhound_data_logger.worker import Worker
 MAX_WAITING_BYTES: Final = 32 << 20
 """Encoded bytes in memory before encoders have to wait."""
 HEARTBEAT_S: Final = 1.0
-"""How often the accounts become durable when there is nothing else to commit."""
+"""How often accounts and outcomes become durable when there is no object to commit them with."""
+MANY_OUTCOMES: Final = 64
+"""So many outcomes are worth a commit of their own."""
+HANGING_S: Final = 10.0
+"""A commit that takes longer hangs in the disk: usual is a hundredth of a second, a slow card at its worst takes a few."""
 
 
 class SpoolWriter:
@@ -40,10 +44,12 @@ class SpoolWriter:
         self._added = self._done = 0
         self._written = Counter[str]()
         self._urgent = False
+        self.prompt = False
+        """Whether outcomes wait for no object to be committed with: somebody waits for them, at a stop say."""
         self._last_commit = -HEARTBEAT_S
         self.damaged = False
         """Whether the index was found damaged: only the recovery of a new start can mend that."""
-        self.worker = Worker('spool-writer', self._step)
+        self.worker = Worker('spool-writer', self._step, patience_s=HEARTBEAT_S + commit_s + HANGING_S)
 
     def open(self) -> None:
         self.worker.start()
@@ -62,10 +68,11 @@ class SpoolWriter:
     def settle(self, outcomes: Sequence[Outcome]) -> None:
         """Queue outcomes of deliveries for the next commit; never waits."""
         with self._changed:
-            if not self._objects and not self._outcomes:  # else it is awake, and one wake an outcome would only cost
-                self._changed.notify_all()
+            was_due = self._due()
             self._outcomes.extend(outcomes)
             self._added += len(outcomes)
+            if self._due() and not was_due:  # else it is awake, and one wake an outcome would only cost
+                self._changed.notify_all()
 
     def written(self) -> tuple[int, int]:
         """Objects that became durable since it was opened, and the messages in them."""
@@ -91,7 +98,7 @@ class SpoolWriter:
 
     def _step(self) -> None:
         with self._changed:
-            self._changed.wait_for(lambda: self._objects or self._outcomes or self._urgent or self.worker.stopping, HEARTBEAT_S)
+            self._changed.wait_for(lambda: self._due() or self.worker.stopping, HEARTBEAT_S)
             pause_s = self._last_commit + self._commit_s - time.monotonic()
             if pause_s > 0 and not self._urgent:
                 self._changed.wait_for(lambda: self._urgent or self.worker.stopping, pause_s)
@@ -104,6 +111,10 @@ class SpoolWriter:
         except sqlite3.DatabaseError:
             self.damaged = True
             raise
+
+    def _due(self) -> bool:
+        """Whether there is something that waits for a commit; the caller holds the lock."""
+        return bool(self._objects) or self._urgent or len(self._outcomes) >= (1 if self.prompt else MANY_OUTCOMES)
 
     def _committed(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome], spooled: Sequence[SpooledObject]) -> None:
         """All of it is durable: let it go and tell who waits for that."""

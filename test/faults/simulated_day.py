@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import random
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from unittest import mock
 from faults.kinds import FAULTS, Condition, Fault, Script
 from faults.report import Report
 from faults.simulated_s3 import LATEST_S, Line, Server
-from faults.virtual_time import Actor, VirtualEvent, VirtualLock, VirtualTime
+from faults.virtual_time import Actor, VirtualLock, VirtualTime
 from spool.making import NOON_NS, assert_whole, put, rows
 
 from shadowhound_data_logger.config import SpoolSettings, StoreSettings, UploadSettings
@@ -38,6 +38,16 @@ CALM_S: Final = 900.0
 """Within so long after the last fault everything is delivered: a backoff of a minute, and a second one."""
 MOST_THREADS: Final = 4
 FOREIGN: Final = b'of another writer'
+
+
+def _ever(step: Callable[[], None]) -> Callable[[], None]:
+    """As a Worker does that nobody stops; a defect ends the day."""
+
+    def work() -> None:
+        while True:
+            step()
+
+    return work
 
 
 class Process:
@@ -58,10 +68,9 @@ class Process:
         parts._s3, parts._creating = line, VirtualLock(time)
         self.uploader = Uploader(self.spool, store, upload, self._settle, monotonic=time, rng=rng)
         parts = self.uploader
-        parts._stopping = VirtualEvent(time)
         parts._schedule.rest = time.rest_on(parts._schedule)
         parts._schedule.activate(True)
-        self._actors: list[Actor] = [time.start(f'upload-{n}', parts._work) for n in range(upload.threads)]
+        self._actors: list[Actor] = [time.start(f'upload-{n}', _ever(parts._round)) for n in range(upload.threads)]
         self._schedule = parts._schedule
 
     def add(self, items: Sequence[DataObject]) -> None:

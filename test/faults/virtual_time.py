@@ -191,14 +191,3 @@ class VirtualLock:
 
     def __exit__(self, *_: object) -> None:
         self._held = False
-
-
-class VirtualEvent:
-    """The part of threading.Event that a supervised loop uses between two rounds."""
-
-    def __init__(self, time: VirtualTime) -> None:
-        self._time = time
-
-    def wait(self, seconds: float) -> bool:
-        self._time.sleep(seconds)
-        return False

@@ -95,7 +95,7 @@ def test_a_stop_does_not_wait_for_the_cap(spool: FakeSpool, server: FakeS3) -> N
     until(lambda: uploader.status().sent_bytes)
     began = time.monotonic()
     uploader.close(0.2)
-    until(lambda: not any(thread.is_alive() for thread in uploader._workers))
+    until(lambda: not any(worker.alive for worker in uploader.workers))
     assert time.monotonic() - began < 3.0
     assert list(spool.items) == [item.id for item in items]
     assert uploader.status().last_error == ''

@@ -8,7 +8,7 @@ from ship.drive import Drive
 
 from shadowhound_data_logger.errors import BucketMissing, StoreUnavailable
 from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.ship.ahead import NEWEST, TURNS
+from shadowhound_data_logger.ship.ahead import LIVE
 
 
 def shipped(drive: Drive, count: int) -> list[SpooledObject]:
@@ -23,14 +23,13 @@ def shipped(drive: Drive, count: int) -> list[SpooledObject]:
 
 
 def test_what_is_new_goes_beside_a_backlog(drive: Drive) -> None:
-    """Of eight turns two are the oldest's and one is the newest's, the most important of these first."""
+    """Every second turn, as long as some is there: in turns the most important, and the priority that waits for the longest."""
     old = drive.spool.add(200, priority=2)
     drive.schedule.wake(clouds := drive.spool.add(3, priority=7))
     drive.schedule.wake(poses := drive.spool.add(2, priority=3))
-    order = shipped(drive, 5 * len(TURNS))
-    assert order[5 :: len(TURNS)] == [*reversed(poses), *reversed(clouds)]
-    assert Counter(TURNS) == {'important': 5, 'oldest': 2, 'newest': 1}
-    assert [item for item in order if item not in (*poses, *clouds)] == old[: len(order) - 5]
+    order = shipped(drive, 30)
+    assert order[1:11:2] == [poses[0], clouds[0], poses[1], clouds[1], clouds[2]]
+    assert [item for item in order if item not in (*poses, *clouds)] == old[:25]
 
 
 def test_live_data_keep_up_while_a_backlog_is_delivered(drive: Drive) -> None:
@@ -47,7 +46,7 @@ def test_live_data_keep_up_while_a_backlog_is_delivered(drive: Drive) -> None:
 
 def test_few_of_the_newest_are_remembered(drive: Drive) -> None:
     """More at once than are remembered are delivered all the same, in the other orders."""
-    drive.schedule.wake(new := drive.spool.add(10 * NEWEST))
+    drive.schedule.wake(new := drive.spool.add(10 * LIVE))
     assert Counter(item.id for item in shipped(drive, len(new))) == Counter(item.id for item in new)
     assert drive.next() is None
 

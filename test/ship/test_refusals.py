@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import random
+from pathlib import Path
+
 import pytest
 from ship.drive import Drive
+from ship.fakes import FakeSpool, Time
 
 from shadowhound_data_logger.errors import (
     AccessDenied,
@@ -14,6 +18,7 @@ from shadowhound_data_logger.errors import (
     StoreError,
     StoreUnavailable,
 )
+from shadowhound_data_logger.ship.history import DENIALS
 from shadowhound_data_logger.ship.retry import Verdict
 from shadowhound_data_logger.ship.steps import Rest
 
@@ -102,9 +107,9 @@ def test_an_answer_about_a_bucket_shows_that_the_store_is_back(drive: Drive) -> 
 
 
 def test_an_object_that_is_denied_while_its_bucket_takes_others_is_quarantined(drive: Drive) -> None:
-    """One denial is a question, a delivery to the bucket and a second denial are the answer."""
+    """One denial is a question; deliveries to the bucket and further denials in turns are the answer, within some minutes."""
     denied = drive.spool.add(priority=0)[0]
-    drive.spool.add(30)
+    drive.spool.add(1200)
     reasons = []
     while drive.spool.items:
         item = drive.wait()
@@ -113,8 +118,30 @@ def test_an_object_that_is_denied_while_its_bucket_takes_others_is_quarantined(d
         else:
             drive.clock.now += 0.1
             drive.deliver(item)
-    assert reasons == [None, 'access_denied']
+    assert reasons == [*[None] * (DENIALS - 1), 'access_denied']
     assert drive.said() == []
+
+
+def test_denials_that_come_and_go_quarantine_nothing(clock: Time, tmp_path: Path) -> None:
+    """A store that denies everything for some seconds, again and again, gets everything all the same."""
+    denied = 0
+    for seed in range(20):
+        rng = random.Random(seed)
+        drive = Drive(FakeSpool(tmp_path), clock)
+        drive.spool.add(300)
+        good_until, bad_until = 0.0, 0.0
+        while drive.spool.items:
+            item = drive.wait()
+            clock.now += 0.2
+            if clock.now > bad_until:
+                good_until = clock.now + rng.uniform(0.5, 20.0)
+                bad_until = good_until + rng.uniform(0.5, 60.0)
+            if clock.now < good_until:
+                drive.deliver(item)
+            else:
+                denied += 1
+                assert drive.fail(item, AccessDenied('no')) is None, seed
+    assert denied > 500
 
 
 def test_when_all_are_denied_none_is_quarantined_and_all_go_once_the_rights_are_there(drive: Drive) -> None:
@@ -142,11 +169,13 @@ def test_a_denied_bucket_is_probed_with_an_object_that_was_not_denied_yet(drive:
     for _ in range(3):
         assert drive.wait() == denied
         assert drive.fail(denied, AccessDenied('no')) is None
-    later = drive.spool.add(priority=9)[0]
-    assert drive.wait() == later
-    drive.deliver(later)
-    assert drive.wait() == denied
-    assert drive.fail(denied, AccessDenied('no')) == 'access_denied'
+    for reason in [*[None] * (DENIALS - 2), 'access_denied']:
+        later = drive.spool.add(priority=9)[0]
+        while drive.wait() != later:
+            assert drive.fail(denied, AccessDenied('no')) is None
+        drive.deliver(later)
+        assert drive.wait() == denied
+        assert drive.fail(denied, AccessDenied('no')) == reason
 
 
 @pytest.mark.parametrize(('error', 'reason'), [

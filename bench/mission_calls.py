@@ -1,0 +1,99 @@
+"""Prints what the calls of MissionDataLogger cost an agent, with Tower up, away and hung, beside MLflow's own client.
+
+Run it as ``python bench/mission_calls.py [--seconds S] [--folder F] [--json]``; S is for each of the three.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from _report import Bar, Report, main, percentile, progress
+
+sys.path.append(str(Path(__file__).parents[1] / 'test'))
+from e2e.wire import HANG, PASS, REFUSE, Wire
+
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.missions.tracking import ENVIRONMENT
+from shadowhound_data_logger.sim.tower import Tower
+
+RATE_HZ: Final = 100.0
+FRAME_EVERY: Final = 10
+JPEG: Final = b'\xff\xd8' + os.urandom(150_000)
+MEDIAN_S, P99_S = 1e-3, 10e-3
+PLAIN_CALLS: Final = 50
+
+
+def timed(call: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    call()
+    return time.perf_counter() - began
+
+
+def calls(home: Path, seconds: float) -> dict[str, list[float]]:
+    """Seconds of each call of a mission at ``RATE_HZ``, by what was called."""
+    took: dict[str, list[float]] = {'start_mission': [], 'log_robot_state': [], 'log_camera_frame': [], 'end_mission': []}
+    logger = MissionDataLogger(home=home)
+    try:
+        took['start_mission'].append(timed(lambda: logger.start_mission('bench', 'calls')))
+        end = time.monotonic() + seconds
+        number = 0
+        while time.monotonic() < end:
+            took['log_robot_state'].append(timed(lambda n=number: logger.log_robot_state(90.0, 40.0, n)))  # type: ignore[misc]
+            if number % FRAME_EVERY == 0:
+                took['log_camera_frame'].append(timed(lambda n=number: logger.log_camera_frame(JPEG, n)))  # type: ignore[misc]
+            number += 1
+            time.sleep(1 / RATE_HZ)
+        took['end_mission'].append(timed(lambda: logger.end_mission(True, 1.0, 1.0)))
+    finally:
+        logger.close()
+    return took
+
+
+def plain(uri: str) -> list[float]:
+    """MLflow's own log_metric against the same server, Tower up."""
+    os.environ |= ENVIRONMENT
+    from mlflow import MlflowClient
+
+    client = MlflowClient(uri)
+    run_id = client.create_run('0').info.run_id
+    return [timed(lambda n=number: client.log_metric(run_id, 'battery_pct', 90.0, step=n)) for number in range(PLAIN_CALLS)]  # type: ignore[misc]
+
+
+def measure(options: argparse.Namespace) -> Report:
+    """The three states of Tower one after the other."""
+    options.folder.mkdir(parents=True, exist_ok=True)
+    bars: list[Bar] = []
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(dir=options.folder, ignore_cleanup_errors=True) as folder:
+        with Tower(Path(folder) / 'tower', mlflow=True) as tower, Wire(tower.tracking_uri) as wire:
+            os.environ |= tower.environment() | {'MLFLOW_TRACKING_URI': wire.url}
+            for name, mode in (('up', PASS), ('away', REFUSE), ('hung', HANG)):
+                progress(f'Tower {name}')
+                wire.set(mode)
+                took = calls(Path(folder) / name, options.seconds)
+                logged = took['log_robot_state'] + took['log_camera_frame']
+                median, p99 = statistics.median(logged), percentile(logged, 99)
+                bars.append(Bar(f'median of a log call, Tower {name}', 'under 1 ms', median * 1e3, 'ms', median < MEDIAN_S))
+                bars.append(Bar(f'p99 of a log call, Tower {name}', 'under 10 ms', p99 * 1e3, 'ms', p99 < P99_S))
+                start = took['start_mission'][0]
+                bars.append(Bar(f'start_mission, Tower {name}', 'at most 2.1 s', start, 's', start < 2.1))
+                figures[name] = {
+                    call: {'calls': len(all_), 'median_ms': statistics.median(all_) * 1e3, 'p99_ms': percentile(all_, 99) * 1e3}
+                    for call, all_ in took.items()
+                }
+            wire.set(PASS)
+            own = plain(tower.tracking_uri)
+            figures['mlflow_log_metric'] = {'median_ms': statistics.median(own) * 1e3, 'p99_ms': percentile(own, 99) * 1e3}
+    return Report(tuple(bars), figures)
+
+
+if __name__ == '__main__':
+    main(__doc__ or '', measure, seconds=20.0)

@@ -1,0 +1,176 @@
+"""Does the store still hold what it confirmed? Each delivered object is asked for by name; no right to list is needed.
+
+A finding is what the store itself says of an object. A store that does not answer is none: the audit then ends early, says
+so, and goes on from there the next time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final, Protocol, TypeVar
+
+from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreError, StoreUnavailable
+from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.ship.retry import backoff
+
+THREADS: Final = 8
+TRIES: Final = 4
+"""For a request that fails in passing; a store that is away for good is told within a minute."""
+CAP_S: Final = 5.0
+KEYS: Final = 20
+"""Keys listed of each kind of finding; all are counted."""
+MISSING: Final = 'missing'
+SIZE: Final = 'size'
+CHECKSUM: Final = 'checksum'
+FOREIGN: Final = 'foreign'
+DENIED: Final = 'denied'
+KINDS: Final = {
+    MISSING: 'not in the store',
+    SIZE: 'of another size',
+    CHECKSUM: 'of other content',
+    FOREIGN: 'without a checksum, so written by somebody else; --deep compares the content',
+    DENIED: 'denied by the store: it may be there or not',
+}
+"""What can be found, in words."""
+
+_Answer = TypeVar('_Answer')
+
+
+class Source(Protocol):
+    """What an audit asks for, and where it notes how far it came."""
+
+    def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]: ...
+
+    def note(self, ids: Iterable[int]) -> None: ...
+
+
+class Target(Protocol):
+    """What it asks of a store (stores/base.py)."""
+
+    def head(self, bucket: str, key: str) -> ObjectInfo | None: ...
+
+    def get(self, bucket: str, key: str) -> bytes: ...
+
+    def probe(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One object that is not what was delivered."""
+
+    kind: str
+    bucket: str
+    key: str
+    detail: str
+
+
+@dataclass(slots=True)
+class Audit:
+    """What came of it."""
+
+    asked: int = 0
+    sound: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+    """Kind -> findings."""
+    first: dict[str, list[Finding]] = field(default_factory=dict)
+    """Kind -> the first of them."""
+    away: StoreError | None = None
+    """Why it ended before its time."""
+
+    def add(self, finding: Finding) -> None:
+        self.counts[finding.kind] = self.counts.get(finding.kind, 0) + 1
+        listed = self.first.setdefault(finding.kind, [])
+        if len(listed) < KEYS:
+            listed.append(finding)
+
+
+def audit(source: Source, store: Target, *, deep: bool = False, threads: int = THREADS,
+          tell: Callable[[], None] = lambda: None, pause: Callable[[float], object] = time.sleep) -> Audit:  # fmt: skip
+    """Ask for everything that ``source`` has; ``deep`` reads each object back as well. ``tell`` is called after each one.
+
+    What is found sound is noted; findings are not, so that the next run of an audit that ended early looks again.
+    """
+    found = Audit()
+    judge = partial(_judge, store, deep=deep, pause=pause)
+    pool = ThreadPoolExecutor(threads, 'verify')
+    try:
+        for page in source.pages():
+            _audit_page(page, pool, judge, source, store, found, tell)
+    except StoreError as error:
+        found.away = error
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return found
+
+
+def _audit_page(page: Sequence[tuple[int, ObjectInfo]], pool: ThreadPoolExecutor, judge: Callable[[ObjectInfo], Finding | None],
+                source: Source, store: Target, found: Audit, tell: Callable[[], None]) -> None:  # fmt: skip
+    sound: list[int] = []
+    findings: list[Finding] = []
+    answers = pool.map(judge, [expected for _, expected in page])
+    try:
+        for (number, _), finding in zip(page, answers, strict=True):
+            if finding is None:
+                sound.append(number)
+            else:
+                findings.append(finding)
+            tell()
+    finally:
+        source.note(sound)
+        found.sound += len(sound)
+        found.asked += len(sound)
+    if findings:
+        _confirm_store(store)
+    found.asked += len(findings)
+    for finding in findings:
+        found.add(finding)
+
+
+def _confirm_store(store: Target) -> None:
+    """Raises StoreError unless it is the store that said so: a hotel's network also answers that there is no such thing."""
+    try:
+        store.probe()
+    except AccessDenied:
+        return  # whoever may only read is answered all the same
+
+
+def _judge(store: Target, expected: ObjectInfo, *, deep: bool, pause: Callable[[float], object]) -> Finding | None:
+    """None when the store has it as it was delivered. Raises StoreError when that cannot be found out."""
+    make = partial(Finding, bucket=expected.bucket, key=expected.key)
+    try:
+        held = _steadily(lambda: store.head(expected.bucket, expected.key), pause)
+        if held is None:
+            return make(MISSING, detail=f'{expected.size} bytes were delivered')
+        if held.size != expected.size:
+            return make(SIZE, detail=f'{held.size} bytes, {expected.size} were delivered')
+        if deep:
+            body = _steadily(lambda: store.get(expected.bucket, expected.key), pause)
+            content = hashlib.sha256(body).hexdigest()
+            if content != expected.sha256:
+                return make(CHECKSUM, detail=f'SHA-256 {content}, {expected.sha256} was delivered')
+        elif held.sha256 is None:
+            return make(FOREIGN, detail='no sha256 in its metadata')
+    except (BucketMissing, ObjectRefused) as error:
+        return make(MISSING, detail=str(error))
+    except AccessDenied as error:
+        return make(DENIED, detail=str(error))
+    if held.sha256 not in {None, expected.sha256}:
+        return make(CHECKSUM, detail=f'sha256 {held.sha256} in its metadata, {expected.sha256} was delivered')
+    return None
+
+
+def _steadily(ask: Callable[[], _Answer], pause: Callable[[float], object]) -> _Answer:
+    """The answer, after a few tries where the store is away in passing."""
+    rng = random.Random()
+    for attempt in range(1, TRIES):
+        try:
+            return ask()
+        except StoreUnavailable:
+            pause(backoff(attempt, CAP_S, rng))
+    return ask()

@@ -1,0 +1,112 @@
+"""The index by itself: what a look at a long backlog costs, and files of older versions."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from spool.conftest import Open
+from spool.making import NOON_NS, assert_whole, files, make, put, reopened, rows
+
+from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.schema import SCHEMA_VERSION
+
+FEW, MANY = 300, 15_000
+STEP = 20
+VERSION_1 = """
+DROP INDEX pending; DROP INDEX waiting; DROP INDEX held;
+CREATE INDEX pending ON objects (priority, id) WHERE state = 'pending';
+CREATE INDEX waiting ON objects (id) WHERE state = 'pending';
+PRAGMA user_version = 1;
+"""
+
+
+@pytest.fixture
+def index(tmp_path: Path) -> Iterator[Index]:
+    """An index, empty."""
+    opened = Index(tmp_path / 'index.db')
+    opened.open()
+    yield opened
+    opened.close()
+
+
+def add(index: Index, numbers: range, bucket: str) -> None:
+    with index.transaction():
+        for number in numbers:
+            item = make(f'{number}', bucket=bucket, priority=number % 9)
+            index.insert(item, item.key, '0' * 64, State.PENDING, None, {}, NOON_NS + number)
+
+
+def work(index: Index, *, oldest: bool, without: tuple[str, ...]) -> int:
+    """Steps of SQLite's machine for one look: what it costs, whatever else the computer does."""
+    steps = 0
+
+    def count() -> int:
+        nonlocal steps
+        steps += STEP
+        return 0
+
+    index.db.set_progress_handler(count, STEP)
+    found = index.pending(40, oldest=oldest, without=without)
+    index.db.set_progress_handler(None, STEP)
+    assert len(found) == (20 if without else 40)
+    return steps
+
+
+@pytest.mark.parametrize('oldest', [False, True])
+@pytest.mark.parametrize('without', [(), ('a',)], ids=['open', 'blocked'])
+def test_a_look_costs_the_same_whatever_the_backlog(index: Index, oldest: bool, without: tuple[str, ...]) -> None:
+    """In both orders, also while the bucket of the backlog takes nothing."""
+    add(index, range(20), 'b')
+    add(index, range(FEW), 'a')
+    few = work(index, oldest=oldest, without=without)
+    add(index, range(FEW, MANY), 'a')
+    assert work(index, oldest=oldest, without=without) < 1.2 * few
+
+
+@pytest.mark.parametrize('oldest', [False, True])
+def test_the_order_holds_across_buckets(index: Index, oldest: bool) -> None:
+    """Objects of several buckets come as if they were in one."""
+    for place in range(30):
+        add(index, range(place, place + 1), 'abc'[place % 3])
+    found = [(row['priority'], row['id']) for row in index.pending(20, oldest=oldest, without=('c',))]
+    expected = [(place % 9, place + 1) for place in range(30) if place % 3 != 2]
+    assert found == (expected if oldest else sorted(expected))[:20]
+    assert index.oldest_pending_ns() == NOON_NS
+
+
+def test_an_index_of_version_1(opened: Open, root: Path, used: dict[str, bytes]) -> None:
+    """The spool of a robot that is updated goes on as it was, with the newer tables."""
+    before = rows(root)
+    with closing(sqlite3.connect(root / 'index.db')) as connection:
+        connection.executescript(VERSION_1)
+    assert reopened(opened, root) == {}
+    with closing(sqlite3.connect(root / 'index.db')) as connection:
+        assert connection.execute('PRAGMA user_version').fetchone() == (SCHEMA_VERSION,)
+    assert rows(root)[: len(before)] == before
+    assert files(root).items() >= used.items()
+
+
+def test_an_index_of_version_1_that_lacks_a_part(opened: Open, root: Path, used: dict[str, bytes]) -> None:
+    """One that cannot be brought up to date is rebuilt as any damaged one."""
+    with closing(sqlite3.connect(root / 'index.db')) as connection:
+        connection.executescript(f'{VERSION_1} DROP INDEX waiting;')
+    assert reopened(opened, root) == {'damaged index rebuilt': 1, 'files adopted': 7}
+    assert_whole(root)
+
+
+def test_an_index_of_version_1_can_be_read_as_it_is(opened: Open, root: Path) -> None:
+    """The verbs of a newer program work beside an older node that runs."""
+    spool = opened()
+    put(spool, make('one'), make('two'))
+    with closing(sqlite3.connect(root / 'index.db')) as connection:
+        connection.executescript(VERSION_1)
+    view = Index(root / 'index.db', read_only=True)
+    view.open()
+    assert len(view.pending(9, oldest=True)) == 2
+    assert view.oldest_pending_ns() == NOON_NS
+    view.close()
