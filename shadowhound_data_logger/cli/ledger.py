@@ -29,12 +29,23 @@ ACCOUNTING: Final = {
 @click.command()
 @click.option('--json', 'as_json', is_flag=True, help='Print the ledger as JSON.')
 @click.option('--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool  [default: $SHADOWHOUND_HOME/spool]')
-def ledger(*, as_json: bool, spool: Path | None) -> int:
+@click.option('--verify', 'ask', is_flag=True, help='Ask the store for every delivered object: is it there, with its checksum?')
+@click.option('--deep', is_flag=True, help='Verify by reading every object back.')
+@click.option('--again', is_flag=True, help='Verify from the beginning, also where a run was interrupted.')
+def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: bool) -> int:
     """Account for every message: stored and where, or lost and why.
 
-    Reads the spool while the node runs and when it does not. Exit code 1 when the ledger does not balance.
+    Reads the spool while the node runs and when it does not. Exit code 1 when the ledger does not balance, or when the store
+    does not hold what was delivered; an interrupted --verify goes on where it was.
     """
-    found = read(spool or home(os.environ) / 'spool', os.environ.get('SHADOWHOUND_ROBOT') or 'thor')
+    folder = spool or home(os.environ) / 'spool'
+    if ask or deep:
+        from shadowhound_data_logger.cli.verify import verify  # noqa: PLC0415 - the other verbs need no threads and no store
+
+        return verify(folder, deep=deep, again=again, as_json=as_json)
+    if again:
+        raise click.UsageError('--again is for --verify or --deep')
+    found = read(folder, os.environ.get('SHADOWHOUND_ROBOT') or 'thor')
     if as_json:
         click.echo(json.dumps(found, indent=2))
     else:

@@ -175,6 +175,11 @@ def _way(found: Mapping[str, Any], console: Console, *, live: bool) -> Table:
         for name, row in found['workers'].items():
             if row['failing']:
                 grid.add_row(plain(name), Text('fails', 'red'), plain(f'{row["failures"]:,} times so far: {row["last_error"]}'))
+            elif name in found['stalls']:
+                grid.add_row(plain(name), Text('hangs', 'yellow'), f'for {duration(row["busy_s"])}')
+            elif row['failures']:
+                text = f'failed {row["failures"]:,} times and was started again, last: {row["last_error"]}'
+                grid.add_row(plain(name), Text('works', 'green'), plain(text))
     return grid
 
 

@@ -27,7 +27,8 @@ ERROR = 'Tower at http://192.168.10.20:9000 refused the connection (is it on, an
 
 def a_topic(**figures: Any) -> dict[str, Any]:
     row = {
-        'sensor': 'imu', 'type': 'x/msg/Y', 'enabled': True, 'publishers': 1, 'rate_hz': 99.84, 'age_s': 0.02, 'received': 1200,
+        'sensor': 'imu', 'type': 'x/msg/Y', 'enabled': True, 'publishers': 1, 'matched': 1, 'may_be_silent': False,
+        'unavailable': '', 'rate_hz': 99.84, 'age_s': 0.02, 'received': 1200,
         'stored': 1100, 'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': 0, 'open': 100, 'accounting': 'exact',
     }  # fmt: skip
     return row | figures
@@ -45,7 +46,7 @@ def a_status(**changes: Any) -> dict[str, Any]:
         'store': {'target': 'the S3 server at http://192.168.10.20:9000', 'state': 'shipping', 'last_error': '',
                   'delivered': 1234, 'in_flight': 0, 'deferred': 0, 'retries': 0, 'quarantined': 0, 'blocked_buckets': {},
                   'mbps': 1.23, 'max_mbps': 8.0},
-        'workers': {'intake': {'failing': False, 'failures': 2, 'last_error': 'once'}},
+        'workers': {'intake': {'failing': False, 'failures': 0, 'last_error': '', 'busy_s': 0.0}}, 'stalls': {},
     }  # fmt: skip
     for name, value in changes.items():
         found[name] = found[name] | value if isinstance(value, dict) and name != 'topics' else value
@@ -146,11 +147,26 @@ def test_trouble_is_told_with_its_remedy() -> None:
                  workers={'upload': {'failing': True, 'failures': 12, 'last_error': 'OSError: no space'}})  # fmt: skip
     assert 'refused (is it on?)' in text
     assert line(text, 'upload').split() == ['upload', 'fails', '12', 'times', 'so', 'far:', 'OSError:', 'no', 'space']
-    assert 'intake' not in text
     assert 'PAUSED' in text
     assert 'delivery: store down' in text
     assert 'Fine' not in text
     assert 'refused' not in shown(store={'state': 'shipping', 'last_error': 'refused (is it on?)'})
+
+
+@pytest.mark.parametrize(
+    ('row', 'words'),
+    [
+        ({}, None),
+        ({'failures': 2, 'last_error': 'SystemExit: 1'}, 'works failed 2 times and was started again, last: SystemExit: 1'),
+        ({'busy_s': 75.0}, 'hangs for 1 min 15 s'),
+    ],
+)
+def test_a_thread_that_had_trouble(row: dict[str, Any], words: str | None) -> None:
+    """One that failed and works again says how often and why, one that is stuck for how long; others need no line."""
+    workers = {'intake': {'failing': False, 'failures': 0, 'last_error': '', 'busy_s': 0.0, **row}}
+    text = shown(100, workers=workers, stalls={'intake': 'it takes no messages'} if 'busy_s' in row else {})
+    shown_as = [' '.join(each.split()[1:]) for each in text.splitlines() if each.startswith('intake')]
+    assert shown_as == ([words] if words else [])
 
 
 def test_text_of_others_is_shown_and_not_obeyed() -> None:

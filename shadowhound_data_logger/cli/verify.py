@@ -1,0 +1,98 @@
+"""``shadowhound-data ledger --verify``: whether the store still holds what it confirmed, as text or as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from contextlib import closing
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from shadowhound_data_logger.cli.tables import number, plain, show_whole
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings, home, store_settings
+from shadowhound_data_logger.ship.audit import KINDS, THREADS, Audit, audit
+from shadowhound_data_logger.spool.deliveries import Deliveries
+from shadowhound_data_logger.stores import open_store
+
+
+def verify(spool: Path, *, deep: bool, again: bool, as_json: bool) -> int:
+    """Ask the store that the environment names; 0 when all is there as it was delivered, else 1."""
+    settings = store_settings(os.environ, home(os.environ))
+    with closing(open_store(settings, UploadSettings(threads=THREADS))) as store, closing(Deliveries(spool)) as deliveries:
+        deliveries.open(f'{"deep" if deep else "head"} {store.describe()}', again=again)
+        earlier, known = deliveries.noted(), deliveries.known()
+        with _progress() as bar:
+            task = bar.add_task('read back' if deep else 'asked for', total=known, completed=earlier)
+            found = audit(deliveries, store, deep=deep, tell=lambda: bar.advance(task))
+        said = _said(found, deliveries, store.describe(), deep=deep, earlier=earlier)
+        if found.away is None:
+            deliveries.finish()
+    if as_json:
+        click.echo(json.dumps(said, indent=2))
+    else:
+        show(said, Console(highlight=False))
+    return 0 if said['ok'] else 1
+
+
+def _progress() -> Progress:
+    """On standard error, where that is a terminal; nothing else is ever written there."""
+    console = Console(stderr=True)
+    columns = (TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+def _said(found: Audit, deliveries: Deliveries, store: str, *, deep: bool, earlier: int) -> dict[str, Any]:
+    known = deliveries.known()
+    return {
+        'store': store, 'deep': deep, 'since_ns': deliveries.since_ns(), 'known': known, 'forgotten': deliveries.ever() - known,
+        'asked': found.asked, 'asked_earlier': earlier, 'sound': earlier + found.sound,
+        'findings': {
+            kind: {
+                'count': count,
+                'first': [{'bucket': one.bucket, 'key': one.key, 'detail': one.detail} for one in found.first[kind]],
+            }
+            for kind, count in found.counts.items()
+        },
+        'unreachable': None if found.away is None else str(found.away), 'ok': found.away is None and not found.counts,
+    }  # fmt: skip
+
+
+def show(said: Mapping[str, Any], console: Console) -> None:
+    """What was asked, each kind of finding with its first keys, and a verdict."""
+    lines: list[RenderableType] = [plain(_scope(said))]
+    for kind, piled in said['findings'].items():
+        lines += ['', Text.assemble((f'{number(piled["count"])} {KINDS[kind]}', 'red'))]
+        lines += [plain(f'  {one["bucket"]}/{one["key"]}: {one["detail"]}') for one in piled['first']]
+        if piled['count'] > len(piled['first']):
+            lines.append(f'  ... and {number(piled["count"] - len(piled["first"]))} more')
+    show_whole([*lines, '', _verdict(said)], console)
+
+
+def _scope(said: Mapping[str, Any]) -> str:
+    since = said['since_ns']
+    text = f'{said["store"]} was asked for {number(said["asked"])} of {number(said["known"])} delivered objects'
+    text += f' ({number(said["asked_earlier"])} more by an earlier run)' if said['asked_earlier'] else ''
+    if since is not None:
+        text += f', those since {datetime.fromtimestamp(since / SECOND, timezone.utc):%Y-%m-%d %H:%M:%S} UTC'
+    forgotten = said['forgotten']
+    return f'{text}; {number(forgotten)} older ones are not remembered (spool.remember_days).' if forgotten > 0 else f'{text}.'
+
+
+def _verdict(said: Mapping[str, Any]) -> Text:
+    how = 'its content read back' if said['deep'] else 'by size and checksum'
+    if said['unreachable']:
+        left = max(said['known'] - said['asked'] - said['asked_earlier'], 0)
+        reason = plain(f': {said["unreachable"]}. {number(left)} objects are not asked for yet: run it again to go on there.')
+        return Text.assemble(('The store is away', 'yellow'), reason)
+    if said['ok']:
+        return Text.assemble(('All of them are there', 'green'), f', {how}.')
+    count = sum(piled['count'] for piled in said['findings'].values())
+    return Text.assemble((f'{number(count)} are not what was delivered', 'red'), f', {how}.')
