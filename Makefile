@@ -18,7 +18,7 @@ test: setup ## run all tests; PYTEST_ARGS="-k spool -x" is handed on
 test-matrix: ## run all tests on other Pythons, numpys and ROS distributions; CELLS=... names some
 	@PYTEST_ARGS="$(PYTEST_ARGS)" scripts/test-matrix $(CELLS)
 
-torture: setup ## campaigns of faults, kills, full disks, rot and long outages; TORTURE_ARGS=--short is shorter
+torture: setup ## campaigns of faults, kills, full disks, rot, hostile input and long outages; TORTURE_ARGS=--short is shorter
 	scripts/with-env python -m torture $(TORTURE_ARGS)
 
 check: setup ## lint, format and types

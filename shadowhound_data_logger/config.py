@@ -20,6 +20,7 @@ from shadowhound_data_logger.options import (
     DEFAULT_SENSORS,
     FORMATS,
     GROUPS,
+    ClockSettings,
     EncodeSettings,
     IntakeSettings,
     QueueSettings,
@@ -32,12 +33,14 @@ from shadowhound_data_logger.options import (
 
 __all__ = [
     'DEFAULT_SENSORS', 'FOREIGN', 'FORMATS',
-    'EncodeSettings', 'IntakeSettings', 'QueueSettings', 'SensorSettings', 'Settings', 'ShutdownSettings', 'SpoolSettings',
+    'ClockSettings', 'EncodeSettings', 'IntakeSettings', 'QueueSettings', 'SensorSettings', 'Settings', 'ShutdownSettings', 'SpoolSettings',
     'StoreSettings', 'UploadSettings', 'default_parameters', 'home', 'store_settings',
 ]  # fmt: skip
 
 MIN_RATE_HZ: Final = 1e-4
 """A message every three hours."""
+MAX_INT: Final = (1 << 63) - 1
+"""Of a ROS parameter."""
 _BUCKET: Final = re.compile(r'[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]')
 """https://docs.aws.amazon.com/AmazonS3/latest/userguide/bucketnamingrules.html"""
 FOREIGN: Final = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
@@ -58,6 +61,7 @@ class Settings:
     spool: SpoolSettings
     upload: UploadSettings
     shutdown: ShutdownSettings
+    clock: ClockSettings
 
     @property
     def spool_path(self) -> Path:
@@ -79,8 +83,15 @@ class Settings:
 
 
 def home(environ: Mapping[str, str]) -> Path:
-    """The folder of the spool and, without a server, of the store: SHADOWHOUND_HOME, else ``~/.shadowhound``."""
-    return Path(environ.get('SHADOWHOUND_HOME') or '~/.shadowhound').expanduser().absolute()
+    """The folder of the spool and, without a server, of the store: SHADOWHOUND_HOME, else ``~/.shadowhound``.
+
+    Raises SettingError for the home of a user who is not known here.
+    """
+    given = environ.get('SHADOWHOUND_HOME') or '~/.shadowhound'
+    try:
+        return Path(given).expanduser().absolute()
+    except RuntimeError as error:
+        raise SettingError('SHADOWHOUND_HOME', given, 'a folder, not one of a user who has no home here') from error
 
 
 def store_settings(environ: Mapping[str, str], folder: Path) -> StoreSettings:
@@ -193,6 +204,8 @@ def _check(name: str, value: Any, default: Any, metadata: Mapping[str, Any]) -> 
         if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(part, str) for part in value):
             raise SettingError(name, value, 'a list of strings')
         return tuple(value)
+    if isinstance(value, int) and abs(value) > MAX_INT:
+        raise SettingError(name, value, 'a number of 64 bits')
     if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not type(default):

@@ -1,10 +1,16 @@
-"""Supervised threads: a loop that fails is seen, counted and started again; it never ends silently (D14)."""
+"""Supervised threads: a loop that fails is seen, counted and started again; it never ends silently (D14).
+
+Whatever a round raises, SystemExit included, costs that round and a pause. Should the thread itself end all the same (no
+memory for its own bookkeeping, say), whoever supervises it finds out in ``look`` and starts another one.
+"""
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 from shadowhound_data_logger.errors import DataLoggerError
@@ -13,27 +19,59 @@ log = logging.getLogger(__name__)
 
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 5.0
+DIED: Final = 'died'
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerStatus:
+    """A thread at one instant."""
+
+    alive: bool
+    failing: bool
+    """Whether the last round failed, or the thread ended on its own."""
+    failures: int
+    """Failed rounds and deaths."""
+    deaths: int
+    """How often the thread itself ended on its own."""
+    last_error: str
+    """The newest failure; it may be over."""
+    busy_s: float
+    """For how long the round under way has lasted."""
+    patience_s: float | None
+    """What is too long for one round; None where any length is fine."""
 
 
 class Worker:
     """One owned daemon thread that calls ``step`` until it is stopped.
 
-    ``step`` does one round and returns; it may block for as long as closing may wait. Life: New; start once; stop once.
+    ``step`` does one round and returns; it may block for as long as closing may wait, and accounts for what it holds
+    whatever ends it. Life: New; start once; ``look`` a few times a second, from one thread; stop once.
     """
 
-    def __init__(self, name: str, step: Callable[[], None]) -> None:
+    def __init__(self, name: str, step: Callable[[], None], *, patience_s: float | None = None,
+                 told: set[str] | None = None) -> None:  # fmt: skip
+        """Workers that share ``told`` say each failure once among them, by its place in the code, and no recovery."""
         self.name = name
         self.failures = 0
+        self.deaths = 0
         self.last_error = ''
         self.failing = False
-        """Whether the last round failed."""
         self._step = step
+        self._patience_s = patience_s
+        self._told = told
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
+        self._started = False
+        self._death: BaseException | None = None
+        self._buried = False  # whether the death of the thread has been counted
+        self._again_s = 0.0
+        self._pause_s = 0.0
+        self._failed_before = 0
+        self._round_s = 0.0
 
     def start(self) -> None:
-        self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
-        self._thread.start()
+        self._started = True
+        self._launch()
 
     def stop(self) -> None:
         """Let the current round be the last one; does not wait."""
@@ -50,28 +88,87 @@ class Worker:
     def stopping(self) -> bool:
         return self._stopping.is_set()
 
+    @property
+    def alive(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def status(self) -> WorkerStatus:
+        """From any thread."""
+        busy_s = time.monotonic() - self._round_s if self.alive and not self.failing else 0.0
+        return WorkerStatus(self.alive, self.failing, self.failures, self.deaths, self.last_error, round(max(0.0, busy_s), 1),
+                            self._patience_s)  # fmt: skip
+
+    def look(self) -> None:
+        """Count the death of the thread, if it died, and start another one after a pause that grows."""
+        if self.alive or self._stopping.is_set() or not self._started:
+            return
+        now_s = time.monotonic()
+        if not self._buried:
+            self._buried = True
+            self._again_s = now_s + self._longer_pause()
+            self.deaths += 1
+            self._fail(self._death or RuntimeError('its thread ended'), DIED)
+        if now_s >= self._again_s:
+            self._launch()
+
+    def _launch(self) -> None:
+        self._death, self._buried = None, False
+        self._round_s = time.monotonic()
+        thread = threading.Thread(target=self._run, name=self.name, daemon=True)
+        try:
+            thread.start()
+        except (RuntimeError, MemoryError) as error:  # the system gives no thread now
+            self._death = error
+        else:
+            self._thread = thread
+
     def _run(self) -> None:
-        pause_s = FIRST_PAUSE_S
-        since = 0
+        try:
+            self._go_round()
+        except BaseException as error:  # noqa: BLE001 - told by ``look``: here there may be no memory left to say anything
+            self._death = error
+
+    def _go_round(self) -> None:
         while not self._stopping.is_set():
+            self._round_s = time.monotonic()
             try:
                 self._step()
-            except Exception as error:  # noqa: BLE001 - the one supervised catch-all (D14); the step accounts for what it holds
-                self._fail(error)
-                self._stopping.wait(pause_s)
-                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+            except BaseException as error:  # noqa: BLE001 - the one supervised catch-all (D14); the step accounts for what it holds
+                self._fail(error, 'failed')
+                self._stopping.wait(self._longer_pause())
             else:
                 if self.failing:
-                    log.info('%s works again after %d failures', self.name, self.failures - since)
-                self.failing = False
-                pause_s, since = FIRST_PAUSE_S, self.failures
+                    self._recover()
 
-    def _fail(self, error: Exception) -> None:
+    def _recover(self) -> None:
+        if self._told is None:
+            log.info('%s works again after %d failures', self.name, self.failures - self._failed_before)
+        self.failing, self._pause_s, self._failed_before = False, 0.0, self.failures
+
+    def _longer_pause(self) -> float:
+        self._pause_s = min(2 * self._pause_s or FIRST_PAUSE_S, LONGEST_PAUSE_S)
+        return self._pause_s
+
+    def _fail(self, error: BaseException, what: str) -> None:
         """Count it; say it when it begins and when it becomes another one, with a traceback where it is a defect of ours."""
-        text = f'{type(error).__name__}: {error}'
-        known = self.failing and text == self.last_error
         self.failures += 1
-        self.failing, self.last_error = True, text
+        was_failing, self.failing = self.failing, True
+        text = f'{type(error).__name__}: {error}'
+        known = was_failing and text == self.last_error
+        self.last_error = text
+        if self._told is not None and what != DIED:
+            place = f'{type(error).__name__} {_line(error)}'
+            known = place in self._told
+            self._told.add(place)
         if not known:
             defect = None if isinstance(error, DataLoggerError) else error
-            log.error('%s failed (%d times so far) and tries again: %s', self.name, self.failures, error, exc_info=defect)
+            text = '%s %s (%d times so far) and tries again: %s'
+            log.error(text, self.name, what, self.failures, error, exc_info=defect)
+
+
+def _line(error: BaseException) -> int:
+    """Where it was raised."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace.tb_lineno if trace is not None else 0

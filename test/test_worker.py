@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
+from collections.abc import Callable
 
 import pytest
 
 from shadowhound_data_logger import worker as worker_module
 from shadowhound_data_logger.worker import Worker
+
+
+def until(condition: Callable[[], object]) -> None:
+    end = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.001)
 
 
 @pytest.fixture(autouse=True)
@@ -81,3 +90,113 @@ def test_a_round_that_hangs_is_told() -> None:
     assert not worker.join(0.01)
     released.set()
     assert worker.join(10)
+
+
+@pytest.mark.parametrize('death', [SystemExit(1), KeyboardInterrupt(), GeneratorExit(), MemoryError('no room')])
+def test_nothing_a_round_raises_ends_the_thread(death: BaseException) -> None:
+    """Not even what is meant to end a program: it is counted as any failure, and the next round comes."""
+    deaths, well = [death], threading.Event()
+
+    def step() -> None:
+        if deaths:
+            raise deaths.pop()
+        well.set()
+
+    worker = Worker('tough', step)
+    worker.start()
+    assert well.wait(10)
+    assert (worker.failures, worker.deaths, worker.alive) == (1, 0, True)
+    assert worker.last_error.startswith(type(death).__name__)
+    worker.stop()
+    assert worker.join(10)
+
+
+def test_a_thread_that_ends_is_started_again(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """One that dies of its own bookkeeping is found dead, counted once, said, and begun anew after its pause."""
+    deaths = [ZeroDivisionError('in a round')]
+    well = threading.Event()
+    worker = Worker('mortal', lambda: _raise(deaths.pop()) if deaths else well.set())
+
+    def no_memory(*_: object) -> None:
+        monkeypatch.undo()
+        raise MemoryError('for the log')
+
+    monkeypatch.setattr(worker, '_fail', no_memory)
+    worker.start()
+    until(lambda: not worker.alive)
+    assert worker.failures == 0
+    monkeypatch.setattr(worker_module, 'FIRST_PAUSE_S', 0.2)
+    for _ in range(3):
+        worker.look()
+    assert (worker.failures, worker.deaths, worker.failing, worker.alive) == (1, 1, True, False)
+    assert worker.status().last_error == 'MemoryError: for the log'
+    assert not well.is_set()
+    until(lambda: worker.look() or worker.alive)  # type: ignore[func-returns-value]
+    assert well.wait(10)
+    until(lambda: not worker.failing)
+    assert (worker.failures, worker.deaths) == (1, 1)
+    assert 'mortal died (1 times so far) and tries again: for the log' in caplog.text
+    worker.stop()
+    assert worker.join(10)
+
+
+def test_a_system_that_gives_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the start, or later: that is a death like any other, and over when there is one again."""
+    well = threading.Event()
+    worker = Worker('starved', well.set)
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, 'start', lambda _: _raise(RuntimeError("can't start new thread")))
+        worker.start()
+        worker.look()
+        assert (worker.deaths, worker.last_error) == (1, "RuntimeError: can't start new thread")
+        until(lambda: worker.look() or worker.deaths > 2)  # type: ignore[func-returns-value]
+    until(lambda: worker.look() or well.is_set())  # type: ignore[func-returns-value]
+    worker.stop()
+    assert worker.join(10)
+
+
+def test_looking_at_one_that_is_not_wanted_starts_nothing() -> None:
+    """Neither before its start nor after its stop."""
+    worker = Worker('idle', lambda: None)
+    worker.look()
+    assert not worker.alive
+    worker.start()
+    worker.stop()
+    assert worker.join(10)
+    worker.look()
+    assert (worker.alive, worker.failures) == (False, 0)
+
+
+def test_how_long_a_round_lasts_is_told() -> None:
+    """A round that hangs grows old in the status; one that ends does not."""
+    released = threading.Event()
+
+    def step() -> None:
+        assert released.wait(30)
+        worker.stop()
+
+    worker = Worker('slow', step, patience_s=3.0)
+    worker.start()
+    until(lambda: worker.status().busy_s >= 0.1)
+    assert worker.status().patience_s == 3.0
+    released.set()
+    assert worker.join(10)
+    assert worker.status().busy_s == 0.0
+
+
+def test_workers_that_share_what_was_told(caplog: pytest.LogCaptureFixture) -> None:
+    """A defect that many of them meet, again and again, is one entry in the log, with its traceback."""
+    told: set[str] = set()
+    workers = [Worker(f'w-{number}', lambda: _raise(ValueError('x')), told=told) for number in range(3)]
+    for worker in workers:
+        worker.start()
+    until(lambda: all(worker.failures > 2 for worker in workers))
+    for worker in workers:
+        worker.stop()
+        assert worker.join(10)
+    (record,) = caplog.records
+    assert record.exc_info
+
+
+def _raise(error: BaseException) -> None:
+    raise error

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from shadowhound_data_logger.capture.gate import STEP_BACK_NS
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.model import Batch, Sample
 from shadowhound_data_logger.options import ARCHIVES
@@ -43,7 +44,7 @@ class Batcher:
         """Take a sample; returns the batches that are closed by it, in order (mostly none, at most two)."""
         closed: list[Batch] = []
         window = sample.stamp_ns // self._window_ns if self._window_ns else 0
-        if self._samples and (window > self._window or sample.stamp_ns < self._samples[0].stamp_ns - STEP_BACK_NS):
+        if self._samples and (window > self._window or _is_elsewhere(sample.stamp_ns, self._samples[0].stamp_ns)):
             closed.append(self.close())
         if not self._samples:
             self._window = window
@@ -67,3 +68,8 @@ class Batcher:
         self._samples = []
         self._size = 0
         return batch
+
+
+def _is_elsewhere(stamp_ns: int, first_ns: int) -> bool:
+    """Whether the clock was set in between: backwards by more than jitter, or from the boot clock's time to UTC."""
+    return stamp_ns < first_ns - STEP_BACK_NS or (stamp_ns < EARLIEST_SANE_NS) != (first_ns < EARLIEST_SANE_NS)

@@ -1,8 +1,9 @@
 """The status as ``/diagnostics``: one entry for each topic, the spool, the store, the workers and the node itself.
 
-Levels: WARN for what needs a look (messages missed, dropped or rejected lately, a silent topic, the store away, a spool that
-fills up), ERROR for what needs a hand (a failing worker, objects in quarantine lately, credentials that are refused), STALE
-for a topic that nobody publishes. Nothing is made, and nothing sent, unless somebody listens.
+Levels: WARN for what needs a look (messages missed, dropped or rejected lately, whatever the watchdog finds to stand still,
+the store away, a spool that fills up), ERROR for what needs a hand (a thread that fails or failed lately, objects in quarantine
+lately, credentials that are refused), STALE for a topic that nobody publishes. Nothing is made, and nothing sent, unless
+somebody listens.
 """
 
 from __future__ import annotations
@@ -16,12 +17,6 @@ from rclpy.node import Node
 TOPIC: Final = '/diagnostics'
 FULL: Final = 0.8
 """Share of its limit from which on the spool is worth a look."""
-SILENT_PERIODS: Final = 10
-"""A topic is silent after so many of its usual periods ..."""
-SILENT_S: Final = 2.0
-"""... but not before this."""
-LEARNING: Final = 0.1
-"""Weight of the newest rate in the usual one."""
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 Entry = tuple[str, Any, str, Mapping[str, Any]]
 """Name, level, what is to be said, and figures."""
@@ -33,7 +28,6 @@ class Diagnostics:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._prefix = f'{node.get_namespace()}/sensor_logger: '.lstrip('/')
-        self._usual: dict[str, float] = {}
         self._publisher: Any = None
 
     def open(self) -> None:
@@ -46,12 +40,11 @@ class Diagnostics:
 
     def publish(self, status: Mapping[str, Any], earlier: Mapping[str, Any] | None) -> None:
         """``earlier`` is a status of a few seconds before: what grew since then is new."""
-        learn(self._usual, status)
         if self._publisher is None or not self._publisher.get_subscription_count():
             return
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
-        for name, level, text, figures in entries(status, earlier or status, self._usual):
+        for name, level, text, figures in entries(status, earlier or status):
             values = [KeyValue(key=key, value=_text(value)) for key, value in figures.items()]
             entry = DiagnosticStatus(
                 name=self._prefix + name, level=level, message=text, hardware_id=status['robot'], values=values
@@ -60,23 +53,16 @@ class Diagnostics:
         self._publisher.publish(message)
 
 
-def learn(usual: dict[str, float], status: Mapping[str, Any]) -> None:
-    """Follow the usual rate of each topic that is heard, Hz; one that has fallen silent keeps its."""
-    for topic, row in status['topics'].items():
-        if row['rate_hz'] and row['age_s'] is not None and row['age_s'] < SILENT_S:
-            before = usual.get(topic, row['rate_hz'])
-            usual[topic] = before + LEARNING * (row['rate_hz'] - before)
-
-
-def entries(status: Mapping[str, Any], earlier: Mapping[str, Any], usual: Mapping[str, float]) -> Iterator[Entry]:
+def entries(status: Mapping[str, Any], earlier: Mapping[str, Any]) -> Iterator[Entry]:
     """All that is to be said of a status."""
+    stalls = status['stalls']
     yield _node(status)
     for topic, row in status['topics'].items():
-        level, text = _topic(row, earlier['topics'].get(topic, row), usual.get(topic, 0.0))
+        level, text = _topic(row, earlier['topics'].get(topic, row), stalls.get(topic, ''))
         yield topic, level, text, row
     yield _spool(status['spool'])
-    yield _store(status['store'], earlier['store'])
-    yield _workers(status['workers'])
+    yield _store(status['store'], earlier['store'], stalls.get('delivery', ''))
+    yield _workers(status['workers'], earlier['workers'], stalls)
 
 
 def _node(status: Mapping[str, Any]) -> Entry:
@@ -87,7 +73,7 @@ def _node(status: Mapping[str, Any]) -> Entry:
     return 'node', OK, 'logging', figures
 
 
-def _topic(row: Mapping[str, Any], before: Mapping[str, Any], usual_hz: float) -> tuple[Any, str]:
+def _topic(row: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> tuple[Any, str]:
     if not row['enabled']:
         return OK, 'not enabled'
     lost = {what: (row[what] or 0) - (before[what] or 0) for what in ('missed', 'dropped', 'rejected')}
@@ -96,9 +82,8 @@ def _topic(row: Mapping[str, Any], before: Mapping[str, Any], usual_hz: float) -
         return WARN, f'{", ".join(grown)} lately'
     if not row['publishers']:
         return STALE, 'nobody publishes it'
-    age_s = row['age_s']
-    if age_s is not None and usual_hz and age_s > max(SILENT_S, SILENT_PERIODS / usual_hz):
-        return WARN, f'silent for {age_s:.1f} s, it came at {usual_hz:.3g} Hz'
+    if stall:
+        return WARN, stall
     return OK, f'{row["rate_hz"]:g} Hz'
 
 
@@ -108,7 +93,7 @@ def _spool(spool: Mapping[str, Any]) -> Entry:
     return 'spool', WARN if share > FULL else OK, text, spool
 
 
-def _store(store: Mapping[str, Any], before: Mapping[str, Any]) -> Entry:
+def _store(store: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> Entry:
     state = str(store['state']).replace('_', ' ')
     quarantined = store['quarantined'] - before['quarantined']
     if quarantined > 0:
@@ -119,13 +104,20 @@ def _store(store: Mapping[str, Any], before: Mapping[str, Any]) -> Entry:
         return 'store', WARN, f'{state}: {store["last_error"]}', store
     if store['blocked_buckets']:
         return 'store', WARN, f'{state}; buckets that take nothing: {", ".join(store["blocked_buckets"])}', store
+    if stall:
+        return 'store', WARN, stall, store
     return 'store', OK, state, store
 
 
-def _workers(workers: Mapping[str, Mapping[str, Any]]) -> Entry:
+def _workers(workers: Mapping[str, Any], before: Mapping[str, Any], stalls: Mapping[str, str]) -> Entry:
     failing = [f'{name} fails: {row["last_error"]}' for name, row in workers.items() if row['failing']]
-    figures = {f'{name} failures': row['failures'] for name, row in workers.items()}
-    return 'workers', ERROR if failing else OK, '; '.join(failing) or 'all work', figures
+    failing += [f'{name} failed lately and works again: {row["last_error"]}' for name, row in workers.items()
+                if not row['failing'] and row['failures'] > before.get(name, row)['failures']]  # fmt: skip
+    stuck = [f'{name}: {text}' for name, text in stalls.items() if name in workers or name == 'encode']
+    figures = {f'{name} {what}': row[what] for name, row in workers.items() for what in ('failures', 'deaths')}
+    figures |= {f'{name} last error': row['last_error'] for name, row in workers.items() if row['last_error']}
+    level = ERROR if failing else WARN if stuck else OK
+    return 'workers', level, '; '.join((*failing, *stuck)) or 'all work', figures
 
 
 def _text(value: Any) -> str:

@@ -17,6 +17,7 @@ from rclpy.node import Node
 
 from shadowhound_data_logger.capture.reader import PolledGroup
 from shadowhound_data_logger.capture.source import Source, SourceStatus
+from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -26,6 +27,8 @@ from shadowhound_data_logger.worker import Worker
 
 REFRESH_S: Final = 0.5
 """How often the graph is looked at: some 80 us a topic."""
+PATIENCE_S: Final = 5.0
+"""A round that lasts longer is stuck: a drain takes milliseconds, a first subscription a tenth of a second."""
 
 
 class Intake:
@@ -35,21 +38,21 @@ class Intake:
     """
 
     def __init__(self, node: Node, sensors: dict[str, SensorSettings], settings: IntakeSettings, accounts: Accounts,
-                 types: MessageTypes, queue: BatchQueue) -> None:  # fmt: skip
+                 types: MessageTypes, queue: BatchQueue, clock: Clock) -> None:  # fmt: skip
         self._sensors = sensors
         self._settings = settings
         self._accounts = accounts
         self._queue = queue
         group = PolledGroup()
         self._sources = tuple(
-            Source(node, sensor, settings, accounts, types, group, self._offer) for sensor in sensors.values()
+            Source(node, sensor, settings, accounts, types, group, self._offer, clock) for sensor in sensors.values()
         )  # fmt: skip
         self._requests: deque[Callable[[], None]] = deque()
         self._wake = threading.Event()
         self._next_poll_s = self._next_refresh_s = 0.0
         self.paused = False
         """Whether messages are counted only; set by the thread."""
-        self.worker = Worker('intake', self._step)
+        self.worker = Worker('intake', self._step, patience_s=PATIENCE_S)
 
     @property
     def topics(self) -> Sequence[str]:

@@ -47,6 +47,7 @@ class Pipeline:
         self._node = node
         self._day = self._today()
         self._due_s = 0.0
+        self._failures = 0
         self._opened = ExitStack()
 
     def open(self) -> None:
@@ -74,7 +75,7 @@ class Pipeline:
         self.pool = EncodePool(queue, sensors, settings.robot, types, self.writer.put, self.spool.accounts.reject,
                                settings.encode.threads)  # fmt: skip
         self.intake = Intake(self._node, sensors, settings.intake, self.spool.accounts, types, queue)
-        stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader)
+        self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader)
         self._status = Status(stages, settings, self._clock, self._store.describe())
         self._diagnostics = Diagnostics(self._node)
         self.control = Control(self._node, self.intake, queue, self.writer)
@@ -109,21 +110,23 @@ class Pipeline:
         if not all(finished.values()):
             return
         self._ship_ledger()
+        self.writer.prompt = True
         self.writer.flush(1.0)
         drain_s = self._settings.shutdown.drain_s
         if drain_s and not self.uploader.drain(drain_s):
             log.warning('%d objects stay in the spool %s and are delivered later', self.spool.pending_count(), self.spool.root)
 
     def tick(self) -> None:
-        """Called several times a second: once a second what goes on is told, at the turn of each UTC day the ledger is shipped.
+        """Called several times a second: starts threads again that died, and once a second tells what goes on.
 
-        Raises SpoolError when the spool cannot be mended while it is in use.
+        A failure of a thread is told at once. At the turn of each UTC day the ledger is shipped. Raises SpoolError when the
+        spool cannot be mended while it is in use.
         """
         if self.writer.damaged:
             text = f'the index of the spool {self.spool.root} is damaged'
             raise SpoolError(text, remedy='start the node again: it is rebuilt then')
         now_s = time.monotonic()
-        if now_s < self._due_s:
+        if not self._supervise() and now_s < self._due_s:
             return
         self._due_s = now_s + PERIOD_S
         self._tell()
@@ -131,6 +134,13 @@ class Pipeline:
         if day != self._day:
             self._day = day
             self._ship_ledger()
+
+    def _supervise(self) -> bool:
+        """Start threads again that died; whether any thread failed since the last time."""
+        for worker in self._stages.workers:
+            worker.look()
+        before, self._failures = self._failures, sum(worker.failures for worker in self._stages.workers)
+        return self._failures != before
 
     def apply(self, settings: Settings) -> None:
         """Go on by other settings, as far as they are live."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from importlib import import_module
 from typing import Any, Final
 
@@ -56,6 +57,16 @@ def message_class(type_name: str) -> type:
     except (ImportError, AttributeError, ValueError, TypeError, NoTypeSupportImportedException) as error:
         raise TypeUnavailable(f'{type_name}: {error}') from error
     return found
+
+
+@lru_cache
+def unavailable(type_name: str) -> str:
+    """Why messages of ``package/msg/Name`` cannot be received here; empty where they can."""
+    try:
+        message_class(type_name)
+    except TypeUnavailable as error:
+        return f'its message package is not installed here ({error})'
+    return ''
 
 
 def endpoints(node: Node, topic: str) -> list[Endpoint]:

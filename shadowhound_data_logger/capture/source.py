@@ -11,8 +11,9 @@ from typing import Final
 from rclpy.node import Node
 
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, plans
-from shadowhound_data_logger.capture.reader import PolledGroup, Reader, TypeUnavailable, endpoints, message_class
+from shadowhound_data_logger.capture.reader import PolledGroup, Reader, endpoints, unavailable
 from shadowhound_data_logger.capture.stream import Offer, Stream
+from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.accounts import Accounts
@@ -35,13 +36,19 @@ class SourceStatus:
     publishers: int
     received_s: float | None
     """When the last message came, by the monotonic clock; None before the first."""
+    matched: int = 0
+    """Publishers that a subscription is connected with."""
+    may_be_silent: bool = False
+    """Whether it is published when there is something to say: kept on change only, or latched by all its publishers."""
+    unavailable: str = ''
+    """Why nobody can listen to it here; empty where that is possible."""
 
 
 class Source:
     """A sensor at work. ``refresh`` follows the graph, ``drain`` takes what came, ``flush`` ends the open batch as well."""
 
     def __init__(self, node: Node, sensor: SensorSettings, settings: IntakeSettings, accounts: Accounts,
-                 types: MessageTypes, group: PolledGroup, offer: Offer) -> None:  # fmt: skip
+                 types: MessageTypes, group: PolledGroup, offer: Offer, clock: Clock) -> None:  # fmt: skip
         self.sensor = sensor
         self._node = node
         self._settings = settings
@@ -49,11 +56,13 @@ class Source:
         self._types = types
         self._group = group
         self._offer = offer
+        self._clock = clock
         self._topics: list[str] = [node.resolve_topic_name(topic) for topic in sensor.topics]
         self._types_expected = dict(zip(self._topics, sensor.types, strict=False))
         self._chosen = self._topics[0]
         self._absent_since_s: float | None = None
-        self._publishers = 0
+        self._publishers = self._matched = 0
+        self._latched = False
         self._type = ''
         self._readers: list[Reader] = []
         self._retiring: dict[Reader, float] = {}
@@ -63,7 +72,7 @@ class Source:
         self._kept_ns: dict[str, int] = {}
         self._paused = False
         self._last_received_s: float | None = None
-        self._unavailable: set[str] = set()
+        self._unavailable = ''
         self._unheard: set[str] = set()
 
     @property
@@ -73,7 +82,8 @@ class Source:
 
     def status(self) -> SourceStatus:
         """From any thread: each of its figures is replaced as a whole."""
-        return SourceStatus(self.sensor.name, self._chosen, self.sensor.enabled, self._publishers, self._last_received_s)
+        return SourceStatus(self.sensor.name, self._chosen, self.sensor.enabled, self._publishers, self._last_received_s,
+                            self._matched, self.sensor.on_change or self._latched, self._unavailable)  # fmt: skip
 
     def refresh(self, now_s: float) -> None:
         """Look at the graph and subscribe as its publishers ask for it."""
@@ -81,6 +91,8 @@ class Source:
             return
         publishers = self._choose(now_s)
         self._publishers = len(publishers)
+        self._matched = max((reader.matched() for reader in self._readers), default=0)
+        self._latched = bool(publishers) and all(publisher.transient_local for publisher in publishers)
         self._senders.look([publisher.gid for publisher in publishers])
         wanted = plans(self._chosen, publishers, self._types_expected.get(self._chosen), self._settings, self._type)
         self._warn_of_types(publishers, wanted)
@@ -159,23 +171,19 @@ class Source:
 
     def _is_available(self, type_name: str) -> bool:
         """Whether messages of the type can be received here; asked before anything is begun or counted for them."""
-        if type_name in self._unavailable:
-            return False
-        try:
-            message_class(type_name)
-        except TypeUnavailable as error:
-            self._unavailable.add(type_name)
-            text = '%s: %s is not logged: its message package is not installed here (%s)'
-            log.warning(text, self.sensor.name, self._chosen, error)
-            return False
-        return True
+        self._unavailable = unavailable(type_name)
+        if self._unavailable and type_name not in self._unheard:
+            self._unheard.add(type_name)
+            log.warning('%s: %s is not logged: %s', self.sensor.name, self._chosen, self._unavailable)
+        return not self._unavailable
 
     def _retype(self, type_name: str, now_s: float) -> None:
         """Begin with a topic that is new, or of another type than before."""
         self._leave(now_s)
         topic = self._chosen
         kept_ns = self._kept_ns.get(topic) or self._accounts.last_kept_ns(topic)
-        self._stream = Stream(self.sensor, topic, type_name, kept_ns, self._accounts, self._types, self._offer)
+        self._stream = Stream(self.sensor, topic, type_name, kept_ns, self._accounts, self._types, self._offer,
+                              self._clock)  # fmt: skip
         self._type = type_name
 
     def _retire(self, wanted: set[Plan], now_s: float) -> None:

@@ -11,13 +11,14 @@ import os
 import sqlite3
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.source import SourceStatus
+from shadowhound_data_logger.capture.watchdog import Watchdog
 from shadowhound_data_logger.clock import SECOND, Clock, iso
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.pool import EncodePool
@@ -48,6 +49,11 @@ class Stages:
     writer: SpoolWriter
     uploader: Uploader
 
+    @property
+    def workers(self) -> Sequence[Worker]:
+        """All threads of the node but the main one."""
+        return self.intake.worker, *self.pool.workers, self.writer.worker, *self.uploader.workers
+
 
 class Status:
     """New; ``look`` once a second, ``write`` what it found. ``earlier`` is the status of up to ``WINDOW_S`` before the last."""
@@ -64,6 +70,7 @@ class Status:
         self._version = _version()
         self._past: deque[tuple[float, int, dict[str, Any]]] = deque()  # monotonic time, bytes sent, status
         self._complained = ''
+        self._watchdog = Watchdog(settings.upload.connect_timeout_s + settings.upload.read_timeout_s)
 
     @property
     def earlier(self) -> Mapping[str, Any] | None:
@@ -86,8 +93,10 @@ class Status:
             'paused': self._stages.intake.paused, 'ended': ended, 'topics': self._topics(now_s),
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
             'spool': {'path': str(self._stages.spool.root), **asdict(piles), 'max_bytes': self._settings.spool.max_bytes},
-            'store': self._store(upload, now_s), 'workers': self._workers(upload),
+            'store': self._store(upload, now_s),
+            'workers': {worker.name: asdict(worker.status()) for worker in self._stages.workers},
         }  # fmt: skip
+        status['stalls'] = self._watchdog.look(status, now_s)
         self._past.append((now_s, upload.sent_bytes, status))
         return status
 
@@ -118,7 +127,9 @@ class Status:
         received_s = source.received_s if source else None
         row = {
             'sensor': source.sensor if source else '', 'enabled': source.enabled if source else False,
-            'publishers': source.publishers if source else 0, 'rate_hz': 0.0,
+            'publishers': source.publishers if source else 0, 'matched': source.matched if source else 0,
+            'may_be_silent': source.may_be_silent if source else False, 'unavailable': source.unavailable if source else '',
+            'rate_hz': 0.0,
             'age_s': None if received_s is None else round(max(0.0, now_s - received_s), 3),
         }  # fmt: skip
         for then_s, _, status in self._past:
@@ -134,19 +145,6 @@ class Status:
         figures = asdict(upload)
         del figures['sent_bytes'], figures['worker_failures']
         return {'target': self._target, **figures, 'mbps': round(mbps, 3)}
-
-    def _workers(self, upload: UploadStatus) -> dict[str, dict[str, Any]]:
-        stages = self._stages
-        workers = (stages.intake.worker, *stages.pool.workers, stages.writer.worker)
-        before = self._past[-1][2]['workers']['upload']['failures'] if self._past else 0
-        failing = upload.worker_failures > before
-        last_error = upload.last_error if failing else ''
-        rows = {worker.name: _worker(worker) for worker in workers}
-        return rows | {'upload': {'failing': failing, 'failures': upload.worker_failures, 'last_error': last_error}}
-
-
-def _worker(worker: Worker) -> dict[str, Any]:
-    return {'failing': worker.failing, 'failures': worker.failures, 'last_error': worker.last_error}
 
 
 def _slope(rise: float, run: float) -> float:

@@ -9,7 +9,7 @@ from zlib import crc32
 from shadowhound_data_logger.capture.batching import Batcher
 from shadowhound_data_logger.capture.endpoints import Senders
 from shadowhound_data_logger.capture.gate import gate_for
-from shadowhound_data_logger.clock import is_sane
+from shadowhound_data_logger.clock import Clock, stamp_of
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.model import Batch, Sample
@@ -33,7 +33,8 @@ class Stream:
     """New for each topic and type; ``add`` what was taken, ``close_batch`` at the end."""
 
     def __init__(self, sensor: SensorSettings, topic: str, type_name: str, last_kept_ns: int, accounts: Accounts,
-                 types: MessageTypes, offer: Offer) -> None:  # fmt: skip
+                 types: MessageTypes, offer: Offer, clock: Clock) -> None:  # fmt: skip
+        self._clock = clock
         self.kept_ns = last_kept_ns
         """Stamp of the newest message that was kept: no period is stored twice."""
         self._topic = topic
@@ -87,9 +88,7 @@ class Stream:
                 if paused:
                     account.dropped[PAUSED] += 1
                     continue
-                stamp_ns = header_stamp_ns(cdr) if self._has_header else 0
-                if not is_sane(stamp_ns, source_ns):
-                    stamp_ns = source_ns
+                stamp_ns = stamp_of(header_stamp_ns(cdr) if self._has_header else 0, source_ns, self._clock)
                 if keep(stamp_ns, cdr):
                     self.kept_ns = stamp_ns
                     kept.append(Sample(stamp_ns, cdr))

@@ -20,6 +20,8 @@ from shadowhound_data_logger.worker import Worker
 log = logging.getLogger(__name__)
 
 WAIT_S: Final = 0.5
+PATIENCE_S: Final = 60.0
+"""A batch that takes longer is stuck: the largest images and clouds take a second on a Jetson."""
 Reject = Callable[[str, Mapping[str, int]], None]
 
 
@@ -35,7 +37,7 @@ class EncodePool:
         self._put = put
         self._reject = reject
         self._told: set[tuple[str, str]] = set()
-        self.workers = [Worker(f'encode-{number}', self._step) for number in range(threads)]
+        self.workers = [Worker(f'encode-{number}', self._step, patience_s=PATIENCE_S) for number in range(threads)]
 
     def open(self) -> None:
         for worker in self.workers:
@@ -71,7 +73,11 @@ class EncodePool:
             self._reject(batch.topic, encoding.rejected)
             self._tell(batch.topic, encoding.details)
         if encoding.object is not None:
-            self._put(encoding.object)
+            try:
+                self._put(encoding.object)
+            except BaseException:
+                self._reject(batch.topic, {'encoder_failed': encoding.object.samples})
+                raise
 
     def _tell(self, topic: str, details: Mapping[str, str]) -> None:
         """Say once for each topic and reason what is wrong; the ledger counts the rest."""

@@ -17,6 +17,8 @@ class QueueStatus:
     batches: int
     messages: int
     bytes: int
+    finished: int = 0
+    """Batches that were taken from it and are done."""
 
 
 class BatchQueue:
@@ -31,7 +33,7 @@ class BatchQueue:
         self._ready = threading.Condition(self._lock)
         self._left = threading.Condition(self._lock)
         self._unfinished: dict[int, int] = {}  # id of a batch -> its number, rising
-        self._put = 0
+        self._put = self._finished = 0
         self._lanes: dict[int, deque[Batch]] = {}
         self._messages = 0
         self._bytes = 0
@@ -69,6 +71,7 @@ class BatchQueue:
     def done(self, batch: Batch) -> None:
         """The batch that ``get`` gave out has been handed on, or rejected."""
         with self._lock:
+            self._finished += 1
             self._finish(batch)
 
     def finished(self, deadline_s: float) -> bool:
@@ -90,7 +93,7 @@ class BatchQueue:
 
     def status(self) -> QueueStatus:
         with self._lock:
-            return QueueStatus(sum(len(lane) for lane in self._lanes.values()), self._messages, self._bytes)
+            return QueueStatus(sum(len(lane) for lane in self._lanes.values()), self._messages, self._bytes, self._finished)
 
     def _remove(self, lane: deque[Batch]) -> Batch:
         batch = lane.popleft()

@@ -15,7 +15,7 @@ from shadowhound_data_logger.encode.raw import encode_cdr
 from shadowhound_data_logger.encode.records import encode_records
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import NameRefused, Rejected
-from shadowhound_data_logger.keys import KeyTemplate
+from shadowhound_data_logger.keys import KeyTemplate, dated
 from shadowhound_data_logger.model import Batch, DataObject
 
 ENCODERS: Final[Mapping[str, Encoder]] = {
@@ -53,21 +53,16 @@ def _encode(batch: Batch, sensor: SensorSettings, robot: str, types: MessageType
     payload = ENCODERS[sensor.format](Job(batch, sensor, robot, types), rejections)
     if payload is None:
         return None
+    pattern = KeyTemplate(sensor.key).pattern(robot=robot, sensor=sensor.name, period_ns=sensor.period_ns, ext=payload.ext)
     try:
-        key = KeyTemplate(sensor.key).render(
-            robot=robot,
-            sensor=sensor.name,
-            stamp_ns=payload.kept[0].stamp_ns,
-            period_ns=sensor.period_ns,
-            ext=payload.ext,
-        )
+        key = dated(pattern, payload.kept[0].stamp_ns)
     except NameRefused as error:
         rejections.add(Rejected('unsafe_key', str(error)), len(payload.kept))
         return None
-    return _object(batch, sensor, robot, payload, key)
+    return _object(batch, sensor, robot, payload, key, pattern)
 
 
-def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, key: str) -> DataObject:
+def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, key: str, pattern: str) -> DataObject:
     start_ns = min(sample.stamp_ns for sample in payload.kept)
     end_ns = max(sample.stamp_ns for sample in payload.kept)
     metadata = {
@@ -92,6 +87,7 @@ def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, 
         t_end_ns=end_ns,
         priority=sensor.priority,
         metadata={**{name: _text(fact) for name, fact in payload.facts.items()}, **metadata},
+        key_pattern=pattern,
     )
 
 

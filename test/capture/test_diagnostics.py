@@ -11,7 +11,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from shadowhound_data_logger.capture.diagnostics import ERROR, OK, STALE, WARN, _text, entries, learn
+from shadowhound_data_logger.capture.diagnostics import ERROR, OK, STALE, WARN, _text, entries
 
 TOPIC = {
     'sensor': 'imu', 'type': 'go2_interfaces/msg/IMU', 'enabled': True, 'publishers': 1, 'rate_hz': 100.0, 'age_s': 0.02,
@@ -24,7 +24,7 @@ STATUS: dict[str, Any] = {
               'oldest_age_s': None},
     'store': {'target': 'the S3 server', 'state': 'idle', 'last_error': 'refused', 'delivered': 5, 'in_flight': 0, 'deferred': 0,
               'retries': 0, 'quarantined': 1, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
-    'workers': {'intake': {'failing': False, 'failures': 1, 'last_error': 'ValueError: x'}},
+    'workers': {'intake': {'failing': False, 'failures': 1, 'deaths': 0, 'last_error': 'ValueError: x'}}, 'stalls': {},
 }  # fmt: skip
 
 
@@ -42,15 +42,15 @@ def changed(**values: Any) -> dict[str, Any]:
     return status
 
 
-def told(name: str, usual_hz: float = 100.0, **values: Any) -> tuple[Any, str]:
+def told(name: str, **values: Any) -> tuple[Any, str]:
     """Level and words of an entry, after a while in which everything was fine."""
-    found = {entry[0]: entry for entry in entries(changed(**values), STATUS, {'/imu': usual_hz})}
+    found = {entry[0]: entry for entry in entries(changed(**values), STATUS)}
     return found[name][1], found[name][2]
 
 
 def test_all_is_fine() -> None:
     """There is an entry for each topic, the spool, the store, the workers and the node; old losses are not told for ever."""
-    found = list(entries(STATUS, STATUS, {'/imu': 100.0}))
+    found = list(entries(STATUS, STATUS))
     assert [entry[0] for entry in found] == ['node', '/imu', 'spool', 'store', 'workers']
     assert {entry[1] for entry in found} == {OK}
     assert told('/imu')[1] == '100 Hz'
@@ -67,25 +67,15 @@ def test_all_is_fine() -> None:
         ({'topic__publishers': 0}, STALE, 'nobody publishes it'),
         ({'topic__publishers': 0, 'topic__missed': 5}, WARN, '1 missed lately'),
         ({'topic__enabled': False, 'topic__publishers': 0}, OK, 'not enabled'),
-        ({'topic__age_s': 1.9}, OK, '100 Hz'),
-        ({'topic__age_s': 2.1}, WARN, 'silent for 2.1 s, it came at 100 Hz'),
+        ({'stalls': {'/imu': 'silent for 7 s'}}, WARN, 'silent for 7 s'),
+        ({'stalls': {'/imu': 'silent for 7 s'}, 'topic__publishers': 0}, STALE, 'nobody publishes it'),
+        ({'stalls': {'/odom': 'silent for 7 s'}}, OK, '100 Hz'),
         ({'topic__age_s': None}, OK, '100 Hz'),
     ],
 )  # fmt: skip
 def test_a_topic(values: dict[str, Any], level: Any, words: str) -> None:
     """Losses since a moment ago and silence need a look; one that nobody publishes is stale, one that is off is fine."""
     assert told('/imu', **values) == (level, words)
-
-
-@pytest.mark.parametrize(('age_s', 'level'), [(19.0, OK), (21.0, WARN)])
-def test_a_slow_topic_is_given_its_time(age_s: float, level: Any) -> None:
-    """Silence begins after ten of its usual periods."""
-    assert told('/imu', usual_hz=0.5, topic__age_s=age_s)[0] == level
-
-
-def test_a_topic_of_which_little_came_is_not_silent() -> None:
-    """A map that is published once has no usual rate."""
-    assert told('/imu', usual_hz=0.0, topic__age_s=9999.0)[0] == OK
 
 
 @pytest.mark.parametrize(
@@ -99,8 +89,13 @@ def test_a_topic_of_which_little_came_is_not_silent() -> None:
         ('store', {'store__state': 'paused'}, ERROR, 'paused: refused'),
         ('store', {'store__quarantined': 3}, ERROR, '2 objects went to quarantine lately: refused'),
         ('store', {'store__blocked_buckets': {'trajectories': 'no'}}, WARN, 'trajectories'),
-        ('workers', {'workers__intake': {'failing': True, 'failures': 2, 'last_error': 'KeyError: y'}}, ERROR,
+        ('store', {'stalls': {'delivery': '3 objects wait'}}, WARN, '3 objects wait'),
+        ('workers', {'workers__intake': {'failing': True, 'failures': 2, 'deaths': 0, 'last_error': 'KeyError: y'}}, ERROR,
          'intake fails: KeyError: y'),
+        ('workers', {'workers__intake': {'failing': False, 'failures': 2, 'deaths': 1, 'last_error': 'SystemExit: '}}, ERROR,
+         'intake failed lately and works again: SystemExit'),
+        ('workers', {'stalls': {'intake': 'it takes no messages'}}, WARN, 'intake: it takes no messages'),
+        ('workers', {'stalls': {'encode': 'no batch', 'delivery': 'x'}}, WARN, 'encode: no batch'),
     ],
 )  # fmt: skip
 def test_the_rest(name: str, values: dict[str, Any], level: Any, words: str) -> None:
@@ -110,21 +105,9 @@ def test_the_rest(name: str, values: dict[str, Any], level: Any, words: str) -> 
     assert words in found[1]
 
 
-def test_the_usual_rate_is_learned_while_a_topic_is_heard() -> None:
-    """It follows slowly, and the last seconds of one that fell silent do not change it."""
-    usual: dict[str, float] = {}
-    learn(usual, changed(topic__rate_hz=50.0))
-    assert usual == {'/imu': 50.0}
-    learn(usual, changed(topic__rate_hz=100.0))
-    assert usual == {'/imu': 55.0}
-    learn(usual, changed(topic__rate_hz=1.0, topic__age_s=2.5))
-    learn(usual, changed(topic__rate_hz=0.0))
-    assert usual == {'/imu': 55.0}
-
-
 def test_every_figure_fits_its_message() -> None:
     """What rclpy refuses in a message would end the node: levels are bytes, values text, and what is unknown is empty."""
-    for name, level, text, figures in entries(changed(store__blocked_buckets={'b': 'why'}), STATUS, {}):
+    for name, level, text, figures in entries(changed(store__blocked_buckets={'b': 'why'}), STATUS):
         values = [KeyValue(key=key, value=_text(value)) for key, value in figures.items()]
         message = DiagnosticStatus(name=name, level=level, message=text, values=values)
         assert message.level in {OK, WARN, ERROR, STALE}

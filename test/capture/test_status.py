@@ -18,6 +18,7 @@ from shadowhound_data_logger.capture.source import SourceStatus
 from shadowhound_data_logger.capture.status import Stages, Status
 from shadowhound_data_logger.config import QueueSettings, Settings
 from shadowhound_data_logger.encode.queue import BatchQueue
+from shadowhound_data_logger.model import Batch, Sample
 from shadowhound_data_logger.ship.uploader import UploadStatus
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import file, read
@@ -49,6 +50,7 @@ class Uploader:
 
     def __init__(self) -> None:
         self.told = UploadStatus('idle', '', 5, 0, 0, 0, 0)
+        self.workers = Threads('upload-lock', 'upload-0').workers
 
     def status(self) -> UploadStatus:
         return self.told
@@ -67,7 +69,8 @@ class Setting:
         writer: Any = Threads('spool-writer')
         intake: Any = self.intake
         uploader: Any = self.uploader
-        stages = Stages(self.spool, intake, BatchQueue(QueueSettings()), encoders, writer, uploader)
+        self.queue = BatchQueue(QueueSettings())
+        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader)
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
         self.status = Status(stages, settings, self.clock, 'a store', lambda: self.now_s)
 
@@ -126,15 +129,20 @@ def test_what_lies_in_the_spool(setting: Setting) -> None:
 
 
 def test_a_failing_worker_is_told(setting: Setting) -> None:
-    """Each thread has its row; delivery fails in the second in which a defect was caught."""
-    setting.look()
-    setting.intake.worker.failing, setting.intake.worker.last_error = True, 'ValueError: x'
-    setting.uploader.told = replace(setting.uploader.told, worker_failures=2, last_error='KeyError: y')
+    """Each thread has its row: whether it lives and fails, how often it failed and died, and why."""
+    worker = setting.intake.worker
+    worker.failing, worker.last_error, worker.failures, worker.deaths = True, 'ValueError: x', 3, 1
     workers = setting.look()['workers']
-    assert workers['intake'] == {'failing': True, 'failures': 0, 'last_error': 'ValueError: x'}
-    assert workers['upload'] == {'failing': True, 'failures': 2, 'last_error': 'KeyError: y'}
-    assert setting.look()['workers']['upload'] == {'failing': False, 'failures': 2, 'last_error': ''}
-    assert set(workers) == {'intake', 'encode-0', 'spool-writer', 'upload'}
+    assert workers['intake'] == {'alive': False, 'failing': True, 'failures': 3, 'deaths': 1, 'last_error': 'ValueError: x',
+                                 'busy_s': 0.0, 'patience_s': None}  # fmt: skip
+    assert set(workers) == {'intake', 'encode-0', 'spool-writer', 'upload-lock', 'upload-0'}
+
+
+def test_a_stall_is_told(setting: Setting) -> None:
+    """What the watchdog finds stands in the status: here a batch that nobody takes from the queue."""
+    setting.queue.put(Batch('imu', '/imu', 't', (Sample(1, b''),), 1), 5)
+    assert setting.look()['stalls'] == {}
+    assert 'no batch was encoded for 11 s' in setting.look(11.0)['stalls']['encode']
 
 
 def test_the_reader_finds_what_was_written(setting: Setting, tmp_path: Path) -> None:

@@ -103,6 +103,29 @@ def test_an_encoder_with_a_fault_of_its_own(monkeypatch: pytest.MonkeyPatch) -> 
     assert [worker.failures for worker in outcome.pool.workers] == [1]
 
 
+@pytest.mark.parametrize('death', [SystemExit(1), MemoryError('no room'), KeyboardInterrupt()])
+@pytest.mark.parametrize('place', ['encode', 'put'])
+def test_a_thread_that_dies(monkeypatch: pytest.MonkeyPatch, death: BaseException, place: str) -> None:
+    """Whatever ends the encoder or the hand-over, its samples are rejected, the next batch is encoded by the same pool."""
+    outcome, deaths = Outcome(threads=1), [death]
+    real = {'encode': pool_module.encode, 'put': outcome.pool._put}[place]
+
+    def dying(*given: object) -> object:
+        if deaths:
+            raise deaths.pop()
+        return real(*given)  # type: ignore[operator]
+
+    monkeypatch.setattr(*((pool_module, 'encode') if place == 'encode' else (outcome.pool, '_put')), dying)
+    outcome.queue.put(talk(TEXT, TEXT, TEXT), 1)
+    outcome.queue.put(talk(TEXT), 5)
+    outcome.pool.open()
+    assert outcome.queue.finished(10)
+    assert outcome.pool.close(10)
+    assert (outcome.samples, outcome.rejected) == (1, {'encoder_failed': 3})
+    assert [worker.failures for worker in outcome.pool.workers] == [1]
+    assert outcome.queue.status().finished == 2
+
+
 def test_a_close_that_takes_too_long_says_so() -> None:
     """A writer that blocks is not waited for longer than told."""
     outcome, entered, blocked = Outcome(threads=1), threading.Event(), threading.Event()

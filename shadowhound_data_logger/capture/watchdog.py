@@ -1,0 +1,120 @@
+"""Notices what stands still though it should not: topics, threads, encoding, commits, delivery. It only reads the status.
+
+Each stall is one sentence that an operator understands: what stands still, for how long, why, what to do. It is logged when
+it begins and when it is over.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any, Final
+
+from shadowhound_data_logger.capture.rhythm import Rhythm
+
+log = logging.getLogger(__name__)
+
+ENCODE_S: Final = 10.0
+"""Batches wait, and none was finished for so long."""
+DELIVERY_S: Final = 30.0
+"""Objects wait, and nothing moved for so long on top of what a single request may take."""
+Stalls = Mapping[str, str]
+
+
+class Watchdog:
+    """New; ``look`` at each status, in their order. ``request_s`` is what one request to the store may take, seconds.
+
+    The keys of what it returns are topics, names of threads, ``encode`` and ``delivery``.
+    """
+
+    def __init__(self, request_s: float) -> None:
+        self._delivery_s = DELIVERY_S + request_s
+        self._rhythms: dict[str, Rhythm] = {}
+        self._encoding, self._delivering = _Progress(), _Progress()
+        self._told: Stalls = {}
+
+    def look(self, status: Mapping[str, Any], now_s: float) -> Stalls:
+        """What stands still; ``now_s`` is monotonic time."""
+        stuck = {name: text for name, row in status['workers'].items() if (text := _hanging(name, row))}
+        writes = 'spool-writer' not in stuck and not _failing(status, 'spool-writer')
+        found = {name: text for name, text in stuck.items() if writes or not name.startswith('encode-')}
+        found |= self._topics(status, now_s, takes='intake' not in stuck and not _failing(status, 'intake'))
+        encoding, delivery = self._encode(status, now_s), self._deliver(status, now_s)
+        if writes:  # else what waits for the disk is no stall of its own
+            found |= {name: text for name, text in (('encode', encoding), ('delivery', delivery)) if text}
+        self._tell(found)
+        return found
+
+    def _tell(self, found: Stalls) -> None:
+        for name in found.keys() - self._told.keys():
+            log.warning('%s: %s', name, found[name])
+        for name in self._told.keys() - found.keys():
+            log.info('%s: it goes on', name)
+        self._told = found
+
+    def _topics(self, status: Mapping[str, Any], now_s: float, *, takes: bool) -> dict[str, str]:
+        found = {}
+        for topic, row in status['topics'].items():
+            text = self._rhythms.setdefault(topic, Rhythm(topic)).look(row, now_s)
+            if text and takes:  # else all of them seem to be silent
+                found[topic] = text
+        return found
+
+    def _encode(self, status: Mapping[str, Any], now_s: float) -> str:
+        queue = status['queue']
+        idle_s = self._encoding.idle_s(queue['finished'], now_s, waiting=bool(queue['batches']))
+        if idle_s <= ENCODE_S:
+            return ''
+        errors = {row['last_error'] for name, row in status['workers'].items() if name.startswith('encode-') and row['failing']}
+        why = f'the encoders fail ({"; ".join(sorted(errors))})' if errors else 'the encoders are busy with what they have'
+        return f'no batch was encoded for {idle_s:.0f} s and {queue["batches"]} wait: {why}; has this machine a core to spare?'
+
+    def _deliver(self, status: Mapping[str, Any], now_s: float) -> str:
+        store, pending = status['store'], status['spool']['pending']
+        waiting = bool(pending) and store['state'] in {'idle', 'shipping'}
+        moved = store['delivered'], store['quarantined'], now_s if store['mbps'] else 0.0
+        idle_s = self._delivering.idle_s(moved, now_s, waiting=waiting)
+        if idle_s <= self._delivery_s:
+            return ''
+        return f'{pending} objects wait and nothing was sent for {idle_s:.0f} s: {_why_undelivered(status)}'
+
+
+class _Progress:
+    """Since when a figure stands still while something waits."""
+
+    def __init__(self) -> None:
+        self._figure: Any = None
+        self._since_s = 0.0
+
+    def idle_s(self, figure: Any, now_s: float, *, waiting: bool) -> float:
+        if figure != self._figure or not waiting:
+            self._figure, self._since_s = figure, now_s
+        return now_s - self._since_s
+
+
+def _failing(status: Mapping[str, Any], name: str) -> bool:
+    return bool(status['workers'].get(name, {}).get('failing'))
+
+
+def _hanging(name: str, row: Mapping[str, Any]) -> str:
+    """What it means that this thread is stuck; empty where it is not."""
+    busy_s = row['busy_s']
+    if row['patience_s'] is None or busy_s <= row['patience_s']:
+        return ''
+    if name == 'intake':
+        return f'it takes no messages for {busy_s:.0f} s and they are being lost; start the node again if that lasts'
+    if name == 'spool-writer':
+        return f'a commit to the spool has taken {busy_s:.0f} s: its disk does not answer; look at dmesg and at its cable or card'
+    return f'one batch has taken {busy_s:.0f} s so far; others go on meanwhile if there are more encoder threads'
+
+
+def _why_undelivered(status: Mapping[str, Any]) -> str:
+    store = status['store']
+    errors = {row['last_error'] for name, row in status['workers'].items() if name.startswith('upload-') and row['failing']}
+    if errors:
+        return f'the upload threads fail ({"; ".join(sorted(errors))})'
+    if store['in_flight']:
+        return f'{store["in_flight"]} uploads hang without an end; does the disk of the store hang, is the network too slow?'
+    if store['deferred']:
+        return f'{store["deferred"]} objects fail again and again: {store["last_error"]}'
+    return 'nothing is under way, which is a defect of this program; start the node again'

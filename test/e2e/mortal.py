@@ -1,0 +1,54 @@
+"""Lets the node's threads die on order: copied as sitecustomize.py to where a Python finds it at its start.
+
+A file ``NAME.round`` in the folder ORDERS makes the next round of that worker raise SystemExit, ``NAME.thread`` ends its thread
+for good. The file's new name ends in ``.done``, and it holds the boot clock of that moment, ns. ``main.round`` is the main loop.
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from shadowhound_data_logger.capture.pipeline import Pipeline
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.worker import Worker
+
+orders = Path(os.environ['ORDERS'])
+clock = SystemClock.of_this_machine()
+make, tick = Worker.__init__, Pipeline.tick
+
+
+def obey(name: str) -> str | None:
+    """How to die now, if so."""
+    for way in ('round', 'thread'):
+        order = orders / f'{name}.{way}'
+        if order.exists():
+            order.write_text(str(clock.boot_ns()))
+            order.rename(order.with_suffix(f'.{way}.done'))
+            return way
+    return None
+
+
+def make_mortal(worker: Worker, name: str, step: Any, **options: Any) -> None:
+    def mortal() -> None:
+        way = obey(name)
+        if way:
+            if way == 'thread':
+                worker._fail = without_memory  # type: ignore[method-assign]
+            raise SystemExit(f'on order of {name}')
+        step()
+
+    def without_memory(*_: Any) -> None:
+        del worker._fail  # type: ignore[misc]
+        raise MemoryError(f'on order of {name}')
+
+    make(worker, name, mortal, **options)
+
+
+def mortal_tick(pipeline: Pipeline) -> None:
+    if obey('main'):
+        raise SystemExit(0)
+    tick(pipeline)
+
+
+Worker.__init__ = make_mortal  # type: ignore[method-assign]
+Pipeline.tick = mortal_tick  # type: ignore[method-assign]

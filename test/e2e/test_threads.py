@@ -1,0 +1,97 @@
+"""Each thread of the real node dies, in a round or for good: seen within a second, started again, counted; nothing is lost."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import statistics
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from e2e.processes import HERE, Node, Processes, Publisher, until
+from e2e.reading import STRING, texts
+
+from shadowhound_data_logger.clock import SECOND, SystemClock
+from shadowhound_data_logger.spool import status
+
+WORKERS = ('intake', 'encode-0', 'spool-writer', 'upload-0')
+PARAMETERS = {
+    'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 0.2,
+    'encode.threads': 1, 'upload.threads': 1,
+}  # fmt: skip
+GROUP = 50
+
+
+@dataclass(frozen=True, slots=True)
+class Mortal:
+    """A node whose threads die on order, and somebody who publishes."""
+
+    node: Node
+    publisher: Publisher
+    orders: Path
+
+    def worker(self, name: str) -> dict[str, Any]:
+        """Its row of the status; with the boot clock of that, ns."""
+        found = status.read(self.node.home / 'spool', self.node.robot, SystemClock.of_this_machine())
+        return {'boot_ns': found.get('boot_ns', 0), **found.get('workers', {}).get(name, {'failures': 0})}
+
+    def order(self, name: str, way: str) -> None:
+        (self.orders / f'{name}.{way}').touch()
+
+    def seen_after_s(self, name: str, way: str, failures: int) -> float:
+        """How long after the death the status tells of it."""
+        row = until(lambda: found if (found := self.worker(name))['failures'] >= failures else None, f'{name} is seen to die')
+        died_ns = int((self.orders / f'{name}.{way}.done').read_text())
+        assert row['failures'] == failures
+        assert f'on order of {name}' in row['last_error']
+        return float(row['boot_ns'] - died_ns) / SECOND
+
+
+@pytest.fixture
+def mortal(processes: Processes, tmp_path: Path) -> Mortal:
+    """The drain lock's thread dies in its first round: it has no second one."""
+    folder, orders = tmp_path / 'mortal', tmp_path / 'orders'
+    folder.mkdir()
+    orders.mkdir()
+    shutil.copy(HERE / 'mortal.py', folder / 'sitecustomize.py')
+    (orders / 'upload-lock.thread').touch()
+    path = os.pathsep.join(filter(None, (str(folder), os.environ.get('PYTHONPATH'))))
+    node = processes.node(None, PARAMETERS, environ={'PYTHONPATH': path, 'ORDERS': str(orders)})
+    publisher = processes.publisher()
+    publisher.create('/talk', STRING)
+    publisher.matched('/talk')
+    return Mortal(node, publisher, orders)
+
+
+def test_each_thread_dies_and_nothing_is_lost(mortal: Mortal) -> None:
+    """Twice each: of what its round raised, and of its own bookkeeping; in the end every message is delivered."""
+    sent, seen_s = 0, [mortal.seen_after_s('upload-lock', 'thread', 1)]
+    for failures, way in enumerate(('round', 'thread'), 1):
+        for name in WORKERS:
+            mortal.order(name, way)
+            mortal.publisher.publish('/talk', texts(range(sent, sent + GROUP)))
+            sent += GROUP
+            seen_s.append(mortal.seen_after_s(name, way, failures))
+    row = mortal.node.settled('/talk', sent)
+    assert (row['received'], row['stored'], row['missed'], row['rejected'], row['dropped']) == (sent, sent, 0, {}, {})
+    for name in WORKERS:
+        until(lambda name=name: not mortal.worker(name)['failing'], f'{name} works again')  # type: ignore[misc]
+        last = mortal.worker(name)
+        assert (last['alive'], last['failures'], last['deaths']) == (True, 2, 1)
+        assert f'{name} died (2 times so far) and tries again' in mortal.node.log
+    assert statistics.median(seen_s) < 1.0, seen_s
+    assert max(seen_s) < 5.0, seen_s  # a machine that is busy with other things
+    mortal.node.stop()
+
+
+def test_the_main_loop_dies(mortal: Mortal) -> None:
+    """The node does not go on without it: it makes all durable, says why and ends with 1, and its service starts it again."""
+    mortal.publisher.publish('/talk', texts(range(GROUP)))
+    mortal.node.received('/talk', GROUP)
+    mortal.order('main', 'round')
+    assert mortal.node.wait() == 1
+    assert 'the node ends: SystemExit: 0' in mortal.node.log
+    row = mortal.node.topic('/talk')
+    assert (row['received'], row['stored'], row['open']) == (GROUP, GROUP, 0)
