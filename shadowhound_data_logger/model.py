@@ -52,6 +52,8 @@ class DataObject:
     """Why it has no final name yet; None when it may be shipped."""
     metadata: Mapping[str, str] = field(default_factory=dict)
     """Further S3 user metadata: lower-case names, printable ASCII values."""
+    key_pattern: str | None = None
+    """The wanted key with its time left open (``keys.dated``), should that not be known yet."""
 
 
 class State(str, Enum):
@@ -82,6 +84,33 @@ class SpooledObject:
     priority: int
     created_ns: int
     attempts: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class HeldObject:
+    """An object that has no final name yet, as the index knows it."""
+
+    id: int
+    bucket: str
+    key: str
+    """A provisional one."""
+    metadata: Mapping[str, str]
+    t_start_ns: int
+    t_end_ns: int
+    created_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Binding:
+    """What a held object becomes; its content stays."""
+
+    id: int
+    key: str
+    """The wanted key; the spool makes it unique."""
+    metadata: Mapping[str, str]
+    """All of it but ``sha256``, which stays."""
+    t_start_ns: int
+    t_end_ns: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,7 @@ of the bytes, too.
 """
 _UNSAFE: Final = re.compile(r'^\.+|[^A-Za-z0-9_.-]+')
 _PART: Final = re.compile(r'[1-9][0-9]{0,17}\.part')
+_SESSION: Final = re.compile(r'[1-9][0-9]{0,17}')
 _FOLDERS: Final = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine'}
 
 
@@ -53,6 +54,10 @@ class Tree:
     def session(self, number: int) -> Path:
         """The file that a live session keeps locked."""
         return self.root / 'sessions' / str(number)
+
+    def sessions(self) -> Iterator[int]:
+        """Those that are alive, and those that did not end."""
+        return (int(path.name) for path in (self.root / 'sessions').iterdir() if _SESSION.fullmatch(path.name))
 
     def part(self, number: int) -> Path:
         return self.incoming / f'{number}.part'
@@ -149,6 +154,13 @@ class Tree:
         except (FileNotFoundError, NotADirectoryError):
             return False
         return status.st_size == size and stat.S_ISREG(status.st_mode)
+
+    def waiting(self, number: int, bucket: str, key: str) -> Path:
+        """The file of a pending object, placed if it was not yet; the part where its place is barred."""
+        path, part = self.path(State.PENDING, None, bucket, key), self.part(number)
+        if not os.path.isfile(path) and not self.place(part, path) and os.path.exists(part):  # noqa: PTH110, PTH113 - these never raise
+            return part
+        return path
 
     def objects(self, known: Callable[[str, str], Collection[str]]) -> Iterator[tuple[State, str | None, str, str, Path]]:
         """(state, reason, bucket, key, path) of every regular file that lies where objects lie.

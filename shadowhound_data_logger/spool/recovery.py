@@ -2,6 +2,12 @@
 
 After it every pending, held or quarantined row has its file, every file has its row, and sessions whose process died
 are settled: what they had received without an outcome is dropped with the reason ``restart``.
+
+A part without a row was never committed, promised to nobody, and is removed. That cannot be said of an index that went back
+in time: it is new, or it does not know a session whose file is there, or a session died and left no write-ahead log (SQLite
+removes that at a clean stop only). Then a part that is whole by its own description is adopted, as are files that have their
+names. Where it had not been committed after all its samples are stored as well as lost at the restart: rather that than the
+other way round. A log that is there but damaged does not show; with it, what was being renamed in that instant is lost.
 """
 
 from __future__ import annotations
@@ -16,9 +22,11 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool import plausible
 from shadowhound_data_logger.spool.accounts import Snapshot, TopicRow
 from shadowhound_data_logger.spool.adoption import Adoption, Recovery, place_said
 from shadowhound_data_logger.spool.ballast import says_full
+from shadowhound_data_logger.spool.binding import renew
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import MISSING, Index
 from shadowhound_data_logger.spool.ledger import imbalances, of_index
@@ -41,10 +49,12 @@ def open_recovered(tree: Tree, now_ns: int, report: Recovery) -> Index:
     while True:
         path.touch(mode=0o600)
         index = Index(path)
+        has_log = bool(Tree.size(Path(f'{path}-wal')))
         try:
             index.open()
             index.check()
-            _recover(tree, index, now_ns, report)
+            plausible.check(index.db)
+            _recover(tree, index, now_ns, report, has_log=has_log)
         except (sqlite3.Error, ValueError, TypeError, AttributeError, OverflowError) as error:
             index.close()
             if report.counts[REBUILT] or not _is_damage(path, error):
@@ -82,16 +92,18 @@ def _set_aside(path: Path) -> None:
         Path(f'{path}{suffix}').unlink(missing_ok=True)
 
 
-def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
+def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery, *, has_log: bool) -> None:
     """Make index and tree agree and settle dead sessions."""
     _follow_rows(tree, index, now_ns, report)
-    _remove_parts(tree, index, report)
+    _settle_parts(tree, index, report, adopt=_went_back(tree, index, has_log=has_log))
     Adoption(tree, index, now_ns, report).run()
     for session in index.sessions(ended=False):
         if _is_dead(tree, session):
             _settle_session(index, session, now_ns, report)
+    for session in set(tree.sessions()).difference(index.sessions(ended=False)):
+        if _is_dead(tree, session):
             tree.remove(tree.session(session))
-    for sentence in imbalances(of_index(index, '')):  # a value in it that is none shows here
+    for sentence in imbalances(of_index(index, '')) or plausible.uncounted(index.db):
         log.error('the ledger of %s does not close, its index was damaged: %s', tree.root, sentence)
         report.counts['sums of the ledger that do not close'] += 1
     tree.prune()
@@ -124,6 +136,7 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
                 report.counts['quarantined files to be tried again'] += 1
             elif found != path and tree.place(found, path):
                 where = path
+                renew(index, row['id'], path)  # a part may say what it was, or what it was about to become
                 report.counts['renames completed'] += 1
         if state is not State.QUARANTINED and tree.size(where) not in {row['bytes'], None}:
             damaged.append((row, where))
@@ -136,15 +149,21 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
         report.counts['files damaged'] += 1
 
 
-def _remove_parts(tree: Tree, index: Index, report: Recovery) -> None:
-    """Parts without a row were never committed; but a new index cannot know that, and what they say of themselves counts."""
-    is_new = not index.sessions(ended=True) and not index.sessions(ended=False)
+def _went_back(tree: Tree, index: Index, *, has_log: bool) -> bool:
+    """Whether commits may have been lost with the index, or with the log beside it."""
+    dead = [session for session in index.sessions(ended=False) if _is_dead(tree, session)]
+    known = {*index.sessions(ended=False), *index.sessions(ended=True)}
+    return not known or not known.issuperset(tree.sessions()) or (bool(dead) and not has_log)
+
+
+def _settle_parts(tree: Tree, index: Index, report: Recovery, *, adopt: bool) -> None:
+    """Parts without a row are removed, or go where they say that they belong."""
     # Inside a transaction: another process that is about to commit a part of its own holds the write lock.
     with index.transaction():
         for number, part in tree.parts():
             if index.rows(f'id = ? AND {_IN_SPOOL}', (number,)):
                 continue
-            place = place_said(tree, part) if is_new else None
+            place = place_said(tree, part) if adopt else None
             if place is None or not tree.place(part, place):
                 tree.remove(part)
                 report.counts['uncommitted parts removed'] += 1

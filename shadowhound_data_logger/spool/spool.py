@@ -22,11 +22,13 @@ from typing import Final
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.keys import check_key, unique
-from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
+from shadowhound_data_logger.keys import check_key
+from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, SpooledObject, State
+from shadowhound_data_logger.spool import binding
 from shadowhound_data_logger.spool.accounts import Accounts, Snapshot
 from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.ballast import Ballast
+from shadowhound_data_logger.spool.binding import free_key
 from shadowhound_data_logger.spool.files import Tree, description, flock
 from shadowhound_data_logger.spool.index import Index, spooled
 from shadowhound_data_logger.spool.piles import Piles, look
@@ -131,9 +133,21 @@ class Spool:
             if row['id'] not in exclude and len(found) < limit:
                 number, bucket, key = row['id'], row['bucket'], row['key']
                 placed = self._tree.part(number) not in parts
-                path = self._tree.path(State.PENDING, None, bucket, key) if placed else self._where(number, bucket, key)
+                path = self._tree.path(State.PENDING, None, bucket, key) if placed else self._tree.waiting(number, bucket, key)
                 found.append(spooled(row, path))
         return found
+
+    def held(self, reason: str, limit: int = 256) -> list[HeldObject]:
+        """What has no final name yet for this reason, the oldest first; waits for no commit. Raises sqlite3.Error."""
+        return binding.held(self._view, reason, limit)
+
+    def bind(self, bindings: Sequence[Binding]) -> list[SpooledObject]:
+        """Give held objects their final (made unique) keys, all or none; returns those that may be shipped now.
+
+        What is not held any more is left out. Raises NameRefused, OSError or sqlite3.OperationalError when nothing was bound.
+        """
+        with self._lock:
+            return self._ballast.work(lambda: binding.bind(self._index, self._tree, bindings, self._clock.wall_ns()))
 
     def pending_count(self) -> int:
         """Waits for no commit."""
@@ -223,7 +237,7 @@ class Spool:
         state, reason = (State.HELD, item.held) if item.held else (State.PENDING, None)
         if not fits and not item.protected:
             state, reason = State.EVICTED, NO_ROOM
-        key = self._free_key(item.bucket, check_key(item.key))
+        key = free_key(self._index, item.bucket, check_key(item.key))
         sha256 = hashlib.sha256(item.body).hexdigest()
         metadata = {**item.metadata, 'sha256': sha256}
         number = self._index.insert(item, key, sha256, state, reason, metadata, now_ns)
@@ -233,13 +247,6 @@ class Spool:
             path = self._tree.path(state, reason, item.bucket, key)
         return SpooledObject(number, item.bucket, key, path, len(item.body), sha256, item.content_type, metadata,
                              item.priority, now_ns), state  # fmt: skip
-
-    def _free_key(self, bucket: str, wanted: str) -> str:
-        """The wanted key or the first of its ``_1``, ``_2``, ... that was never given out (D7)."""
-        attempt = 0
-        while self._index.has(bucket, key := unique(wanted, attempt)):
-            attempt += 1
-        return key
 
     def _discard(self, added: Iterable[tuple[SpooledObject, State]]) -> None:
         """Remove the parts of a transaction that is rolled back: on a full disk they would keep it full."""
@@ -251,31 +258,24 @@ class Spool:
         pending: list[SpooledObject] = []
         for item, state in added:
             if state is State.PENDING:
-                pending.append(replace(item, path=self._where(item.id, item.bucket, item.key)))
+                pending.append(replace(item, path=self._tree.waiting(item.id, item.bucket, item.key)))
             elif state is not State.EVICTED:
                 self._tree.place(self._tree.part(item.id), item.path)
         return pending
-
-    def _where(self, number: int, bucket: str, key: str) -> Path:
-        """The file of a pending object, placed if it was not yet; the part where its place is barred."""
-        path, part = self._tree.path(State.PENDING, None, bucket, key), self._tree.part(number)
-        if not os.path.isfile(path) and not self._tree.place(part, path) and os.path.exists(part):  # noqa: PTH110, PTH113 - these never raise
-            return part
-        return path
 
     def _settle(self, outcomes: Iterable[Outcome]) -> None:
         """Let the files follow their rows."""
         for outcome in outcomes:
             item = outcome.item
             if outcome.state is State.QUARANTINED:
-                source = self._where(item.id, item.bucket, item.key)
+                source = self._tree.waiting(item.id, item.bucket, item.key)
                 self._tree.place(source, self._tree.path(outcome.state, outcome.reason, item.bucket, item.key))
             elif outcome.state in _LEFT and not self._tree.remove(item.path):
-                self._tree.remove(self._where(item.id, item.bucket, item.key))
+                self._tree.remove(self._tree.waiting(item.id, item.bucket, item.key))
 
     def _forget(self, now_ns: int) -> None:
         """Once an hour, drop rows of deliveries that nobody will ask for any more."""
-        if now_ns - self._forgot_ns > 3600 * SECOND and now_ns > EARLIEST_SANE_NS:
+        if not 0 <= now_ns - self._forgot_ns < 3600 * SECOND and now_ns > EARLIEST_SANE_NS:
             done = self._index.forget(now_ns - round(self._settings.remember_days * DAY_NS))
             self._forgot_ns = now_ns if done else 0
 

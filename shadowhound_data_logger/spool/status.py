@@ -28,19 +28,23 @@ FINE_STORE: Final = frozenset({'idle', 'shipping', 'not_draining'})
 NAMED: Final = 3
 """Topics that a finding names; the figures of the others stand in the table."""
 _TOPIC: Final[dict[str, Any]] = {
-    'sensor': '', 'type': '', 'enabled': True, 'publishers': 0, 'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
+    'sensor': '', 'type': '', 'enabled': True, 'publishers': 0, 'matched': 0, 'may_be_silent': False, 'unavailable': '',
+    'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
     'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': None, 'open': 0, 'accounting': 'received-only',
 }  # fmt: skip
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
-    'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'max_messages': 0, 'max_bytes': 0},
+    'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
     'spool': {'path': '', 'pending': 0, 'held': 0, 'quarantined': 0, 'bytes': 0, 'max_bytes': None, 'free_bytes': None,
               'oldest_age_s': None},
     'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
               'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
 }  # fmt: skip
-_WORKER: Final[dict[str, Any]] = {'failing': False, 'failures': 0, 'last_error': ''}
+_WORKER: Final[dict[str, Any]] = {
+    'alive': True, 'failing': False, 'failures': 0, 'deaths': 0, 'last_error': '', 'busy_s': 0.0, 'patience_s': None,
+}  # fmt: skip
 _HEAD: Final[dict[str, Any]] = {
     'version': '', 'pid': 0, 'boot_id': '', 'boot_ns': 0, 'time': '', 'uptime_s': 0.0, 'paused': False, 'ended': False,
+    'stalls': {},
 }  # fmt: skip
 
 
@@ -145,6 +149,7 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
         yield f'delivery: {str(store["state"]).replace("_", " ")}'
     yield from (f'bucket {name} takes nothing: {reason}' for name, reason in store['blocked_buckets'].items())
     yield from (f'{name} fails: {row["last_error"]}' for name, row in found['workers'].items() if row['failing'])
+    yield from (f'{name}: {text}' for name, text in found['stalls'].items())
     for what in ('missed', 'dropped', 'rejected'):
         lost = {topic: row[what] for topic, row in found['topics'].items() if row[what]}
         if lost:

@@ -15,7 +15,9 @@ from typing import Any
 
 from spool.making import make, new_spool, put, receive
 
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.model import Binding, State
+from shadowhound_data_logger.spool.files import Tree
+from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Outcome
 
 TEST = Path(__file__).parents[1]
@@ -74,7 +76,37 @@ def load(root: Path) -> None:
         say(settled=[outcome.item.key for outcome in outcomes])
 
 
-VERBS: dict[str, Callable[..., None]] = {'hold': hold, 'add': add, 'load': load}
+def die(root: Path, moment: str) -> None:
+    """End without warning in a commit: before it is one, or before its files have their names."""
+    spool = new_spool(root)
+    spool.open()
+    put(spool, make('thor/whole.jpg', b'whole'))
+    if moment == 'checkpointed':
+        spool._index.db.execute('PRAGMA wal_checkpoint(PASSIVE)')
+    step = 'sync_incoming' if moment == 'uncommitted' else 'place'
+    setattr(Tree, step, lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+    put(spool, make('thor/a.jpg', b'a'), make('thor/b.jpg', b'b', held='clock'))
+
+
+def bind(root: Path, moment: str) -> None:
+    """End without warning while two held objects get their final names."""
+    spool = new_spool(root)
+    spool.open()
+    put(spool, *(make(f'thor/provisional/{name}', name.encode(), held='clock') for name in 'ab'))
+    owner, step = {'renamed': (Tree, 'sync_incoming'), 'synced': (Index, 'transaction'), 'bound': (Tree, 'waiting')}[moment]
+    work = getattr(owner, step)
+
+    @contextmanager
+    def to_the_end(index: Index, undo: Callable[[], None]) -> Iterator[object]:
+        with work(index, undo) as db:
+            yield db
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    setattr(owner, step, to_the_end if moment == 'synced' else lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+    spool.bind([Binding(item.id, f'thor/final/{item.key[-1]}', {'bound': 'yes'}, 5, 6) for item in spool.held('clock')])
+
+
+VERBS: dict[str, Callable[..., None]] = {'hold': hold, 'add': add, 'load': load, 'die': die, 'bind': bind}
 
 if __name__ == '__main__':
     VERBS[sys.argv[1]](Path(sys.argv[2]), *sys.argv[3:])

@@ -124,9 +124,9 @@ def _damage(rotten: Rotten, path: Path, rng: random.Random) -> None:
     if not path.is_file():
         return
     payload = not path.name.startswith('index')
-    if path.name == 'index.db-wal':  # what was committed last is known to the log alone, and its file not in its place yet
-        rotten.touched.add('thor/part.jpg')
     damage = rng.choice((*DAMAGES, _empty_folder) if payload else DAMAGES)
+    if path.name == 'index.db-wal' and damage is not _delete:  # then nobody sees that there was a commit of what has no name yet
+        rotten.touched.add('thor/part.jpg')
     before = path.read_bytes()
     damage(rng, path)
     if before in rotten.planted:
@@ -157,8 +157,6 @@ def _lose(rotten: Rotten, rng: random.Random) -> None:
     """Whole folders, all of the index, or all that knows of the sessions."""
     for name in rng.choice(LOSSES):
         path = rotten.root / name
-        if name == 'index.db-wal':
-            rotten.touched.add('thor/part.jpg')
         if path.is_dir():
             rotten.touched |= {_key(found) for found in path.rglob('*')}
             rotten.planted -= {found.read_bytes() for found in path.rglob('*') if found.is_file()}

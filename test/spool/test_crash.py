@@ -5,64 +5,17 @@ from __future__ import annotations
 import hashlib
 import json
 import random
-import shutil
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import pytest
 from spool.child import started
-from spool.conftest import Open
+from spool.conftest import Moments, Open
 from spool.making import BUCKET, abandon, assert_whole, files, make, new_spool, put, receive, rows, settle
 
 from shadowhound_data_logger.model import Outcome, State
 from shadowhound_data_logger.spool.spool import Spool
-
-CALLS = frozenset({
-    'open', 'write', 'flush', 'fsync', 'replace', 'unlink', 'mkdir', 'rmdir', 'setxattr', 'flock', 'close', 'execute',
-    'executemany', 'executescript',
-})  # fmt: skip
-"""Built-in functions that change a spool, or stand between two that do."""
-Moments = Callable[[Callable[[], None]], list[Path]]
-
-
-@pytest.fixture
-def moments(root: Path, tmp_path: Path) -> Moments:
-    """Copies of the spool as a kill at each moment of a work would leave it: before each call to the system that changes it.
-
-    What the kernel has been told survives a killed process, and nothing else; so the copies are made while it works. The last
-    one is that of a process that lived to the end.
-    """
-
-    def copies(work: Callable[[], None]) -> list[Path]:
-        out = tmp_path / 'moments'
-        made: list[Path] = []
-        before: dict[str, bytes] = {}
-
-        def look() -> None:
-            nonlocal before
-            now = {str(path): path.read_bytes() for path in root.rglob('*') if path.is_file() and path.suffix != '.db-shm'}
-            if now != before:
-                before = now
-                made.append(Path(shutil.copytree(root, out / f'{len(made):03d}')))
-
-        def watch(_: FrameType, event: str, called: Any) -> None:
-            if event == 'c_call' and called.__name__ in CALLS:
-                look()
-
-        sys.setprofile(watch)
-        try:
-            work()
-        finally:
-            sys.setprofile(None)
-        look()
-        assert len(made) > 12
-        return made
-
-    return copies
 
 
 def reopened(root: Path) -> Spool:

@@ -17,6 +17,7 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import adoption
 from shadowhound_data_logger.spool import files as files_module
+from shadowhound_data_logger.spool.schema import SCHEMA_VERSION
 from shadowhound_data_logger.spool.spool import Spool
 
 
@@ -141,9 +142,9 @@ def use(spool: Spool, number: int) -> None:
 def test_an_index_of_a_newer_version(opened: Open, root: Path, used: dict[str, bytes]) -> None:
     """A newer program's index is refused and left as it is."""
     with sqlite3.connect(root / 'index.db') as connection:
-        connection.execute('PRAGMA user_version = 2')
+        connection.executescript(f'CREATE TABLE newer (id); PRAGMA user_version = {SCHEMA_VERSION + 1}')
     connection.close()
-    with pytest.raises(SpoolError, match=r'version 2.*update shadowhound_data_logger'):
+    with pytest.raises(SpoolError, match=rf'version {SCHEMA_VERSION + 1}.*update shadowhound_data_logger'):
         opened()
     assert not (root / 'index.db.damaged-1').exists()
     assert files(root) == used

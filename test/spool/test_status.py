@@ -155,6 +155,7 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
         ({'store': {'blocked_buckets': {'maps': 'there is none'}}}, 'bucket maps takes nothing: there is none'),
         ({'workers': {'intake': {'failing': True, 'last_error': 'OSError: 5'}}}, 'intake fails: OSError: 5'),
         ({'paused': True}, 'the node is paused: nothing is logged'),
+        ({'stalls': {'/imu': 'silent for 7 s'}}, '/imu: silent for 7 s'),
     ],
 )
 def test_what_somebody_should_look_at(tmp_path: Path, changes: dict[str, Any], finding: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from spool.making import assert_whole, make, receive, rows
@@ -14,7 +15,7 @@ from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.spool import writer as writer_module
 from shadowhound_data_logger.spool.spool import Outcome, Spool
-from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.spool.writer import MANY_OUTCOMES, SpoolWriter
 
 
 @pytest.fixture
@@ -71,6 +72,47 @@ def test_objects_share_commits(opened: Callable[..., SpoolWriter], spool: Spool,
     assert writing.flush(10)
     assert sum(commits) == 51
     assert len(commits) <= 3
+
+
+@pytest.mark.parametrize(('prompt', 'count', 'commits_alone'), [(False, 1, False), (True, 1, True), (False, MANY_OUTCOMES, True)])
+def test_outcomes_wait_for_an_object(
+    opened: Callable[..., SpoolWriter],
+    spool: Spool,
+    monkeypatch: pytest.MonkeyPatch,
+    prompt: bool,
+    count: int,
+    commits_alone: bool,
+) -> None:
+    """A few outcomes share the next object's commit, unless somebody waits for them; many have one of their own."""
+    monkeypatch.setattr(writer_module, 'HEARTBEAT_S', 60.0)
+    items = spool.commit([make(f'{number}', topic=None) for number in range(count)])
+    settled = threading.Event()
+    writing = opened(settled=lambda _: settled.set())
+    writing.prompt = prompt
+    writing.settle([Outcome(item, State.DELIVERED) for item in items])
+    assert settled.wait(10.0 if commits_alone else 0.1) is commits_alone
+    writing.put(make('next', topic=None))
+    assert settled.wait(10.0)
+
+
+def test_a_thread_that_dies_in_a_commit(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
+                                        monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """All that was to be committed is committed by the next round, once."""
+    monkeypatch.setattr(worker, 'FIRST_PAUSE_S', 0.001)
+    deaths, commit = [SystemExit(1), MemoryError()], spool.commit
+
+    def dying(*given: Any, **told: Any) -> list[SpooledObject]:
+        if deaths:
+            raise deaths.pop()
+        return commit(*given, **told)
+
+    monkeypatch.setattr(spool, 'commit', dying)
+    writing = opened()
+    receive(spool)
+    writing.put(make())
+    assert writing.flush(10)
+    assert writing.worker.failures == 2
+    assert assert_whole(root)['objects']['pending'] == 1
 
 
 def test_outcomes_are_durable_before_they_are_told(opened: Callable[..., SpoolWriter], spool: Spool, root: Path) -> None:

@@ -1,0 +1,116 @@
+"""Binding: what is held gets its final name, and may be shipped from then on (D5).
+
+All of it is one step in the index. Before its transaction ends the files lie as ``incoming/<id>.part`` and describe themselves as
+what they become, so that a death leaves them where recovery looks for the file of any row: it puts back what was not
+committed, and gives its final name to what was.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.keys import check_key, unique
+from shadowhound_data_logger.model import Binding, HeldObject, SpooledObject, State
+from shadowhound_data_logger.spool.files import Tree, describe
+from shadowhound_data_logger.spool.index import Index, spooled
+
+
+def held(index: Index, reason: str, limit: int) -> list[HeldObject]:
+    """What is held for this reason, the oldest first."""
+    rows = index.db.execute(
+        "SELECT id, bucket, key, metadata, t_start_ns, t_end_ns, created_ns FROM objects WHERE state = 'held' AND reason = ?"
+        ' ORDER BY id LIMIT ?', (reason, limit),
+    )  # fmt: skip
+    return [HeldObject(number, bucket, key, json.loads(metadata), start_ns, end_ns, created_ns)
+            for number, bucket, key, metadata, start_ns, end_ns, created_ns in rows]  # fmt: skip
+
+
+def bind(index: Index, tree: Tree, bindings: Sequence[Binding], now_ns: int) -> list[SpooledObject]:
+    """Make what is still held pending under its final key. The caller holds the spool's lock.
+
+    An object that is not held any more (evicted meanwhile, bound by another process) is left out.
+    Raises NameRefused for a key that cannot be one, OSError or sqlite3.OperationalError when nothing was bound.
+    """
+    for binding in bindings:
+        check_key(binding.key)
+    before: list[sqlite3.Row] = []
+    with index.transaction(undo=lambda: _put_back(tree, before)):
+        for binding in bindings:
+            row = _row(index, binding.id)
+            if row is not None and row['state'] == State.HELD.value and _to_part(tree, row):
+                before.append(row)
+                _change(index, row, binding, now_ns)
+                renew(index, row['id'], tree.part(row['id']))
+        if before:
+            tree.sync_incoming()
+    bound = [row for old in before if (row := _row(index, old['id'])) is not None]
+    return [spooled(row, tree.waiting(row['id'], row['bucket'], row['key'])) for row in bound]
+
+
+def renew(index: Index, number: int, path: Path) -> None:
+    """Have a file say what its row says now. A file that is gone says nothing; raises OSError when the disk fails."""
+    row = _row(index, number)
+    if row is not None:
+        _describe(path, row)
+
+
+def free_key(index: Index, bucket: str, wanted: str, own: str | None = None) -> str:
+    """The wanted key or the first of its ``_1``, ``_2``, ... that was never given out (D7), or is the object's ``own``."""
+    attempt = 0
+    while index.has(bucket, key := unique(wanted, attempt)) and key != own:
+        attempt += 1
+    return key
+
+
+def _row(index: Index, number: int) -> sqlite3.Row | None:
+    cursor = index.db.execute('SELECT * FROM objects WHERE id = ?', (number,))
+    cursor.row_factory = sqlite3.Row
+    row: sqlite3.Row | None = cursor.fetchone()
+    return row
+
+
+def _to_part(tree: Tree, row: sqlite3.Row) -> bool:
+    """Whether a held file does not lie under its provisional name any more. One that is gone is the uploader's to notice."""
+    path = _held_path(tree, row)
+    return tree.place(path, tree.part(row['id'])) or tree.size(path) is None
+
+
+def _held_path(tree: Tree, row: sqlite3.Row) -> Path:
+    return tree.path(State.HELD, row['reason'], row['bucket'], row['key'])
+
+
+def _change(index: Index, row: sqlite3.Row, binding: Binding, now_ns: int) -> None:
+    key = free_key(index, row['bucket'], binding.key, row['key'])
+    metadata = {**binding.metadata, 'sha256': row['sha256']}
+    created_ns = row['created_ns']
+    if created_ns < EARLIEST_SANE_NS <= now_ns:  # spooled before the clock was set: for how long it waits is told from this
+        created_ns = binding.t_end_ns if EARLIEST_SANE_NS <= binding.t_end_ns <= now_ns else now_ns
+    index.db.execute(
+        "UPDATE objects SET state = 'pending', reason = NULL, key = ?, metadata = ?, t_start_ns = ?, t_end_ns = ?, created_ns = ?"
+        ' WHERE id = ?', (key, json.dumps(metadata), binding.t_start_ns, binding.t_end_ns, created_ns, row['id']),
+    )  # fmt: skip
+
+
+def _put_back(tree: Tree, before: Sequence[sqlite3.Row]) -> None:
+    """After a failure, with the transaction still open. What fails here as well is found in its part."""
+    for row in before:
+        with suppress(OSError):
+            _describe(tree.part(row['id']), row)
+        tree.place(tree.part(row['id']), _held_path(tree, row))
+
+
+def _describe(path: Path, row: sqlite3.Row) -> None:
+    said: Mapping[str, object] = {
+        'bucket': row['bucket'], 'key': row['key'], 'sha256': row['sha256'], 'content_type': row['content_type'],
+        'sensor': row['sensor'], 'topic': row['topic'], 'type': row['type'], 'samples': row['samples'],
+        't_start_ns': row['t_start_ns'], 't_end_ns': row['t_end_ns'], 'priority': row['priority'],
+        'protected': bool(row['protected']), 'held': row['reason'] if row['state'] == State.HELD.value else None,
+        'metadata': json.loads(row['metadata']),
+    }  # fmt: skip
+    with suppress(FileNotFoundError):
+        describe(path, said)

@@ -1,0 +1,208 @@
+"""Held objects get their final name at once or not at all, whatever happens in between, and only once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from spool.child import started
+from spool.conftest import Moments, Open
+from spool.making import BUCKET, NOON_NS, READY, FakeClock, assert_whole, files, make, new_spool, put, rows, settle
+
+from shadowhound_data_logger.errors import NameRefused
+from shadowhound_data_logger.model import Binding, State
+from shadowhound_data_logger.spool.files import Tree, description_of
+from shadowhound_data_logger.spool.spool import Spool
+
+HELD = f'held/clock/{BUCKET}'
+
+
+def hold(spool: Spool, *names: str, **fields: Any) -> list[Binding]:
+    """Spool held objects; returns what they are to become."""
+    put(spool, *(make(f'thor/provisional/{name}', name.encode(), **{'held': 'clock', **fields}) for name in names))
+    return [final(item.id, item.key.rpartition('/')[2]) for item in spool.held('clock')]
+
+
+def final(number: int, name: str) -> Binding:
+    return Binding(number, f'thor/final/{name}', {'bound': 'yes'}, NOON_NS + 5, NOON_NS + 6)
+
+
+def test_held_objects_are_told_oldest_first(spool: Spool) -> None:
+    """Those of one reason, as many as are asked for, with all that a binding is made from."""
+    put(spool, *(make(f'k/{name}', held='clock', metadata={'name': name}) for name in 'cab'))
+    put(spool, make('k/other', held='mission-7'), make('k/free'))
+    one, two = spool.held('clock', 2)
+    assert [one.key, two.key] == ['k/c', 'k/a']
+    assert (one.bucket, one.metadata['name'], one.t_start_ns, one.t_end_ns, one.created_ns) == (BUCKET, 'c', *[NOON_NS] * 3)
+    assert [item.key for item in spool.held('mission-7')] == ['k/other']
+
+
+def test_a_bound_object_is_pending_under_its_final_name(spool: Spool, root: Path) -> None:
+    """Row, file and what the file says of itself are those of the final name; content and its checksum stay."""
+    (binding,) = hold(spool, 'a')
+    (item,) = spool.bind([binding])
+    assert (item.key, item.path, item.path.read_bytes()) == ('thor/final/a', root / READY / 'thor/final/a', b'a')
+    assert item.metadata == {'bound': 'yes', 'sha256': item.sha256}
+    assert spool.pending(9) == [item]
+    (row,) = rows(root)
+    said = description_of(item.path)
+    for found in (row, said):
+        assert (found['key'], found['t_start_ns'], found['t_end_ns']) == (item.key, NOON_NS + 5, NOON_NS + 6)
+    assert (said['held'], said['metadata']) == (None, item.metadata)
+    assert spool.held('clock') == []
+    assert assert_whole(root)['objects']['pending'] == 1
+
+
+def test_what_is_bound_counts_as_before(spool: Spool, root: Path) -> None:
+    """The ledger closes in between, and the samples of a bound object are delivered in the end."""
+    bindings = hold(spool, 'a', 'b', 'c')
+    items = spool.bind(bindings[:2])
+    assert assert_whole(root)['topics']['/camera']['stored_in']['held'] == 1
+    settle(spool, items[0], State.DELIVERED)
+    stored = assert_whole(root)['topics']['/camera']['stored_in']
+    assert (stored['held'], stored['pending'], stored['delivered']) == (1, 1, 1)
+
+
+def test_final_names_are_unique(spool: Spool) -> None:
+    """A name that was given out, in the same call as well, is numbered; an object may keep the name that it has."""
+    put(spool, make('thor/final/a'))
+    one, two, three = hold(spool, 'a', 'b', 'c')
+    same = Binding(two.id, 'thor/final/a', {}, 1, 2)
+    stays = Binding(three.id, 'thor/provisional/c', {}, 1, 2)
+    assert [item.key for item in spool.bind([one, same, stays])] == ['thor/final/a_1', 'thor/final/a_2', 'thor/provisional/c']
+
+
+def test_what_is_not_held_any_more_is_left_out(spool: Spool, opened: Open, root: Path) -> None:
+    """A second binding of an object, by another process say, changes nothing; nor does one of an object that left."""
+    bindings = hold(spool, 'a', 'b')
+    (done,) = opened().bind(bindings[:1])
+    settle(spool, done, State.DELIVERED)
+    again = spool.bind([final(bindings[0].id, 'x'), bindings[1], final(99, 'y')])
+    assert [item.key for item in again] == ['thor/final/b']
+    assert {row['key']: row['state'] for row in rows(root)} == {'thor/final/a': 'delivered', 'thor/final/b': 'pending'}
+    assert_whole(root)
+
+
+def test_a_name_that_can_be_none_binds_nothing(spool: Spool, root: Path) -> None:
+    """One refused name leaves all objects as they were."""
+    one, two = hold(spool, 'a', 'b')
+    before = files(root)
+    with pytest.raises(NameRefused):
+        spool.bind([one, Binding(two.id, '../b', {}, 1, 2)])
+    assert files(root) == before
+    assert assert_whole(root)['objects']['held'] == 2
+
+
+def test_a_failing_disk_binds_nothing(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows, files and descriptions are as before, and the next try succeeds."""
+    bindings = hold(spool, 'a', 'b')
+    before = files(root)
+
+    def fails(_: Tree) -> None:
+        raise OSError(5, 'Input/output error')
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Tree, 'sync_incoming', fails)
+        with pytest.raises(OSError, match='Input/output'):
+            spool.bind(bindings)
+    assert files(root) == before
+    said = description_of(root / HELD / 'thor/provisional/a')
+    assert (said['key'], said['held']) == ('thor/provisional/a', 'clock')
+    assert_whole(root)
+    assert len(spool.bind(bindings)) == 2
+    assert_whole(root)
+
+
+def test_a_file_that_is_gone_does_not_hold_up_the_others(spool: Spool, root: Path) -> None:
+    """It is bound like any other, so that delivery finds that it is missing."""
+    bindings = hold(spool, 'a', 'b')
+    (root / HELD / 'thor/provisional/a').unlink()
+    assert [item.path.exists() for item in spool.bind(bindings)] == [False, True]
+    assert spool.held('clock') == []
+
+
+def test_how_long_it_waits_is_told_from_a_clock_that_is_set(spool: Spool, root: Path, clock: FakeClock) -> None:
+    """An object of 1970 waits since its own end, once that is known, and not for half a century."""
+    clock.now_ns = 60
+    bindings = hold(spool, 'a')
+    clock.now_ns = NOON_NS + 10
+    spool.bind(bindings)
+    assert rows(root)[0]['created_ns'] == NOON_NS + 6
+
+
+@pytest.mark.parametrize(('moment', 'state'), [('renamed', 'held'), ('synced', 'held'), ('bound', 'pending')])
+@pytest.mark.parametrize('index', ['kept', 'lost'])
+def test_killed_between_two_steps(opened: Open, root: Path, moment: str, state: str, index: str) -> None:
+    """Until it is committed all are held, from then on all are bound: rows, files and descriptions agree after the next start."""
+    with started('bind', root, moment) as child:
+        assert child.wait(30) == -9
+    assert sorted(name.split('/')[0] for name in files(root)) == ['incoming', 'incoming']
+    opened().close()
+    if index == 'lost':
+        for path in root.glob('index.db*'):
+            path.unlink()
+    spool = opened()
+    folder = 'provisional' if state == 'held' else 'final'
+    expected = {f'thor/{folder}/{name}' for name in 'ab'}
+    assert {row['key'] for row in rows(root)} == expected
+    for row in rows(root):
+        assert (row['state'], row['reason']) == (state, 'clock' if state == 'held' else None)
+        assert row['t_start_ns'] == (NOON_NS if state == 'held' else 5)
+        assert ('bound' in row['metadata']) is (state == 'pending')
+    assert_whole(root)
+    spool.bind([final(item.id, item.key[-1]) for item in spool.held('clock')])
+    assert {item.key for item in spool.pending(9)} == {'thor/final/a', 'thor/final/b'}
+
+
+def test_death_at_any_moment_of_a_binding(root: Path, moments: Moments) -> None:
+    """Objects are bound all or none; what is left can be bound and delivered, and the ledger closes."""
+    spool = new_spool(root)
+    spool.open()
+    hold(spool, 'a', 'b', 'c')
+    spool.close()
+
+    def work() -> None:
+        spool = new_spool(root)
+        spool.open()
+        spool.bind([final(item.id, item.key[-1]) for item in spool.held('clock')])
+        spool.close()
+
+    seen = []
+    for copy in moments(work):
+        spool = new_spool(copy)
+        spool.open()
+        assert_whole(copy)
+        bound = [row['state'] == 'pending' for row in rows(copy)]
+        seen.append(bound[0])
+        assert len(set(bound)) == 1
+        for row in rows(copy):
+            place = f'{READY}/thor/final/{row["key"][-1]}' if bound[0] else f'{HELD}/thor/provisional/{row["key"][-1]}'
+            said = description_of(copy / place)
+            assert (said['key'], said['t_start_ns'], said['held']) == (row['key'], row['t_start_ns'], row['reason'])
+        spool.bind([final(item.id, item.key[-1]) for item in spool.held('clock')])
+        for item in spool.pending(9):
+            assert item.path.read_bytes() == item.key[-1].encode()
+            settle(spool, item, State.DELIVERED)
+        assert assert_whole(copy)['objects']['delivered'] == 3
+        spool.close()
+    assert seen == sorted(seen)
+    assert set(seen) == {False, True}
+
+
+def test_a_binding_that_a_dead_process_began_is_gone_on_with(opened: Open, root: Path) -> None:
+    """Parts that a failing SQLite left in their place are bound by the next try, without a start in between."""
+    spool = opened()
+    bindings = hold(spool, 'a', 'b')
+    (root / HELD / 'thor/provisional/a').rename(root / f'incoming/{bindings[0].id}.part')
+    assert [item.path.read_bytes() for item in spool.bind(bindings)] == [b'a', b'b']
+    assert_whole(root)
+
+
+def test_what_is_held_is_found_without_looking_at_the_rest(spool: Spool) -> None:
+    """A hundred thousand delivered objects cost it nothing."""
+    asked: list[str] = []
+    spool._view.db.set_trace_callback(asked.append)
+    spool.held('clock')
+    plan = spool._index.db.execute(f'EXPLAIN QUERY PLAN {asked[0]}').fetchall()
+    assert [row[3] for row in plan] == ['SEARCH objects USING INDEX held (reason=?)']

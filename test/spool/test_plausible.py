@@ -1,0 +1,80 @@
+"""Values in an index that cannot be ours are found at the start, before they end it or lead out of the spool."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from spool import editing, rotting
+from spool.conftest import Open
+from spool.making import make, put, settle
+
+from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool import plausible
+
+ROUNDS = 40
+
+
+@pytest.fixture
+def index(opened: Open, root: Path) -> Path:
+    """Of a closed spool, with objects in every state and with the strangest names and times that are allowed."""
+    spool = opened()
+    strange = make("thor/a..b/!x_'(1)=+@-.jpg", bucket='Other_Bucket.1', t_start_ns=-1, t_end_ns=2**63 - 1, priority=0)
+    items = put(spool, strange, *(make(f'thor/{number}') for number in range(5)), make('thor/h', held='clock'))
+    for item, (state, reason) in zip(items, [(State.DELIVERED, None), (State.QUARANTINED, 'access_denied')], strict=False):
+        settle(spool, item, state, reason)
+    spool.close()
+    return root / 'index.db'
+
+
+def test_what_is_ours_is_not_doubted(index: Path) -> None:
+    """No value that the spool itself wrote is called impossible, and its totals are those of its objects."""
+    with closing(sqlite3.connect(index)) as db:
+        plausible.check(db)
+        assert list(plausible.uncounted(db)) == []
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        "accounts SET last_kept_ns = 'x'", 'accounts SET received = -1', "publishers SET last = x'00'",
+        "objects SET metadata = 'x'",
+        "objects SET key = '../../etc/passwd' WHERE id = 3", "objects SET key = '/etc/passwd' WHERE id = 3",
+        "objects SET reason = '../x' WHERE id = 2", "objects SET bucket = '..' WHERE id = 3", 'objects SET bytes = 1 << 60',
+        'sqlite_sequence SET seq = 9223372036854775807', "tally SET bytes = 'x'", "sessions SET ended_ns = 'x'",
+    ],
+)  # fmt: skip
+def test_what_cannot_be_ours_is_found(index: Path, opened: Open, change: str) -> None:
+    """The index is rebuilt from the files then, and the start works."""
+    with closing(sqlite3.connect(index)) as db:
+        db.execute(f'UPDATE {change}')
+        db.commit()
+        with pytest.raises(sqlite3.DatabaseError, match='cannot be'):
+            plausible.check(db)
+    assert opened().recovery.counts['damaged index rebuilt'] == 1
+
+
+def test_totals_of_other_objects_are_told(index: Path, opened: Open, caplog: pytest.LogCaptureFixture) -> None:
+    """An object that counts for another topic than its total says shows in no sum of today, and is said all the same."""
+    with closing(sqlite3.connect(index)) as db:
+        db.execute("UPDATE objects SET topic = '/other' WHERE key = 'thor/3'")
+        db.commit()
+        assert len(list(plausible.uncounted(db))) == 2
+    assert opened().recovery.counts['sums of the ledger that do not close'] == 2
+    assert '/other: pending None, but in the spool (1, 7, 1)' in caplog.text
+
+
+def test_random_edits(tmp_path: Path) -> None:
+    """Whatever is changed in an index, a start works, ships nothing else than what was spooled, and sums close or it is told."""
+    bodies = rotting.new_base(tmp_path / 'base')
+    for seed in range(ROUNDS):
+        done = editing.edit(tmp_path / 'base', tmp_path / 'edited', random.Random(seed))
+        try:
+            editing.check(tmp_path / 'edited', bodies)
+        except Exception as error:
+            raise AssertionError(f'seed {seed}: {done}') from error
+        shutil.rmtree(tmp_path / 'edited')
