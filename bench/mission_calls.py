@@ -60,7 +60,7 @@ def calls(home: Path, seconds: float) -> dict[str, list[float]]:
 def plain(uri: str) -> list[float]:
     """MLflow's own log_metric against the same server, Tower up."""
     os.environ |= ENVIRONMENT
-    from mlflow import MlflowClient
+    from mlflow import MlflowClient  # noqa: PLC0415 - the logger's own process must not load it
 
     client = MlflowClient(uri)
     run_id = client.create_run('0').info.run_id
@@ -72,7 +72,7 @@ def measure(options: argparse.Namespace) -> Report:
     options.folder.mkdir(parents=True, exist_ok=True)
     bars: list[Bar] = []
     figures: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory(dir=options.folder, ignore_cleanup_errors=True) as folder:
+    with tempfile.TemporaryDirectory(dir=options.folder, ignore_cleanup_errors=True) as folder:  # noqa: SIM117 - one is too long
         with Tower(Path(folder) / 'tower', mlflow=True) as tower, Wire(tower.tracking_uri) as wire:
             os.environ |= tower.environment() | {'MLFLOW_TRACKING_URI': wire.url}
             for name, mode in (('up', PASS), ('away', REFUSE), ('hung', HANG)):

@@ -28,8 +28,8 @@ BATCH: Final = 1000
 
 def alone(uri: str, points: int) -> float:
     """Points a second of MLflow's client with nothing around it."""
-    from mlflow import MlflowClient
-    from mlflow.entities import Metric
+    from mlflow import MlflowClient  # noqa: PLC0415 - after its environment is set
+    from mlflow.entities import Metric  # noqa: PLC0415
 
     client = MlflowClient(uri)
     run_id = client.create_run('0').info.run_id

@@ -70,3 +70,15 @@ class ObjectRefused(StoreError):
 
 class ForeignObject(StoreError):
     """The key holds other content already; it is never overwritten."""
+
+
+class TrackingError(DataLoggerError):
+    """Base of what the tracking server (MLflow) reports about a request."""
+
+
+class TrackingUnavailable(TrackingError):
+    """Transient, or nobody's mission's fault: away, overloaded, credentials refused. The same request may succeed later."""
+
+
+class TrackingRefused(TrackingError):
+    """Terminal for what was sent: the server will never take it."""

@@ -1,0 +1,70 @@
+"""The artifacts of a mission's run: which files they are, and how a file gets the name that it has there.
+
+trajectories/trajectory.csv   camera/frame_NNNNNN.jpg (a sample)   what the agent gave to log_artifact
+summary.json   events.jsonl (where there are any)   mission_command.txt (where it is longer than a param)
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from shadowhound_data_logger.missions import journal
+from shadowhound_data_logger.missions.folder import MissionFolder
+from shadowhound_data_logger.missions.story import Story
+from shadowhound_data_logger.missions.values import MAX_PARAM
+
+
+class Artifact(NamedTuple):
+    """A file of the mission's folder and what it is called among the run's artifacts."""
+
+    path: Path
+    name: str
+    folder: str = ''
+
+
+def artifacts_of(record: Mapping[str, Any], folder: MissionFolder, story: Story) -> Iterator[Artifact]:
+    """What belongs to a record of the journal, in the order in which it is sent; the summary last. Raises OSError."""
+    kind, files = record.get('k'), folder.files
+    if kind == 'start' and len(record['command']) > MAX_PARAM:
+        path = files / 'command'
+        path.write_text(record['command'], encoding='utf-8')
+        yield Artifact(path, 'mission_command.txt')
+    elif kind == 'frame' and record.get('artifact'):
+        yield Artifact(files / record['file'], f'frame_{record["id"]:06d}.jpg', 'camera')
+    elif kind == 'trajectory':
+        yield Artifact(files / record['file'], 'trajectory.csv', 'trajectories')
+    elif kind == 'artifact':
+        yield Artifact(files / record['file'], record['name'], record['folder'])
+    elif kind == 'end':
+        if story.counts['event']:
+            yield Artifact(_write_events(folder), 'events.jsonl')
+        yield Artifact(folder.summary, 'summary.json')
+
+
+def prepared(folder: MissionFolder, artifact: Artifact) -> Path:
+    """The same file under its own name, which MLflow takes from it. Raises FileNotFoundError for one that is gone."""
+    place = folder.files / 'sending'
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(mode=0o700)
+    try:
+        os.link(artifact.path, place / artifact.name)
+    except FileNotFoundError:
+        raise
+    except OSError:  # a file system without links
+        shutil.copyfile(artifact.path, place / artifact.name)
+    return place / artifact.name
+
+
+def _write_events(folder: MissionFolder) -> Path:
+    """All events of the mission, a line each."""
+    path = folder.files / 'events'
+    with path.open('w', encoding='utf-8') as file:
+        for line in journal.read(folder.journal):
+            if line.record and line.record.get('k') == 'event':
+                file.write(json.dumps({name: line.record[name] for name in ('t', 'name', 'data')}) + '\n')
+    return path

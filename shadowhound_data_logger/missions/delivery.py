@@ -1,0 +1,275 @@
+"""What one mission still owes to its receivers: MLflow's run, its artifacts, and the objects of the store.
+
+Each receiver has its own place in the journal, so that artifacts that cannot be stored hold up no metric. A place moves
+on after what lies before it has arrived; whatever is sent again after a crash changes nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import TrackingRefused
+from shadowhound_data_logger.missions import journal
+from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of, prepared
+from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped, write_json
+from shadowhound_data_logger.missions.objects import Item, Shelf, objects_of
+from shadowhound_data_logger.missions.story import KILLED, Point, Story
+from shadowhound_data_logger.missions.tracking import RUN_GONE, Tracking
+from shadowhound_data_logger.missions.values import MAX_KEYS, MAX_TAG
+
+log = logging.getLogger(__name__)
+
+MOST_POINTS: Final = 1000
+"""MLflow's limit of a batch."""
+ARTIFACTS_A_STEP: Final = 4
+OBJECTS_A_STEP: Final = 64
+BYTES_A_STEP: Final = 8 << 20
+Part = tuple[Sequence[Point], Mapping[str, str], Mapping[str, str]]
+
+
+@dataclass(slots=True)
+class Batch:
+    """What goes to the run in one request."""
+
+    end: int
+    points: list[Point] = field(default_factory=list)
+    params: dict[str, str] = field(default_factory=dict)
+    tags: dict[str, str] = field(default_factory=dict)
+    is_last: bool = False
+
+
+class Delivery:
+    """Life: New; ``track``, ``attach`` and ``shelve`` in turns, until ``sent.complete``. Not thread-safe.
+
+    The three do a bounded piece of work and say whether there was any. They raise TrackingError, SpoolError or OSError.
+    """
+
+    def __init__(self, folder: MissionFolder, tracking: Tracking, shelf: Shelf) -> None:
+        self.folder = folder
+        self.sent = folder.sent()
+        self.run: Run | None = folder.run()
+        self.story = Story()
+        self._tracking = tracking
+        self._shelf = shelf
+        self._told = 0  # up to here the story knows the journal
+        self._batch: Batch | None = None
+
+    def track(self) -> bool:
+        """Send the next batch of metrics; make the run first, end it after the last."""
+        self._recall()
+        if self.sent.ended:
+            return False
+        batch = self._batch = self._batch or self._next_batch()
+        if batch is None:
+            return self._end_abandoned()
+        run = self._run_of()
+        self._send(run, batch.points, batch.params, batch.tags)
+        if batch.is_last:
+            self._tracking.finish(
+                run.run_id, self.folder.mission_id, self.story.end['status'], int(self.story.end['t']) // 1_000_000
+            )
+        self._move(metrics=batch.end, ended=batch.is_last)
+        self._batch = None
+        return True
+
+    def attach(self) -> bool:
+        """Send the next artifacts."""
+        self._recall()
+        if self.run is None:
+            return False
+        done, end = 0, self.sent.artifacts
+        for line in self._lines(self.sent.artifacts):
+            for artifact in artifacts_of(line.record or {}, self.folder, self.story):
+                self._attach(self.run, artifact)
+                done += 1
+            end = line.end
+            if done >= ARTIFACTS_A_STEP:
+                break
+        return self._moved(artifacts=end)
+
+    def shelve(self, *, hold: bool = False) -> bool:
+        """Hand the next frames, trajectories and the summary to the spool; without a run only with ``hold``, to be held there."""
+        self._recall()
+        if self.run is not None and self.sent.held:
+            if not self._shelf.bind(self.folder.mission_id, self.run.run_id):
+                self._move(held=False)
+            return True
+        if self.run is None and not (hold and self.story.start):
+            return False
+        items: list[Item] = []
+        size, end = 0, self.sent.objects
+        for line in self._lines(self.sent.objects) if self.run else self._lines_before_a_run():
+            found = list(objects_of(line.record or {}, self.story.start, self.folder, self.run))
+            items += found
+            size += sum(len(item.content.body) for item in found)
+            end = line.end
+            if len(items) >= OBJECTS_A_STEP or size >= BYTES_A_STEP:
+                break
+        if self.run is None and items and not self.sent.held:
+            self._move(held=True)
+        self._shelf.add([item.content for item in items])
+        moved = self._moved(objects=end)
+        for item in items:
+            if item.is_done_with:
+                item.path.unlink(missing_ok=True)
+        return moved
+
+    def complete(self) -> bool:
+        """Whether everything has arrived; what was kept for sending goes then."""
+        if (
+            self.sent.ended
+            and not self.sent.held
+            and not self.sent.complete
+            and self.sent.artifacts == self.sent.objects == self.sent.metrics
+        ):
+            self._move(complete=True)
+            shutil.rmtree(self.folder.files, ignore_errors=True)
+        return self.sent.complete
+
+    def give_up(self, error: str) -> None:
+        """Say why nothing more of it can be sent; the next start tries again."""
+        self._move(error=error)
+
+    # -- the journal -----------------------------------------------------------------------------------------------
+
+    def _recall(self) -> None:
+        """After a restart: tell the story what was sent before."""
+        if self._told < self.sent.metrics:
+            for line in journal.read(self.folder.journal, self._told):
+                self.story.add(line.record)
+                self._told = line.end
+                if self._told >= self.sent.metrics:
+                    break
+
+    def _next_batch(self) -> Batch | None:
+        """The next records that are not sent."""
+        batch = Batch(self._told)
+        for line in journal.read(self.folder.journal, self._told):
+            batch.points += self.story.add(line.record)
+            self._told = batch.end = line.end
+            kind = (line.record or {}).get('k')
+            if kind == 'start':
+                batch.params |= self.story.params()
+                break
+            if kind == 'end':
+                batch.params |= self.story.final_params()
+                batch.tags |= _last_words(self.story)
+                batch.is_last = True
+                break
+            if len(batch.points) > MOST_POINTS - MAX_KEYS:
+                break
+        return batch if self._told > self.sent.metrics else None
+
+    def _end_abandoned(self) -> bool:
+        """Where the agent died in the middle, say so in its place; whether that was so."""
+        if not self.story.start or self.story.end:
+            return False
+        with journal.abandoned(self.folder.journal) as descriptor:
+            if descriptor is None or any(True for _ in journal.read(self.folder.journal, self._told)):
+                return descriptor is not None
+            error = 'the agent ended without ending its mission'
+            record = {'k': 'end', 't': self.story.last_ns, 'status': KILLED, 'success': False, 'by': 'replayer', 'error': error}
+            torn = journal.finish(self.folder.journal, descriptor, self._told, record)
+        cut = f', {torn} bytes of a record that was being written are cut off' if torn else ''
+        log.warning('mission %s: %s; it is closed as %s%s', self.folder.mission_id, error, KILLED, cut)
+        return True
+
+    def _lines(self, offset: int) -> Iterator[journal.Line]:
+        """As far as the run has everything, so that the story is known at the end."""
+        for line in journal.read(self.folder.journal, offset):
+            if line.end > self.sent.metrics:
+                return
+            if (line.record or {}).get('k') == 'end':
+                self._summarize()
+            yield line
+
+    def _lines_before_a_run(self) -> Iterator[journal.Line]:
+        """Up to the end, which needs the run for its summary."""
+        for line in journal.read(self.folder.journal, self.sent.objects):
+            if (line.record or {}).get('k') == 'end':
+                return
+            yield line
+
+    # -- the run ---------------------------------------------------------------------------------------------------
+
+    def _run_of(self) -> Run:
+        if self.run is None:
+            start = self.story.start
+            tags = {'mlflow.user': start['robot'], 'mlflow.source.name': 'shadowhound_data_logger'}
+            name = stamped(start['type'], int(start['t']))
+            run = self._tracking.run_of(self.folder.mission_id, name, int(start['t']) // 1_000_000, tags)
+            self.folder.set_run(run)
+            self.run = run
+        return self.run
+
+    def _send(self, run: Run, points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> None:
+        """Send; what the server refuses is found by halving, counted and left out."""
+        if not (points or params or tags):
+            return
+        try:
+            self._tracking.log(run.run_id, points, params, tags)
+        except TrackingRefused as error:
+            if error.data.get('code') == RUN_GONE:
+                raise
+            parts = _parts(points, params, tags)
+            for part in parts:
+                self._send(run, *part)
+            if not parts:
+                self._refuse(error)
+
+    def _refuse(self, error: Exception) -> None:
+        log.error('mission %s: %s', self.folder.mission_id, error)
+        self._move(refused=self.sent.refused + 1, error=str(error))
+
+    # -- artifacts -------------------------------------------------------------------------------------------------
+
+    def _attach(self, run: Run, artifact: Artifact) -> None:
+        """Send one file; that it is gone, or refused, is counted."""
+        try:
+            path = prepared(self.folder, artifact)
+        except FileNotFoundError as error:
+            self._refuse(error)
+            return
+        try:
+            self._tracking.artifact(run, path, artifact.folder)
+        except TrackingRefused as error:
+            self._refuse(error)
+
+    def _summarize(self) -> None:
+        """Once: artifact and object must be the same."""
+        assert self.run is not None
+        if not self.folder.summary.exists():
+            robot = self.story.start['robot']
+            write_json(self.folder.summary, self.story.summary(self.folder.mission_id, self.run, robot), durable=True)
+
+    # -- places ----------------------------------------------------------------------------------------------------
+
+    def _moved(self, **offset: int) -> bool:
+        """Move one place; False where it was there."""
+        if all(getattr(self.sent, name) == value for name, value in offset.items()):
+            return False
+        self._move(**offset)
+        return True
+
+    def _move(self, **changes: Any) -> None:
+        self.sent = replace(self.sent, **changes)
+        self.folder.set_sent(self.sent)
+
+
+def _parts(points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> list[Part]:
+    """What a batch that was refused is sent as; none for a single thing."""
+    if len(points) + len(params) + len(tags) <= 1:
+        return []
+    half = len(points) // 2
+    halves: list[Part] = [(points[:half], {}, {}), (points[half:], {}, {})]
+    singles: list[Part] = [([], {name: value}, {}) for name, value in params.items()]
+    return [*halves, *singles, *(([], {}, {name: value}) for name, value in tags.items())]
+
+
+def _last_words(story: Story) -> dict[str, str]:
+    error = story.end.get('error')
+    return {'shadowhound.error': str(error)[:MAX_TAG]} if error else {}

@@ -1,0 +1,157 @@
+"""The folder of a mission, ``$SHADOWHOUND_HOME/missions/<mission id>/``: where everything about it lies.
+
+    journal        what the agent logged (journal.py)
+    files/         copies of frames, trajectories and artifacts, until they are sent
+    run.json       the MLflow run, once there is one
+    sent.json      how far the replayer came
+    summary.json   what the mission was, once it is over
+
+Both ids find it: the folder has the mission's, ``run.json`` the run's.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.clock import utc
+from shadowhound_data_logger.errors import NameRefused
+from shadowhound_data_logger.keys import MAX_NAME_BYTES, check_name
+
+FOLDER: Final = 'missions'
+UNIQUE_BYTES: Final = 4
+"""Of the random end of a mission's id: another robot may begin a patrol in the same second."""
+_UNSAFE: Final = re.compile(r'[^A-Za-z0-9_.-]+')
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """The MLflow run of a mission."""
+
+    run_id: str
+    experiment_id: str
+    artifact_uri: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """How far a mission is sent: offsets in its journal, up to which each receiver has everything."""
+
+    metrics: int = 0
+    artifacts: int = 0
+    objects: int = 0
+    held: bool = False
+    """Whether the spool may hold some of its objects until there is a run."""
+    ended: bool = False
+    """Whether the run has its last state."""
+    complete: bool = False
+    refused: int = 0
+    """Things that the tracking server will never take."""
+    error: str = ''
+    """What was refused last."""
+
+
+@dataclass(frozen=True, slots=True)
+class MissionFolder:
+    """Paths and small files of one mission; no state of its own."""
+
+    path: Path
+
+    @property
+    def mission_id(self) -> str:
+        return self.path.name
+
+    @property
+    def journal(self) -> Path:
+        return self.path / 'journal'
+
+    @property
+    def files(self) -> Path:
+        return self.path / 'files'
+
+    @property
+    def summary(self) -> Path:
+        return self.path / 'summary.json'
+
+    def run(self) -> Run | None:
+        """The run, once the replayer made it."""
+        found = read_json(self.path / 'run.json')
+        try:
+            return Run(**{spec.name: str(found[spec.name]) for spec in fields(Run)})
+        except KeyError:
+            return None
+
+    def set_run(self, run: Run) -> None:
+        write_json(self.path / 'run.json', {**asdict(run), 'mission_id': self.mission_id}, durable=True)
+
+    def sent(self) -> Sent:
+        """From the beginning where nothing readable says otherwise: what is sent again changes nothing."""
+        found = read_json(self.path / 'sent.json')
+        try:
+            return Sent(**found)
+        except TypeError:
+            return Sent()
+
+    def set_sent(self, sent: Sent) -> None:
+        write_json(self.path / 'sent.json', asdict(sent), durable=sent.complete)
+
+
+def missions(home: Path) -> Iterator[MissionFolder]:
+    """All missions of a home, the newest last as far as their names tell. Raises OSError but for a missing folder."""
+    try:
+        names = sorted(entry.name for entry in os.scandir(home / FOLDER) if entry.is_dir() and not entry.name.startswith('.'))
+    except FileNotFoundError:
+        return
+    yield from (MissionFolder(home / FOLDER / name) for name in names)
+
+
+def safe_type(mission_type: str) -> str:
+    """The mission type as it stands in names: unchanged where it can, else the nearest that can."""
+    try:
+        return check_name(mission_type, 'the mission type')
+    except NameRefused:
+        return _UNSAFE.sub('_', mission_type).strip('_.-')[:MAX_NAME_BYTES].replace('..', '_') or 'mission'
+
+
+def stamped(mission_type: str, start_ns: int) -> str:
+    """The name of the run: ``<mission type>_YYYYMMDD_HHMMSS``, UTC."""
+    return f'{safe_type(mission_type)}_{utc(start_ns):%Y%m%d_%H%M%S}'
+
+
+def new_folder(home: Path, mission_type: str, start_ns: int) -> MissionFolder:
+    """Make the folder of a new mission, readable by its owner alone. Raises OSError."""
+    (home / FOLDER).mkdir(mode=0o700, parents=True, exist_ok=True)
+    while True:
+        folder = MissionFolder(home / FOLDER / f'{stamped(mission_type, start_ns)}_{secrets.token_hex(UNIQUE_BYTES)}')
+        try:
+            folder.path.mkdir(mode=0o700)
+        except FileExistsError:
+            continue
+        folder.files.mkdir(mode=0o700)
+        return folder
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Empty where there is none, or none that is whole."""
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def write_json(path: Path, content: Mapping[str, Any], *, durable: bool = False) -> None:
+    """Replace a file as a whole: a reader sees the old or the new one. Raises OSError."""
+    part = path.with_name(f'{path.name}.part')
+    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), 'w', encoding='utf-8') as file:
+        json.dump(content, file, indent=1)
+        if durable:
+            file.flush()
+            os.fsync(file.fileno())
+    os.replace(part, path)

@@ -1,0 +1,162 @@
+"""The journal of one mission: an append-only file that has what was logged when the call returns (D11).
+
+A line a record: eight hex digits, the CRC-32 of what follows the space, then JSON in ASCII. A line break cannot occur in such
+JSON, so that a torn or rotten line costs itself alone. The file is locked (flock) for as long as its writer lives.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import threading
+import weakref
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+CHUNK: Final = 1 << 20
+MAX_LINE_BYTES: Final = 16 << 20
+"""More without a line break is damage: what a call may say is cut far below."""
+
+
+class Line(NamedTuple):
+    """What the journal says in one line."""
+
+    end: int
+    """Offset of the first byte after it: where reading goes on."""
+    record: Mapping[str, Any] | None
+    """None for a line that is damaged."""
+
+
+class Journal:
+    """The writer's side. Life: New; create once; append from any thread; sync from one; close once.
+
+    ``_lock`` guards the descriptor and makes a line one write.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.Lock()
+        self._descriptor = -1
+        self._torn = False
+
+    def create(self) -> None:
+        """Raises FileExistsError where there is one, OSError where there is no room or right for it."""
+        self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600)
+        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        _open.add(self)
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        """Survives the death of the process when it returns, that of the power after ``sync``. Raises OSError (a full disk)."""
+        data = line_of(record)
+        with self._lock:
+            if self._descriptor < 0:
+                return
+            if self._torn:  # what a full disk cut off must not swallow this line
+                data = b'\n' + data
+            torn, self._torn = self._torn, True
+            try:
+                self._torn = os.write(self._descriptor, data) != len(data)
+            except OSError:
+                self._torn = torn  # nothing of it was written
+                raise
+            torn = self._torn
+        if torn:
+            raise OSError(f'only a part of a record was written to {self.path}')
+
+    def sync(self) -> None:
+        """Wait for the disk, while others append. Raises OSError."""
+        with self._lock:
+            if self._descriptor < 0:
+                return
+            descriptor = os.dup(self._descriptor)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def close(self) -> None:
+        """Let go of the file and of its lock; idempotent. What was appended stays."""
+        with self._lock:
+            descriptor, self._descriptor = self._descriptor, -1
+        if descriptor >= 0:
+            os.close(descriptor)
+
+    def forget(self) -> None:
+        """In a forked child: the parent alone writes, and its death must not be hidden by the child's copy of the lock."""
+        self._lock = threading.Lock()
+        with suppress(OSError):
+            self.close()
+
+
+_open: weakref.WeakSet[Journal] = weakref.WeakSet()
+
+
+def _forget_all() -> None:
+    for journal in tuple(_open):
+        journal.forget()
+
+
+os.register_at_fork(after_in_child=_forget_all)
+
+
+def line_of(record: Mapping[str, Any]) -> bytes:
+    """A record as it stands in the file."""
+    text = json.dumps(record, separators=(',', ':'), allow_nan=False).encode('ascii')
+    return b'%08x %s\n' % (zlib.crc32(text), text)
+
+
+def read(path: Path, offset: int = 0) -> Iterator[Line]:
+    """The lines from ``offset`` on that are whole; one that is still being written, or torn, is left out. Raises OSError."""
+    with path.open('rb') as file:
+        file.seek(offset)
+        rest = b''
+        while chunk := file.read(CHUNK):
+            *lines, rest = (rest + chunk).split(b'\n')
+            for line in lines:
+                offset += len(line) + 1
+                if line:
+                    yield Line(offset, parse(line))
+            if len(rest) > MAX_LINE_BYTES:
+                return
+
+
+def parse(line: bytes) -> Mapping[str, Any] | None:
+    """The record of a line, None where its checksum says that it is not what was written."""
+    try:
+        if int(line[:8], 16) != zlib.crc32(line[9:]) or line[8:9] != b' ':
+            return None
+        found = json.loads(line[9:])
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+@contextmanager
+def abandoned(path: Path) -> Iterator[int | None]:
+    """The journal of a writer that is dead, opened to be finished and locked meanwhile; None while the writer lives."""
+    descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield None
+        else:
+            yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def finish(path: Path, descriptor: int, end: int, record: Mapping[str, Any]) -> int:
+    """Cut what is torn after ``end`` and append the last record; returns how many bytes were cut. Raises OSError."""
+    torn = path.stat().st_size - end
+    os.ftruncate(descriptor, end)
+    data = line_of(record)
+    if os.write(descriptor, data) != len(data):
+        os.ftruncate(descriptor, end)
+        raise OSError(f'there is no room to finish {path}')
+    os.fsync(descriptor)
+    return torn

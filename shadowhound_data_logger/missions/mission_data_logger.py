@@ -1,0 +1,297 @@
+"""MissionDataLogger: what the mission agent uses. No call waits for Tower, and none raises because of it (D11).
+
+logger = MissionDataLogger()
+with logger.mission('patrol', 'go round the house') as mission:
+    mission.log_robot_state(battery_pct=87.0, temperature_c=41.0, step=0)
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import NameRefused, SettingError
+from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.missions import values
+from shadowhound_data_logger.missions.child import Replayer
+from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, new_folder, safe_type, stamped
+from shadowhound_data_logger.missions.journal import Journal
+from shadowhound_data_logger.missions.recorder import Mission
+from shadowhound_data_logger.missions.report import Report, has_arrived, report
+from shadowhound_data_logger.missions.story import FAILED, KILLED
+from shadowhound_data_logger.worker import Worker
+
+log = logging.getLogger(__name__)
+
+SYNC_S: Final = 0.1
+"""How often the disk is asked to hold what was logged: with a slow fsync it has it after 250 ms."""
+IDLE_S: Final = 1.0
+POLL_S: Final = 0.01
+CLOSE_S: Final = 5.0
+
+
+class MissionDataLogger:
+    """One agent's logger. Life: New; any number of missions, one at a time; close once, or never.
+
+    The constructor starts the process that sends (it takes seconds to load MLflow, and a mission's start should not wait for
+    that) and the thread ``missions``, which syncs journals. All methods may be called from any thread. ``_lock`` guards the
+    active mission. Raises SettingError for a robot's name that cannot be in a key, and nothing else, ever.
+    """
+
+    def __init__(
+        self, *, robot: str | None = None, home: str | os.PathLike[str] | None = None, tracking_uri: str | None = None,
+        experiment: str = 'thor_missions', start_timeout_s: float = 2.0, frame_artifact_every_s: float = 5.0,
+        replay: bool = True,
+    ) -> None:  # fmt: skip
+        """What is not given is read from SHADOWHOUND_ROBOT, SHADOWHOUND_HOME and MLFLOW_TRACKING_URI.
+
+        Of the frames, one every ``frame_artifact_every_s`` seconds becomes an artifact of the run. ``replay=False`` only writes
+        journals: another logger of the same home sends them.
+        """
+        environ = dict(os.environ) | ({'MLFLOW_TRACKING_URI': tracking_uri} if tracking_uri else {})
+        self.robot = _robot(robot or environ.get('SHADOWHOUND_ROBOT') or 'thor')
+        self.home = Path(home or environ.get('SHADOWHOUND_HOME') or '~/.shadowhound').expanduser().absolute()
+        self._environ = environ | {'SHADOWHOUND_ROBOT': self.robot}
+        self._start_timeout_s = start_timeout_s
+        self._frame_artifact_every_s = frame_artifact_every_s
+        self._lock = threading.RLock()
+        self._mission: Mission | None = None
+        self._ended: list[Mission] = []
+        self._newest: MissionFolder | None = None
+        self._warned: set[str] = set()
+        self._wake = threading.Event()
+        self._replayer = Replayer(self.home, experiment, self._environ) if replay else None
+        self._worker = Worker('missions', self._step)
+        self._closed = False
+        _alive.add(self)
+        if self._replayer:
+            self._replayer.start()
+        self._worker.start()
+
+    def __repr__(self) -> str:
+        return f'MissionDataLogger(robot={self.robot!r}, home={str(self.home)!r}, mission={self._mission!r})'
+
+    # -- a mission's life ------------------------------------------------------------------------------------------
+
+    def start_mission(self, mission_type: str, mission_command: str) -> str:
+        """Begin a mission; a mission that is active ends as KILLED.
+
+        Returns the MLflow run id when it is made within ``start_timeout_s``, else the mission's own id: both find the mission
+        from then on (tag ``shadowhound.mission_id`` of the run, and ``missions/<mission id>/run.json``). A type that cannot be
+        in a name has its odd characters replaced there, and stands as it is in the run's params.
+        """
+        mission = self._start(mission_type, mission_command)
+        return mission.run_id or mission.id
+
+    @contextmanager
+    def mission(self, mission_type: str, mission_command: str) -> Iterator[Mission]:
+        """A mission for a ``with``: what is raised in it ends it as FAILED, is recorded, and goes on."""
+        mission = self._start(mission_type, mission_command)
+        try:
+            yield mission
+        except BaseException as error:
+            mission.log_event('exception', type=type(error).__name__, text=str(error))
+            mission.end(success=False, status=FAILED, error=f'{type(error).__name__}: {error}')
+            raise
+        else:
+            mission.end(success=True)
+        finally:
+            self._leave(mission)
+
+    def end_mission(self, success: bool, distance_m: float, duration_s: float) -> None:
+        """End the active mission as FINISHED or FAILED. Where 0 is stated and something else was measured, that stands."""
+        with self._lock:
+            mission = self._active('end_mission')
+            self._mission = None
+        if mission is not None:
+            mission.end(success, distance_m, duration_s)
+            self._leave(mission)
+
+    # -- what happens in it ----------------------------------------------------------------------------------------
+
+    def log_camera_frame(self, frame_data: bytes, frame_id: int) -> None:
+        """See Mission, as of the calls below; without a mission they do nothing."""
+        if mission := self._active('log_camera_frame'):
+            mission.log_camera_frame(frame_data, frame_id)
+
+    def log_robot_state(self, battery_pct: float, temperature_c: float, step: int) -> None:
+        if mission := self._active('log_robot_state'):
+            mission.log_robot_state(battery_pct, temperature_c, step)
+
+    def log_trajectory(self, trajectory_csv_path: str | os.PathLike[str]) -> None:
+        if mission := self._active('log_trajectory'):
+            mission.log_trajectory(trajectory_csv_path)
+
+    def log_metric(self, key: str, value: float, step: int | None = None) -> None:
+        if mission := self._active('log_metric'):
+            mission.log_metric(key, value, step)
+
+    def log_event(self, name: str, /, **data: Any) -> None:
+        if mission := self._active('log_event'):
+            mission.log_event(name, **data)
+
+    def log_artifact(self, path: str | os.PathLike[str], artifact_path: str | None = None) -> None:
+        if mission := self._active('log_artifact'):
+            mission.log_artifact(path, artifact_path)
+
+    # -- sending ---------------------------------------------------------------------------------------------------
+
+    def flush(self, deadline_s: float = 10.0) -> Report:
+        """Have all that was logged sent now, at most for ``deadline_s``; says how far it came. Never raises."""
+        self._sync()
+        self._poke()
+        folder, is_active = self._newest, self._mission is not None
+        if folder is None:
+            return Report('', None, 0, 0, complete=True)
+        _until(lambda: has_arrived(folder, is_active=is_active), deadline_s)
+        return report(folder)
+
+    def close(self, deadline_s: float = 0.0) -> Report:
+        """End what is active as KILLED, wait for the sending for at most ``deadline_s``, and let go; idempotent.
+
+        What is not sent yet is sent by the process that goes on without us, or at the next start.
+        """
+        with self._lock:
+            mission, self._mission = self._mission, None
+        if mission is not None:
+            log.warning('mission %s is active while its logger is closed: it ends as KILLED', mission.id)
+            mission.end(success=False, status=KILLED, error='the logger was closed')
+            self._leave(mission)
+        found = self.flush(0.0 if self._closed else deadline_s)
+        self._closed = True
+        self._worker.stop()
+        self._wake.set()
+        self._worker.join(CLOSE_S)
+        if self._replayer:
+            self._replayer.let_go()
+        return found
+
+    # -- within ----------------------------------------------------------------------------------------------------
+
+    def _start(self, mission_type: str, mission_command: str) -> Mission:
+        mission = self._begin(mission_type, mission_command)
+        if self._replayer and mission.is_active:
+            self._replayer.wake()
+            _until(lambda: mission.run_id is not None, self._start_timeout_s)
+        return mission
+
+    def _begin(self, mission_type: str, mission_command: str) -> Mission:
+        """Make the folder and the journal; when the disk takes neither, the mission goes on unlogged."""
+        now_ns = time.time_ns()
+        given = values.text(mission_type, values.MAX_PARAM)
+        if safe_type(given) != given:
+            log.warning('the mission type %.80r cannot stand in names: %s stands there', given, safe_type(given))
+        with self._lock:
+            before, self._mission = self._mission, None
+            if before is not None:
+                log.warning('mission %s is still active: it ends as KILLED', before.id)
+                before.end(success=False, status=KILLED, error='another mission was started')
+                self._ended.append(before)
+            try:
+                folder = new_folder(self.home, given, now_ns)
+                journal = _begun(folder, {'k': 'start', 't': now_ns, 'type': given, 'command': values.text(mission_command),
+                                          'robot': self.robot, 'pid': os.getpid()})  # fmt: skip
+            except OSError as error:
+                log.error('the mission %.80s is not logged: %s', given, error)  # noqa: TRY400 - no defect
+                return _nothing(self.home, given, now_ns)
+            self._newest = folder
+            self._mission = Mission(folder, journal, self._frame_artifact_every_s)
+            self._wake.set()
+            return self._mission
+
+    def _active(self, call: str) -> Mission | None:
+        mission = self._mission
+        if mission is None and call not in self._warned:
+            self._warned.add(call)
+            log.warning('%s without a mission does nothing', call)
+        return mission
+
+    def _leave(self, mission: Mission) -> None:
+        """Let the thread sync and close what has ended."""
+        with self._lock:
+            if self._mission is mission:
+                self._mission = None
+            self._ended.append(mission)
+        self._wake.set()
+        self._poke()
+
+    def _poke(self) -> None:
+        if self._replayer:
+            self._replayer.wake()
+
+    def _step(self) -> None:
+        """The thread's round: sync the journal, look after the replayer."""
+        self._wake.wait(SYNC_S if self._mission else IDLE_S)
+        self._wake.clear()
+        self._sync()
+        if self._replayer and not self._closed:
+            self._replayer.look()
+
+    def _sync(self) -> None:
+        with self._lock:
+            mission = self._mission
+            ended, self._ended = self._ended, []
+        for each in ended:
+            each.close()
+        if mission is not None:
+            mission.sync()
+
+    def _forget_all(self) -> None:
+        """In a forked child: threads, journal and replayer are the parent's."""
+        self._lock = threading.RLock()
+        self._mission = None
+        if self._replayer:
+            self._replayer.forget()
+            self._replayer = None
+
+
+_alive: weakref.WeakSet[MissionDataLogger] = weakref.WeakSet()
+
+
+def _after_fork() -> None:
+    for logger in tuple(_alive):
+        logger._forget_all()
+
+
+os.register_at_fork(after_in_child=_after_fork)
+
+
+def _robot(name: str) -> str:
+    try:
+        return check_name(name, 'the robot name')
+    except NameRefused as error:
+        raise SettingError('robot', name, error.remedy) from error
+
+
+def _begun(folder: MissionFolder, start: dict[str, Any]) -> Journal:
+    """A journal with its first record; nothing is left open when the disk does not take it."""
+    journal = Journal(folder.journal)
+    journal.create()
+    try:
+        journal.append(start)
+    except OSError:
+        journal.close()
+        raise
+    return journal
+
+
+def _nothing(home: Path, mission_type: str, start_ns: int) -> Mission:
+    """A mission that is over: all its calls do nothing. For a disk that takes no journal."""
+    folder = MissionFolder(home / FOLDER / f'{stamped(mission_type, start_ns)}_unlogged')
+    mission = Mission(folder, Journal(folder.journal), 0.0)
+    mission.end()
+    return mission
+
+
+def _until(done: Callable[[], bool], seconds: float) -> None:
+    """Wait for another process, whose only sign is a file."""
+    end = time.monotonic() + seconds
+    while not done() and time.monotonic() < end:
+        time.sleep(POLL_S)

@@ -1,0 +1,199 @@
+"""A mission's objects of the store: its frames, its trajectory and its summary, handed to the spool and, without a node, on.
+
+sensor-data/<robot>/missions/<run id>/camera/frame_NNNNNN.jpg, trajectory.csv, summary.json
+trajectories/<robot>/<mission type>_YYYYMMDD_HHMMSS.csv
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.clock import Clock
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.errors import StoreUnavailable
+from shadowhound_data_logger.keys import unique
+from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped
+from shadowhound_data_logger.missions.story import BUCKET, TRAJECTORIES
+from shadowhound_data_logger.model import Binding, DataObject
+from shadowhound_data_logger.ship.uploader import Uploader
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
+
+FRAME_PRIORITY: Final = 6
+"""As the camera's own images."""
+CONTENT_TYPES: Final = {'jpg': 'image/jpeg', 'csv': 'text/csv', 'json': 'application/json'}
+REST_S: Final = 30.0
+"""Without use for so long, the spool is closed again."""
+SLICE_S: Final = 3.0
+"""How long the drain is kept from a node that starts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """An object and the file that it was made from."""
+
+    content: DataObject
+    path: Path
+    is_done_with: bool
+    """Whether nobody else needs the file."""
+
+
+def held_reason(mission_id: str) -> str:
+    """Under which the spool keeps what waits for the mission's run."""
+    return f'mission-{mission_id}'
+
+
+def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: MissionFolder, run: Run | None) -> Iterator[Item]:
+    """What a record of the journal gives to the store; a file that is gone gives nothing. Raises OSError.
+
+    Without a run it is held under the mission's id, which ``Shelf.bind`` replaces.
+    """
+    kind, robot = record.get('k'), start['robot']
+    home = f'{robot}/missions/{run.run_id if run else folder.mission_id}'
+    metadata = {'robot': robot, 'mission_id': folder.mission_id} | ({'run_id': run.run_id} if run else {})
+    time_ns = int(record.get('t', 0))
+    if kind == 'frame':
+        number, path = int(record['id']), folder.files / record['file']
+        key, more = f'{home}/camera/frame_{number:06d}.jpg', {**metadata, 'frame_id': str(number)}
+        yield from _item(path, BUCKET, key, time_ns, more, is_done_with=not record.get('artifact'))
+    elif kind == 'trajectory':
+        path = folder.files / record['file']
+        yield from _item(path, BUCKET, f'{home}/trajectory.csv', time_ns, metadata)
+        yield from _item(path, TRAJECTORIES, f'{robot}/{stamped(start["type"], int(start["t"]))}.csv', time_ns, metadata)
+    elif kind == 'end':
+        yield from _item(folder.summary, BUCKET, f'{home}/summary.json', time_ns, metadata)
+
+
+def _item(path: Path, bucket: str, key: str, time_ns: int, metadata: Mapping[str, str], *,
+          is_done_with: bool = False) -> Iterator[Item]:  # fmt: skip
+    try:
+        body = path.read_bytes()
+    except FileNotFoundError:
+        return
+    extension = key.rpartition('.')[2]
+    is_frame = extension == 'jpg'
+    content = DataObject(
+        bucket=bucket, key=key, body=body, content_type=CONTENT_TYPES[extension], sensor='missions', topic=None, type='',
+        samples=0, t_start_ns=time_ns, t_end_ns=time_ns, priority=FRAME_PRIORITY if is_frame else 1,
+        protected=not is_frame, metadata=metadata,
+        held=None if 'run_id' in metadata else held_reason(metadata['mission_id']),
+    )  # fmt: skip
+    yield Item(content, path, is_done_with)
+
+
+class Shelf:
+    """The spool as missions use it. Life: New; add and drain any number; close once. Opened by the first ``add``; one thread."""
+
+    def __init__(self, settings: Settings, clock: Clock, *, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._settings = settings
+        self._clock = clock
+        self._monotonic = monotonic
+        self._used_s = 0.0
+        self._node_drains = False
+        self._is_new = True
+        self._spool: Spool | None = None
+
+    def add(self, objects: Sequence[DataObject]) -> None:
+        """Make them durable in the spool; what is or was there already is left out. Raises SpoolError."""
+        if not objects:
+            return
+        spool = self._opened()
+        known = Index(spool.root / 'index.db', read_only=True)
+        try:
+            known.open()
+            new = [item for item in objects if not _has(known, item)]
+            if new:
+                spool.commit(new)
+        except (OSError, sqlite3.Error) as error:
+            raise spool.unwritable(error) from error
+        finally:
+            known.close()
+
+    def bind(self, mission_id: str, run_id: str) -> bool:
+        """Give what is held for a mission its final names; False when nothing is held any more. Raises SpoolError."""
+        spool = self._opened()
+        try:
+            found = spool.held(held_reason(mission_id))
+            spool.bind([
+                Binding(item.id, item.key.replace(f'/missions/{mission_id}/', f'/missions/{run_id}/', 1),
+                        {**item.metadata, 'run_id': run_id}, item.t_start_ns, item.t_end_ns)
+                for item in found
+            ])  # fmt: skip
+        except (OSError, sqlite3.Error) as error:
+            raise spool.unwritable(error) from error
+        return bool(found)
+
+    def pending(self) -> int:
+        """What waits for delivery, as far as this process has the spool open."""
+        return self._spool.pending_count() if self._spool else 0
+
+    @property
+    def owes(self) -> bool:
+        """Whether something waits for delivery, and no node is there to deliver it."""
+        return not self._node_drains and self.pending() > 0
+
+    def drain(self) -> None:
+        """Deliver for a moment where no node does. Raises StoreError, SettingError or SpoolError when that does not work."""
+        if self._spool is None:
+            if self._is_new and (self._settings.spool_path / 'index.db').exists():
+                self._opened()  # for what an earlier process left
+            self._is_new = False
+            return
+        if not self.pending():
+            if self._monotonic() - self._used_s > REST_S:
+                self.close()
+            return
+        with self._spool.drain_lock() as mine:
+            self._node_drains = not mine
+        if mine:
+            store = open_store(self._settings.store, self._settings.upload)
+            try:
+                self._drain(self._spool, store)
+            finally:
+                store.close()
+
+    def close(self) -> None:
+        if self._spool is not None:
+            self._spool.close()
+            self._spool = None
+
+    def _drain(self, spool: Spool, store: ObjectStore) -> None:
+        writer = SpoolWriter(spool, self._settings.spool.commit_s, settled=lambda ids: uploader.settled(ids))  # noqa: PLW0108 - made below
+        uploader = Uploader(spool, store, self._settings.upload, writer.settle)
+        writer.open()
+        uploader.open()
+        try:
+            drained = uploader.drain(SLICE_S)
+            status = uploader.status()
+        finally:
+            uploader.close(1.0)
+            writer.close(SLICE_S)
+        if not drained and not status.delivered and status.last_error:
+            raise StoreUnavailable(status.last_error)
+
+    def _opened(self) -> Spool:
+        self._used_s = self._monotonic()
+        if self._spool is None:
+            spool = Spool(self._settings.spool_path, self._settings.spool, self._clock, self._settings.robot)
+            spool.open()
+            self._spool = spool
+        return self._spool
+
+
+def _has(index: Index, item: DataObject) -> bool:
+    """Whether the very same content was spooled under this key, or the next free one, before."""
+    sha256, attempt = hashlib.sha256(item.body).hexdigest(), 0
+    while rows := index.rows('bucket = ? AND key = ?', (item.bucket, unique(item.key, attempt))):
+        if rows[0]['sha256'] == sha256:
+            return True
+        attempt += 1
+    return False

@@ -1,0 +1,231 @@
+"""An active mission as its agent holds it: every method writes to the journal, returns within a millisecond and never raises.
+
+What cannot be taken (no number, no room on the disk) is counted in the mission's summary and said once a reason.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import Rejected
+from shadowhound_data_logger.missions import copies, values
+from shadowhound_data_logger.missions.folder import MissionFolder
+from shadowhound_data_logger.missions.journal import Journal
+from shadowhound_data_logger.missions.story import BATTERY, FAILED, FINISHED, TEMPERATURE
+
+log = logging.getLogger(__name__)
+
+MOST_FRAME_ARTIFACTS: Final = 500
+"""Of one run: MLflow's page lists them all; the store has every frame."""
+
+
+class Mission:
+    """Life: made by MissionDataLogger; log_... from any thread; end once, after which calls do nothing but warn once.
+
+    ``_lock`` makes a record one step with what is remembered of it: that it is to be synced, and that the last one was written.
+    """
+
+    def __init__(self, folder: MissionFolder, journal: Journal, frame_artifact_every_s: float) -> None:
+        self.folder = folder
+        self._journal = journal
+        self._every_s = frame_artifact_every_s
+        self._left = MOST_FRAME_ARTIFACTS
+        self._next_s = float('-inf')
+        self._lock = threading.Lock()
+        self._number = 0
+        self._unsynced: list[Path] = []
+        self._is_dirty = True
+        self._warned: set[str] = set()
+        self._ended = False
+
+    def __repr__(self) -> str:
+        return f'Mission({self.id!r}, {"ended" if self._ended else "active"})'
+
+    @property
+    def id(self) -> str:
+        """The mission's own id, which it has whether MLflow answers or not."""
+        return self.folder.mission_id
+
+    @property
+    def run_id(self) -> str | None:
+        """The MLflow run's id; None until it is made."""
+        run = self.folder.run()
+        return run.run_id if run else None
+
+    @property
+    def is_active(self) -> bool:
+        return not self._ended
+
+    def log_camera_frame(self, frame_data: bytes, frame_id: int) -> None:
+        """A JPEG; all go to the store, a sample of them (``frame_artifact_every_s``) to the run's artifacts as well."""
+        try:
+            number = values.whole(frame_id, 'frame_id')
+            data = values.content(frame_data, f'frame {number}')
+            name = self._new_name('.jpg')
+            copies.write(self.folder.files / name, data)
+            self._append('frame', id=number, file=name, artifact=self._is_sampled())
+        except Rejected as error:
+            self._refuse(error)
+        except OSError as error:
+            self._lose(error)
+
+    def log_robot_state(self, battery_pct: float, temperature_c: float, step: int) -> None:
+        """Two points of one time: percent and degrees Celsius."""
+        self._log({BATTERY: battery_pct, TEMPERATURE: temperature_c}, step)
+
+    def log_metric(self, key: str, value: float, step: int | None = None) -> None:
+        """One point; without a step it is 0, as in MLflow."""
+        self._log({key: value}, 0 if step is None else step)
+
+    def log_event(self, name: str, /, **data: Any) -> None:
+        """Something that happened; all of them are the run's ``events.jsonl``, those named ``error`` stand in the summary."""
+        try:
+            self._append('event', name=values.text(name, values.MAX_KEY), data=values.bounded(values.plain(data)))
+        except Rejected as error:
+            self._refuse(error)
+        except OSError as error:
+            self._lose(error)
+
+    def log_trajectory(self, trajectory_csv_path: str | os.PathLike[str]) -> None:
+        """Copy a CSV file with the header ``timestamp,x,y,yaw`` and what it has now; it is stored as it is."""
+        self._log_file('trajectory', trajectory_csv_path, {})
+
+    def log_artifact(self, path: str | os.PathLike[str], artifact_path: str | None = None) -> None:
+        """Copy a file as it is now, for the run's artifacts, in the folder ``artifact_path``."""
+        try:
+            name = values.text(os.path.basename(os.fspath(path)), values.MAX_KEY)  # noqa: PTH119 - a text or a Path
+            more = {'name': name or 'artifact', 'folder': values.artifact_folder(artifact_path)}
+        except Rejected as error:
+            self._refuse(error)
+        except TypeError as error:
+            self._refuse(Rejected('no_file', str(error)))
+        else:
+            self._log_file('artifact', path, more)
+
+    def end(self, success: bool = True, distance_m: float | None = None, duration_s: float | None = None, *,
+            status: str | None = None, error: str | None = None) -> None:  # fmt: skip
+        """The last record: FINISHED or FAILED unless ``status`` (KILLED) says otherwise. What is not stated is measured."""
+        stated: dict[str, Any] = {'success': values.truth(success)}
+        for name, value in (('distance_m', distance_m), ('duration_s', duration_s)):
+            try:
+                stated[name] = None if value is None else values.number(value, name)
+            except Rejected as refused:
+                self._refuse(refused)
+        if error:
+            stated['error'] = values.text(error, values.MAX_PARAM)
+        try:
+            self._append('end', status=status or (FINISHED if stated['success'] else FAILED), **stated)
+        except OSError as refused:
+            self._lose(refused)
+
+    def close(self) -> None:
+        """Make durable what was logged and let go of the journal, after ``end``; idempotent."""
+        self.sync()
+        self._journal.close()
+
+    def sync(self) -> None:
+        """Make durable what was logged before. Called by the logger's thread; never raises OSError."""
+        with self._lock:
+            files, self._unsynced = self._unsynced, []
+            dirty, self._is_dirty = self._is_dirty, False
+        if not dirty:
+            return
+        try:
+            for path in (*files, *((self.folder.files,) if files else ())):
+                with suppress(FileNotFoundError):  # the replayer was faster: it is in the spool
+                    _fsync(path)
+            self._journal.sync()
+        except OSError as error:
+            self._lose(error)
+
+    # -- within ----------------------------------------------------------------------------------------------------
+
+    def _log(self, metrics: Mapping[str, Any], step: Any) -> None:
+        found: dict[str, float] = {}
+        try:
+            number = values.whole(step, 'step')
+        except Rejected as error:
+            self._refuse(error)
+            return
+        for key, value in metrics.items():
+            try:
+                found[values.metric_key(key)] = values.number(value, key)
+            except Rejected as error:
+                self._refuse(error)
+        if found:
+            try:
+                self._append('metrics', m=found, s=number)
+            except OSError as error:
+                self._lose(error)
+
+    def _log_file(self, kind: str, path: str | os.PathLike[str], more: Mapping[str, str]) -> None:
+        name = self._new_name('')
+        try:
+            copies.copy(path, self.folder.files / name)
+            self._append(kind, file=name, **more)
+        except Rejected as error:
+            self._refuse(error)
+        except OSError as error:
+            self._lose(error)
+
+    def _append(self, kind: str, **fields: Any) -> None:
+        record = {'k': kind, 't': time.time_ns(), **fields}
+        with self._lock:
+            ended = self._ended
+            if not ended:
+                self._ended = kind == 'end'
+                self._journal.append(record)
+                self._is_dirty = True
+                if 'file' in fields:
+                    self._unsynced.append(self.folder.files / fields['file'])
+        if ended:
+            self._warn('ended', 'mission %s has ended: what is logged to it now is left out', self.id)
+
+    def _new_name(self, extension: str) -> str:
+        with self._lock:
+            self._number += 1
+            return f'{self._number:08d}{extension}'
+
+    def _is_sampled(self) -> bool:
+        """Whether this frame becomes an artifact of the run as well."""
+        now_s = time.monotonic()
+        with self._lock:
+            if now_s < self._next_s or not self._left:
+                return False
+            self._next_s, self._left = now_s + self._every_s, self._left - 1
+            return True
+
+    def _refuse(self, error: Rejected) -> None:
+        """Count what is nobody's data in the journal."""
+        self._warn(error.reason, 'mission %s leaves out what cannot be logged: %s', self.id, error)
+        try:
+            self._append('refused', reason=error.reason)
+        except OSError as full:
+            self._lose(full)
+
+    def _lose(self, error: OSError) -> None:
+        """The disk takes nothing: the mission goes on."""
+        self._warn('lost', 'mission %s loses what is logged while the disk takes nothing: %s', self.id, error)
+
+    def _warn(self, reason: str, text: str, *values_: object) -> None:
+        """Once a reason."""
+        with self._lock:
+            known = reason in self._warned
+            self._warned.add(reason)
+        if not known:
+            log.warning(text, *values_)
+
+
+def _fsync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

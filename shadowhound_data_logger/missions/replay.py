@@ -1,0 +1,264 @@
+"""The process that sends missions: ``python -m shadowhound_data_logger.missions.replay``, started by MissionDataLogger.
+
+One a home works at a time (a lock that dies with it); others wait. It outlives the agent until all is sent, or Tower was
+away for ``LINGER_S``: what is left then waits for the next start. Standard input wakes it; its end is that of the agent.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import random
+import select
+import signal
+import sqlite3
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.errors import DataLoggerError, TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.missions.delivery import Delivery
+from shadowhound_data_logger.missions.folder import FOLDER, missions, write_json
+from shadowhound_data_logger.missions.objects import Shelf
+from shadowhound_data_logger.missions.report import STATE
+from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
+from shadowhound_data_logger.ship.retry import backoff
+from shadowhound_data_logger.spool.files import flock
+
+log = logging.getLogger(__name__)
+
+LOOK_EVERY_S: Final = 0.5
+"""How often the journals are looked at when nobody wakes it."""
+LINGER_S: Final = 600.0
+"""How long it tries on after the agent ended and nothing gets through."""
+LONGEST_PAUSE_S: Final = 60.0
+NICE: Final = 5
+SLICE_S: Final = 0.5
+TRACKING, ARTIFACTS, OBJECTS, STORE = 'tracking', 'artifacts', 'objects', 'store'
+
+
+class Gate:
+    """One receiver's outage: when to try it next (exponential backoff, full jitter, up to a minute)."""
+
+    def __init__(self, monotonic: Callable[[], float], rng: random.Random) -> None:
+        self._monotonic = monotonic
+        self._rng = rng
+        self._failures = 0
+        self._next_s = float('-inf')
+        self.error: Exception | None = None
+
+    @property
+    def is_open(self) -> bool:
+        return self._monotonic() >= self._next_s
+
+    def failed(self, error: Exception) -> None:
+        self._failures += 1
+        self.error = error
+        self._next_s = self._monotonic() + backoff(self._failures, LONGEST_PAUSE_S, self._rng)
+
+    def worked(self) -> None:
+        self._failures, self.error, self._next_s = 0, None, float('-inf')
+
+    def hurry(self) -> None:
+        """Try at once: somebody waits for it."""
+        self._next_s = float('-inf')
+
+
+class Replay:
+    """All missions of one home. Life: New; step any number; close once. Not thread-safe."""
+
+    def __init__(self, home: Path, tracking: Tracking, shelf: Shelf, *, monotonic: Callable[[], float] = time.monotonic,
+                 rng: random.Random | None = None) -> None:  # fmt: skip
+        self._home = home
+        self._tracking = tracking
+        self._shelf = shelf
+        self._monotonic = monotonic
+        self._progress = False
+        rng = rng or random.Random()
+        self.gates = {name: Gate(monotonic, rng) for name in (TRACKING, ARTIFACTS, OBJECTS, STORE)}
+        self._deliveries: dict[str, Delivery] = {}
+        self._settled: set[str] = set()  # complete, or beyond help until the next start
+        self._told: dict[str, object] = {}
+        self._logged: set[str] = set()
+
+    def step(self) -> bool:
+        """Some pieces of work, those of the newest mission first; whether any was done."""
+        began_s = self._monotonic()
+        self._look()
+        self._progress = False
+        tried = [gate for gate in self.gates.values() if gate.is_open]
+        newest_first = sorted(self._deliveries.values(), key=lambda delivery: _age(delivery.folder.mission_id), reverse=True)
+        for delivery in newest_first:
+            if self._work(delivery):
+                self._settled.add(delivery.folder.mission_id)
+                del self._deliveries[delivery.folder.mission_id]
+            if self._progress and self._monotonic() - began_s > SLICE_S:
+                break  # a mission that begins must not wait for old ones
+        else:
+            if not self._progress:
+                self._try(STORE, self._drain)
+            for gate in tried:
+                if gate.is_open:  # nothing failed
+                    gate.worked()
+        self._tell()
+        return self._progress
+
+    def _work(self, delivery: Delivery) -> bool:
+        """One piece for each receiver; whether nothing is left to do for this mission."""
+        try:
+            self._try(TRACKING, delivery.track)
+            self._try(ARTIFACTS, delivery.attach)
+            self._try(OBJECTS, lambda: delivery.shelve(hold=self.gates[TRACKING].error is not None))
+            return delivery.complete()
+        except TrackingRefused as error:
+            log.error('mission %s is not sent on: %s', delivery.folder.mission_id, error)  # noqa: TRY400 - no defect
+            delivery.give_up(str(error))
+        except Exception as error:  # the supervised catch-all (D14): one rotten journal must not stop the others
+            log.error('mission %s cannot be sent', delivery.folder.mission_id, exc_info=error)  # noqa: TRY400
+        return True
+
+    @property
+    def owes(self) -> bool:
+        """Whether something could not be sent yet."""
+        return any(gate.error for gate in self.gates.values()) or self._shelf.owes
+
+    def hurry(self) -> None:
+        for gate in self.gates.values():
+            gate.hurry()
+
+    def close(self) -> None:
+        self._shelf.close()
+        self._tell(ended=True)
+
+    def _look(self) -> None:
+        """Take up missions that are new here."""
+        for folder in missions(self._home):
+            if folder.mission_id not in self._deliveries and folder.mission_id not in self._settled and folder.journal.exists():
+                if folder.sent().complete:
+                    self._settled.add(folder.mission_id)
+                else:
+                    self._deliveries[folder.mission_id] = Delivery(folder, self._tracking, self._shelf)
+                    self.gates[TRACKING].hurry()  # its agent waits for the run's id
+
+    def _try(self, name: str, work: Callable[[], bool]) -> None:
+        gate = self.gates[name]
+        if not gate.is_open:
+            return
+        try:
+            worked = work()
+        except TrackingRefused:
+            raise
+        except (DataLoggerError, OSError, sqlite3.Error) as error:
+            gate.failed(error)
+            if str(error) not in self._logged:
+                self._logged.add(str(error))
+                log.warning('%s: %s', name, error)
+        else:
+            if worked:
+                gate.worked()
+            self._progress = self._progress or worked
+
+    def _drain(self) -> bool:
+        """True while there is more to deliver."""
+        before = self._shelf.pending()
+        self._shelf.drain()
+        return self._shelf.pending() < before
+
+    def _tell(self, *, ended: bool = False) -> None:
+        """The state for whoever asks; written when it changes."""
+        errors = {
+            name: {'error': str(gate.error), 'remedy': getattr(gate.error, 'remedy', '')}
+            for name, gate in self.gates.items() if gate.error is not None
+        }  # fmt: skip
+        state: dict[str, object] = {'pid': 0 if ended else os.getpid(), 'errors': errors}
+        if state != self._told:
+            self._told = state
+            write_json(self._home / FOLDER / STATE, state)
+
+
+def _age(mission_id: str) -> list[str]:
+    """Greater for a mission that began later."""
+    return mission_id.split('_')[-3:-1]
+
+
+class Parent:
+    """The agent: it wakes us by a byte, and its end is the end of our standard input."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._pid = os.getppid()
+        self.gone = False
+
+    def wait(self, seconds: float) -> bool:
+        """Whether it woke us before."""
+        if self.gone:
+            time.sleep(seconds)
+            return False
+        ready = select.select([self._descriptor], [], [], seconds)[0]
+        said = os.read(self._descriptor, 4096) if ready else b''
+        self.gone = bool(ready and not said) or os.getppid() != self._pid
+        return bool(said)
+
+
+def run(replay: Replay, parent: Parent, stopping: Callable[[], bool]) -> None:
+    """Until all is sent and the agent is gone; or for ``LINGER_S`` after the last success."""
+    worked_s = time.monotonic()
+    woken = False
+    while not stopping():
+        if woken:
+            replay.hurry()
+        if replay.step():
+            worked_s = time.monotonic()
+            woken = parent.wait(0.0)
+            continue
+        if parent.gone and (not replay.owes or time.monotonic() - worked_s > LINGER_S):
+            return
+        woken = parent.wait(LOOK_EVERY_S)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Until all is sent, the agent is gone, or SIGTERM; SIGINT at the agent's terminal is none of ours."""
+    parser = argparse.ArgumentParser(prog='python -m shadowhound_data_logger.missions.replay', description='Send missions.')
+    parser.add_argument('--home', type=Path, required=True)
+    parser.add_argument('--experiment', required=True)
+    options = parser.parse_args(arguments)
+    asked: list[int] = []
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
+    os.nice(NICE)
+    logging.basicConfig(level=logging.INFO, format='%(asctime)s %(levelname)s %(message)s')
+    parent = Parent(sys.stdin.fileno())
+    with ExitStack() as opened:
+        while not opened.enter_context(flock(options.home / FOLDER / 'replay.lock', wait=False)):
+            opened.close()
+            parent.wait(LOOK_EVERY_S)
+            if parent.gone or asked:
+                return 0
+        settings = Settings.load({}, {**os.environ, 'SHADOWHOUND_HOME': str(options.home)})
+        tracking = open_tracking(options.home, options.experiment)
+        replay = Replay(options.home, tracking, Shelf(settings, SystemClock.of_this_machine()))
+        opened.callback(replay.close)
+        run(replay, parent, lambda: bool(asked))
+    return 0
+
+
+def open_tracking(home: Path, experiment: str) -> MlflowTracking:
+    """The tracking server that the environment names, else a SQLite file in the home (D13)."""
+    uri = os.environ.get('MLFLOW_TRACKING_URI') or f'sqlite:///{home / "mlflow.db"}'
+    root = home / 'mlartifacts' if uri.startswith('sqlite:') else None
+    tracking = MlflowTracking(uri, experiment, root)
+    try:
+        tracking.open()  # now, because it takes seconds that a mission's start should not wait for
+    except TrackingUnavailable as error:
+        log.warning('%s', error)
+    return tracking
+
+
+if __name__ == '__main__':
+    sys.exit(main())

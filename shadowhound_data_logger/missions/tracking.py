@@ -1,0 +1,208 @@
+"""MLflow as missions need it: the one file that imports it. Explicit run ids, never the fluent API (D11).
+
+Every method blocks for as long as a request may take (``ENVIRONMENT``) and raises TrackingUnavailable or TrackingRefused; each
+may be repeated: a run is looked up by its mission's id before it is made, and points, params and artifacts that are
+there already stay as they are. (Only ``file:`` stores keep a point twice that is sent twice.)
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.missions.folder import Run
+from shadowhound_data_logger.missions.story import Point
+
+MISSION_TAG: Final = 'shadowhound.mission_id'
+DUPLICATE_TAG: Final = 'shadowhound.duplicate_of'
+ENVIRONMENT: Final = {
+    'MLFLOW_HTTP_REQUEST_TIMEOUT': '10',
+    'MLFLOW_HTTP_REQUEST_MAX_RETRIES': '0',
+    'MLFLOW_DISABLE_TELEMETRY': 'true',
+    'MLFLOW_ALLOW_FILE_STORE': 'true',
+    'MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR': 'false',
+    'MLFLOW_ENABLE_ASYNC_LOGGING': 'false',
+    'MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT': 'true',
+    'GIT_PYTHON_REFRESH': 'quiet',
+    'AWS_MAX_ATTEMPTS': '2',
+}
+"""Set before MLflow is imported, where the user says nothing else: the replayer itself tries again, with a backoff."""
+REFUSALS: Final = frozenset({
+    'INVALID_PARAMETER_VALUE', 'BAD_REQUEST', 'MALFORMED_REQUEST', 'RESOURCE_DOES_NOT_EXIST', 'INVALID_STATE',
+    'RESOURCE_CONFLICT', 'NOT_IMPLEMENTED',
+})  # fmt: skip
+"""MLflow's error codes after which trying the same again is no use."""
+RUN_GONE: Final = 'RUN_GONE'
+"""``data['code']`` of the refusal of everything that belongs to a run that somebody deleted."""
+S3_REMEDY: Final = 'set MLFLOW_S3_ENDPOINT_URL to the S3 server of Tower, such as http://TOWER_IP:9000'
+_USER: Final = re.compile(r'//[^/@]*@')
+
+
+class Tracking(Protocol):
+    """What the delivery of a mission asks of a tracking server."""
+
+    def run_of(self, mission_id: str, name: str, start_ms: int, tags: Mapping[str, str]) -> Run:
+        """The mission's run, made where there is none."""
+
+    def log(self, run_id: str, points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> None:
+        """At most 1,000 points, 100 params and 100 tags."""
+
+    def artifact(self, run: Run, path: Path, folder: str) -> None:
+        """Under the file's own name."""
+
+    def finish(self, run_id: str, mission_id: str, status: str, end_ms: int) -> None:
+        """Give the run its last state and close what duplicates it."""
+
+
+class MlflowTracking:
+    """Life: New; open once, before anything else; not thread-safe."""
+
+    def __init__(self, uri: str, experiment: str, artifact_root: Path | None = None) -> None:
+        """``artifact_root`` is where a new experiment's artifacts go; None leaves that to the server."""
+        self._uri = uri
+        self._experiment = experiment
+        self._artifact_root = artifact_root
+        self._client: Any = None
+        self._experiment_id = ''
+
+    def __repr__(self) -> str:
+        return f'MlflowTracking({self.where!r}, {self._experiment!r})'
+
+    @property
+    def where(self) -> str:
+        """The tracking URI without user and password."""
+        return _USER.sub('//', self._uri)
+
+    def open(self) -> None:
+        """Load MLflow, which takes seconds, and make the client; idempotent, and done by the first call where it was not."""
+        if self._client is not None:
+            return
+        for name, value in ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
+        if os.environ.get('AWS_ENDPOINT_URL'):
+            os.environ.setdefault('MLFLOW_S3_ENDPOINT_URL', os.environ['AWS_ENDPOINT_URL'])
+        try:
+            from mlflow import MlflowClient  # noqa: PLC0415 - seconds and 80 MB or more, and not installed everywhere
+        except ImportError as error:
+            remedy = 'install mlflow-skinny for a server, mlflow for sqlite: and file: stores'
+            raise TrackingUnavailable(f'MLflow cannot be imported: {error}', remedy=remedy) from error
+        with self._translated('cannot be used'):  # SQLite's tables are made here
+            self._client = MlflowClient(tracking_uri=self._uri)
+
+    def run_of(self, mission_id: str, name: str, start_ms: int, tags: Mapping[str, str]) -> Run:
+        self.open()
+        with self._translated(f'made no run for {mission_id}'):
+            experiment = self._experiment_of()
+            found = self._runs(experiment, mission_id)
+            if found:
+                run = found[0]
+            else:
+                all_tags = {**tags, MISSION_TAG: mission_id}
+                run = self._client.create_run(experiment, start_time=start_ms, tags=all_tags, run_name=name)
+            return Run(run.info.run_id, experiment, run.info.artifact_uri)
+
+    def log(self, run_id: str, points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> None:
+        self.open()
+        from mlflow.entities import Metric, Param, RunTag  # noqa: PLC0415 - see open
+
+        try:
+            with self._translated(f'took no batch of run {run_id}'):
+                self._client.log_batch(
+                    run_id, metrics=[Metric(point.key, point.value, point.time_ms, point.step) for point in points],
+                    params=[Param(*item) for item in params.items()], tags=[RunTag(*item) for item in tags.items()],
+                )  # fmt: skip
+        except TrackingRefused as error:
+            if self._is_gone(run_id):
+                text = f'the run {run_id} was deleted from {self.where}'
+                raise TrackingRefused(text, remedy='restore it: MlflowClient().restore_run', code=RUN_GONE) from error
+            raise
+
+    def artifact(self, run: Run, path: Path, folder: str) -> None:
+        self.open()
+        if run.artifact_uri.startswith('s3:') and not os.environ.get('MLFLOW_S3_ENDPOINT_URL'):
+            text = (
+                f'artifacts of run {run.run_id} lie in {run.artifact_uri}, and MLFLOW_S3_ENDPOINT_URL does not say where that is'
+            )
+            raise TrackingUnavailable(text, remedy=S3_REMEDY)
+        try:
+            with self._translated(f'took no artifact of run {run.run_id}'):
+                self._client.log_artifact(run.run_id, str(path), folder or None)
+        except (TrackingUnavailable, TrackingRefused):
+            raise
+        except Exception as error:  # each kind of artifact store (S3, Azure, SFTP, ...) raises what it likes
+            text = f'the artifact {path.name} did not reach {run.artifact_uri}: {type(error).__name__}: {error}'
+            raise TrackingUnavailable(text, remedy=S3_REMEDY if run.artifact_uri.startswith('s3:') else '') from error
+
+    def finish(self, run_id: str, mission_id: str, status: str, end_ms: int) -> None:
+        self.open()
+        with self._translated(f'did not end run {run_id}'):
+            for run in self._runs(self._experiment_of(), mission_id):
+                if run.info.run_id != run_id:  # made by a request that seemed lost
+                    self._client.set_tag(run.info.run_id, DUPLICATE_TAG, run_id)
+                    self._client.delete_run(run.info.run_id)
+            self._client.set_terminated(run_id, status=status, end_time=end_ms)
+
+    def _is_gone(self, run_id: str) -> bool:
+        try:
+            with self._translated(f'does not say what run {run_id} is'):
+                return bool(self._client.get_run(run_id).info.lifecycle_stage != 'active')
+        except TrackingRefused:
+            return True
+
+    def _experiment_of(self) -> str:
+        """The id of the experiment, made where there is none; another process may make it at the same time."""
+        if not self._experiment_id:
+            found = self._client.get_experiment_by_name(self._experiment)
+            if found is None:
+                found = self._new_experiment()
+            if found.lifecycle_stage != 'active':
+                raise TrackingUnavailable(f'the experiment {self._experiment} of {self.where} is deleted',
+                                          remedy='restore it: mlflow experiments restore -x ' + found.experiment_id)  # fmt: skip
+            self._experiment_id = found.experiment_id
+        return self._experiment_id
+
+    def _new_experiment(self) -> Any:
+        from mlflow.exceptions import MlflowException  # noqa: PLC0415 - see open
+
+        location = self._artifact_root.as_uri() if self._artifact_root else None
+        try:
+            return self._client.get_experiment(self._client.create_experiment(self._experiment, artifact_location=location))
+        except MlflowException as error:
+            if error.error_code != 'RESOURCE_ALREADY_EXISTS':
+                raise
+            return self._client.get_experiment_by_name(self._experiment)
+
+    def _runs(self, experiment: str, mission_id: str) -> list[Any]:
+        """The runs of a mission that nobody deleted, always in the same order."""
+        found = self._client.search_runs([experiment], f"tags.`{MISSION_TAG}` = '{mission_id}'", max_results=10)
+        return sorted(found, key=lambda run: (run.info.start_time, run.info.run_id))
+
+    @contextmanager
+    def _translated(self, what: str) -> Iterator[None]:
+        from mlflow.exceptions import MlflowException, RestException  # noqa: PLC0415 - see open
+
+        try:
+            yield
+        except MlflowException as error:
+            code, is_own = error.error_code, isinstance(error, RestException) or not self._uri.startswith('http')
+            text = f'{self.where} {what}: {_USER.sub("//", str(error))[:500]}'
+            if code in REFUSALS and is_own:
+                raise TrackingRefused(text, code=code) from error
+            raise TrackingUnavailable(text, remedy=remedy_for(code), code=code) from error
+        except Exception as error:  # whatever else a client raises (a captive portal's page is no JSON) is no mission's fault
+            text = f'{self.where} {what}: {type(error).__name__}: {_USER.sub("//", str(error))[:500]}'
+            raise TrackingUnavailable(text, remedy=remedy_for('')) from error
+
+
+def remedy_for(code: str) -> str:
+    """What an operator can do about an error code of MLflow."""
+    if code in {'PERMISSION_DENIED', 'UNAUTHENTICATED', 'CUSTOMER_UNAUTHORIZED'}:
+        return 'check MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD, or MLFLOW_TRACKING_TOKEN'
+    if code == 'ENDPOINT_NOT_FOUND':
+        return 'is MLFLOW_TRACKING_URI the address of an MLflow server?'
+    return 'is MLFLOW_TRACKING_URI right, and Tower on? It is tried again by itself'

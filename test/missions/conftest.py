@@ -1,0 +1,32 @@
+"""A real MLflow server behind a wire that can be cut, and what is in it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from e2e.wire import Wire
+from missions.server import FOREIGN, Server, end_replayers
+
+from shadowhound_data_logger.sim.tower import Tower
+
+
+@pytest.fixture
+def server(tower: Tower, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    """The session's Tower, its MLflow behind a wire of this test's own, as the environment of the logger."""
+    for name in [name for name in os.environ if name.startswith(FOREIGN)]:
+        monkeypatch.delenv(name)
+    with Wire(tower.tracking_uri) as wire:
+        environ = tower.environment() | {'MLFLOW_TRACKING_URI': wire.url, 'MLFLOW_HTTP_REQUEST_TIMEOUT': '2'}
+        for name, value in environ.items():
+            monkeypatch.setenv(name, value)
+        yield Server(tower, wire)
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[Path]:
+    """Of the logger; what sends its missions ends with the test."""
+    yield tmp_path / 'home'
+    end_replayers(tmp_path / 'home')

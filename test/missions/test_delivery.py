@@ -1,0 +1,277 @@
+"""The delivery of a mission to a server that fails at any moment: in order, once to effect, nothing left out."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+import pytest
+from missions.fakes import FakeShelf, FakeTracking, journalling
+
+from shadowhound_data_logger.errors import TrackingError, TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.missions.delivery import Delivery
+from shadowhound_data_logger.missions.folder import MissionFolder, missions
+from shadowhound_data_logger.missions.journal import Journal, read
+from shadowhound_data_logger.missions.story import Point
+
+JPEG = b'\xff\xd8 a picture \xff\xd9'
+
+
+def fly(home: Path, points: int = 3, frames: int = 2, *, command: str = 'go round', end: bool = True) -> MissionFolder:
+    """A mission on the disk."""
+    csv = home / 't.csv'
+    csv.write_text('timestamp,x,y,yaw\n1,2,3,4\n')
+    with journalling(home, frame_artifact_every_s=0.0) as logger:
+        mission_id = logger.start_mission('patrol', command)
+        for number in range(points):
+            logger.log_robot_state(90.0 - number, 40.0 + number, number)
+        for number in range(frames):
+            logger.log_camera_frame(JPEG + bytes([number]), number)
+        logger.log_trajectory(csv)
+        logger.log_artifact(csv, 'notes')
+        logger.log_event('error', text='a wheel fell off')
+        if end:
+            logger.end_mission(True, 12.0, 60.0)
+    return next(folder for folder in missions(home) if folder.mission_id == mission_id)
+
+
+def work(delivery: Delivery) -> bool:
+    """One round; whether all of it is done."""
+    worked = [delivery.track(), delivery.attach(), delivery.shelve()]
+    return delivery.complete() or not any(worked)
+
+
+def deliver(folder: MissionFolder, tracking: FakeTracking, shelf: FakeShelf) -> Delivery:
+    delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
+    while not work(delivery):
+        pass
+    return delivery
+
+
+def names(tracking: FakeTracking) -> list[str]:
+    return sorted(tracking.artifacts)
+
+
+def test_everything_arrives_in_order(tmp_path: Path) -> None:
+    """Params, points with their own times, artifacts, objects and the end."""
+    folder = fly(tmp_path)
+    journal = [line.record or {} for line in read(folder.journal)]
+    tracking, shelf = FakeTracking(), FakeShelf()
+    deliver(folder, tracking, shelf)
+    states = [point for point in tracking.points if point.key == 'battery_pct']
+    assert states == [Point('battery_pct', 90.0 - n, journal[n + 1]['t'] // 1_000_000, n) for n in range(3)]
+    assert tracking.params == {'mission_type': 'patrol', 'mission_command': 'go round', 'robot': 'thor',
+                               'timestamp': tracking.params['timestamp'], 'duration_s': '60.000'}  # fmt: skip
+    assert tracking.finished == [('run0', 'FINISHED', journal[-1]['t'] // 1_000_000)]
+    last = {point.key: point.value for point in tracking.points}
+    assert {key: last[key] for key in ('success', 'distance_m', 'distance_traveled_m', 'duration_s', 'battery_consumed_pct')} == {
+        'success': 1.0, 'distance_m': 12.0, 'distance_traveled_m': 12.0, 'duration_s': 60.0, 'battery_consumed_pct': 2.0,
+    }  # fmt: skip
+    assert (last['camera_frame_0'], last['camera_frame_1'], last['camera_frames']) == (1.0, 1.0, 2.0)
+    frames = ['camera/frame_000000.jpg', 'camera/frame_000001.jpg']
+    assert names(tracking) == [*frames, 'events.jsonl', 'notes/t.csv', 'summary.json', 'trajectories/trajectory.csv']
+    run_name = folder.mission_id.rpartition('_')[0]
+    assert shelf.names() == [
+        'sensor-data/thor/missions/run0/camera/frame_000000.jpg', 'sensor-data/thor/missions/run0/camera/frame_000001.jpg',
+        'sensor-data/thor/missions/run0/trajectory.csv', f'trajectories/thor/{run_name}.csv',
+        'sensor-data/thor/missions/run0/summary.json',
+    ]  # fmt: skip
+    assert [item.protected for item in shelf.objects] == [False, False, True, True, True]
+    assert not folder.files.exists()
+
+
+def test_the_summary_tells_the_mission(tmp_path: Path) -> None:
+    """Its times, result, errors, counts and where its data are; the same in the run and in the store."""
+    folder = fly(tmp_path)
+    tracking, shelf = FakeTracking(), FakeShelf()
+    deliver(folder, tracking, shelf)
+    assert tracking.artifacts['summary.json'] == shelf.objects[-1].body
+    summary = json.loads(tracking.artifacts['summary.json'])
+    assert (summary['mission_id'], summary['run_id'], summary['result']) == (folder.mission_id, 'run0', 'FINISHED')
+    assert summary['errors'][0]['text'] == 'a wheel fell off'
+    assert summary['counts'] == {
+        'metric_points': 6, 'camera_frames': 2, 'trajectories': 1, 'artifacts': 1, 'events': 1, 'refused': {},
+        'damaged_records': 0,
+    }  # fmt: skip
+    assert summary['stated'] == {'success': True, 'distance_m': 12.0, 'duration_s': 60.0}
+    assert summary['data']['mission'] == 'sensor-data/thor/missions/run0/'
+    assert summary['start'] < summary['end']
+
+
+def test_a_long_command_is_whole_as_an_artifact(tmp_path: Path) -> None:
+    """The param is cut where MLflow would cut it."""
+    tracking = FakeTracking()
+    deliver(fly(tmp_path, command='x' * 7000), tracking, FakeShelf())
+    assert tracking.params['mission_command'] == 'x' * 6000
+    assert tracking.artifacts['mission_command.txt'] == b'x' * 7000
+
+
+def test_batches_are_large_and_never_too_large(tmp_path: Path) -> None:
+    """A backlog goes in batches of nearly a thousand points, none above."""
+    tracking = FakeTracking()
+    deliver(fly(tmp_path, points=3000), tracking, FakeShelf())
+    assert max(tracking.batches) <= 1000
+    assert len(tracking.batches) <= 10
+    assert len([point for point in tracking.points if point.key == 'battery_pct']) == 3000
+
+
+@pytest.mark.parametrize('seed', range(12))
+def test_any_failure_changes_nothing(tmp_path: Path, seed: int) -> None:
+    """Requests and answers get lost, the replayer dies in between: afterwards all is there, each thing once to effect."""
+    rng = random.Random(seed)
+    folder = fly(tmp_path, points=1200, frames=9)
+    tracking = FakeTracking(fail=lambda _: rng.random() < 0.3)
+    shelf, delivery = FakeShelf(), None
+    for _ in range(2000):
+        if delivery is None or rng.random() < 0.2:
+            delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]  # as after a kill
+        try:
+            if delivery.run is None and rng.random() < 0.5:
+                delivery.shelve(hold=True)
+            if work(delivery):
+                break
+        except TrackingError:
+            continue
+    assert folder.sent().complete
+    assert len(tracking.runs) == 1
+    quiet = FakeTracking()
+    (tmp_path / 'other').mkdir()
+    deliver(fly(tmp_path / 'other', points=1200, frames=9), quiet, FakeShelf())
+    assert sorted({(p.key, p.step, p.value) for p in tracking.points}) == sorted({(p.key, p.step, p.value) for p in quiet.points})
+    assert names(tracking) == names(quiet)
+    assert len(shelf.names()) == len(set(shelf.names())) == 9 + 3
+    assert tracking.finished[-1][1] == 'FINISHED'
+
+
+def test_the_run_is_looked_up_after_a_lost_answer(tmp_path: Path) -> None:
+    """A run that was made although the answer got lost is the mission's, and no second one is made."""
+    folder, answers = fly(tmp_path), iter([False, True])
+    tracking = FakeTracking(fail=lambda _: next(answers, False))
+    delivery = Delivery(folder, tracking, FakeShelf())  # type: ignore[arg-type]
+    with pytest.raises(TrackingUnavailable):
+        delivery.track()
+    while not work(delivery):
+        pass
+    assert list(tracking.runs) == [folder.mission_id]
+
+
+def test_what_the_server_refuses_is_left_out_and_counted(tmp_path: Path) -> None:
+    """One bad point does not keep the others of its batch."""
+    folder = fly(tmp_path, points=50)
+    tracking = FakeTracking(refuses=lambda point: point.key == 'battery_pct' and point.step == 33)
+    deliver(folder, tracking, FakeShelf())
+    assert sorted(point.step for point in tracking.points if point.key == 'battery_pct') == [n for n in range(50) if n != 33]
+    assert (folder.sent().refused, folder.sent().complete) == (1, True)
+    assert tracking.params['duration_s'] == '60.000'
+
+
+def test_a_deleted_run_is_not_made_again(tmp_path: Path) -> None:
+    """Whoever deletes a run does not want it: the mission stops, and says so."""
+    tracking = FakeTracking(gone=True)
+    delivery = Delivery(fly(tmp_path), tracking, FakeShelf())  # type: ignore[arg-type]
+    with pytest.raises(TrackingRefused):
+        delivery.track()
+    assert tracking.points == []
+
+
+def test_artifacts_that_do_not_arrive_hold_up_no_metric(tmp_path: Path) -> None:
+    """The run is whole and ended while its artifacts wait, and the mission is not complete."""
+    folder = fly(tmp_path)
+    tracking = FakeTracking(fail=lambda name: name == 'artifact')
+    shelf = FakeShelf()
+    delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
+    while delivery.track():
+        pass
+    with pytest.raises(TrackingUnavailable):
+        delivery.attach()
+    while delivery.shelve():
+        pass
+    assert tracking.finished
+    assert len(shelf.objects) == 5
+    assert not delivery.complete()
+    tracking.fail = lambda _: False
+    while not work(delivery):
+        pass
+    assert 'summary.json' in tracking.artifacts
+
+
+def abandon(home: Path) -> MissionFolder:
+    """A mission whose agent dies in the middle of writing a record."""
+    folder = fly(home, points=5)
+    lines = folder.journal.read_bytes().splitlines(keepends=True)
+    folder.journal.write_bytes(b''.join(lines[:-1]) + b'0000 {"torn')
+    return folder
+
+
+def test_a_mission_of_a_dead_agent_ends_as_killed(tmp_path: Path) -> None:
+    """It ends at its last record, with its last known state, and what was torn is cut off."""
+    folder = abandon(tmp_path)
+    last_ns = [line.record['t'] for line in read(folder.journal) if line.record][-1]
+    tracking, shelf = FakeTracking(), FakeShelf()
+    deliver(folder, tracking, shelf)
+    assert tracking.finished == [('run0', 'KILLED', last_ns // 1_000_000)]
+    last = {point.key: point.value for point in tracking.points}
+    assert (last['success'], last['battery_consumed_pct'], last['distance_traveled_m']) == (0.0, 4.0, 0.0)
+    summary = json.loads(tracking.artifacts['summary.json'])
+    assert (summary['result'], summary['ended_by'], summary['last']['battery_pct']) == ('KILLED', 'replayer', 86.0)
+    assert b'torn' not in folder.journal.read_bytes()
+
+
+def test_a_mission_of_a_living_agent_goes_on(tmp_path: Path) -> None:
+    """What is there is sent; the end is the agent's own business."""
+    folder = abandon(tmp_path)
+    content = folder.journal.read_bytes().rpartition(b'\n')[0] + b'\n'
+    folder.journal.unlink()
+    journal = Journal(folder.journal)
+    journal.create()
+    with folder.journal.open('ab') as file:
+        file.write(content)
+    tracking = FakeTracking()
+    delivery = deliver(folder, tracking, FakeShelf())
+    assert not delivery.complete()
+    assert tracking.finished == []
+    journal.append({'k': 'end', 't': 10**18, 'status': 'FINISHED', 'success': True, 'distance_m': 1.0, 'duration_s': 2.0})
+    journal.close()
+    while not work(delivery):
+        pass
+    assert tracking.finished == [('run0', 'FINISHED', 10**12)]
+
+
+def test_a_measured_distance_stands_where_zero_is_stated(tmp_path: Path) -> None:
+    """The agent's failure path states zeros; its positive numbers win."""
+    for stated, expected in ((0.0, 7.5), (9.0, 9.0)):
+        home = tmp_path / str(stated)
+        with journalling(home) as logger:
+            logger.start_mission('patrol', '')
+            logger.log_metric('distance_traveled_m', 7.5, step=4)
+            logger.end_mission(False, stated, 0.0)
+        tracking = FakeTracking()
+        deliver(next(missions(home)), tracking, FakeShelf())
+        distance = max((point for point in tracking.points if point.key == 'distance_traveled_m'), key=lambda point: point.step)
+        assert distance.value == expected
+        summary = json.loads(tracking.artifacts['summary.json'])
+        assert (summary['distance_m'], summary['stated']['distance_m'], summary['measured']['distance_m']) == (
+            expected,
+            stated,
+            7.5,
+        )
+        assert summary['duration_s'] > 0
+
+
+def test_frames_do_not_wait_for_a_run(tmp_path: Path) -> None:
+    """While Tower is away they are held in the spool, out of the mission's folder; with the run they get their names."""
+    folder = fly(tmp_path)
+    tracking, shelf = FakeTracking(fail=lambda name: name == 'run_of'), FakeShelf()
+    delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
+    with pytest.raises(TrackingUnavailable):
+        delivery.track()
+    while delivery.shelve(hold=True):
+        pass
+    assert {item.held for item in shelf.objects} == {f'mission-{folder.mission_id}'}
+    assert len(shelf.objects) == 4
+    tracking.fail = lambda _: False
+    deliver(folder, tracking, shelf)
+    assert not any(item.held for item in shelf.objects)
+    assert len(shelf.objects) == len(set(shelf.names())) == 5
+    assert all('/missions/run0/' in key or key.startswith('trajectories/') for key in shelf.names())

@@ -1,0 +1,177 @@
+"""The journal: what is written stays readable, whatever happens to the rest."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shadowhound_data_logger.missions.journal import Journal, abandoned, finish, line_of, read
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Iterator[Journal]:
+    made = Journal(tmp_path / 'journal')
+    made.create()
+    yield made
+    made.close()
+
+
+def records(path: Path, offset: int = 0) -> list[object]:
+    return [line.record for line in read(path, offset)]
+
+
+def test_it_is_read_as_it_was_written(journal: Journal) -> None:
+    """Records come back in order, floats to the last bit, and reading goes on at any line's end."""
+    said = [{'k': 'metrics', 'm': {'a': 0.1 + 0.2}, 't': 1 << 60}, {'k': 'event', 'name': 'Küche\n\0'}, {'k': 'end'}]
+    for record in said:
+        journal.append(record)
+    assert records(journal.path) == said
+    ends = [line.end for line in read(journal.path)]
+    assert [records(journal.path, end) for end in ends] == [said[1:], said[2:], []]
+    assert ends[-1] == journal.path.stat().st_size
+
+
+def test_a_torn_line_costs_itself(journal: Journal) -> None:
+    """A line that ends in the middle is left out until it is whole; one that never becomes whole is damaged."""
+    journal.append({'a': 1})
+    with journal.path.open('ab') as file:
+        file.write(line_of({'b': 2})[:-4])
+    assert records(journal.path) == [{'a': 1}]
+    with journal.path.open('ab') as file:
+        file.write(b'\n')
+    journal.append({'c': 3})
+    assert records(journal.path) == [{'a': 1}, None, {'c': 3}]
+
+
+def test_a_record_after_a_full_disk_is_whole(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a full disk cut off in the middle of a record does not swallow the next one."""
+    journal.append({'a': 1})
+    write = os.write
+    monkeypatch.setattr(os, 'write', lambda descriptor, data: write(descriptor, data[:7]))
+    with pytest.raises(OSError, match='only a part'):
+        journal.append({'b': 2})
+    monkeypatch.undo()
+    journal.append({'c': 3})
+    assert records(journal.path) == [{'a': 1}, None, {'c': 3}]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 400), st.integers(1, 255))
+def test_rot_is_seen(tmp_path_factory: pytest.TempPathFactory, place: int, flip: int) -> None:
+    """Of a journal with a changed byte, every record that is read is one that was written, and at most two are missing."""
+    said = [{'k': 'metrics', 'n': number, 'v': number / 7} for number in range(10)]
+    data = bytearray(b''.join(map(line_of, said)))
+    data[place % len(data)] ^= flip
+    path = tmp_path_factory.mktemp('rot') / 'journal'
+    path.write_bytes(data)
+    found = [record for record in records(path) if record is not None]
+    assert all(record in said for record in found)
+    assert len(found) >= len(said) - 2
+
+
+def test_threads_share_it(journal: Journal) -> None:
+    """Records of many threads do not mix, and each thread's stay in order."""
+    threads = [
+        threading.Thread(target=lambda me=me: [journal.append({'me': me, 'n': n, 'x': 'y' * 99}) for n in range(200)])
+        for me in range(5)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    found = records(journal.path)
+    assert len(found) == 1000
+    for me in range(5):
+        assert [record['n'] for record in found if record['me'] == me] == list(range(200))  # type: ignore[index]
+
+
+def test_a_living_writer_is_known(journal: Journal) -> None:
+    """As long as the writer has it open nobody may finish it; afterwards anybody may."""
+    with abandoned(journal.path) as descriptor:
+        assert descriptor is None
+    journal.close()
+    with abandoned(journal.path) as descriptor:
+        assert descriptor is not None
+
+
+def test_a_dead_writer_is_known_whatever_it_forked(tmp_path: Path) -> None:
+    """A killed writer's lock is free although a process that it forked lives on."""
+    program = """
+import os, signal, sys
+from pathlib import Path
+from shadowhound_data_logger.missions.journal import Journal
+journal = Journal(Path(sys.argv[1]))
+journal.create()
+journal.append({'a': 1})
+if os.fork() == 0:
+    journal.append({'from': 'the child'})
+    os.write(1, b'%d\\n' % os.getpid())
+signal.pause()
+"""
+    path = tmp_path / 'journal'
+    writer = subprocess.Popen([sys.executable, '-c', program, str(path)], stdout=subprocess.PIPE, text=True)
+    assert writer.stdout is not None
+    child = int(writer.stdout.readline())
+    try:
+        with abandoned(path) as descriptor:
+            assert descriptor is None
+        writer.kill()
+        writer.wait()
+        with abandoned(path) as descriptor:
+            assert descriptor is not None
+        assert records(path) == [{'a': 1}]
+    finally:
+        os.kill(child, 9)
+        writer.stdout.close()
+
+
+def test_the_last_record_replaces_what_is_torn(journal: Journal) -> None:
+    """Finishing cuts half a record off and says how much that was."""
+    journal.append({'a': 1})
+    end = journal.path.stat().st_size
+    with journal.path.open('ab') as file:
+        file.write(b'01234567 {"half')
+    journal.close()
+    with abandoned(journal.path) as descriptor:
+        assert descriptor is not None
+        assert finish(journal.path, descriptor, end, {'k': 'end'}) == 15
+    assert records(journal.path) == [{'a': 1}, {'k': 'end'}]
+
+
+def test_syncing_does_not_hold_up_writers(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the disk is busy with a sync, records go on."""
+    entered, leave = threading.Event(), threading.Event()
+    monkeypatch.setattr(os, 'fsync', lambda _: (entered.set(), leave.wait(10)))
+    thread = threading.Thread(target=journal.sync)
+    thread.start()
+    try:
+        assert entered.wait(10)
+        journal.append({'a': 1})
+        assert records(journal.path) == [{'a': 1}]
+    finally:
+        leave.set()
+        thread.join()
+
+
+def test_nobody_else_reads_it(journal: Journal) -> None:
+    """What a robot did is its owner's business."""
+    assert journal.path.stat().st_mode & 0o077 == 0
+
+
+def test_a_journal_is_made_once(journal: Journal) -> None:
+    """A second one under the same name is refused, and the first keeps its lock."""
+    with pytest.raises(FileExistsError):
+        Journal(journal.path).create()
+    descriptor = os.open(journal.path, os.O_RDONLY)
+    with pytest.raises(BlockingIOError):
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    os.close(descriptor)

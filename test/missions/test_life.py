@@ -1,0 +1,87 @@
+"""A logger's life: its thread and its disk, forks, and how it ends."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import threading
+from pathlib import Path
+
+import pytest
+from missions.fakes import journal, journalling
+
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.missions.folder import FOLDER
+
+JPEG = b'\xff\xd8 a picture \xff\xd9'
+
+
+def _in_a_fork(logger: MissionDataLogger) -> None:
+    logger.log_metric('from the child', 1.0)
+    logger.close()
+
+
+@pytest.mark.filterwarnings('ignore:This process .* is multi-threaded')
+def test_a_fork_has_no_mission(tmp_path: Path) -> None:
+    """A forked child's calls do nothing, and the parent's mission goes on."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        child = multiprocessing.get_context('fork').Process(target=_in_a_fork, args=(logger,))
+        child.start()
+        child.join(30)
+        assert child.exitcode == 0
+        logger.log_metric('a', 1.0)
+    assert [record['k'] for record in journal(tmp_path)] == ['start', 'metrics', 'end']
+
+
+def test_closing_ends_the_mission_as_killed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A logger that is closed in a mission says so; closing twice is the same as once."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.close()
+        logger.close()
+    assert [record.get('status') for record in journal(tmp_path)] == [None, 'KILLED']
+    assert logging.WARNING in {record.levelno for record in caplog.records}
+
+
+def test_a_robot_s_name_is_checked_at_once(tmp_path: Path) -> None:
+    """A name that cannot lead a key is the one thing that is refused, and before any mission."""
+    with pytest.raises(SettingError, match='robot'):
+        MissionDataLogger(robot='../thor', home=tmp_path, replay=False)
+
+
+def test_what_was_logged_reaches_the_disk_within_a_quarter_of_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread syncs the frame, its folder and then the journal, soon after a call and without another one."""
+    synced: list[str] = []
+    done = threading.Event()
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.log_camera_frame(JPEG, 0)
+        fsync = os.fsync
+
+        def note(descriptor: int) -> None:
+            synced.append(Path(f'/proc/self/fd/{descriptor}').readlink().name)
+            fsync(descriptor)
+            if synced[-1] == 'journal':
+                done.set()
+
+        monkeypatch.setattr(os, 'fsync', note)
+        logger.log_camera_frame(JPEG, 1)
+        assert done.wait(5.0)
+    assert synced[: synced.index('journal') + 1][-3:] == ['00000002.jpg', 'files', 'journal']
+
+
+def test_a_disk_that_is_full_at_the_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mission goes on unlogged, and the journal that took no record is closed."""
+
+    def full(*_: object) -> int:
+        raise OSError(28, 'No space left on device')
+
+    with journalling(tmp_path) as logger:
+        with monkeypatch.context() as patched:
+            patched.setattr(os, 'write', full)
+            assert logger.start_mission('patrol', '').endswith('_unlogged')
+        opened = [path.resolve() for path in Path('/proc/self/fd').iterdir()]
+        assert not [path for path in opened if path.is_relative_to(tmp_path / FOLDER)]

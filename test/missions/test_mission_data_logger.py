@@ -1,0 +1,259 @@
+"""MissionDataLogger as the agent uses it: nothing it says is lost, and nothing that goes wrong reaches the mission."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from missions.fakes import journal, journalling, journals
+
+from shadowhound_data_logger.missions import copies
+from shadowhound_data_logger.missions.folder import FOLDER, missions
+from shadowhound_data_logger.missions.recorder import Mission
+
+JPEG = b'\xff\xd8 a picture \xff\xd9'
+
+
+def test_the_guide_s_calls_are_journalled(tmp_path: Path) -> None:
+    """Each call of the integration guide, by its own argument names, is a record when it returns."""
+    csv = tmp_path / 't.csv'
+    csv.write_text('timestamp,x,y,yaw\n')
+    with journalling(tmp_path) as logger:
+        mission_id = logger.start_mission(mission_type='patrol', mission_command='go round')
+        logger.log_camera_frame(JPEG, frame_id=7)
+        logger.log_robot_state(battery_pct=88, temperature_c=41.5, step=3)
+        logger.log_trajectory(str(csv))
+        csv.unlink()
+        logger.end_mission(success=True, distance_m=12.0, duration_s=60.0)
+        start, frame, state, trajectory, end = journal(tmp_path)
+    assert re.fullmatch(r'patrol_\d{8}_\d{6}_[0-9a-f]{8}', mission_id)
+    folder = tmp_path / FOLDER / mission_id
+    assert (start['type'], start['command'], start['robot']) == ('patrol', 'go round', 'thor')
+    assert (frame['id'], (folder / 'files' / frame['file']).read_bytes()) == (7, JPEG)
+    assert (state['m'], state['s']) == ({'battery_pct': 88.0, 'temperature_c': 41.5}, 3)
+    assert (folder / 'files' / trajectory['file']).read_text() == 'timestamp,x,y,yaw\n'
+    assert (end['status'], end['success'], end['distance_m'], end['duration_s']) == ('FINISHED', True, 12.0, 60.0)
+    times = [record['t'] for record in (start, frame, state, trajectory, end)]
+    assert times == sorted(times)
+
+
+def test_a_failure_is_the_run_s_state(tmp_path: Path) -> None:
+    """``success=False`` ends it as FAILED."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.end_mission(False, 0.0, 0.0)
+    assert journal(tmp_path)[-1]['status'] == 'FAILED'
+
+
+def test_without_a_mission_calls_warn_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The agent may call whenever it likes; each kind of call is warned of once."""
+    with journalling(tmp_path) as logger:
+        for _ in range(3):
+            logger.log_camera_frame(JPEG, 0)
+            logger.log_robot_state(1, 2, 3)
+            logger.log_trajectory('/nowhere')
+            logger.log_metric('a', 1)
+            logger.log_event('a')
+            logger.log_artifact('/nowhere')
+            logger.end_mission(True, 1, 1)
+    assert len([record for record in caplog.records if 'without a mission' in record.message]) == 7
+    assert journals(tmp_path) == []
+
+
+def fail(mission: Mission) -> None:
+    mission.log_metric('a', 1.5, step=2)
+    raise ZeroDivisionError('oh')
+
+
+def test_an_exception_ends_the_mission_and_goes_on(tmp_path: Path) -> None:
+    """What is raised inside ``with`` is recorded, ends the mission as FAILED, and reaches the agent unchanged."""
+    with journalling(tmp_path) as logger:
+        with pytest.raises(ZeroDivisionError, match='oh'), logger.mission('explore', 'up') as mission:
+            fail(mission)
+        logger.log_metric('a', 2.5)
+    *_, event, end = journal(tmp_path)
+    assert (event['name'], event['data']) == ('exception', {'type': 'ZeroDivisionError', 'text': 'oh'})
+    assert (end['status'], end['success'], end['error']) == ('FAILED', False, 'ZeroDivisionError: oh')
+
+
+def test_a_with_that_ends_well_is_a_success(tmp_path: Path) -> None:
+    """Leaving ``with`` ends the mission as FINISHED, unless it said its end itself."""
+    with journalling(tmp_path) as logger:
+        with logger.mission('a', ''):
+            pass
+        with logger.mission('b', '') as mission:
+            mission.end(False, 3.0, 4.0)
+    first, second = journals(tmp_path)
+    assert [record['k'] for record in first] == ['start', 'end']
+    assert first[-1]['status'] == 'FINISHED'
+    assert [(record['k'], record.get('status')) for record in second] == [('start', None), ('end', 'FAILED')]
+
+
+def test_a_second_start_ends_the_first(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """It ends as KILLED with a warning, and what follows belongs to the second."""
+    with journalling(tmp_path) as logger:
+        first = logger.start_mission('patrol', '1')
+        second = logger.start_mission('patrol', '2')
+        logger.log_metric('a', 1.0)
+        logger.end_mission(True, 1, 1)
+    assert first != second
+    assert f'{first} is still active' in caplog.text
+    found = {records[0]['command']: records for records in journals(tmp_path)}
+    assert [record['k'] for record in found['1']] == ['start', 'end']
+    assert found['1'][-1]['status'] == 'KILLED'
+    assert [record['k'] for record in found['2']] == ['start', 'metrics', 'end']
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, None, 'twelve', '12', [1, 2], object(), 10**400])
+def test_what_is_no_number_is_counted(tmp_path: Path, value: Any) -> None:
+    """It is left out and counted, and the rest of the call stands."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.log_robot_state(value, 40.0, 1)
+        logger.log_metric('m', value)
+        logger.log_robot_state(1.0, 2.0, value)
+        logger.log_camera_frame(JPEG, value)
+        logger.log_camera_frame(value, 1)
+        logger.end_mission(True, value, value)
+    kinds = [record['k'] for record in journal(tmp_path)]
+    points = [record['m'] for record in journal(tmp_path) if record['k'] == 'metrics']
+    assert points[0] == {'temperature_c': 40.0}
+    assert kinds.count('refused') >= 4
+    assert kinds[-1] == 'end'
+
+
+@pytest.mark.parametrize('key', ['', 'a' * 251, '../up', 'a//b', '/a', 'a\n', 'a*', None, 3])
+def test_a_bad_metric_name_is_counted(tmp_path: Path, key: Any) -> None:
+    """Names that MLflow would refuse never reach it."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.log_metric(key, 1.0)
+    assert [record['k'] for record in journal(tmp_path)] == ['start', 'refused', 'end']
+
+
+@pytest.mark.parametrize('path', ['/nowhere', '', 'a\0b', None, 3.5, '/dev/zero', '/tmp'])  # noqa: S108
+def test_what_is_no_file_is_counted(tmp_path: Path, path: Any) -> None:
+    """No artifact, and no error in the mission."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.log_artifact(path)
+        logger.log_trajectory(path)
+        logger.log_artifact(__file__, '../outside')
+    assert [record['k'] for record in journal(tmp_path)] == ['start', 'refused', 'refused', 'refused', 'end']
+
+
+@pytest.mark.parametrize(
+    ('given', 'named'),
+    [('night patrol', 'night_patrol'), ('../../etc', 'etc'), ('', 'mission'), ('x' * 300, 'x' * 64), ('наблюдение', 'mission'),
+     (None, 'None'), ('a..b', 'a_b')],
+)  # fmt: skip
+def test_a_hostile_type_is_made_safe(tmp_path: Path, given: Any, named: str) -> None:
+    """The mission goes on: its name is the nearest that can be one, its type stands as it was given."""
+    with journalling(tmp_path) as logger:
+        mission_id = logger.start_mission(given, 'x')
+    assert re.fullmatch(re.escape(named) + r'_\d{8}_\d{6}_[0-9a-f]{8}', mission_id)
+    assert (tmp_path / FOLDER / mission_id / 'journal').is_file()
+    assert journal(tmp_path)[0]['type'] == str(given)
+
+
+def test_events_hold_anything_but_files(tmp_path: Path) -> None:
+    """What JSON cannot hold becomes text, whatever it is called; what is as large as a file is refused."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.log_event('seen', name='a cat', self=1, where=Path('/x'), how=math.nan, what={1: {2, 3}}, deep=[[[[[[1]]]]]])
+        logger.log_event('film', frames=['x' * 6000] * 200)
+        logger.end_mission([1, 2], 1.0, 1.0)  # type: ignore[arg-type]
+    _, event, refused, end = journal(tmp_path)
+    assert event['data'] == {
+        'name': 'a cat',
+        'self': 1,
+        'where': '/x',
+        'how': 'nan',
+        'what': {'1': '{2, 3}'},
+        'deep': [[['[[[1]]]']]],
+    }
+    assert refused['reason'] == 'too_large'
+    assert end['status'] == 'FINISHED'
+
+
+def test_a_full_disk_does_not_reach_the_mission(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What cannot be written is warned of once; when there is room again the journal goes on."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+
+        def full(*_: object) -> int:
+            raise OSError(28, 'No space left on device')
+
+        with monkeypatch.context() as patched:
+            patched.setattr(os, 'write', full)
+            for number in range(3):
+                logger.log_metric('a', number)
+                logger.log_camera_frame(JPEG, number)
+        logger.log_metric('a', 3.0)
+    assert len([record for record in caplog.records if 'loses' in record.message]) == 1
+    assert [record['k'] for record in journal(tmp_path)] == ['start', 'metrics', 'end']
+
+
+def test_little_room_is_kept_for_the_journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames and artifacts stop before the disk is full, metrics do not."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        monkeypatch.setattr(copies, 'MIN_FREE_BYTES', 1 << 60)
+        logger.log_camera_frame(JPEG, 0)
+        logger.log_artifact(__file__)
+        logger.log_metric('a', 1.0)
+    assert [record['k'] for record in journal(tmp_path)] == ['start', 'metrics', 'end']
+
+
+def test_a_home_that_cannot_be_written_costs_the_log_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The agent gets an id and goes on; the log says that nothing is logged."""
+    (tmp_path / 'file').write_text('')
+    with journalling(tmp_path / 'file') as logger:
+        assert logger.start_mission('patrol', '').endswith('_unlogged')
+        logger.log_metric('a', 1.0)
+        logger.end_mission(True, 1, 1)
+        with logger.mission('patrol', '') as mission:
+            mission.log_metric('a', 1.0)
+    assert 'is not logged' in caplog.text
+
+
+def test_threads_share_a_logger(tmp_path: Path) -> None:
+    """Calls of many threads are all there, each frame with its own content."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+
+        def work(me: int) -> None:
+            for number in range(50):
+                logger.log_metric(f'm{me}', number, step=number)
+                logger.log_camera_frame(JPEG + bytes([me, number]), me * 1000 + number)
+
+        threads = [threading.Thread(target=work, args=(me,)) for me in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        found = journal(tmp_path)
+        (folder,) = missions(tmp_path)
+        for record in found:
+            if record['k'] == 'frame':
+                content = (folder.files / record['file']).read_bytes()
+                assert content == JPEG + bytes(divmod(record['id'], 1000))
+    assert sum(record['k'] == 'frame' for record in found) == 200
+    for me in range(4):
+        assert [record['s'] for record in found if record['k'] == 'metrics' and f'm{me}' in record['m']] == list(range(50))
+
+
+def test_frames_are_sampled_for_the_run(tmp_path: Path) -> None:
+    """The first frame is an artifact of the run, the others of the same moment are not."""
+    with journalling(tmp_path, frame_artifact_every_s=3600.0) as logger:
+        logger.start_mission('patrol', '')
+        for number in range(5):
+            logger.log_camera_frame(JPEG, number)
+    assert [record['artifact'] for record in journal(tmp_path) if record['k'] == 'frame'] == [True, False, False, False, False]

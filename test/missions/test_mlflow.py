@@ -1,0 +1,176 @@
+"""Missions against a real MLflow server and a real S3 server, through the process that sends them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from e2e.wire import HANG, PASS, REFUSE
+from missions.agent import FRAME_EVERY, jpeg
+from missions.server import Server, complete, until
+
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.errors import TrackingUnavailable
+from shadowhound_data_logger.missions.folder import FOLDER, missions, read_json
+from shadowhound_data_logger.missions.journal import read
+from shadowhound_data_logger.missions.tracking import MlflowTracking
+
+pytestmark = [pytest.mark.seaweedfs, pytest.mark.slow]
+
+
+def fly(logger: MissionDataLogger, command: str, tmp_path: Path) -> str:
+    """A short mission, by the guide's calls."""
+    csv = tmp_path / 'trajectory.csv'
+    csv.write_text('timestamp,x,y,yaw\n1,2,3,4\n')
+    given = logger.start_mission('patrol', command)
+    for number in range(20):
+        logger.log_robot_state(90.0 - number, 40.0 + number, number)
+    logger.log_camera_frame(jpeg(0), 0)
+    logger.log_camera_frame(jpeg(1), 1)
+    logger.log_trajectory(str(csv))
+    logger.end_mission(True, 12.5, 60.0)
+    return given
+
+
+def check(server: Server, command: str, home: Path) -> None:
+    """All of ``fly`` is in MLflow and in the store, with its own times."""
+    run = server.run(command)
+    (folder,) = [folder for folder in missions(home) if (found := folder.run()) and found.run_id == run.info.run_id]
+    times = [line.record['t'] // 1_000_000 for line in read(folder.journal) if line.record]
+    assert (run.info.status, run.info.start_time, run.info.end_time) == ('FINISHED', times[0], times[-1])
+    assert run.info.run_name == folder.mission_id.rpartition('_')[0]
+    assert run.data.tags['shadowhound.mission_id'] == folder.mission_id
+    assert run.data.params == {'mission_type': 'patrol', 'mission_command': command, 'robot': 'thor',
+                               'timestamp': run.data.params['timestamp'], 'duration_s': '60.000'}  # fmt: skip
+    assert run.data.metrics == {
+        'battery_pct': 71.0, 'temperature_c': 59.0, 'camera_frame_0': 1.0, 'camera_frame_1': 1.0, 'camera_frames': 2.0,
+        'success': 1.0, 'distance_m': 12.5, 'distance_traveled_m': 12.5, 'duration_s': 60.0, 'battery_consumed_pct': 19.0,
+    }  # fmt: skip
+    battery = server.history(run.info.run_id, 'battery_pct')
+    assert [(point.step, point.value, point.timestamp) for point in battery] == [(n, 90.0 - n, times[n + 1]) for n in range(20)]
+    assert server.artifacts(run.info.run_id) == {'camera/frame_000000.jpg', 'trajectories/trajectory.csv', 'summary.json'}
+    prefix = f'thor/missions/{run.info.run_id}'
+    assert server.keys(prefix) == {f'{prefix}/{name}': 1 for name in (
+        'camera/frame_000000.jpg', 'camera/frame_000001.jpg', 'trajectory.csv', 'summary.json')}  # fmt: skip
+    assert server.keys(f'thor/{run.info.run_name}', 'trajectories') == {f'thor/{run.info.run_name}.csv': 1}
+
+
+def test_a_mission_is_in_mlflow_and_in_the_store(server: Server, home: Path, tmp_path: Path) -> None:
+    """While it goes on its points are there, afterwards all of it; the id that start_mission gave is the run's."""
+    logger = MissionDataLogger(home=home, start_timeout_s=60.0)
+    given = fly(logger, 'whole', tmp_path)
+    report = logger.close(60.0)
+    assert (report.complete, report.unsent, report.last_error) == (True, 0, '')
+    assert given == report.run_id == server.run('whole').info.run_id
+    until(lambda: len(server.keys(f'thor/missions/{given}')) == 4, 'the objects are delivered')
+    check(server, 'whole', home)
+    until(lambda: not read_json(home / FOLDER / 'replay.json')['pid'], 'the replayer ends after its agent')
+
+
+def test_a_run_lives_while_its_mission_does(server: Server, home: Path) -> None:
+    """What was logged is in the run before the mission ends, and a mission in another process has a run of its own."""
+    one, two = (MissionDataLogger(home=home, start_timeout_s=60.0) for _ in range(2))
+    try:
+        first, second = one.start_mission('patrol', 'live 1'), two.start_mission('patrol', 'live 2')
+        one.log_metric('a', 1.5, step=3)
+        two.log_metric('a', 2.5, step=4)
+        assert one.flush(60.0).unsent == two.flush(60.0).unsent == 0
+        assert [server.run(f'live {n}').data.metrics['a'] for n in (1, 2)] == [1.5, 2.5]
+        assert server.run('live 1').info.status == 'RUNNING'
+        assert {first, second} == {server.run(f'live {n}').info.run_id for n in (1, 2)}
+    finally:
+        for logger in (one, two):
+            logger.end_mission(True, 0, 0)
+            logger.close()
+    until(lambda: complete(home, 2), 'both are sent')
+
+
+def test_tower_away_for_the_whole_mission(server: Server, home: Path, tmp_path: Path) -> None:
+    """No call waits for it; when it is back, after the robot's next start, the run is whole with the original times."""
+    server.wire.set(HANG)
+    logger = MissionDataLogger(home=home, start_timeout_s=0.3)
+    began = time.monotonic()
+    given = fly(logger, 'away', tmp_path)
+    logger.close()
+    assert time.monotonic() - began < 1.5
+    assert (home / FOLDER / given / 'journal').is_file()
+    until(lambda: read_json(home / FOLDER / 'replay.json').get('errors'), 'the replayer says what is wrong')
+    os.kill(read_json(home / FOLDER / 'replay.json')['pid'], signal.SIGKILL)  # the robot is switched off
+    server.wire.set(PASS)
+    again = MissionDataLogger(home=home)
+    until(lambda: complete(home), 'it is sent')
+    again.close()
+    run_id = server.run('away').info.run_id
+    assert read_json(home / FOLDER / given / 'run.json')['run_id'] == run_id
+    until(lambda: len(server.keys(f'thor/missions/{run_id}')) == 4, 'the objects are delivered')
+    check(server, 'away', home)
+
+
+def test_a_killed_agent_s_mission(server: Server, home: Path, tmp_path: Path) -> None:
+    """One run, KILLED at its last record; each point and frame that a call had returned for is there, and once."""
+    csv = tmp_path / 'trajectory.csv'
+    csv.write_text('timestamp,x,y,yaw\n')
+    server.wire.set(REFUSE)
+    command = 'killed'
+    agent = subprocess.Popen(
+        [sys.executable, '-m', 'missions.agent', str(home), command, str(csv)], stdout=subprocess.PIPE, text=True,
+        env={**os.environ, 'PYTHONPATH': str(Path(__file__).parents[1])},
+    )  # fmt: skip
+    assert agent.stdout is not None
+    for line in agent.stdout:
+        if line.strip() == '300':
+            agent.kill()
+    agent.wait()
+    agent.stdout.close()
+    server.wire.set(PASS)
+    until(lambda: complete(home), 'its replayer sends it')
+    run = server.run(command)
+    (folder,) = missions(home)
+    said = [line.record for line in read(folder.journal) if line.record]
+    assert (run.info.status, run.info.end_time) == ('KILLED', said[-1]['t'] // 1_000_000)
+    steps = [point.step for point in server.history(run.info.run_id, 'battery_pct')]
+    assert steps == list(range(len(steps)))
+    assert len(steps) > 300
+    frames = {record['id'] for record in said if record['k'] == 'frame'}
+    assert frames >= set(range(0, 301, FRAME_EVERY))
+    wanted = {f'camera/frame_{number:06d}.jpg' for number in frames} | {'summary.json', 'trajectories/trajectory.csv'}
+    assert server.artifacts(run.info.run_id) == wanted
+    prefix = f'thor/missions/{run.info.run_id}/camera/'
+    until(lambda: len(server.keys(prefix)) == len(frames), 'the frames are delivered')
+    assert server.keys(prefix) == {f'{prefix}frame_{number:06d}.jpg': 1 for number in frames}
+
+
+def test_artifacts_in_s3(server: Server, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where artifacts lie in S3 the error names the missing variable, the run is whole without them, and with it they arrive."""
+    server.client.create_experiment('in s3', artifact_location='s3://sensor-data/mlflow')
+    for name in ('MLFLOW_S3_ENDPOINT_URL', 'AWS_ENDPOINT_URL'):
+        monkeypatch.delenv(name)
+    logger = MissionDataLogger(home=home, experiment='in s3', start_timeout_s=60.0)
+    run_id = fly(logger, 'in s3', tmp_path)
+    until(lambda: 'MLFLOW_S3_ENDPOINT_URL' in logger.flush(0.1).remedy, 'the error says so')
+    until(lambda: server.client.get_run(run_id).info.status == 'FINISHED', 'the run ends all the same')
+    logger.close()
+    os.kill(read_json(home / FOLDER / 'replay.json')['pid'], signal.SIGKILL)
+    monkeypatch.setenv('MLFLOW_S3_ENDPOINT_URL', server.tower.endpoint_url)
+    again = MissionDataLogger(home=home, experiment='in s3')
+    until(lambda: complete(home), 'it is sent')
+    again.close()
+    found = server.keys(f'mlflow/{run_id}/artifacts')
+    names = ('camera/frame_000000.jpg', 'summary.json', 'trajectories/trajectory.csv')
+    assert found == {f'mlflow/{run_id}/artifacts/{name}': 1 for name in names}
+
+
+@pytest.mark.parametrize('mode', [REFUSE, HANG, (200, 'Portal'), (403, 'Forbidden'), (500, 'Broken'), (404, 'Elsewhere')])
+def test_a_server_that_is_none_is_tried_again(server: Server, mode: str | tuple[int, str]) -> None:
+    """Whatever answers, or does not: the mission waits, and the error has a remedy and no password."""
+    server.wire.set(mode)
+    tracking = MlflowTracking(server.wire.url.replace('//', '//thor:secret@'), 'thor_missions')
+    with pytest.raises(TrackingUnavailable) as caught:
+        tracking.run_of('patrol_1', 'patrol', 0, {})
+    assert 'MLFLOW_TRACKING_' in caught.value.remedy
+    assert 'secret' not in str(caught.value)

@@ -1,0 +1,112 @@
+"""A mission's objects in a real spool: each once, held until their run is known, delivered where no node does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from missions.fakes import journalling
+from spool.making import rows
+
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
+from shadowhound_data_logger.missions.journal import read
+from shadowhound_data_logger.missions.objects import Shelf, objects_of
+from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.spool.files import flock
+
+RUN = Run('abc', '1', 'x')
+
+
+@pytest.fixture
+def shelf(tmp_path: Path) -> Iterator[Shelf]:
+    settings = Settings.load({'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path)})
+    made = Shelf(settings, SystemClock('boot'))
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> MissionFolder:
+    """A mission with two frames of the same id and other content, and a trajectory."""
+    csv = tmp_path / 't.csv'
+    csv.write_text('timestamp,x,y,yaw\n')
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.log_camera_frame(b'one', 7)
+        logger.log_camera_frame(b'two', 7)
+        logger.log_trajectory(csv)
+    return next(missions(tmp_path))
+
+
+def objects(folder: MissionFolder, run: Run | None) -> list[DataObject]:
+    records = [line.record or {} for line in read(folder.journal)]
+    return [item.content for record in records[:-1] for item in objects_of(record, records[0], folder, run)]
+
+
+def spooled(home: Path) -> dict[str, str]:
+    return {row['key']: row['state'] for row in rows(home / 'spool')}
+
+
+def test_what_is_handed_over_twice_is_spooled_once(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+    """A replayer that was killed before it noted its progress adds nothing again, frames of one id included."""
+    prefix = 'thor/missions/abc'
+    for _ in range(3):
+        shelf.add(objects(folder, RUN))
+    name = folder.mission_id.rpartition('_')[0]
+    assert set(spooled(tmp_path)) == {
+        f'{prefix}/camera/frame_000007.jpg', f'{prefix}/camera/frame_000007_1.jpg', f'{prefix}/trajectory.csv',
+        f'thor/{name}.csv',
+    }  # fmt: skip
+
+
+def test_what_is_held_gets_the_run_s_name(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+    """Under the run's id, with it in the metadata; handed over again afterwards it is still there once."""
+    shelf.add(objects(folder, None))
+    assert set(spooled(tmp_path).values()) == {'held'}
+    assert shelf.bind(folder.mission_id, 'abc')
+    assert not shelf.bind(folder.mission_id, 'abc')
+    shelf.add(objects(folder, RUN))
+    assert set(spooled(tmp_path).values()) == {'pending'}
+    assert len(spooled(tmp_path)) == 4
+    assert all(f'"run_id": "{RUN.run_id}"' in row['metadata'] for row in rows(tmp_path / 'spool'))
+    assert sorted(path.name for path in (tmp_path / 'spool' / 'ready').rglob('frame*')) == [
+        'frame_000007.jpg',
+        'frame_000007_1.jpg',
+    ]
+
+
+def test_without_a_node_it_is_delivered(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+    """The folder store has all of it, and the drain is free again afterwards."""
+    shelf.add(objects(folder, RUN))
+    assert shelf.owes
+    shelf.drain()
+    assert set(spooled(tmp_path).values()) == {'delivered'}
+    assert (tmp_path / 'store/sensor-data/thor/missions/abc/camera/frame_000007.jpg').read_bytes() == b'one'
+    assert not shelf.owes
+    with flock(tmp_path / 'spool' / 'drain.lock', wait=False) as free:
+        assert free
+
+
+def test_beside_a_node_it_is_the_node_s(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+    """Whoever drains already delivers it."""
+    shelf.add(objects(folder, RUN))
+    with flock(tmp_path / 'spool' / 'drain.lock', wait=False):
+        shelf.drain()
+    assert set(spooled(tmp_path).values()) == {'pending'}
+    assert not shelf.owes
+
+
+def test_what_an_earlier_process_left_is_delivered(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+    """A new replayer without a mission of its own empties the spool."""
+    shelf.add(objects(folder, RUN))
+    shelf.close()
+    later = Shelf(Settings.load({}, {'SHADOWHOUND_HOME': str(tmp_path)}), SystemClock('boot'))
+    try:
+        later.drain()
+        later.drain()
+    finally:
+        later.close()
+    assert set(spooled(tmp_path).values()) == {'delivered'}

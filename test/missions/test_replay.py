@@ -1,0 +1,211 @@
+"""The sender's rounds: outages, many missions, who comes first, and when it ends."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from missions.fakes import FakeShelf, FakeTracking, journalling
+from missions.server import until
+
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.missions.folder import FOLDER, missions, read_json
+from shadowhound_data_logger.missions.replay import LINGER_S, Gate, Parent, Replay, run
+from shadowhound_data_logger.missions.report import report
+from shadowhound_data_logger.spool.files import flock
+
+
+class Now:
+    """Time that passes when told to."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+def new_replay(home: Path, tracking: FakeTracking, now: Now | None = None) -> Replay:
+    (home / FOLDER).mkdir(parents=True, exist_ok=True)
+    return Replay(home, tracking, FakeShelf(), monotonic=now or Now(), rng=random.Random(1))  # type: ignore[arg-type]
+
+
+def fly(home: Path, mission_type: str = 'patrol') -> str:
+    with journalling(home) as logger:
+        mission_id = logger.start_mission(mission_type, '')
+        logger.log_metric('a', 1.0)
+        logger.end_mission(True, 1.0, 1.0)
+    return mission_id
+
+
+def test_all_missions_are_sent(tmp_path: Path) -> None:
+    """Of every agent that ever logged here, and then there is nothing to do."""
+    for _ in range(3):
+        fly(tmp_path)
+    tracking = FakeTracking()
+    replay = new_replay(tmp_path, tracking)
+    while replay.step():
+        pass
+    assert [folder.sent().complete for folder in missions(tmp_path)] == [True] * 3
+    assert (len(tracking.runs), replay.owes) == (3, False)
+
+
+def test_an_outage_is_probed_ever_more_rarely(tmp_path: Path) -> None:
+    """At most one request a round, pauses up to a minute; the state says what is wrong and what to do, until it is over."""
+    for _ in range(5):
+        fly(tmp_path)
+    asked: list[float] = []
+    now, away = Now(), True
+    tracking = FakeTracking(fail=lambda _: bool(asked.append(now())) or away)
+    replay = new_replay(tmp_path, tracking, now)
+    while now() < 3600:
+        replay.step()
+        now.seconds += 0.5
+    assert 60 < len(asked) < 300
+    assert max(later - sooner for sooner, later in pairwise(asked)) <= 61
+    assert replay.owes
+    newest = max(missions(tmp_path), key=lambda folder: folder.mission_id)
+    assert (report(newest).last_error, report(newest).remedy) == ('away (wait)', 'wait')
+    away = False
+    replay.hurry()
+    while replay.step():
+        pass
+    assert not replay.owes
+    assert read_json(tmp_path / FOLDER / 'replay.json')['errors'] == {}
+    assert report(newest).complete
+
+
+def test_a_mission_that_begins_ends_a_pause(tmp_path: Path) -> None:
+    """Its agent waits for the run's id for two seconds, and an outage's pause may be a minute."""
+    fly(tmp_path)
+    now, away = Now(), True
+    tracking = FakeTracking(fail=lambda _: away)
+    replay = new_replay(tmp_path, tracking, now)
+    for _ in range(20):
+        replay.hurry()
+        replay.step()
+    away = False
+    assert not replay.step()
+    assert tracking.runs == {}
+    begun = fly(tmp_path)
+    replay.step()
+    assert begun in tracking.runs
+
+
+def test_the_newest_mission_comes_first(tmp_path: Path) -> None:
+    """An agent that begins does not wait for the backlog of others, whatever its mission is called."""
+    old = tmp_path / FOLDER / fly(tmp_path, 'zzz')
+    old.rename(old.with_name('zzz_20200101_000000_00000000'))
+    newest = fly(tmp_path, 'aaa')
+    tracking = FakeTracking()
+    new_replay(tmp_path, tracking).step()
+    assert next(iter(tracking.runs)) == newest
+
+
+def test_a_rotten_mission_does_not_stop_the_others(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """One whose first record is damaged is told of and left, the others are sent."""
+    rotten = fly(tmp_path)
+    path = tmp_path / FOLDER / rotten / 'journal'
+    path.write_bytes(b'X' + path.read_bytes()[1:])
+    whole = fly(tmp_path)
+    tracking = FakeTracking()
+    replay = new_replay(tmp_path, tracking)
+    while replay.step():
+        pass
+    assert list(tracking.runs) == [whole]
+    assert rotten in caplog.text
+
+
+def test_a_deleted_run_is_told(tmp_path: Path) -> None:
+    """Its mission is left alone, with the reason in its report."""
+    mission_id = fly(tmp_path)
+    replay = new_replay(tmp_path, FakeTracking(gone=True))
+    while replay.step():
+        pass
+    (folder,) = missions(tmp_path)
+    assert (folder.mission_id, folder.sent().complete) == (mission_id, False)
+    assert 'deleted' in report(folder).last_error
+
+
+def test_pauses_grow_to_a_minute_and_end_with_a_success() -> None:
+    """Full jitter: between nothing and the cap, which doubles."""
+    now = Now()
+    gate = Gate(now, random.Random(2))
+    longest = 0.0
+    for _ in range(200):
+        gate.failed(OSError('away'))
+        began = now()
+        while not gate.is_open:
+            now.seconds += 0.1
+        longest = max(longest, now() - began)
+    assert 50 < longest <= 60.2
+    gate.worked()
+    assert gate.is_open
+    assert gate.error is None
+
+
+def test_it_ends_after_its_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At once when all is sent; after ten minutes when nothing gets through."""
+    fly(tmp_path)
+    now = Now()
+    monkeypatch.setattr('shadowhound_data_logger.missions.replay.time.monotonic', now)
+    monkeypatch.setattr(
+        'shadowhound_data_logger.missions.replay.time.sleep', lambda seconds: setattr(now, 'seconds', now() + seconds)
+    )
+    reader, writer = os.pipe()
+    os.close(writer)
+    parent = Parent(reader)
+    parent.wait(0.0)
+    assert parent.gone
+    run(new_replay(tmp_path, FakeTracking(fail=lambda _: True), now), parent, lambda: False)
+    assert LINGER_S <= now() <= LINGER_S + 60
+    before = now()
+    run(new_replay(tmp_path, FakeTracking(), now), parent, lambda: False)
+    assert now() - before < 1.0
+    os.close(reader)
+
+
+def test_a_byte_wakes_it() -> None:
+    """And the end of its input is that of the agent."""
+    reader, writer = os.pipe()
+    parent = Parent(reader)
+    os.write(writer, b'\n')
+    assert parent.wait(5.0)
+    assert not parent.wait(0.0)
+    os.close(writer)
+    assert not parent.wait(5.0)
+    assert parent.gone
+    os.close(reader)
+
+
+def test_a_second_one_waits_and_ends_with_its_agent(tmp_path: Path) -> None:
+    """One a home sends."""
+    (tmp_path / FOLDER).mkdir()
+    with flock(tmp_path / FOLDER / 'replay.lock', wait=False) as mine:
+        assert mine
+        command = [sys.executable, '-m', 'shadowhound_data_logger.missions.replay', '--home', str(tmp_path), '--experiment', 'x']
+        waiting = subprocess.Popen(command, stdin=subprocess.PIPE)
+        assert waiting.stdin is not None
+        with pytest.raises(subprocess.TimeoutExpired):
+            waiting.wait(1.0)
+        waiting.stdin.close()
+        assert waiting.wait(10.0) == 0
+
+
+def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sender that dies is replaced after a pause, it is no zombie meanwhile, and none is left after its logger."""
+    monkeypatch.setattr('shadowhound_data_logger.missions.child.AGAIN_S', 0.1)
+    monkeypatch.setattr('shadowhound_data_logger.missions.child.sys.executable', '/bin/false')
+    logger = MissionDataLogger(home=tmp_path, start_timeout_s=0.0)
+    try:
+        first = logger._replayer._process  # type: ignore[union-attr]
+        until(lambda: logger._replayer._process is not first, 'another is started', 20.0)  # type: ignore[union-attr]
+        assert first is not None
+        assert first.returncode == 1
+    finally:
+        logger.close()
