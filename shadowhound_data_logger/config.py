@@ -33,8 +33,8 @@ from shadowhound_data_logger.options import (
 
 __all__ = [
     'DEFAULT_SENSORS', 'FOREIGN', 'FORMATS',
-    'ClockSettings', 'EncodeSettings', 'IntakeSettings', 'QueueSettings', 'SensorSettings', 'Settings', 'ShutdownSettings', 'SpoolSettings',
-    'StoreSettings', 'UploadSettings', 'default_parameters', 'home', 'store_settings',
+    'ClockSettings', 'EncodeSettings', 'IntakeSettings', 'QueueSettings', 'SensorSettings', 'Settings', 'ShutdownSettings',
+    'SpoolSettings', 'StoreSettings', 'UploadSettings', 'default_parameters', 'home', 'store_settings',
 ]  # fmt: skip
 
 MIN_RATE_HZ: Final = 1e-4

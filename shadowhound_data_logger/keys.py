@@ -96,8 +96,32 @@ class KeyTemplate:
 
     def render(self, *, robot: str, sensor: str, stamp_ns: int, period_ns: int, ext: str) -> str:
         """The key of an object that begins at ``stamp_ns``; ``period_ns`` is the least time between two of them."""
-        when = utc(stamp_ns)
-        time = when.strftime('%H%M%S')
-        if period_ns % SECOND or not period_ns:
-            time = f'{time}_{stamp_ns % SECOND // 1_000_000:03d}'
-        return check_key(self.template.format(robot=robot, sensor=sensor, date=when.strftime('%Y%m%d'), time=time, ext=ext))
+        return dated(self.pattern(robot=robot, sensor=sensor, period_ns=period_ns, ext=ext), stamp_ns)
+
+    def pattern(self, *, robot: str, sensor: str, period_ns: int, ext: str) -> str:
+        """The key of an object whose time is not known yet, for ``dated``."""
+        time = '{time}_{ms}' if period_ns % SECOND or not period_ns else '{time}'
+        return self.template.format(robot=robot, sensor=sensor, date='{date}', time=time, ext=ext)
+
+
+def dated(pattern: str, stamp_ns: int) -> str:
+    """The key of a pattern at this time. Raises NameRefused where that is none."""
+    when = utc(stamp_ns)
+    values = {
+        '{date}': when.strftime('%Y%m%d'),
+        '{time}': when.strftime('%H%M%S'),
+        '{ms}': f'{stamp_ns % SECOND // 1_000_000:03d}',
+    }
+    for name, value in values.items():
+        pattern = pattern.replace(name, value)
+    return check_key(pattern)
+
+
+def unsynced(robot: str, boot_id: str, sensor: str, boot_ns: int, key: str) -> str:
+    """The key of an object whose time is known by the boot clock alone; it ends as ``key`` does.
+
+    ``thor/_unsynced/<boot_id>/camera/00000123_456_camera.jpg``: seconds since boot, milliseconds.
+    """
+    _, dot, extension = key.rpartition('/')[2].partition('.')
+    seconds, rest_ns = divmod(boot_ns, SECOND)
+    return check_key(f'{robot}/_unsynced/{boot_id}/{sensor}/{seconds:08d}_{rest_ns // 1_000_000:03d}_{sensor}{dot}{extension}')

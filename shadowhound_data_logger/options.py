@@ -71,7 +71,7 @@ class SensorSettings:
 class IntakeSettings:
     """The polled reader (D1)."""
 
-    poll_s: float = _setting(0.1, 'Seconds between two drains of the subscriptions.', low=0.005, high=1.0)
+    poll_s: float = _setting(0.2, 'Seconds between two drains of the subscriptions.', low=0.005, high=1.0)
     history_bytes: int = _setting(32 * MEBI, 'Most bytes one subscription may hold between two drains.', low=MEBI)
     max_rate_hz: float = _setting(2000.0, 'Rate for which the history of small messages is sized.', low=1.0, high=1e5)
 
@@ -95,7 +95,7 @@ class EncodeSettings:
 class SpoolSettings:
     """The durable spool (D5, D9)."""
 
-    commit_s: float = _setting(0.2, 'Longest time between an encoded object and its group commit.', low=0.01, high=10.0)
+    commit_s: float = _setting(0.1, 'Longest time between an encoded object and its group commit.', low=0.01, high=10.0)
     max_bytes: int = _setting(20 * GIBI, 'Most payload bytes in the spool; beyond it the least important is evicted.', low=MEBI)
     min_free_bytes: int = _setting(2 * GIBI, 'Free space of the file system that is never used.', low=0)
     remember_days: float = _setting(3.0, 'Days for which delivered keys are remembered.', low=1.0, high=3650.0)

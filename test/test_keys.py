@@ -6,7 +6,16 @@ from hypothesis import strategies as st
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import NameRefused, SettingError
-from shadowhound_data_logger.keys import MAX_NAME_BYTES, MAX_SEGMENT_BYTES, KeyTemplate, check_key, check_name, unique
+from shadowhound_data_logger.keys import (
+    MAX_NAME_BYTES,
+    MAX_SEGMENT_BYTES,
+    KeyTemplate,
+    check_key,
+    check_name,
+    dated,
+    unique,
+    unsynced,
+)
 
 NOON_NS = 1_760_788_800 * SECOND + 250_000_000
 HOSTILE = ['', '.', '..', '../x', 'a/../b', '/a', 'a//b', 'a/', 'a b', 'a\n',
@@ -98,3 +107,18 @@ def test_the_time_is_as_fine_as_objects_come(period_ns: int, time: str) -> None:
     key = KeyTemplate.parse('{robot}/{sensor}/{date}/{time}_front.{ext}', 'camera.key')
     rendered = key.render(robot='thor', sensor='camera', stamp_ns=NOON_NS, period_ns=period_ns, ext='jpg')
     assert rendered == f'thor/camera/20251018/{time}_front.jpg'
+
+
+@pytest.mark.parametrize('period_ns', [SECOND, 0])
+def test_a_pattern_gets_its_time_later(period_ns: int) -> None:
+    """A key whose time is left open is in the end the one that it would have been at once."""
+    key = KeyTemplate.parse('{robot}/{sensor}/{date}/{time}_front.{ext}', 'camera.key')
+    pattern = key.pattern(robot='thor', sensor='camera', period_ns=period_ns, ext='jpg')
+    at_once = key.render(robot='thor', sensor='camera', stamp_ns=NOON_NS + SECOND // 4, period_ns=period_ns, ext='jpg')
+    assert dated(pattern, NOON_NS + SECOND // 4) == at_once
+
+
+def test_a_key_by_the_boot_clock() -> None:
+    """It has no date, sorts by time, and ends as the final one will."""
+    key = unsynced('thor', 'a-boot', 'imu', 123 * SECOND + 45_000_000, 'thor/imu/{date}/{time}_imu.tar.gz')
+    assert key == 'thor/_unsynced/a-boot/imu/00000123_045_imu.tar.gz'

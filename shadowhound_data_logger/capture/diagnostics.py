@@ -1,9 +1,9 @@
-"""The status as ``/diagnostics``: one entry for each topic, the spool, the store, the workers and the node itself.
+"""The status as ``/diagnostics``: one entry for each topic, the spool, the store, the clock, the workers and the node itself.
 
 Levels: WARN for what needs a look (messages missed, dropped or rejected lately, whatever the watchdog finds to stand still,
-the store away, a spool that fills up), ERROR for what needs a hand (a thread that fails or failed lately, objects in quarantine
-lately, credentials that are refused), STALE for a topic that nobody publishes. Nothing is made, and nothing sent, unless
-somebody listens.
+the store away, a spool that fills up, a clock that is not set or stepped lately), ERROR for what needs a hand (a thread that
+fails or failed lately, objects in quarantine lately, credentials that are refused), STALE for a topic that nobody publishes.
+Nothing is made, and nothing sent, unless somebody listens.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from rclpy.node import Node
 TOPIC: Final = '/diagnostics'
 FULL: Final = 0.8
 """Share of its limit from which on the spool is worth a look."""
+STEPPED_S: Final = 60.0
+"""For how long a step of the clock is worth a look."""
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 Entry = tuple[str, Any, str, Mapping[str, Any]]
 """Name, level, what is to be said, and figures."""
@@ -62,6 +64,7 @@ def entries(status: Mapping[str, Any], earlier: Mapping[str, Any]) -> Iterator[E
         yield topic, level, text, row
     yield _spool(status['spool'])
     yield _store(status['store'], earlier['store'], stalls.get('delivery', ''))
+    yield _clock(status['clock'])
     yield _workers(status['workers'], earlier['workers'], stalls)
 
 
@@ -107,6 +110,15 @@ def _store(store: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> E
     if stall:
         return 'store', WARN, stall, store
     return 'store', OK, state, store
+
+
+def _clock(clock: Mapping[str, Any]) -> Entry:
+    if not clock['is_set']:
+        what = 'objects go to _unsynced' if clock['gave_up'] else 'objects wait for their date'
+        return 'clock', WARN, f'not set for {clock["unset_s"]:.0f} s: {what}', clock
+    if clock['last_step_age_s'] is not None and clock['last_step_age_s'] < STEPPED_S:
+        return 'clock', WARN, f'stepped by {clock["last_step_s"]:g} s {clock["last_step_age_s"]:.0f} s ago', clock
+    return 'clock', OK, 'set', clock
 
 
 def _workers(workers: Mapping[str, Any], before: Mapping[str, Any], stalls: Mapping[str, str]) -> Entry:

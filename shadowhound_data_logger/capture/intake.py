@@ -17,6 +17,7 @@ from rclpy.node import Node
 
 from shadowhound_data_logger.capture.reader import PolledGroup
 from shadowhound_data_logger.capture.source import Source, SourceStatus
+from shadowhound_data_logger.capture.stream import Shared
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.queue import BatchQueue
@@ -43,9 +44,9 @@ class Intake:
         self._settings = settings
         self._accounts = accounts
         self._queue = queue
-        group = PolledGroup()
+        group, shared = PolledGroup(), Shared(accounts, types, self._offer, clock)
         self._sources = tuple(
-            Source(node, sensor, settings, accounts, types, group, self._offer, clock) for sensor in sensors.values()
+            Source(node, sensor, settings, group, shared) for sensor in sensors.values()
         )  # fmt: skip
         self._requests: deque[Callable[[], None]] = deque()
         self._wake = threading.Event()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import sqlite3
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -18,14 +19,18 @@ from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.parameters import live
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.clock import SystemClock, utc
+from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.pool import EncodePool
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import DataLoggerError, SpoolError
+from shadowhound_data_logger.keys import dated
 from shadowhound_data_logger.model import DataObject, Outcome
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.clock_record import ClockRecord
+from shadowhound_data_logger.spool.redating import Redating
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 from shadowhound_data_logger.stores import open_store
@@ -42,8 +47,10 @@ class Pipeline:
 
     def __init__(self, node: Node, settings: Settings) -> None:
         self._settings = settings
-        self._clock = SystemClock.of_this_machine()
+        system_clock, record = SystemClock.of_this_machine(), ClockRecord(settings.spool_path, settings.robot)
+        self._clock = ClockWatch(system_clock, settings.clock.hold_s, record.steps)
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
+        self._redating = Redating(self.spool, self._clock, record, settings.robot)
         self._node = node
         self._day = self._today()
         self._due_s = 0.0
@@ -72,9 +79,9 @@ class Pipeline:
         types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         queue = BatchQueue(settings.queue)
         sensors = {sensor.name: sensor for sensor in settings.sensors}
-        self.pool = EncodePool(queue, sensors, settings.robot, types, self.writer.put, self.spool.accounts.reject,
+        self.pool = EncodePool(queue, sensors, settings.robot, types, self._spool_later, self.spool.accounts.reject,
                                settings.encode.threads)  # fmt: skip
-        self.intake = Intake(self._node, sensors, settings.intake, self.spool.accounts, types, queue)
+        self.intake = Intake(self._node, sensors, settings.intake, self.spool.accounts, types, queue, self._clock)
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader)
         self._status = Status(stages, settings, self._clock, self._store.describe())
         self._diagnostics = Diagnostics(self._node)
@@ -129,6 +136,7 @@ class Pipeline:
         if not self._supervise() and now_s < self._due_s:
             return
         self._due_s = now_s + PERIOD_S
+        self._name_held()
         self._tell()
         day = self._today()
         if day != self._day:
@@ -163,20 +171,32 @@ class Pipeline:
     def _ship_ledger(self) -> None:
         """A ledger that cannot be read now is not worth the node: the next one holds all that this one would."""
         try:
-            self.writer.put(self._ledger(), wait=False)
+            self.writer.put(self._redating.date(self._ledger()), wait=False)
         except DataLoggerError as error:
             log.warning('the ledger was not shipped: %s', error)
+
+    def _spool_later(self, item: DataObject) -> None:
+        self.writer.put(self._redating.date(item))
+
+    def _name_held(self) -> None:
+        """What waited for the clock to be set may go now, or as soon as the disk lets it."""
+        try:
+            if named := self._redating.step():
+                self.uploader.wake(named)
+        except (OSError, sqlite3.Error) as error:
+            log.warning('objects that wait for the clock are not named yet: %s', error)
 
     def _settle(self, outcomes: Sequence[Outcome]) -> None:
         self.writer.settle(outcomes)
 
     def _ledger(self) -> DataObject:
         """The ledger as an object of its own, for the store."""
-        now_ns = self._clock.wall_ns()
+        now_ns = self._clock.wall_ns() if self._clock.is_set else self._clock.boot_ns()
         content: dict[str, Any] = ledger.read(self.spool.root, self._settings.robot)
         robot = self._settings.robot
+        pattern = f'{robot}/_ledger/{{date}}/{{time}}_ledger.json'
         return DataObject(
-            bucket=LEDGER_BUCKET, key=f'{robot}/_ledger/{utc(now_ns):%Y%m%d/%H%M%S}_ledger.json',
+            bucket=LEDGER_BUCKET, key=dated(pattern, now_ns), key_pattern=pattern,
             body=json.dumps(content, indent=1).encode(), content_type='application/json', sensor='_ledger', topic=None,
             type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns, priority=0, protected=True, metadata={'robot': robot},
         )  # fmt: skip

@@ -12,11 +12,8 @@ from rclpy.node import Node
 
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, plans
 from shadowhound_data_logger.capture.reader import PolledGroup, Reader, endpoints, unavailable
-from shadowhound_data_logger.capture.stream import Offer, Stream
-from shadowhound_data_logger.clock import Clock
+from shadowhound_data_logger.capture.stream import Shared, Stream
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
-from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.spool.accounts import Accounts
 
 log = logging.getLogger(__name__)
 
@@ -47,16 +44,15 @@ class SourceStatus:
 class Source:
     """A sensor at work. ``refresh`` follows the graph, ``drain`` takes what came, ``flush`` ends the open batch as well."""
 
-    def __init__(self, node: Node, sensor: SensorSettings, settings: IntakeSettings, accounts: Accounts,
-                 types: MessageTypes, group: PolledGroup, offer: Offer, clock: Clock) -> None:  # fmt: skip
+    def __init__(self, node: Node, sensor: SensorSettings, settings: IntakeSettings, group: PolledGroup,
+                 shared: Shared) -> None:  # fmt: skip
         self.sensor = sensor
         self._node = node
         self._settings = settings
-        self._accounts = accounts
-        self._types = types
+        self._accounts = shared.accounts
+        self._types = shared.types
         self._group = group
-        self._offer = offer
-        self._clock = clock
+        self._shared = shared
         self._topics: list[str] = [node.resolve_topic_name(topic) for topic in sensor.topics]
         self._types_expected = dict(zip(self._topics, sensor.types, strict=False))
         self._chosen = self._topics[0]
@@ -182,8 +178,7 @@ class Source:
         self._leave(now_s)
         topic = self._chosen
         kept_ns = self._kept_ns.get(topic) or self._accounts.last_kept_ns(topic)
-        self._stream = Stream(self.sensor, topic, type_name, kept_ns, self._accounts, self._types, self._offer,
-                              self._clock)  # fmt: skip
+        self._stream = Stream(self.sensor, topic, type_name, kept_ns, self._shared)
         self._type = type_name
 
     def _retire(self, wanted: set[Plan], now_s: float) -> None:

@@ -19,7 +19,8 @@ from typing import Any, Final
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.source import SourceStatus
 from shadowhound_data_logger.capture.watchdog import Watchdog
-from shadowhound_data_logger.clock import SECOND, Clock, iso
+from shadowhound_data_logger.clock import SECOND, iso
+from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.pool import EncodePool
 from shadowhound_data_logger.encode.queue import BatchQueue
@@ -58,7 +59,7 @@ class Stages:
 class Status:
     """New; ``look`` once a second, ``write`` what it found. ``earlier`` is the status of up to ``WINDOW_S`` before the last."""
 
-    def __init__(self, stages: Stages, settings: Settings, clock: Clock, target: str,
+    def __init__(self, stages: Stages, settings: Settings, clock: ClockWatch, target: str,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
         self._stages = stages
         self._settings = settings
@@ -93,7 +94,7 @@ class Status:
             'paused': self._stages.intake.paused, 'ended': ended, 'topics': self._topics(now_s),
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
             'spool': {'path': str(self._stages.spool.root), **asdict(piles), 'max_bytes': self._settings.spool.max_bytes},
-            'store': self._store(upload, now_s),
+            'store': self._store(upload, now_s), 'clock': asdict(self._clock.state()),
             'workers': {worker.name: asdict(worker.status()) for worker in self._stages.workers},
         }  # fmt: skip
         status['stalls'] = self._watchdog.look(status, now_s)

@@ -29,23 +29,31 @@ class Taken(NamedTuple):
     number: int | None
 
 
+class Shared(NamedTuple):
+    """What all streams work with."""
+
+    accounts: Accounts
+    types: MessageTypes
+    offer: Offer
+    clock: Clock
+
+
 class Stream:
     """New for each topic and type; ``add`` what was taken, ``close_batch`` at the end."""
 
-    def __init__(self, sensor: SensorSettings, topic: str, type_name: str, last_kept_ns: int, accounts: Accounts,
-                 types: MessageTypes, offer: Offer, clock: Clock) -> None:  # fmt: skip
-        self._clock = clock
+    def __init__(self, sensor: SensorSettings, topic: str, type_name: str, last_kept_ns: int, shared: Shared) -> None:
+        self._clock = shared.clock
         self.kept_ns = last_kept_ns
         """Stamp of the newest message that was kept: no period is stored twice."""
         self._topic = topic
-        self._accounts = accounts
-        self._offer = offer
+        self._accounts = shared.accounts
+        self._offer = shared.offer
         self._sensor = sensor
-        self._has_header = types.has_header(type_name)
+        self._has_header = shared.types.has_header(type_name)
         self._gate = gate_for(sensor, has_header=self._has_header, last_kept_ns=last_kept_ns)
         self._batcher = Batcher(sensor, topic, type_name)
         self._recent: dict[tuple[int, int], None] = {}
-        with accounts.entry(topic) as account:
+        with shared.accounts.entry(topic) as account:
             account.type = type_name
 
     def update(self, sensor: SensorSettings) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -95,7 +95,16 @@ def notes(found: Mapping[str, Any]) -> list[str]:
             lines.append(f'{topic}: of {row["stored"]:,} stored, {_listed(elsewhere)}')
         if row['accounting'] in ACCOUNTING:
             lines.append(f'{topic}: {ACCOUNTING[row["accounting"]]}')
-    return lines
+    return [*lines, *clock_notes(found.get('clock', {}))]
+
+
+def clock_notes(clock: Mapping[str, Any]) -> Iterator[str]:
+    """What the clock of the robot did that somebody who reads dates should know."""
+    if clock.get('held'):
+        yield f'{clock["held"]:,} objects wait for their date: the clock of the robot was not set when they were taken'
+    if clock.get('steps'):
+        by = '' if clock['last_step_s'] is None else f', last by {clock["last_step_s"]:,.3f} s at {clock["last_step_time"]}'
+        yield f'the clock of the robot stepped {clock["steps"]:,} times{by}'
 
 
 def verdict(found: Mapping[str, Any]) -> Text:

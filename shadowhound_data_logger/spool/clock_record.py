@@ -26,7 +26,7 @@ def file(spool: Path, robot: str) -> Path:
 
 
 def read(spool: Path, robot: str) -> dict[str, Any]:
-    """``is_set`` (None where no node has looked yet), ``steps``, ``last_step_s``, ``last_step_time`` and ``offsets`` by boot id."""
+    """``is_set`` (None: no node has looked yet), ``steps``, ``last_step_s``, ``last_step_time``, ``offsets`` by boot id."""
     try:
         given = json.loads(file(spool, robot).read_bytes())
         offsets = {str(boot): int(offset) for boot, offset in given['offsets'].items()}

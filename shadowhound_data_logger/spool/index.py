@@ -140,6 +140,11 @@ class Index:
             bucket = row[0]
             yield bucket
 
+    def held_count(self, reason: str) -> int:
+        """How many objects have no final name yet for this reason."""
+        query = "SELECT count(*) FROM objects WHERE state = 'held' AND reason = ?"
+        return int(self.db.execute(query, (reason,)).fetchone()[0])
+
     def rows(self, where: str, values: Sequence[object] = ()) -> list[sqlite3.Row]:
         """Object rows by a condition of this package's own (never of a user's)."""
         cursor = self.db.execute(f'SELECT {_OBJECT} FROM objects WHERE {where}', tuple(values))  # noqa: S608 - own constants only

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool import clock_record
 from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.index import Index
 
@@ -27,7 +28,9 @@ def read(spool: Path, robot: str) -> dict[str, Any]:
     index = Index(path, read_only=True)
     try:
         index.open()
-        return of_index(index, robot)
+        known = clock_record.read(spool, robot)
+        del known['offsets']
+        return {**of_index(index, robot), 'clock': {**known, 'held': index.held_count('clock')}}
     except (sqlite3.Error, ValueError) as error:
         raise SpoolError(f'the spool index {path} cannot be read: {error}',
                          remedy='a start of the node rebuilds a damaged one') from error  # fmt: skip

@@ -1,14 +1,14 @@
 """Dates objects whose time was taken while the clock of this machine was not set.
 
 A time before 2024 is that of the boot clock (``clock.stamp_of`` sees to that). An object that begins at such a time is held
-under ``<robot>/_unsynced/<boot_id>/<sensor>/<seconds since boot>``, with all that its final name is made of in its metadata, where
-it survives a restart and a lost index. Once the clock is set the offset between the clocks is known, and key, times and metadata are
-those of UTC; content stays as it is. Where the clock is not set for too long, or the boot ended before it was, objects ship under the
-names that they have.
+under ``<robot>/_unsynced/<boot_id>/<sensor>/<seconds since boot>``, with all that its final name is made of in its metadata,
+where it survives a restart and a lost index. Once the clock is set the offset between the clocks is known, and key, times and
+metadata are those of UTC; content stays as it is. Where the clock is not set for too long, or the boot ended before it was,
+objects ship under the names that they have.
 
-Every object says when it was by both clocks: ``boot_id``, ``boot_start_ns``, ``boot_end_ns``, and as ``clock`` how its date is known:
-``set`` (this machine's clock was right), ``publisher`` (it was not, but that of the publisher's machine), ``set_later``
-(re-dated; ``clock_offset_ns`` is to be added to times in the content), ``unset`` (it has none).
+Every object says when it was by both clocks: ``boot_id``, ``boot_start_ns``, ``boot_end_ns``, and as ``clock`` how its date is
+known: ``set`` (this machine's clock was right), ``publisher`` (it was not, but that of the publisher's machine),
+``set_later`` (re-dated; ``clock_offset_ns`` is to be added to times in the content), ``unset`` (it has none).
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ class Redating:
         if start_ns >= EARLIEST_SANE_NS:
             away_ns = offset_ns if offset_ns is not None else end_ns - self._watch.boot_ns()
             clock = SET if offset_ns is not None else PUBLISHER
-            return replace(item, metadata={**item.metadata, **_boot(boot_id, start_ns - away_ns, end_ns - away_ns), 'clock': clock})
+            return replace(
+                item, metadata={**item.metadata, **_boot(boot_id, start_ns - away_ns, end_ns - away_ns), 'clock': clock}
+            )
         known = {name: value for name, value in item.metadata.items() if name not in _TIMES}
         metadata = {**known, **_boot(boot_id, start_ns, end_ns), 'clock': UNSET, _PATTERN: item.key_pattern or item.key}
         if offset_ns is not None:
@@ -83,7 +85,7 @@ class Redating:
                 return Binding(item.id, key, metadata, item.t_start_ns + offset_ns, item.t_end_ns + offset_ns)
             except (NameRefused, LookupError, ValueError) as error:
                 log.warning('%s cannot be dated: %s', item.key, error)
-        elif item.metadata.get('boot_id') == self._watch.boot_id and not self._watch.state().gave_up:
+        elif offset_ns is None and item.metadata.get('boot_id') == self._watch.boot_id and not self._watch.state().gave_up:
             return None
         return Binding(item.id, item.key, item.metadata, item.t_start_ns, item.t_end_ns)
 

@@ -38,6 +38,7 @@ _SECTIONS: Final[dict[str, dict[str, Any]]] = {
               'oldest_age_s': None},
     'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
               'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
+    'clock': {'is_set': True, 'gave_up': False, 'unset_s': 0.0, 'steps': 0, 'last_step_s': None, 'last_step_age_s': None},
 }  # fmt: skip
 _WORKER: Final[dict[str, Any]] = {
     'alive': True, 'failing': False, 'failures': 0, 'deaths': 0, 'last_error': '', 'busy_s': 0.0, 'patience_s': None,
@@ -145,6 +146,9 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
     store = found['store']
     if found['paused']:
         yield 'the node is paused: nothing is logged'
+    if not found['clock']['is_set']:
+        what = 'objects go without a date' if found['clock']['gave_up'] else 'objects wait for their date'
+        yield f'the clock of this machine is not set: {what}'
     if store['state'] not in FINE_STORE:
         yield f'delivery: {str(store["state"]).replace("_", " ")}'
     yield from (f'bucket {name} takes nothing: {reason}' for name, reason in store['blocked_buckets'].items())

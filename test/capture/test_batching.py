@@ -112,3 +112,14 @@ def test_a_late_sample_joins_the_open_batch() -> None:
     open_batch.add(Sample(5 * SECOND, b''), 0.0)
     assert open_batch.add(Sample(3 * SECOND + SECOND // 2, b''), 0.0) == []
     assert stamps(open_batch.close()) == [5 * SECOND, 3 * SECOND + SECOND // 2]
+
+
+@pytest.mark.parametrize(('batch_s', 'batch_count'), [(1.0, 0), (0.0, 50), (3600.0, 50)])
+@pytest.mark.parametrize('first', ['boot clock', 'UTC'])
+def test_a_batch_ends_where_the_clock_is_set(batch_s: float, batch_count: int, first: str) -> None:
+    """No object holds times of the boot clock and of UTC, in whichever direction the clock is set."""
+    noon_ns = 1_760_788_800 * SECOND
+    order = [60 * SECOND, noon_ns] if first == 'boot clock' else [noon_ns, 60 * SECOND]
+    open_batch = batcher(batch_s, batch_count)
+    closed = [batch for stamp in order for batch in open_batch.add(Sample(stamp, b'x'), 0.0)]
+    assert [stamps(batch) for batch in (*closed, open_batch.close())] == [[stamp] for stamp in order]

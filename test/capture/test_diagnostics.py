@@ -25,6 +25,7 @@ STATUS: dict[str, Any] = {
     'store': {'target': 'the S3 server', 'state': 'idle', 'last_error': 'refused', 'delivered': 5, 'in_flight': 0, 'deferred': 0,
               'retries': 0, 'quarantined': 1, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
     'workers': {'intake': {'failing': False, 'failures': 1, 'deaths': 0, 'last_error': 'ValueError: x'}}, 'stalls': {},
+    'clock': {'is_set': True, 'gave_up': False, 'unset_s': 0.0, 'steps': 2, 'last_step_s': 3.5, 'last_step_age_s': 61.0},
 }  # fmt: skip
 
 
@@ -49,9 +50,9 @@ def told(name: str, **values: Any) -> tuple[Any, str]:
 
 
 def test_all_is_fine() -> None:
-    """There is an entry for each topic, the spool, the store, the workers and the node; old losses are not told for ever."""
+    """There is an entry for each topic, spool, store, clock, workers and the node; old losses are not told for ever."""
     found = list(entries(STATUS, STATUS))
-    assert [entry[0] for entry in found] == ['node', '/imu', 'spool', 'store', 'workers']
+    assert [entry[0] for entry in found] == ['node', '/imu', 'spool', 'store', 'clock', 'workers']
     assert {entry[1] for entry in found} == {OK}
     assert told('/imu')[1] == '100 Hz'
 
@@ -82,6 +83,10 @@ def test_a_topic(values: dict[str, Any], level: Any, words: str) -> None:
     ('name', 'values', 'level', 'words'),
     [
         ('node', {'paused': True}, WARN, 'paused'),
+        ('clock', {'clock__is_set': False, 'clock__unset_s': 12.0}, WARN, 'not set for 12 s: objects wait for their date'),
+        ('clock', {'clock__is_set': False, 'clock__gave_up': True}, WARN, 'objects go to _unsynced'),
+        ('clock', {'clock__last_step_age_s': 59.0}, WARN, 'stepped by 3.5 s 59 s ago'),
+        ('clock', {'clock__last_step_s': None, 'clock__last_step_age_s': None}, OK, 'set'),
         ('spool', {'spool__bytes': 80}, OK, '80%'),
         ('spool', {'spool__bytes': 81}, WARN, '81% of its limit'),
         ('store', {'store__state': 'not_draining'}, OK, 'not draining'),

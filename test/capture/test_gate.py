@@ -74,3 +74,10 @@ def test_the_rate_is_the_period() -> None:
     """At 4 Hz four messages a second are kept."""
     gate = gate_for(SensorSettings(name='x', rate_hz=4.0), has_header=True, last_kept_ns=0)
     assert sum(gate.keep(NOON_NS + number * SECOND // 100, b'') for number in range(300)) == 12
+
+
+def test_a_clock_that_is_set_does_not_stop_the_sampling() -> None:
+    """From seconds since boot to UTC and back, each period has its message and none has two."""
+    up = 60 * SECOND
+    stamps = [up, up + 1, up + SECOND, NOON_NS, NOON_NS + 1, NOON_NS + SECOND, up + 5 * SECOND, up + 6 * SECOND]
+    assert kept(FirstOfPeriod(SECOND, NOON_NS - 3600 * SECOND), *stamps) == [up, up + SECOND, *stamps[3:4], *stamps[5:]]

@@ -16,6 +16,7 @@ pytest.importorskip('rclpy')
 
 from shadowhound_data_logger.capture.source import SourceStatus
 from shadowhound_data_logger.capture.status import Stages, Status
+from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import QueueSettings, Settings
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.model import Batch, Sample
@@ -72,7 +73,7 @@ class Setting:
         self.queue = BatchQueue(QueueSettings())
         stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader)
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
-        self.status = Status(stages, settings, self.clock, 'a store', lambda: self.now_s)
+        self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 
     def look(self, seconds: float = 1.0) -> dict[str, Any]:
         """So much later."""

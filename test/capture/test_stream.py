@@ -8,8 +8,8 @@ from itertools import count
 import pytest
 
 from shadowhound_data_logger.capture.endpoints import Senders
-from shadowhound_data_logger.capture.stream import Stream, Taken
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.capture.stream import Shared, Stream, Taken
+from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch
@@ -29,7 +29,8 @@ class Talk:
         self.batches: list[Batch] = []
         self.senders = Senders()
         self.numbers = count(1)
-        self.stream = Stream(self.sensor, TOPIC, TYPE, last_kept_ns, self.accounts, MessageTypes(), self.batches.append)
+        shared = Shared(self.accounts, MessageTypes(), self.batches.append, SystemClock.of_this_machine())
+        self.stream = Stream(self.sensor, TOPIC, TYPE, last_kept_ns, shared)
 
     def messages(self, how_many: int, **fields: object) -> list[Taken]:
         """The next ones, of a publisher that is known unless ``fields`` say otherwise."""

@@ -138,3 +138,25 @@ def test_no_spool_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     assert error.count('\n') == 1
     assert str(tmp_path / 'none') in error
     assert 'SHADOWHOUND_HOME' in error
+
+
+@pytest.mark.parametrize(
+    ('clock', 'words'),
+    [
+        (
+            {'is_set': False, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'held': 7},
+            ['7 objects wait for their date'],
+        ),
+        (
+            {'is_set': True, 'steps': 2, 'last_step_s': -5.0, 'last_step_time': '2025-10-18T11:59:55.000000Z', 'held': 0},
+            ['stepped 2 times, last by -5.000 s at 2025-10-18T11:59:55'],
+        ),
+        ({'is_set': True, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'held': 0}, []),
+    ],
+)
+def test_what_the_clock_did_is_said(clock: dict[str, Any], words: list[str]) -> None:
+    """Only where somebody who reads dates should know."""
+    text = ' '.join(shown({**a_ledger(), 'clock': clock}).split())
+    for part in words:
+        assert part in text
+    assert ('clock of the robot' in text) is bool(words)

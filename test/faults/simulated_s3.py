@@ -11,7 +11,7 @@ from typing import IO, Final, TypeVar
 from faults.kinds import Condition, Fault, Script
 from faults.virtual_time import VirtualTime
 
-from shadowhound_data_logger.errors import AccessDenied, BucketMissing, CredentialsRejected, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.stores.content import object_metadata
 from shadowhound_data_logger.stores.pace import Pace
@@ -168,5 +168,5 @@ class Line:
             self.denied[where] += 1
             raise AccessDenied('denied', reason='AccessDenied')
         if fault is Fault.SKEWED:
-            raise CredentialsRejected('the clocks differ')
+            raise StoreUnavailable('the clocks differ')
         raise StoreUnavailable(fault.value)

@@ -15,7 +15,7 @@ from ship.fakes import until
 from stores.spooled import Spool
 
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import AccessDenied, CredentialsRejected, ForeignObject, StoreError, StoreUnavailable
+from shadowhound_data_logger.errors import AccessDenied, ForeignObject, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
@@ -23,7 +23,7 @@ from shadowhound_data_logger.stores.s3 import S3Store
 pytestmark = pytest.mark.seaweedfs
 
 IMPATIENT = UploadSettings(connect_timeout_s=1.0, read_timeout_s=0.3)
-KINDS: dict[Fault, type[StoreError]] = {Fault.DENIED: AccessDenied, Fault.SKEWED: CredentialsRejected}
+KINDS: dict[Fault, type[StoreError]] = {Fault.DENIED: AccessDenied}
 SAID = {
     Fault.REFUSED: 'broke the connection off', Fault.RESET: 'broke the connection off', Fault.HUNG: 'gave no answer within 0.3 s',
     Fault.SLOW: 'gave no answer within 0.3 s', Fault.ERROR_500: '500 InternalError', Fault.SLOW_DOWN: '503 SlowDown',

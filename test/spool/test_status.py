@@ -177,3 +177,23 @@ def test_the_robots_that_have_written_here(tmp_path: Path) -> None:
     written(tmp_path, robot='robot_1.a')
     (tmp_path / 'status.json').touch()
     assert robots(tmp_path) == ['robot_1.a', 'thor']
+
+
+@pytest.mark.parametrize(('gave_up', 'words'), [(False, 'objects wait for their date'), (True, 'objects go without a date')])
+def test_a_clock_that_is_not_set_is_a_finding(tmp_path: Path, words: str, *, gave_up: bool) -> None:
+    """And so is what that means for the objects."""
+    written(tmp_path, clock={'is_set': False, 'gave_up': gave_up})
+    assert f'the clock of this machine is not set: {words}' in read(tmp_path, 'thor', FakeClock())['findings']
+
+
+def test_an_age_that_nobody_knows(tmp_path: Path) -> None:
+    """What was spooled before the clock was set has not waited since 1970."""
+    clock = FakeClock(60 * SECOND)
+    spool = new_spool(tmp_path, clock)
+    spool.open()
+    put(spool, make())
+    clock.now_ns += 9 * SECOND
+    assert spool.piles().oldest_age_s == 9.0
+    clock.now_ns = NOON_NS
+    assert spool.piles().oldest_age_s is None
+    spool.close()

@@ -43,7 +43,7 @@ ANSWERS: tuple[tuple[int, str, type[StoreError]], ...] = (
     (403, 'AccessDenied', AccessDenied),
     (403, 'InvalidAccessKeyId', CredentialsRejected),
     (403, 'InvalidTokenId', CredentialsRejected),
-    (403, 'RequestTimeTooSkewed', CredentialsRejected),
+    (403, 'RequestTimeTooSkewed', StoreUnavailable),
     (403, 'SignatureDoesNotMatch', CredentialsRejected),
     (403, 'SomethingNew', AccessDenied),
     (404, 'NoSuchBucket', BucketMissing),

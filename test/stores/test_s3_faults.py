@@ -22,7 +22,7 @@ from stores.fake_s3 import FakeS3, served
 from stores.spooled import QUICK, Spool
 
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import CredentialsRejected, StoreError, StoreUnavailable
+from shadowhound_data_logger.errors import StoreError, StoreUnavailable
 from shadowhound_data_logger.model import Put
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import s3
@@ -82,7 +82,7 @@ ANSWERS: dict[str, tuple[int, bytes, type[StoreError], str]] = {
     'internal error': (500, fake_s3.error('InternalError'), StoreUnavailable, 'a server error (500 InternalError)'),
     'bad gateway': (502, b'<html>nginx</html>', StoreUnavailable, 'a server error (502'),
     'disk full': (507, fake_s3.error('XMinioStorageFull'), StoreUnavailable, 'the disk of Tower'),
-    'clock': (403, fake_s3.error('RequestTimeTooSkewed'), CredentialsRejected, 'set the clock'),
+    'clock': (403, fake_s3.error('RequestTimeTooSkewed'), StoreUnavailable, 'set the clock'),
     'another web server': (404, b'<html>Not found</html>', StoreUnavailable, 'does not answer like an S3 server'),
     'a login page': (200, b'<html>Welcome to our WiFi</html>', StoreUnavailable, 'does not answer like an S3 server'),
     'a redirect to a login page': (302, b'', StoreUnavailable, 'does not answer like an S3 server'),

@@ -1,0 +1,138 @@
+"""A robot that starts in 1970 and learns the time later: what it stored meanwhile gets its date, by a restart as well."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from e2e.processes import HERE, Node, Processes, until
+from e2e.reading import STRING, Objects, texts
+
+from shadowhound_data_logger.stores.directory import DirectoryStore
+
+PARAMETERS = {
+    'sensors': ['talk', 'slow'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 0.2,
+    'slow.topics': ['slow'], 'slow.types': [STRING], 'slow.rate_hz': 20.0,
+}  # fmt: skip
+GROUP = 40
+SECOND = 10**9
+RIGHT_NS = SECOND
+"""How exactly a date has to be right."""
+
+
+class Robot:
+    """A node whose clock stands in 1970 until it is set."""
+
+    def __init__(self, processes: Processes, folder: Path) -> None:
+        self._processes = processes
+        self._behind = folder / 'behind'
+        self._behind.write_text(str(time.time_ns() - 60 * SECOND))
+        shutil.copy(HERE / 'wrong_clock.py', folder / 'sitecustomize.py')
+        path = os.pathsep.join(filter(None, (str(folder), os.environ.get('PYTHONPATH'))))
+        self._environ = {'PYTHONPATH': path, 'WRONG_CLOCK': str(self._behind)}
+        self.publisher = processes.publisher()
+        self.publisher.create('/talk', STRING)
+        self.publisher.create('/slow', STRING)
+        self.spans: list[tuple[int, int]] = []
+        self.node = self.start()
+
+    def start(self, **parameters: Any) -> Node:
+        self.node = self._processes.node(None, {**PARAMETERS, **parameters}, environ=self._environ)
+        for topic in ('/talk', '/slow'):
+            self.publisher.matched(topic)
+        return self.node
+
+    def publish(self) -> None:
+        """The next group on both topics."""
+        numbers = range(len(self.spans) * GROUP, len(self.spans) * GROUP + GROUP)
+        began_ns = time.time_ns()
+        self.publisher.publish('/talk', texts(numbers))
+        self.publisher.publish('/slow', texts(numbers))
+        self.spans.append((began_ns, time.time_ns()))
+        for topic in ('/talk', '/slow'):
+            self.node.received(topic, len(self.spans) * GROUP)
+            until(lambda topic=topic: not self.node.topic(topic)['open'], f'{topic} is stored')  # type: ignore[misc]
+
+    def set_clock(self) -> None:
+        self._behind.unlink()
+
+    def settled(self) -> None:
+        """Wait until nothing is held, open or pending."""
+        for topic in ('/talk', '/slow'):
+            self.node.settled(topic, len(self.spans) * GROUP)
+        until(lambda: not self.node.ledger()['objects']['held'], 'nothing is held')
+        self.node.delivered()
+
+    def objects(self) -> Objects:
+        store = DirectoryStore(self.node.home / 'store')
+        store.open()
+        return Objects.of(store, 'sensor-data', self.node.robot)
+
+    def clocks_of(self, sensor: str) -> set[str]:
+        """How its objects say that they know their date."""
+        with closing(DirectoryStore(self.node.home / 'store')) as store:
+            store.open()
+            found = store.list('sensor-data', f'{self.node.robot}/{sensor}/')
+            infos = [store.head('sensor-data', info.key) for info in found]
+        return {info.metadata['clock'] for info in infos if info}
+
+    def keys(self) -> list[str]:
+        folder = self.node.home / 'store' / 'sensor-data'
+        return [str(path.relative_to(folder)) for path in folder.rglob('*') if path.is_file()]
+
+
+@pytest.fixture
+def robot(processes: Processes, tmp_path: Path) -> Robot:
+    folder = tmp_path / 'clock'
+    folder.mkdir()
+    return Robot(processes, folder)
+
+
+def test_a_clock_that_is_set_later(robot: Robot) -> None:
+    """Nothing is stored under a date of 1970, all of it under the right one, and the ledger says what the clock did."""
+    robot.publish()
+    robot.node.stop()
+    robot.start()
+    robot.publish()
+    until(lambda: robot.node.topic('/talk')['stored_in']['held'] >= 2, 'objects are held')
+    assert robot.node.ledger()['objects']['delivered'] == 0
+    robot.set_clock()
+    robot.publish()
+    robot.settled()
+    ledger = robot.node.stop()
+    assert ledger['objects']['held'] == 0
+    assert (ledger['clock']['is_set'], ledger['clock']['steps'], ledger['clock']['held']) == (True, 1, 0)
+    keys = robot.keys()
+    today = {time.strftime('%Y%m%d', time.gmtime(when / SECOND)) for span in robot.spans for when in span}
+    assert {key.split('/')[2] for key in keys} == today
+    assert not [key for key in keys if '1970' in key or '_unsynced' in key]
+    check_dates(robot, robot.objects())
+    assert 'set_later' in robot.clocks_of('_ledger'), 'that of the stop in 1970'
+
+
+def check_dates(robot: Robot, objects: Objects) -> None:
+    """Each message's time, as the metadata of its object dates it, is that of its group."""
+    found: dict[int, int] = {}
+    for key, info in objects.infos.items():
+        said = info.metadata
+        start_ns, end_ns = int(said['t_start_ns']), int(said['t_end_ns'])
+        assert key.split('/')[3].startswith(time.strftime('%H%M%S', time.gmtime(start_ns / SECOND)))
+        assert start_ns - int(said['boot_start_ns']) == pytest.approx(end_ns - int(said['boot_end_ns']), abs=RIGHT_NS)
+        assert start_ns - int(said['boot_start_ns']) == pytest.approx(offset_ns(), abs=RIGHT_NS)
+        if key.split('/')[1] == 'talk':
+            for sample in json.loads(objects.contents[key])['samples']:
+                found[int(sample['data'])] = sample['stamp_ns'] + int(said.get('clock_offset_ns', 0))
+    assert sorted(found) == list(range(len(robot.spans) * GROUP))
+    for number, stamp_ns in found.items():
+        began_ns, ended_ns = robot.spans[number // GROUP]
+        assert began_ns - RIGHT_NS <= stamp_ns <= ended_ns + RIGHT_NS
+
+
+def offset_ns() -> int:
+    return time.time_ns() - time.clock_gettime_ns(time.CLOCK_BOOTTIME)
