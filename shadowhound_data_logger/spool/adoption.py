@@ -52,6 +52,7 @@ class _Found(NamedTuple):
     reason: str | None
     item: DataObject
     sha256: str
+    path: Path
 
 
 class Adoption:
@@ -90,7 +91,7 @@ class Adoption:
             elif (item := _described(path, bucket, key, body, sha256)) is None:
                 self._foreign(path)
             else:
-                self._group.append(_Found(state, reason, item, sha256))
+                self._group.append(_Found(state, reason, item, sha256, path))
                 if len(self._group) >= GROUP_FILES or sum(len(found.item.body) for found in self._group) >= GROUP_BYTES:
                     self._adopt()
         self._adopt()
@@ -132,7 +133,8 @@ class Adoption:
             for found in self._group:
                 item = found.item
                 if self._index.has(item.bucket, item.key):
-                    continue  # the same key lies in two folders: the first one counts
+                    self._foreign(found.path)  # the same key lies in two folders: the first one counts
+                    continue
                 self._index.insert(item, item.key, found.sha256, found.state, found.reason, item.metadata, self._now_ns)
                 if item.topic is not None:
                     self._topics[item.topic] = _more(self._topics.get(item.topic), item.topic, item)

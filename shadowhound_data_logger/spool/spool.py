@@ -7,10 +7,8 @@ is the only commit point, so objects and ledger cannot disagree; a rename that d
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import logging
-import os
 import sqlite3
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -25,7 +23,7 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.spool import binding
-from shadowhound_data_logger.spool.accounts import Accounts, Snapshot
+from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.ballast import Ballast
 from shadowhound_data_logger.spool.binding import free_key
@@ -34,6 +32,7 @@ from shadowhound_data_logger.spool.index import Index, spooled
 from shadowhound_data_logger.spool.piles import Piles, look
 from shadowhound_data_logger.spool.recovery import open_recovered
 from shadowhound_data_logger.spool.retention import NO_ROOM, OVERHEAD_BYTES, Shortage, make_room
+from shadowhound_data_logger.spool.session import Session
 
 log = logging.getLogger(__name__)
 
@@ -60,8 +59,7 @@ class Spool:
         self._lock = threading.Lock()
         self._index = Index(root / 'index.db')
         self._view = Index(root / 'index.db', read_only=True)
-        self._session = 0
-        self._session_lock: int | None = None
+        self._session: Session | None = None
         self._forgot_ns = 0
         self._shortage = Shortage(root)
         self._ballast = Ballast(root / 'ballast')
@@ -79,7 +77,8 @@ class Spool:
 
     def close(self) -> None:
         """Commit the last accounts and end the session; idempotent. Raises SpoolError when the disk does not take them."""
-        if not self._session:
+        session = self._session
+        if session is None:
             return
         with self._had_within(CLOSE_S):
             lost = self.accounts.drop_open('shutdown')
@@ -87,17 +86,14 @@ class Spool:
                 log.error('%d messages were still in memory when the spool %s was closed', lost, self.root)
             snapshot = self.accounts.snapshot({})
             try:
-                self._ballast.work(lambda: self._end(snapshot))
+                self._ballast.work(lambda: session.end(self._index, snapshot, self._clock.wall_ns()))
             except (OSError, sqlite3.Error) as error:
                 self.accounts.mark_dirty()
                 raise self.unwritable(error) from error
             self._view.close()
             self._index.close()
-            self._tree.remove(self._tree.session(self._session))
-            self._session = 0
-        if self._session_lock is not None:
-            os.close(self._session_lock)
-            self._session_lock = None
+            session.leave()
+            self._session = None
 
     def commit(self, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (), *,
                durable: Callable[[list[SpooledObject]], None] = lambda _: None) -> list[SpooledObject]:  # fmt: skip
@@ -187,25 +183,12 @@ class Spool:
             with flock(self.root / 'recovery.lock'):
                 self._index = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
                 self._view.open()
-                self._begin()
+                self._session = Session.begin(self._index, self._tree, self._robot, self._clock)
+                self.accounts = _continued(self._index)
         except (OSError, sqlite3.Error):
             self._index.close()
             self._view.close()
             raise
-
-    def _begin(self) -> None:
-        now_ns = self._clock.wall_ns()
-        with self._index.transaction():
-            self._session = self._index.begin_session(self._robot, self._clock.boot_id, os.getpid(), now_ns)
-        self._session_lock = os.open(self._tree.session(self._session), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        fcntl.flock(self._session_lock, fcntl.LOCK_EX)
-        self.accounts = _continued(self._index)
-
-    def _end(self, snapshot: Snapshot | None) -> None:
-        with self._index.transaction():
-            if snapshot:
-                self._index.write(self._session, snapshot)
-            self._index.end_session(self._session, self._clock.wall_ns())
 
     def _commit(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> list[SpooledObject]:
         now_ns = self._clock.wall_ns()
@@ -223,8 +206,8 @@ class Spool:
                     self._tree.sync_incoming()
                 for outcome in outcomes:
                     self._index.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
-                if snapshot is not None:
-                    self._index.write(self._session, snapshot)
+                if snapshot is not None and self._session is not None:
+                    self._index.write(self._session.number, snapshot)
                 self._forget(now_ns)
         except BaseException:
             self.accounts.mark_dirty()

@@ -74,8 +74,9 @@ def settle(spool: Spool, item: SpooledObject, state: State, reason: str | None =
 
 
 def rows(root: Path) -> list[dict[str, Any]]:
-    """All object rows, read by somebody else."""
+    """All object rows, read by somebody else, who minds no flipped bit in the words of what has left the spool."""
     connection = sqlite3.connect(root / 'index.db')
+    connection.text_factory = lambda text: text.decode(errors='replace')
     connection.row_factory = sqlite3.Row
     try:
         return [dict(row) for row in connection.execute('SELECT * FROM objects ORDER BY id')]
@@ -132,5 +133,5 @@ def reopened(opened: Callable[[], Spool], root: Path) -> dict[str, int]:
 def abandon(spool: Spool) -> None:
     """Leave a spool as a process that dies does."""
     spool._index.close()
-    assert spool._session_lock is not None
-    os.close(spool._session_lock)
+    assert spool._session is not None
+    os.close(spool._session._lock)

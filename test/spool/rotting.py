@@ -217,6 +217,6 @@ def check(rotten: Rotten, bodies: Mapping[str, bytes]) -> dict[str, int]:
     spool.close()
     again = new_spool(rotten.root)
     again.open()
-    assert not {what for what in again.recovery.counts if 'ledger' not in what}, 'what was repaired stays repaired'
+    assert not {what for what in again.recovery.counts if 'ledger' not in what}, f'what was repaired stays repaired: {again.recovery.counts}'
     again.close()
     return done

@@ -170,13 +170,14 @@ def test_a_rebuilt_key_is_not_given_out_again(opened: Open, root: Path, used: di
 
 
 def test_the_same_key_in_two_folders(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """Two files of one key after a lost index: one becomes the object, the other stays where it is."""
+    """Two files of one key after a lost index: one becomes the object, the other is set aside."""
     (root / 'index.db').unlink()
     twin = root / f'quarantine/refused/{BUCKET}/thor/a/2.jpg'
     twin.write_bytes(b'twin')
     spool = opened()
     assert spool.recovery.counts['files adopted'] == 7
-    assert twin.read_bytes() == b'twin'
+    assert spool.recovery.counts['foreign files set aside'] == 1
+    assert (root / 'foreign' / twin.relative_to(root)).read_bytes() == b'twin'
 
 
 @pytest.mark.parametrize('number', [errno.EACCES, errno.EIO, errno.ENOTSUP, errno.ENODATA])
