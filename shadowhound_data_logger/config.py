@@ -23,6 +23,7 @@ from shadowhound_data_logger.options import (
     ClockSettings,
     EncodeSettings,
     IntakeSettings,
+    MissionSettings,
     QueueSettings,
     SensorSettings,
     ShutdownSettings,
@@ -33,14 +34,16 @@ from shadowhound_data_logger.options import (
 
 __all__ = [
     'DEFAULT_SENSORS', 'FOREIGN', 'FORMATS',
-    'ClockSettings', 'EncodeSettings', 'IntakeSettings', 'QueueSettings', 'SensorSettings', 'Settings', 'ShutdownSettings',
-    'SpoolSettings', 'StoreSettings', 'UploadSettings', 'default_parameters', 'home', 'store_settings',
+    'ClockSettings', 'EncodeSettings', 'IntakeSettings', 'MissionSettings', 'QueueSettings', 'SensorSettings', 'Settings',
+    'ShutdownSettings', 'SpoolSettings', 'StoreSettings', 'UploadSettings', 'default_parameters', 'home', 'store_settings',
 ]  # fmt: skip
 
 MIN_RATE_HZ: Final = 1e-4
 """A message every three hours."""
 MAX_INT: Final = (1 << 63) - 1
 """Of a ROS parameter."""
+_FIELD: Final = re.compile(r'[^:\s]+:[A-Za-z]\w*(\.\w+)*', re.ASCII)
+"""A part of the field that is a number counts in an array: lowstate:motor_state.0.temperature."""
 _BUCKET: Final = re.compile(r'[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]')
 """https://docs.aws.amazon.com/AmazonS3/latest/userguide/bucketnamingrules.html"""
 FOREIGN: Final = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
@@ -62,6 +65,7 @@ class Settings:
     upload: UploadSettings
     shutdown: ShutdownSettings
     clock: ClockSettings
+    mission: MissionSettings
 
     @property
     def spool_path(self) -> Path:
@@ -74,6 +78,7 @@ class Settings:
         robot = _robot(given.pop('robot', ''), environ, namespace)
         sensors = _sensors(given, robot)
         groups = {name: _fill(kind, name, given) for name, kind in GROUPS.items()}
+        _check_fields(groups['mission'])
         if given:
             name, value = next(iter(given.items()))
             known = sorted({'robot', 'sensors', *GROUPS, *(sensor.name for sensor in sensors)})
@@ -184,6 +189,14 @@ def _check_batches(sensor: SensorSettings) -> None:
     if sensor.format in ARCHIVES and not sensor.batched:
         text = f'more than 0 with format {sensor.format!r}, or a batch_count: an archive holds several messages'
         raise SettingError(f'{sensor.name}.batch_s', sensor.batch_s, text)
+
+
+def _check_fields(mission: MissionSettings) -> None:
+    """Raises SettingError for what is no topic with a field."""
+    for name in ('battery', 'temperature'):
+        given = getattr(mission, name)
+        if given and not _FIELD.fullmatch(given):
+            raise SettingError(f'mission.{name}', given, "empty, or 'topic:field' such as lowstate:bms_state.soc")
 
 
 def _fill(kind: type, prefix: str, given: dict[str, Any], defaults: Mapping[str, Any] | None = None) -> Any:

@@ -16,6 +16,7 @@ ARCHIVES: Final = ('zip', 'tar')
 """Formats that hold a file of each message; they make sense for batches alone."""
 BATCHED: Final = ('json', *ARCHIVES)
 """Formats that can hold several messages."""
+CAPTURES: Final = ('always', 'mission')
 COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
 IMAGE: Final = 'sensor_msgs/msg/Image'
 POINT_CLOUD: Final = 'sensor_msgs/msg/PointCloud2'
@@ -131,6 +132,21 @@ class ClockSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MissionSettings:
+    """What the node does while a mission of its robot is active."""
+
+    capture: str = _setting('always', 'When sensor data is stored: always, or only while a mission is active.', choices=CAPTURES)
+    join: bool = _setting(True, "Log the robot's state to the mission's run beside the agent.")
+    period_s: float = _setting(1.0, 'Seconds between two points of a metric that the node logs.', low=0.01, high=3600.0)
+    battery: str = _setting('lowstate:bms_state.soc', 'Topic and field of battery_pct; empty for none.')
+    temperature: str = _setting('imu:temperature', 'Topic and field of temperature_c; empty for none.')
+    odometry: str = _setting('odom', 'Topic (nav_msgs/Odometry) of pose, trajectory and distance; empty for none.')
+    max_speed_mps: float = _setting(5.0, 'A step of the odometry that is faster is a jump and no way.', low=0.01, high=1000.0)
+    frames: str = _setting('camera', 'Sensor whose pictures become frames of the run; empty for none.')
+    frame_every_s: float = _setting(5.0, 'Seconds between two of these frames.', low=0.0, high=1e6)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StoreSettings:
     """Where objects go: an S3 server, or without an endpoint a folder of the same layout (D13)."""
 
@@ -150,6 +166,7 @@ GROUPS: Final[dict[str, type]] = {
     'upload': UploadSettings,
     'shutdown': ShutdownSettings,
     'clock': ClockSettings,
+    'mission': MissionSettings,
 }
 DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
     'camera': {

@@ -160,3 +160,11 @@ def test_an_endpoint_is_a_url() -> None:
     """An endpoint without a scheme is refused with its name."""
     with pytest.raises(SettingError, match=r"AWS_ENDPOINT_URL = 'tower:9000'.*http://TOWER_IP:9000"):
         load({'AWS_ENDPOINT_URL': 'tower:9000'})
+
+
+@pytest.mark.parametrize('given', ['lowstate', 'lowstate:', ':soc', 'lowstate:bms_state..soc', 'a b:c', 'a:b:c'])
+def test_a_field_needs_a_topic_and_a_name(given: str) -> None:
+    """The node says at its start what it could never find in a message."""
+    error = refused(mission__battery=given)
+    assert (error.data['name'], error.data['value']) == ('mission.battery', given)
+    assert load(mission__battery='', mission__temperature='low/state:motor_state.0.temperature')

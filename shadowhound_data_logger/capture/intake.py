@@ -66,6 +66,10 @@ class Intake:
     def open(self) -> None:
         self.worker.start()
 
+    def begin_idle(self) -> None:
+        """Before ``open``: nobody wants the data yet."""
+        self._set_idle(idle=True)
+
     def close(self, deadline_s: float) -> bool:
         """Take what waits, close the batches and the subscriptions, end the thread; False if that failed or took too long."""
         if self.worker.stopping:
@@ -82,6 +86,10 @@ class Intake:
     def pause(self, deadline_s: float, *, paused: bool) -> bool:
         """From now on count and drop what comes, or store it again; False if that failed or took too long."""
         return self._ask(partial(self._pause, paused=paused), deadline_s)
+
+    def idle(self, deadline_s: float, *, idle: bool) -> bool:
+        """From now on count and skip what comes, or store it again; False if that failed or took too long."""
+        return self._ask(partial(self._set_idle, idle=idle), deadline_s)
 
     def update(self, sensors: Iterable[SensorSettings]) -> None:
         """Go on by these settings soon; sensors that are not among them stay as they are."""
@@ -113,6 +121,10 @@ class Intake:
         now_s = time.monotonic()
         self.paused = paused
         _each([partial(source.pause, now_s, paused=paused) for source in self._sources])
+
+    def _set_idle(self, *, idle: bool) -> None:
+        now_s = time.monotonic()
+        _each([partial(source.idle, now_s, idle=idle) for source in self._sources])
 
     def _update(self, sensors: Sequence[SensorSettings]) -> None:
         now_s = time.monotonic()

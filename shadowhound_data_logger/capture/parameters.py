@@ -109,18 +109,27 @@ def _descriptor(spec: Field[Any]) -> ParameterDescriptor:
 def _check_topics(node: Node, settings: Settings) -> None:
     """Every topic has a valid name and, once resolved (namespace, remapping), a single sensor. Raises SettingError."""
     owners: dict[str, str] = {}
+    mission = settings.mission
+    for name, given in (('odometry', mission.odometry), ('battery', mission.battery), ('temperature', mission.temperature)):
+        if given:
+            _resolve(node, f'mission.{name}', given.partition(':')[0], given)
     for sensor in settings.sensors:
         for topic in sensor.topics:
             name = f'{sensor.name}.topics'
-            try:
-                resolved = node.resolve_topic_name(topic)
-            except (RuntimeError, ValueError) as error:  # RCLError is the one, InvalidTopicNameException the other
-                reason = str(error).partition(', at ')[0].partition('\n')[0]
-                raise SettingError(name, list(sensor.topics), f'valid topic names, not {topic!r} ({reason})') from error
+            resolved = _resolve(node, name, topic, list(sensor.topics))
             if resolved in owners:
                 text = f'a topic of its own, and {resolved} is in {owners[resolved]} already'
                 raise SettingError(name, list(sensor.topics), text)
             owners[resolved] = name
+
+
+def _resolve(node: Node, name: str, topic: str, given: object) -> str:
+    """The full name of a topic; raises SettingError for one that is none."""
+    try:
+        return str(node.resolve_topic_name(topic))
+    except (RuntimeError, ValueError) as error:  # RCLError is the one, InvalidTopicNameException the other
+        reason = str(error).partition(', at ')[0].partition('\n')[0]
+        raise SettingError(name, given, f'valid topic names, not {topic!r} ({reason})') from error
 
 
 def _plain(value: Any) -> Any:

@@ -16,6 +16,9 @@ from rclpy.node import Node
 from shadowhound_data_logger.capture.control import Control
 from shadowhound_data_logger.capture.diagnostics import Diagnostics
 from shadowhound_data_logger.capture.intake import Intake
+from shadowhound_data_logger.capture.mission import MissionWatch
+from shadowhound_data_logger.capture.mission_tap import MissionTap
+from shadowhound_data_logger.capture.mission_topic import MissionTopic
 from shadowhound_data_logger.capture.parameters import live
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.clock import SystemClock, utc
@@ -82,7 +85,11 @@ class Pipeline:
         self.pool = EncodePool(queue, sensors, settings.robot, types, self._spool_later, self.spool.accounts.reject,
                                settings.encode.threads)  # fmt: skip
         self.intake = Intake(self._node, sensors, settings.intake, self.spool.accounts, types, queue, self._clock)
-        self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader)
+        tap = MissionTap(settings.mission, sensors, settings.robot, types, self._clock, self._node.resolve_topic_name)
+        topic = MissionTopic(self._node)
+        self.mission = MissionWatch(settings, self.intake, queue, tap, topic.tell)
+        self.pool.observe = self.mission.observe
+        self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission)
         self._status = Status(stages, settings, self._clock, self._store.describe())
         self._diagnostics = Diagnostics(self._node)
         self.control = Control(self._node, self.intake, queue, self.writer)
@@ -92,7 +99,12 @@ class Pipeline:
         self.pool.open()
         self.uploader.open()
         opened.callback(self.uploader.close, 0.5)
+        opened.callback(self.mission.close)
         opened.callback(self._finish)
+        topic.open()
+        opened.callback(topic.close)
+        self.mission.open()
+        opened.callback(self.mission.stop)
         self.intake.open()
         self._diagnostics.open()
         opened.callback(self._diagnostics.close)
@@ -176,7 +188,7 @@ class Pipeline:
             log.warning('the ledger was not shipped: %s', error)
 
     def _spool_later(self, item: DataObject) -> None:
-        self.writer.put(self._redating.date(item))
+        self.writer.put(self._redating.date(self.mission.mark(item)))
 
     def _name_held(self) -> None:
         """What waited for the clock to be set may go now, or as soon as the disk lets it."""

@@ -67,6 +67,7 @@ class Source:
         self._stream: Stream | None = None
         self._kept_ns: dict[str, int] = {}
         self._paused = False
+        self._idle = False
         self._last_received_s: float | None = None
         self._unavailable = ''
         self._unheard: set[str] = set()
@@ -122,6 +123,11 @@ class Source:
         """While it is paused messages are counted and dropped; whatever came before is treated as before."""
         self.flush(now_s)
         self._paused = paused
+
+    def idle(self, now_s: float, *, idle: bool) -> None:
+        """While nobody wants its data messages are counted and skipped; whatever came before is treated as before."""
+        self.flush(now_s)
+        self._idle = idle
 
     def update(self, sensor: SensorSettings, now_s: float) -> None:
         """Go on by other settings."""
@@ -228,7 +234,7 @@ class Source:
             lost = self._lost(reader)
         elif taken[0].publisher is None and not self._senders.gids:
             self._senders.look([publisher.gid for publisher in endpoints(self._node, self._chosen)])
-        self._stream.add(taken, self._senders, lost, now_s, paused=self._paused)
+        self._stream.add(taken, self._senders, lost, now_s, paused=self._paused, idle=self._idle)
 
     def _lost(self, reader: Reader) -> int | None:
         """What the middleware reports to have lost; None where that cannot be known.

@@ -17,6 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
 from shadowhound_data_logger.capture.intake import Intake
+from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.source import SourceStatus
 from shadowhound_data_logger.capture.watchdog import Watchdog
 from shadowhound_data_logger.clock import SECOND, iso
@@ -49,11 +50,12 @@ class Stages:
     pool: EncodePool
     writer: SpoolWriter
     uploader: Uploader
+    mission: MissionWatch
 
     @property
     def workers(self) -> Sequence[Worker]:
         """All threads of the node but the main one."""
-        return self.intake.worker, *self.pool.workers, self.writer.worker, *self.uploader.workers
+        return self.intake.worker, *self.pool.workers, self.writer.worker, *self.uploader.workers, self.mission.worker
 
 
 class Status:
@@ -91,7 +93,8 @@ class Status:
         status = {
             'robot': self._settings.robot, 'version': self._version, 'pid': os.getpid(), 'boot_id': self._clock.boot_id,
             'boot_ns': boot_ns, 'time': iso(self._clock.wall_ns()), 'uptime_s': round((boot_ns - self._began_ns) / SECOND, 1),
-            'paused': self._stages.intake.paused, 'ended': ended, 'topics': self._topics(now_s),
+            'paused': self._stages.intake.paused, 'ended': ended,
+            'mission': self._stages.mission.status(), 'topics': self._topics(now_s),
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
             'spool': {'path': str(self._stages.spool.root), **asdict(piles), 'max_bytes': self._settings.spool.max_bytes},
             'store': self._store(upload, now_s), 'clock': asdict(self._clock.state()),

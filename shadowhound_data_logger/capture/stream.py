@@ -62,12 +62,14 @@ class Stream:
             self._gate = gate_for(sensor, has_header=self._has_header, last_kept_ns=self.kept_ns)
         self._sensor = sensor
 
-    def add(self, taken: Sequence[Taken], senders: Senders, lost: int | None, now_s: float, *, paused: bool) -> None:
+    def add(self, taken: Sequence[Taken], senders: Senders, lost: int | None, now_s: float, *, paused: bool,
+            idle: bool = False) -> None:  # fmt: skip
         """Take messages in the order in which they came.
 
         ``lost`` is what the middleware reports to have lost since the last time, None where it reports nothing.
+        While ``paused`` they are counted as dropped, while ``idle`` (nobody asked for them) as skipped.
         """
-        for sample in self._keep(taken, senders, lost, paused=paused):
+        for sample in self._keep(taken, senders, lost, paused=paused, idle=idle):
             for batch in self._batcher.add(sample, now_s):
                 self._offer(batch)
 
@@ -81,7 +83,7 @@ class Stream:
         if len(self._batcher):
             self._offer(self._batcher.close())
 
-    def _keep(self, taken: Sequence[Taken], senders: Senders, lost: int | None, *, paused: bool) -> list[Sample]:
+    def _keep(self, taken: Sequence[Taken], senders: Senders, lost: int | None, *, paused: bool, idle: bool) -> list[Sample]:
         """Count the messages, drop repeats and choose those to store."""
         kept: list[Sample] = []
         keep = self._gate.keep
@@ -95,6 +97,9 @@ class Stream:
                     continue
                 if paused:
                     account.dropped[PAUSED] += 1
+                    continue
+                if idle:
+                    account.skipped += 1
                     continue
                 stamp_ns = stamp_of(header_stamp_ns(cdr) if self._has_header else 0, source_ns, self._clock)
                 if keep(stamp_ns, cdr):

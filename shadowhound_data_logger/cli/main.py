@@ -7,6 +7,7 @@ import sys
 import click
 
 from shadowhound_data_logger.cli.ledger import ledger
+from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.status import status
 from shadowhound_data_logger.errors import DataLoggerError
 
@@ -21,6 +22,7 @@ def cli() -> None:
 
 
 cli.add_command(ledger)
+cli.add_command(missions)
 cli.add_command(status)
 
 

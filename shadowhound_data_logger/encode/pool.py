@@ -36,6 +36,8 @@ class EncodePool:
         self._types = types
         self._put = put
         self._reject = reject
+        self.observe: Callable[[Batch], None] = lambda _: None
+        """Set before ``open``: shown each batch after its object is on its way; what it raises loses nothing."""
         self._told: set[tuple[str, str]] = set()
         self.workers = [Worker(f'encode-{number}', self._step, patience_s=PATIENCE_S) for number in range(threads)]
 
@@ -78,6 +80,7 @@ class EncodePool:
             except BaseException:
                 self._reject(batch.topic, {'encoder_failed': encoding.object.samples})
                 raise
+        self.observe(batch)
 
     def _tell(self, topic: str, details: Mapping[str, str]) -> None:
         """Say once for each topic and reason what is wrong; the ledger counts the rest."""

@@ -1,7 +1,7 @@
 """The artifacts of a mission's run: which files they are, and how a file gets the name that it has there.
 
 trajectories/trajectory.csv   camera/frame_NNNNNN.jpg (a sample)   what the agent gave to log_artifact
-summary.json   events.jsonl (where there are any)   mission_command.txt (where it is longer than a param)
+summary.json   camera_summary.jpg   trajectory.png   battery.png   events.jsonl   mission_command.txt
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from shadowhound_data_logger.missions import journal
+from shadowhound_data_logger.missions.drawing import NAMES
 from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.story import Story
 from shadowhound_data_logger.missions.values import MAX_PARAM
@@ -43,6 +44,9 @@ def artifacts_of(record: Mapping[str, Any], folder: MissionFolder, story: Story)
     elif kind == 'end':
         if story.counts['event']:
             yield Artifact(_write_events(folder), 'events.jsonl')
+        if folder.trajectory.exists():
+            yield Artifact(folder.trajectory, 'trajectory.csv', 'trajectories')
+        yield from (Artifact(folder.files / name, name) for name in NAMES if (folder.files / name).exists())
         yield Artifact(folder.summary, 'summary.json')
 
 

@@ -15,9 +15,12 @@ from typing import Any, Final
 from shadowhound_data_logger.errors import TrackingRefused
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of, prepared
+from shadowhound_data_logger.missions.drawing import Pictures, nothing
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped, write_json
+from shadowhound_data_logger.missions.node_delivery import NodeDelivery
 from shadowhound_data_logger.missions.objects import Item, Shelf, objects_of
 from shadowhound_data_logger.missions.story import KILLED, Point, Story
+from shadowhound_data_logger.missions.summary import summary_of
 from shadowhound_data_logger.missions.tracking import RUN_GONE, Tracking
 from shadowhound_data_logger.missions.values import MAX_KEYS, MAX_TAG
 
@@ -40,6 +43,8 @@ class Batch:
     params: dict[str, str] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
     is_last: bool = False
+    is_all: bool = False
+    """Whether nothing more is in the journal."""
 
 
 class Delivery:
@@ -48,13 +53,16 @@ class Delivery:
     The three do a bounded piece of work and say whether there was any. They raise TrackingError, SpoolError or OSError.
     """
 
-    def __init__(self, folder: MissionFolder, tracking: Tracking, shelf: Shelf) -> None:
+    def __init__(self, folder: MissionFolder, tracking: Tracking, shelf: Shelf, pictures: Pictures = nothing) -> None:
         self.folder = folder
         self.sent = folder.sent()
         self.run: Run | None = folder.run()
         self.story = Story()
+        self.node = NodeDelivery(folder, self.story, MOST_POINTS)
+        self.story.node = self.node.story
         self._tracking = tracking
         self._shelf = shelf
+        self._pictures = pictures
         self._told = 0  # up to here the story knows the journal
         self._batch: Batch | None = None
 
@@ -62,10 +70,10 @@ class Delivery:
         """Send the next batch of metrics; make the run first, end it after the last."""
         self._recall()
         if self.sent.ended:
-            return False
+            return self.node.track(self.run, self._send)
         batch = self._batch = self._batch or self._next_batch()
         if batch is None:
-            return self._end_abandoned()
+            return self.node.track(self.run, self._send) or self._end_abandoned()
         run = self._run_of()
         self._send(run, batch.points, batch.params, batch.tags)
         if batch.is_last:
@@ -74,6 +82,8 @@ class Delivery:
             )
         self._move(metrics=batch.end, ended=batch.is_last)
         self._batch = None
+        if batch.is_all:  # the agent's first: what it logs itself is not sent for the node
+            self.node.track(run, self._send)
         return True
 
     def attach(self) -> bool:
@@ -89,7 +99,8 @@ class Delivery:
             end = line.end
             if done >= ARTIFACTS_A_STEP:
                 break
-        return self._moved(artifacts=end)
+        moved = self._moved(artifacts=end)
+        return self.node.attach(self.run, self._attach, ARTIFACTS_A_STEP - done) or moved
 
     def shelve(self, *, hold: bool = False) -> bool:
         """Hand the next frames, trajectories and the summary to the spool; without a run only with ``hold``, to be held there."""
@@ -101,18 +112,21 @@ class Delivery:
         if self.run is None and not (hold and self.story.start):
             return False
         items: list[Item] = []
-        size, end = 0, self.sent.objects
+        size, end, missing = 0, self.sent.objects, 0
         for line in self._lines(self.sent.objects) if self.run else self._lines_before_a_run():
             found = list(objects_of(line.record or {}, self.story.start, self.folder, self.run))
             items += found
+            missing += not found and (line.record or {}).get('k') in {'frame', 'trajectory'}
             size += sum(len(item.content.body) for item in found)
             end = line.end
             if len(items) >= OBJECTS_A_STEP or size >= BYTES_A_STEP:
                 break
         if self.run is None and items and not self.sent.held:
             self._move(held=True)
-        self._shelf.add([item.content for item in items])
-        moved = self._moved(objects=end)
+        more, node_end = self.node.shelve(self.run, OBJECTS_A_STEP - len(items))
+        self._shelf.add([item.content for item in (*items, *more)])
+        moved = self.node.shelved(node_end)
+        moved = self._moved(objects=end, missing=self.sent.missing + missing) or moved
         for item in items:
             if item.is_done_with:
                 item.path.unlink(missing_ok=True)
@@ -125,9 +139,11 @@ class Delivery:
             and not self.sent.held
             and not self.sent.complete
             and self.sent.artifacts == self.sent.objects == self.sent.metrics
+            and self.node.is_sent()
         ):
             self._move(complete=True)
-            shutil.rmtree(self.folder.files, ignore_errors=True)
+            for folder in (self.folder, self.folder.node):
+                shutil.rmtree(folder.files, ignore_errors=True)
         return self.sent.complete
 
     def give_up(self, error: str) -> None:
@@ -138,6 +154,7 @@ class Delivery:
 
     def _recall(self) -> None:
         """After a restart: tell the story what was sent before."""
+        self.node.recall()
         if self._told < self.sent.metrics:
             for line in journal.read(self.folder.journal, self._told):
                 self.story.add(line.record)
@@ -149,6 +166,8 @@ class Delivery:
         """The next records that are not sent."""
         batch = Batch(self._told)
         for line in journal.read(self.folder.journal, self._told):
+            if (line.record or {}).get('k') == 'end' and not self.node.is_over():
+                break
             batch.points += self.story.add(line.record)
             self._told = batch.end = line.end
             kind = (line.record or {}).get('k')
@@ -162,17 +181,20 @@ class Delivery:
                 break
             if len(batch.points) > MOST_POINTS - MAX_KEYS:
                 break
+        else:
+            batch.is_all = True
         return batch if self._told > self.sent.metrics else None
 
     def _end_abandoned(self) -> bool:
         """Where the agent died in the middle, say so in its place; whether that was so."""
-        if not self.story.start or self.story.end:
+        if not self.story.start or self.story.end or not self.node.is_over():
             return False
         with journal.abandoned(self.folder.journal) as descriptor:
             if descriptor is None or any(True for _ in journal.read(self.folder.journal, self._told)):
                 return descriptor is not None
             error = 'the agent ended without ending its mission'
-            record = {'k': 'end', 't': self.story.last_ns, 'status': KILLED, 'success': False, 'by': 'replayer', 'error': error}
+            last_ns = max(self.story.last_ns, self.node.story.last_ns)
+            record = {'k': 'end', 't': last_ns, 'status': KILLED, 'success': False, 'by': 'replayer', 'error': error}
             torn = journal.finish(self.folder.journal, descriptor, self._told, record)
         cut = f', {torn} bytes of a record that was being written are cut off' if torn else ''
         log.warning('mission %s: %s; it is closed as %s%s', self.folder.mission_id, error, KILLED, cut)
@@ -183,8 +205,9 @@ class Delivery:
         for line in journal.read(self.folder.journal, offset):
             if line.end > self.sent.metrics:
                 return
-            if (line.record or {}).get('k') == 'end':
-                self._summarize()
+            if (line.record or {}).get('k') == 'end' and (self.sent.objects < offset or not self._summarize()):
+                return
+            offset = line.end
             yield line
 
     def _lines_before_a_run(self) -> Iterator[journal.Line]:
@@ -221,9 +244,9 @@ class Delivery:
             if not parts:
                 self._refuse(error)
 
-    def _refuse(self, error: Exception) -> None:
+    def _refuse(self, error: Exception, count: str = 'refused') -> None:
         log.error('mission %s: %s', self.folder.mission_id, error)
-        self._move(refused=self.sent.refused + 1, error=str(error))
+        self._move(**{count: getattr(self.sent, count) + 1, 'error': str(error)})
 
     # -- artifacts -------------------------------------------------------------------------------------------------
 
@@ -232,19 +255,25 @@ class Delivery:
         try:
             path = prepared(self.folder, artifact)
         except FileNotFoundError as error:
-            self._refuse(error)
+            self._refuse(error, 'unattached')
             return
         try:
             self._tracking.artifact(run, path, artifact.folder)
         except TrackingRefused as error:
-            self._refuse(error)
+            self._refuse(error, 'unattached')
 
-    def _summarize(self) -> None:
-        """Once: artifact and object must be the same."""
+    def _summarize(self) -> bool:
+        """Once: artifact and object must be the same. False while the pictures are being made."""
         assert self.run is not None
+        if not self.story.counts['trajectory']:
+            self.node.write_trajectory()
         if not self.folder.summary.exists():
-            robot = self.story.start['robot']
-            write_json(self.folder.summary, self.story.summary(self.folder.mission_id, self.run, robot), durable=True)
+            made = self._pictures(self.folder, stamped(self.story.start['type'], int(self.story.start['t'])))
+            if made is None:
+                return False
+            content = summary_of(self.story, self.folder.mission_id, self.run, self.sent, made)
+            write_json(self.folder.summary, content, durable=True)
+        return True
 
     # -- places ----------------------------------------------------------------------------------------------------
 
@@ -257,7 +286,8 @@ class Delivery:
 
     def _move(self, **changes: Any) -> None:
         self.sent = replace(self.sent, **changes)
-        self.folder.set_sent(self.sent)
+        durable = not changes.keys().isdisjoint({'objects', 'held', 'complete'})  # after these, files go
+        self.folder.set_sent(self.sent, durable=durable)
 
 
 def _parts(points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> list[Part]:

@@ -5,6 +5,10 @@
     run.json       the MLflow run, once there is one
     sent.json      how far the replayer came
     summary.json   what the mission was, once it is over
+    pictures.json  what became of its pictures
+    floor.npy      x and y (m) of lidar points, a row each, where the node saw any: the floor plan under the trajectory's picture
+    trajectory.csv what the node made of odometry, once the mission is over and where the agent logged no trajectory
+    node/          the same for what the node logged: its journal, files/ and sent.json
 
 Both ids find it: the folder has the mission's, ``run.json`` the run's.
 """
@@ -15,6 +19,7 @@ import json
 import os
 import re
 import secrets
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -52,7 +57,11 @@ class Sent:
     """Whether the run has its last state."""
     complete: bool = False
     refused: int = 0
-    """Things that the tracking server will never take."""
+    """Points, params and tags that the tracking server will never take."""
+    unattached: int = 0
+    """Artifacts that it will never take, or whose file is gone."""
+    missing: int = 0
+    """Frames and trajectories that were logged and whose file was gone before the spool had it."""
     error: str = ''
     """What was refused last."""
 
@@ -79,6 +88,23 @@ class MissionFolder:
     def summary(self) -> Path:
         return self.path / 'summary.json'
 
+    @property
+    def pictures(self) -> Path:
+        return self.path / 'pictures.json'
+
+    @property
+    def floor(self) -> Path:
+        return self.path / 'floor.npy'
+
+    @property
+    def trajectory(self) -> Path:
+        return self.path / 'trajectory.csv'
+
+    @property
+    def node(self) -> MissionFolder:
+        """What the node logged beside the agent."""
+        return MissionFolder(self.path / 'node')
+
     def run(self) -> Run | None:
         """The run, once the replayer made it."""
         found = read_json(self.path / 'run.json')
@@ -98,8 +124,12 @@ class MissionFolder:
         except TypeError:
             return Sent()
 
-    def set_sent(self, sent: Sent) -> None:
-        write_json(self.path / 'sent.json', asdict(sent), durable=sent.complete)
+    def age_s(self) -> float:
+        """Since something of it was sent last. Raises OSError where nothing was."""
+        return time.time() - (self.path / 'sent.json').stat().st_mtime
+
+    def set_sent(self, sent: Sent, *, durable: bool = False) -> None:
+        write_json(self.path / 'sent.json', asdict(sent), durable=durable)
 
 
 def missions(home: Path) -> Iterator[MissionFolder]:

@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 CHUNK: Final = 1 << 20
+TAIL_BYTES: Final = 64 << 10
+"""Within it lies the last record of a mission: what an agent states at the end is short."""
 MAX_LINE_BYTES: Final = 16 << 20
 """More without a line break is damage: what a call may say is cut far below."""
 
@@ -47,6 +49,17 @@ class Journal:
         """Raises FileExistsError where there is one, OSError where there is no room or right for it."""
         self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        _open.add(self)
+
+    def reopen(self) -> None:
+        """Go on with what a writer that is gone wrote, or begin. Raises BlockingIOError while there is another, or OSError."""
+        descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(descriptor)
+            raise
+        self._descriptor, self._torn = descriptor, os.fstat(descriptor).st_size > 0
         _open.add(self)
 
     def append(self, record: Mapping[str, Any]) -> None:
@@ -133,6 +146,32 @@ def parse(line: bytes) -> Mapping[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
+
+
+def is_locked(path: Path) -> bool:
+    """Whether its writer lives. Raises OSError (there is no such file)."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def first(path: Path) -> Mapping[str, Any]:
+    """The first record; empty where there is none yet. Raises OSError."""
+    line = next(read(path), None)
+    return (line and line.record) or {}
+
+
+def last(path: Path) -> Mapping[str, Any]:
+    """The last record; empty where it is damaged or longer than any end. Raises OSError."""
+    with path.open('rb') as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
+        lines = file.read().split(b'\n')
+    return (parse(lines[-2]) if len(lines) > 1 else None) or {}
 
 
 @contextmanager

@@ -66,11 +66,15 @@ def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: Miss
         key, more = f'{home}/camera/frame_{number:06d}.jpg', {**metadata, 'frame_id': str(number)}
         yield from _item(path, BUCKET, key, time_ns, more, is_done_with=not record.get('artifact'))
     elif kind == 'trajectory':
-        path = folder.files / record['file']
-        yield from _item(path, BUCKET, f'{home}/trajectory.csv', time_ns, metadata)
-        yield from _item(path, TRAJECTORIES, f'{robot}/{stamped(start["type"], int(start["t"]))}.csv', time_ns, metadata)
+        yield from _trajectory(folder.files / record['file'], home, start, time_ns, metadata)
     elif kind == 'end':
+        yield from _trajectory(folder.trajectory, home, start, time_ns, metadata)
         yield from _item(folder.summary, BUCKET, f'{home}/summary.json', time_ns, metadata)
+
+
+def _trajectory(path: Path, home: str, start: Mapping[str, Any], time_ns: int, metadata: Mapping[str, str]) -> Iterator[Item]:
+    yield from _item(path, BUCKET, f'{home}/trajectory.csv', time_ns, metadata)
+    yield from _item(path, TRAJECTORIES, f'{start["robot"]}/{stamped(start["type"], int(start["t"]))}.csv', time_ns, metadata)
 
 
 def _item(path: Path, bucket: str, key: str, time_ns: int, metadata: Mapping[str, str], *,

@@ -40,6 +40,7 @@ class Mission:
         self._next_s = float('-inf')
         self._lock = threading.Lock()
         self._number = 0
+        self._lost = 0
         self._unsynced: list[Path] = []
         self._is_dirty = True
         self._warned: set[str] = set()
@@ -118,6 +119,7 @@ class Mission:
                 stated[name] = None if value is None else values.number(value, name)
             except Rejected as refused:
                 self._refuse(refused)
+        stated['lost'] = self._lost
         if error:
             stated['error'] = values.text(error, values.MAX_PARAM)
         try:
@@ -212,6 +214,8 @@ class Mission:
 
     def _lose(self, error: OSError) -> None:
         """The disk takes nothing: the mission goes on."""
+        with self._lock:
+            self._lost += 1
         self._warn('lost', 'mission %s loses what is logged while the disk takes nothing: %s', self.id, error)
 
     def _warn(self, reason: str, text: str, *values_: object) -> None:

@@ -11,6 +11,7 @@ import logging
 import os
 import random
 import select
+import shutil
 import signal
 import sqlite3
 import sys
@@ -24,6 +25,7 @@ from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import DataLoggerError, TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
+from shadowhound_data_logger.missions.drawing import Drawing
 from shadowhound_data_logger.missions.folder import FOLDER, missions, write_json
 from shadowhound_data_logger.missions.objects import Shelf
 from shadowhound_data_logger.missions.report import STATE
@@ -37,6 +39,8 @@ LOOK_EVERY_S: Final = 0.5
 """How often the journals are looked at when nobody wakes it."""
 LINGER_S: Final = 600.0
 """How long it tries on after the agent ended and nothing gets through."""
+KEEP_S: Final = 30 * 86_400.0
+"""How long a mission that has arrived stays on the robot; looked at when a sender starts."""
 LONGEST_PAUSE_S: Final = 60.0
 NICE: Final = 5
 SLICE_S: Final = 0.5
@@ -73,11 +77,12 @@ class Gate:
 class Replay:
     """All missions of one home. Life: New; step any number; close once. Not thread-safe."""
 
-    def __init__(self, home: Path, tracking: Tracking, shelf: Shelf, *, monotonic: Callable[[], float] = time.monotonic,
-                 rng: random.Random | None = None) -> None:  # fmt: skip
+    def __init__(self, home: Path, tracking: Tracking, shelf: Shelf, drawing: Drawing, *,
+                 monotonic: Callable[[], float] = time.monotonic, rng: random.Random | None = None) -> None:  # fmt: skip
         self._home = home
         self._tracking = tracking
         self._shelf = shelf
+        self._drawing = drawing
         self._monotonic = monotonic
         self._progress = False
         rng = rng or random.Random()
@@ -126,7 +131,7 @@ class Replay:
     @property
     def owes(self) -> bool:
         """Whether something could not be sent yet."""
-        return any(gate.error for gate in self.gates.values()) or self._shelf.owes
+        return any(gate.error for gate in self.gates.values()) or self._shelf.owes or self._drawing.busy
 
     def hurry(self) -> None:
         for gate in self.gates.values():
@@ -134,6 +139,7 @@ class Replay:
 
     def close(self) -> None:
         self._shelf.close()
+        self._drawing.close()
         self._tell(ended=True)
 
     def _look(self) -> None:
@@ -142,8 +148,10 @@ class Replay:
             if folder.mission_id not in self._deliveries and folder.mission_id not in self._settled and folder.journal.exists():
                 if folder.sent().complete:
                     self._settled.add(folder.mission_id)
+                    if folder.age_s() > KEEP_S:
+                        shutil.rmtree(folder.path, ignore_errors=True)
                 else:
-                    self._deliveries[folder.mission_id] = Delivery(folder, self._tracking, self._shelf)
+                    self._deliveries[folder.mission_id] = Delivery(folder, self._tracking, self._shelf, self._drawing.of)
                     self.gates[TRACKING].hurry()  # its agent waits for the run's id
 
     def _try(self, name: str, work: Callable[[], bool]) -> None:
@@ -242,7 +250,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return 0
         settings = Settings.load({}, {**os.environ, 'SHADOWHOUND_HOME': str(options.home)})
         tracking = open_tracking(options.home, options.experiment)
-        replay = Replay(options.home, tracking, Shelf(settings, SystemClock.of_this_machine()))
+        replay = Replay(options.home, tracking, Shelf(settings, SystemClock.of_this_machine()), Drawing())
         opened.callback(replay.close)
         run(replay, parent, lambda: bool(asked))
     return 0
@@ -250,14 +258,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def open_tracking(home: Path, experiment: str) -> MlflowTracking:
     """The tracking server that the environment names, else a SQLite file in the home (D13)."""
-    uri = os.environ.get('MLFLOW_TRACKING_URI') or f'sqlite:///{home / "mlflow.db"}'
+    uri = os.environ.get('MLFLOW_TRACKING_URI') or _private_store(home)
     root = home / 'mlartifacts' if uri.startswith('sqlite:') else None
+    if root is not None:
+        root.mkdir(mode=0o700, exist_ok=True)
     tracking = MlflowTracking(uri, experiment, root)
     try:
         tracking.open()  # now, because it takes seconds that a mission's start should not wait for
     except TrackingUnavailable as error:
         log.warning('%s', error)
     return tracking
+
+
+def _private_store(home: Path) -> str:
+    """The home's own SQLite file, for its owner alone: commands and pictures of a home are nobody else's business."""
+    path = home / 'mlflow.db'
+    os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+    return f'sqlite:///{path}'
 
 
 if __name__ == '__main__':

@@ -24,6 +24,8 @@ class Report:
     unsent: int
     complete: bool
     """Whether everything has arrived: metrics and artifacts in the run, objects in the spool."""
+    missing: int = 0
+    """Frames and trajectories whose file was gone before it was handed on."""
     last_error: str = ''
     """What holds it up now, or was refused for ever; empty when nothing."""
     remedy: str = ''
@@ -42,7 +44,8 @@ def report(folder: MissionFolder) -> Report:
         for one in errors(folder.path.parent).values():
             error, remedy = one
             break
-    return Report(folder.mission_id, run.run_id if run else None, len(ends) - unsent, unsent, sent.complete, error, remedy)
+    run_id = run.run_id if run else None
+    return Report(folder.mission_id, run_id, len(ends) - unsent, unsent, sent.complete, sent.missing, error, remedy)
 
 
 def has_arrived(folder: MissionFolder, *, is_active: bool) -> bool:

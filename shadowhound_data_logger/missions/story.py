@@ -1,8 +1,8 @@
 """What a mission's journal tells as a whole: its first and last values, its counts, and what the run ends with.
 
 The records of a journal, by their ``k``: ``start`` (type, command, robot), ``metrics`` (m: key -> value, s: step), ``frame``,
-``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``refused`` (reason) and ``end`` (status, what the agent
-stated). Every record has ``t``, ns since 1970 UTC.
+``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``refused`` (reason), ``end`` (status, what the agent
+stated), and of the node ``poses``. Every record has ``t``, ns since 1970 UTC.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.clock import SECOND, iso, utc
-from shadowhound_data_logger.missions.folder import Run, stamped
 from shadowhound_data_logger.missions.values import MAX_PARAM
 
 MS: Final = 1_000_000
@@ -47,6 +46,8 @@ class Story:
     steps: dict[str, int] = field(default_factory=dict)
     """The greatest step of each key: MLflow takes the point of the greatest step for the newest."""
     last_ns: int = 0
+    node: Story | None = None
+    """What the node measured beside the agent; where both state the same, the agent's stands."""
 
     def add(self, record: Mapping[str, Any] | None) -> list[Point]:
         """Take the next record (None: a damaged one); returns the metric points it stands for."""
@@ -81,13 +82,20 @@ class Story:
     @property
     def battery_consumed_pct(self) -> float | None:
         """First minus last; None where nobody said."""
-        return self.first[BATTERY] - self.last[BATTERY] if BATTERY in self.first else None
+        if BATTERY in self.first:
+            return self.first[BATTERY] - self.last[BATTERY]
+        return self.node.battery_consumed_pct if self.node else None
 
     @property
     def distance_m(self) -> float | None:
         """What the agent states when it is positive, else what was measured, else what it states (0, say)."""
         stated = self.end.get('distance_m')
-        return stated if stated is not None and stated > 0 else self.last.get(DISTANCE) or stated
+        return stated if stated is not None and stated > 0 else self.newest.get(DISTANCE) or stated
+
+    @property
+    def newest(self) -> dict[str, float]:
+        """The last value of each metric, the agent's where it logged any."""
+        return {**(self.node.last if self.node else {}), **self.last}
 
     @property
     def duration_s(self) -> float:
@@ -98,6 +106,10 @@ class Story:
     @property
     def measured_s(self) -> float:
         return max(0, int(self.end.get('t', self.last_ns)) - int(self.start.get('t', 0))) / SECOND
+
+    @property
+    def has_trajectory(self) -> bool:
+        return bool(self.counts['trajectory'] or (self.node and self.node.counts['poses']))
 
     @property
     def success(self) -> bool:
@@ -115,31 +127,6 @@ class Story:
     def final_params(self) -> dict[str, str]:
         return {'duration_s': f'{self.duration_s:.3f}'}
 
-    def summary(self, mission_id: str, run: Run, robot_prefix: str) -> dict[str, Any]:
-        """The content of summary.json."""
-        start_ns, end_ns = int(self.start['t']), int(self.end['t'])
-        name = stamped(self.start['type'], start_ns)
-        return {
-            'mission_id': mission_id, 'run_id': run.run_id, 'run_name': name, 'robot': self.start['robot'],
-            'mission_type': self.start['type'], 'mission_command': self.start['command'],
-            'start': iso(start_ns), 'end': iso(end_ns), 'start_ns': start_ns, 'end_ns': end_ns,
-            'result': self.end['status'], 'success': self.success, 'ended_by': self.end.get('by', 'agent'),
-            'errors': [*self.errors, *([self.end['error']] if self.end.get('error') else [])],
-            'distance_m': self.distance_m, 'duration_s': self.duration_s, 'battery_consumed_pct': self.battery_consumed_pct,
-            'stated': {name: self.end.get(name) for name in ('success', 'distance_m', 'duration_s')},
-            'measured': {'distance_m': self.last.get(DISTANCE), 'duration_s': self.measured_s},
-            'last': dict(sorted(self.last.items())),
-            'counts': {
-                'metric_points': self.counts['points'], 'camera_frames': self.counts['frame'],
-                'trajectories': self.counts['trajectory'], 'artifacts': self.counts['artifact'], 'events': self.counts['event'],
-                'refused': dict(self.refused), 'damaged_records': self.counts['damaged'],
-            },
-            'data': {
-                'mission': f'{BUCKET}/{robot_prefix}/missions/{run.run_id}/',
-                'trajectory': f'{TRAJECTORIES}/{robot_prefix}/{name}.csv' if self.counts['trajectory'] else None,
-            },
-        }  # fmt: skip
-
     def _note(self, key: str, value: float, step: int) -> None:
         self.first.setdefault(key, value)
         self.last[key] = value
@@ -149,7 +136,12 @@ class Story:
         points = [Point('success', float(self.success), time_ms, 0), Point('duration_s', self.duration_s, time_ms, 0)]
         if self.distance_m is not None:
             points += [Point('distance_m', self.distance_m, time_ms, 0),
-                       Point(DISTANCE, self.distance_m, time_ms, self.steps.get(DISTANCE, 0) + 1)]  # fmt: skip
+                       Point(DISTANCE, self.distance_m, time_ms, self._next_step(DISTANCE))]  # fmt: skip
         if self.battery_consumed_pct is not None:
             points.append(Point('battery_consumed_pct', self.battery_consumed_pct, time_ms, 0))
-        return points
+        both = set(self.last).intersection(self.node.last if self.node else ()) - {DISTANCE}
+        return points + [Point(key, self.last[key], time_ms, self._next_step(key)) for key in sorted(both)]
+
+    def _next_step(self, key: str) -> int:
+        """Beyond those of agent and node, for what shall be the newest."""
+        return max(self.steps.get(key, 0), self.node.steps.get(key, 0) if self.node else 0) + 1

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -87,7 +88,8 @@ class MlflowTracking:
         if os.environ.get('AWS_ENDPOINT_URL'):
             os.environ.setdefault('MLFLOW_S3_ENDPOINT_URL', os.environ['AWS_ENDPOINT_URL'])
         try:
-            from mlflow import MlflowClient  # noqa: PLC0415 - seconds and 80 MB or more, and not installed everywhere
+            with _without('pandas'):  # a third of the time and of the memory; mlflow-skinny has none either
+                from mlflow import MlflowClient  # noqa: PLC0415 - seconds and 80 MB or more, and not installed everywhere
         except ImportError as error:
             remedy = 'install mlflow-skinny for a server, mlflow for sqlite: and file: stores'
             raise TrackingUnavailable(f'MLflow cannot be imported: {error}', remedy=remedy) from error
@@ -197,6 +199,19 @@ class MlflowTracking:
         except Exception as error:  # whatever else a client raises (a captive portal's page is no JSON) is no mission's fault
             text = f'{self.where} {what}: {type(error).__name__}: {_USER.sub("//", str(error))[:500]}'
             raise TrackingUnavailable(text, remedy=remedy_for('')) from error
+
+
+@contextmanager
+def _without(module: str) -> Iterator[None]:
+    """Have an optional dependency look as if it were not installed, unless it is loaded already."""
+    if module in sys.modules:
+        yield
+        return
+    sys.modules[module] = None  # type: ignore[assignment]  # that is how the import system spells it
+    try:
+        yield
+    finally:
+        del sys.modules[module]
 
 
 def remedy_for(code: str) -> str:

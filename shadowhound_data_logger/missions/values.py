@@ -1,7 +1,7 @@
 """What the tracking server can take: names, numbers and texts, checked or cut before they are journalled.
 
-The limits are MLflow's own (``mlflow/utils/validation.py``, the same from 2.14 to 3.17 but for the colon in names, which
-older servers refuse).
+The limits are MLflow's own (``mlflow/utils/validation.py`` of 2.14.0 and 3.17.2, the smaller of both; the colon in names, which
+2.14 refuses, is left out). A request holds at most 1,000 points, params and tags together, and a million characters.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_KEYS: Final = 50
 """Metrics in one record."""
 MAX_PARAM: Final = 6000
 MAX_TAG: Final = 5000
-"""Servers before 2.17 or so take 5,000 characters, later ones 8,000."""
+"""What 2.14 takes; 3.17 takes 8,000."""
 MAX_TEXT: Final = 1 << 20
 """Of anything that is journalled: a mission's command is no film."""
 MAX_STEP: Final = (1 << 63) - 1

@@ -16,20 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from pypcd4.pypcd4 import PointCloud
 
+from shadowhound_data_logger.missions.plots import AMBER, BLUE, DPI, INK, STYLE, TEAL
 from shadowhound_data_logger.sim.demo_run import Record
 from shadowhound_data_logger.sim.floor_plan import FloorPlan
 
-INK: Final = '#22303c'
-BLUE: Final = '#1f6fb2'
-TEAL: Final = '#16917f'
-AMBER: Final = '#e08a1e'
-STYLE: Final = {
-    'font.family': 'DejaVu Sans', 'font.size': 10, 'text.color': INK, 'axes.labelcolor': INK, 'axes.edgecolor': '#c7cfd6',
-    'xtick.color': INK, 'ytick.color': INK, 'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True,
-    'grid.color': '#e9edf0', 'axes.axisbelow': True, 'legend.frameon': False, 'axes.titlelocation': 'left',
-    'axes.titleweight': 'bold', 'axes.titlesize': 12, 'axes.titlepad': 10,
-}  # fmt: skip
-DPI: Final = 120
 CELL_M: Final = 0.03
 """Of the map that the point clouds are drawn into."""
 FLOOR_M: Final = 0.08

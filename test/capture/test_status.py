@@ -46,6 +46,13 @@ class Threads:
         self.worker = self.workers[0]
 
 
+class Missions(Threads):
+    """None is active."""
+
+    def status(self) -> dict[str, Any]:
+        return {}
+
+
 class Uploader:
     """Delivers as much as it is told."""
 
@@ -70,8 +77,9 @@ class Setting:
         writer: Any = Threads('spool-writer')
         intake: Any = self.intake
         uploader: Any = self.uploader
+        mission: Any = Missions('mission')
         self.queue = BatchQueue(QueueSettings())
-        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader)
+        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission)
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
         self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 
@@ -136,7 +144,7 @@ def test_a_failing_worker_is_told(setting: Setting) -> None:
     workers = setting.look()['workers']
     assert workers['intake'] == {'alive': False, 'failing': True, 'failures': 3, 'deaths': 1, 'last_error': 'ValueError: x',
                                  'busy_s': 0.0, 'patience_s': None}  # fmt: skip
-    assert set(workers) == {'intake', 'encode-0', 'spool-writer', 'upload-lock', 'upload-0'}
+    assert set(workers) == {'intake', 'encode-0', 'spool-writer', 'upload-lock', 'upload-0', 'mission'}
 
 
 def test_a_stall_is_told(setting: Setting) -> None:

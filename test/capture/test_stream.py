@@ -38,8 +38,8 @@ class Talk:
         made = [Taken(b'%d' % number, NOON_NS + number * SECOND // 10, 'p', number) for number in taken]
         return [one._replace(**fields) for one in made]  # type: ignore[arg-type]
 
-    def add(self, taken: list[Taken], lost: int | None = None, *, paused: bool = False) -> None:
-        self.stream.add(taken, self.senders, lost, 0.0, paused=paused)
+    def add(self, taken: list[Taken], lost: int | None = None, *, paused: bool = False, idle: bool = False) -> None:
+        self.stream.add(taken, self.senders, lost, 0.0, paused=paused, idle=idle)
 
     def update(self, **settings: float) -> None:
         self.sensor = replace(self.sensor, **settings)  # type: ignore[arg-type]
@@ -63,6 +63,16 @@ def test_a_pause_counts_and_drops() -> None:
         talk.add(talk.messages(3), paused=paused)
     assert talk.kept() == [1, 2, 3, 7, 8, 9]
     assert (talk.account.received, talk.account.dropped, talk.account.missed) == (9, {'paused': 3}, 0)
+
+
+def test_what_nobody_asked_for_is_skipped() -> None:
+    """Outside of a mission messages are counted as skipped, and those that a pause drops as dropped."""
+    talk = Talk()
+    for idle in (True, False, True):
+        talk.add(talk.messages(3), idle=idle)
+    talk.add(talk.messages(2), paused=True, idle=True)
+    assert talk.kept() == [4, 5, 6]
+    assert (talk.account.received, talk.account.skipped, talk.account.dropped) == (11, 6, {'paused': 2})
 
 
 def test_a_pause_wins_over_the_rate() -> None:

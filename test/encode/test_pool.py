@@ -71,6 +71,23 @@ def test_what_is_wrong_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
     assert record.getMessage().startswith('/talk: a message cannot be stored: malformed: ')
 
 
+def test_an_observer_with_a_fault_costs_nothing() -> None:
+    """Each batch is shown to it after its object is on its way; what it raises is counted as the thread's failure."""
+    outcome, seen = Outcome(threads=1), []
+
+    def observe(batch: Batch) -> None:
+        seen.append((batch, outcome.samples))
+        raise ZeroDivisionError('a fault')
+
+    outcome.pool.observe = observe
+    outcome.queue.put(talk(TEXT, TEXT), 5)
+    outcome.pool.open()
+    assert outcome.queue.finished(10)
+    assert outcome.pool.close(10)
+    assert [(len(batch.samples), stored) for batch, stored in seen] == [(2, 2)]
+    assert (outcome.samples, outcome.rejected, outcome.pool.workers[0].failures) == (2, {}, 1)
+
+
 def test_close_encodes_what_is_queued() -> None:
     """Nothing that was queued before the close is lost, and closing again is allowed."""
     outcome = Outcome(threads=1)

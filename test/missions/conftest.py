@@ -10,6 +10,7 @@ import pytest
 from e2e.wire import Wire
 from missions.server import FOREIGN, Server, end_replayers
 
+from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.sim.tower import Tower
 
 
@@ -23,6 +24,21 @@ def server(tower: Tower, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
         for name, value in environ.items():
             monkeypatch.setenv(name, value)
         yield Server(tower, wire)
+
+
+@pytest.fixture(scope='session')
+def warm_home(tower: Tower, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A home whose sender is there and has loaded MLflow, for all tests that do nothing to it; straight to Tower."""
+    home = tmp_path_factory.mktemp('warm')
+    with pytest.MonkeyPatch.context() as patched:
+        for name in [name for name in os.environ if name.startswith(FOREIGN)]:
+            patched.delenv(name)
+        for name, value in tower.environment().items():
+            patched.setenv(name, value)
+        keeper = MissionDataLogger(home=home)
+    yield home
+    keeper.close()
+    end_replayers(home)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
-from shadowhound_data_logger.missions.folder import Run, missions
+from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.mission_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions.story import Point
@@ -94,6 +94,18 @@ class FakeShelf:
 
     def names(self) -> list[str]:
         return [f'{item.bucket}/{item.key}' for item in self.objects]
+
+
+class FakeDrawing:
+    """No pictures, at once."""
+
+    busy = False
+
+    def of(self, folder: MissionFolder, title: str) -> dict[str, str]:
+        return {}
+
+    def close(self) -> None:
+        pass
 
 
 @contextmanager

@@ -11,8 +11,10 @@ from missions.fakes import FakeShelf, FakeTracking, journalling
 
 from shadowhound_data_logger.errors import TrackingError, TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
+from shadowhound_data_logger.missions.drawing import Pictures, nothing
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
 from shadowhound_data_logger.missions.journal import Journal, read
+from shadowhound_data_logger.missions.report import report
 from shadowhound_data_logger.missions.story import Point
 
 JPEG = b'\xff\xd8 a picture \xff\xd9'
@@ -42,10 +44,11 @@ def work(delivery: Delivery) -> bool:
     return delivery.complete() or not any(worked)
 
 
-def deliver(folder: MissionFolder, tracking: FakeTracking, shelf: FakeShelf) -> Delivery:
-    delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
-    while not work(delivery):
-        pass
+def deliver(folder: MissionFolder, tracking: FakeTracking, shelf: FakeShelf, pictures: Pictures = nothing) -> Delivery:
+    delivery = Delivery(folder, tracking, shelf, pictures)  # type: ignore[arg-type]
+    for _ in range(1000):
+        if work(delivery) and (delivery.sent.complete or not delivery.sent.ended):
+            break
     return delivery
 
 
@@ -91,8 +94,11 @@ def test_the_summary_tells_the_mission(tmp_path: Path) -> None:
     assert (summary['mission_id'], summary['run_id'], summary['result']) == (folder.mission_id, 'run0', 'FINISHED')
     assert summary['errors'][0]['text'] == 'a wheel fell off'
     assert summary['counts'] == {
-        'metric_points': 6, 'camera_frames': 2, 'trajectories': 1, 'artifacts': 1, 'events': 1, 'refused': {},
-        'damaged_records': 0,
+        'metric_points': 6, 'camera_frames': 2, 'trajectories': 1, 'artifacts': 1, 'events': 1,
+    }  # fmt: skip
+    assert summary['ledger'] == {
+        'metric_points': {'logged': 6, 'in_run': 6, 'refused_by_server': 0},
+        'files': {'logged': 3, 'spooled': 3, 'missing': 0}, 'not_logged': {'disk_full': 0}, 'damaged_records': 0,
     }  # fmt: skip
     assert summary['stated'] == {'success': True, 'distance_m': 12.0, 'duration_s': 60.0}
     assert summary['data']['mission'] == 'sensor-data/thor/missions/run0/'
@@ -257,6 +263,20 @@ def test_a_measured_distance_stands_where_zero_is_stated(tmp_path: Path) -> None
             7.5,
         )
         assert summary['duration_s'] > 0
+
+
+def test_a_frame_that_is_gone_is_counted(tmp_path: Path) -> None:
+    """In the report, in the summary's ledger, and nowhere as an object; what is not gone arrives."""
+    folder = fly(tmp_path, frames=3)
+    (folder.files / '00000002.jpg').unlink()
+    tracking, shelf = FakeTracking(), FakeShelf()
+    deliver(folder, tracking, shelf)
+    assert report(folder).missing == 1
+    assert json.loads(tracking.artifacts['summary.json'])['ledger']['files'] == {'logged': 4, 'spooled': 3, 'missing': 1}
+    assert folder.sent().unattached == 1
+    assert [key for key in shelf.names() if 'frame' in key] == [
+        f'sensor-data/thor/missions/run0/camera/frame_{number:06d}.jpg' for number in (0, 2)
+    ]
 
 
 def test_frames_do_not_wait_for_a_run(tmp_path: Path) -> None:

@@ -53,28 +53,28 @@ def check(server: Server, command: str, home: Path) -> None:
     }  # fmt: skip
     battery = server.history(run.info.run_id, 'battery_pct')
     assert [(point.step, point.value, point.timestamp) for point in battery] == [(n, 90.0 - n, times[n + 1]) for n in range(20)]
-    assert server.artifacts(run.info.run_id) == {'camera/frame_000000.jpg', 'trajectories/trajectory.csv', 'summary.json'}
+    artifacts = {'camera/frame_000000.jpg', 'trajectories/trajectory.csv', 'summary.json', 'battery.png'}
+    assert server.artifacts(run.info.run_id) == artifacts
     prefix = f'thor/missions/{run.info.run_id}'
     assert server.keys(prefix) == {f'{prefix}/{name}': 1 for name in (
         'camera/frame_000000.jpg', 'camera/frame_000001.jpg', 'trajectory.csv', 'summary.json')}  # fmt: skip
     assert server.keys(f'thor/{run.info.run_name}', 'trajectories') == {f'thor/{run.info.run_name}.csv': 1}
 
 
-def test_a_mission_is_in_mlflow_and_in_the_store(server: Server, home: Path, tmp_path: Path) -> None:
-    """While it goes on its points are there, afterwards all of it; the id that start_mission gave is the run's."""
-    logger = MissionDataLogger(home=home, start_timeout_s=60.0)
+def test_a_mission_is_in_mlflow_and_in_the_store(server: Server, warm_home: Path, tmp_path: Path) -> None:
+    """All of it, and the id that start_mission gave is the run's."""
+    logger = MissionDataLogger(home=warm_home, start_timeout_s=60.0)
     given = fly(logger, 'whole', tmp_path)
     report = logger.close(60.0)
     assert (report.complete, report.unsent, report.last_error) == (True, 0, '')
     assert given == report.run_id == server.run('whole').info.run_id
     until(lambda: len(server.keys(f'thor/missions/{given}')) == 4, 'the objects are delivered')
-    check(server, 'whole', home)
-    until(lambda: not read_json(home / FOLDER / 'replay.json')['pid'], 'the replayer ends after its agent')
+    check(server, 'whole', warm_home)
 
 
-def test_a_run_lives_while_its_mission_does(server: Server, home: Path) -> None:
-    """What was logged is in the run before the mission ends, and a mission in another process has a run of its own."""
-    one, two = (MissionDataLogger(home=home, start_timeout_s=60.0) for _ in range(2))
+def test_a_run_lives_while_its_mission_does(server: Server, warm_home: Path) -> None:
+    """What was logged is in the run before the mission ends, and a mission of another logger has a run of its own."""
+    one, two = (MissionDataLogger(home=warm_home, start_timeout_s=60.0) for _ in range(2))
     try:
         first, second = one.start_mission('patrol', 'live 1'), two.start_mission('patrol', 'live 2')
         one.log_metric('a', 1.5, step=3)
@@ -87,7 +87,7 @@ def test_a_run_lives_while_its_mission_does(server: Server, home: Path) -> None:
         for logger in (one, two):
             logger.end_mission(True, 0, 0)
             logger.close()
-    until(lambda: complete(home, 2), 'both are sent')
+    until(lambda: complete(warm_home, 2), 'both are sent')
 
 
 def test_tower_away_for_the_whole_mission(server: Server, home: Path, tmp_path: Path) -> None:
@@ -109,6 +109,7 @@ def test_tower_away_for_the_whole_mission(server: Server, home: Path, tmp_path: 
     assert read_json(home / FOLDER / given / 'run.json')['run_id'] == run_id
     until(lambda: len(server.keys(f'thor/missions/{run_id}')) == 4, 'the objects are delivered')
     check(server, 'away', home)
+    until(lambda: not read_json(home / FOLDER / 'replay.json')['pid'], 'the sender ends after its agent')
 
 
 def test_a_killed_agent_s_mission(server: Server, home: Path, tmp_path: Path) -> None:
@@ -138,31 +139,30 @@ def test_a_killed_agent_s_mission(server: Server, home: Path, tmp_path: Path) ->
     assert len(steps) > 300
     frames = {record['id'] for record in said if record['k'] == 'frame'}
     assert frames >= set(range(0, 301, FRAME_EVERY))
-    wanted = {f'camera/frame_{number:06d}.jpg' for number in frames} | {'summary.json', 'trajectories/trajectory.csv'}
+    wanted = {f'camera/frame_{number:06d}.jpg' for number in frames}
+    wanted |= {'summary.json', 'trajectories/trajectory.csv', 'battery.png'}
     assert server.artifacts(run.info.run_id) == wanted
     prefix = f'thor/missions/{run.info.run_id}/camera/'
     until(lambda: len(server.keys(prefix)) == len(frames), 'the frames are delivered')
     assert server.keys(prefix) == {f'{prefix}frame_{number:06d}.jpg': 1 for number in frames}
 
 
-def test_artifacts_in_s3(server: Server, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where artifacts lie in S3 the error names the missing variable, the run is whole without them, and with it they arrive."""
+def test_artifacts_in_s3(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where artifacts lie in S3 the error names the missing variable, and with it they arrive."""
     server.client.create_experiment('in s3', artifact_location='s3://sensor-data/mlflow')
+    tracking = MlflowTracking(server.wire.url, 'in s3')
+    run = tracking.run_of('patrol_1', 'patrol', 1, {})
+    path = tmp_path / 'frame_000000.jpg'
+    path.write_bytes(jpeg(0))
     for name in ('MLFLOW_S3_ENDPOINT_URL', 'AWS_ENDPOINT_URL'):
         monkeypatch.delenv(name)
-    logger = MissionDataLogger(home=home, experiment='in s3', start_timeout_s=60.0)
-    run_id = fly(logger, 'in s3', tmp_path)
-    until(lambda: 'MLFLOW_S3_ENDPOINT_URL' in logger.flush(0.1).remedy, 'the error says so')
-    until(lambda: server.client.get_run(run_id).info.status == 'FINISHED', 'the run ends all the same')
-    logger.close()
-    os.kill(read_json(home / FOLDER / 'replay.json')['pid'], signal.SIGKILL)
+    with pytest.raises(TrackingUnavailable, match='MLFLOW_S3_ENDPOINT_URL') as caught:
+        tracking.artifact(run, path, 'camera')
+    assert 'MLFLOW_S3_ENDPOINT_URL' in caught.value.remedy
     monkeypatch.setenv('MLFLOW_S3_ENDPOINT_URL', server.tower.endpoint_url)
-    again = MissionDataLogger(home=home, experiment='in s3')
-    until(lambda: complete(home), 'it is sent')
-    again.close()
-    found = server.keys(f'mlflow/{run_id}/artifacts')
-    names = ('camera/frame_000000.jpg', 'summary.json', 'trajectories/trajectory.csv')
-    assert found == {f'mlflow/{run_id}/artifacts/{name}': 1 for name in names}
+    tracking.artifact(run, path, 'camera')
+    key = f'mlflow/{run.run_id}/artifacts/camera/frame_000000.jpg'
+    assert server.keys('mlflow/') == {key: 1}
 
 
 @pytest.mark.parametrize('mode', [REFUSE, HANG, (200, 'Portal'), (403, 'Forbidden'), (500, 'Broken'), (404, 'Elsewhere')])

@@ -6,16 +6,17 @@ import os
 import random
 import subprocess
 import sys
+import time
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from missions.fakes import FakeShelf, FakeTracking, journalling
+from missions.fakes import FakeDrawing, FakeShelf, FakeTracking, journalling
 from missions.server import until
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions.folder import FOLDER, missions, read_json
-from shadowhound_data_logger.missions.replay import LINGER_S, Gate, Parent, Replay, run
+from shadowhound_data_logger.missions.replay import KEEP_S, LINGER_S, Gate, Parent, Replay, open_tracking, run
 from shadowhound_data_logger.missions.report import report
 from shadowhound_data_logger.spool.files import flock
 
@@ -32,7 +33,7 @@ class Now:
 
 def new_replay(home: Path, tracking: FakeTracking, now: Now | None = None) -> Replay:
     (home / FOLDER).mkdir(parents=True, exist_ok=True)
-    return Replay(home, tracking, FakeShelf(), monotonic=now or Now(), rng=random.Random(1))  # type: ignore[arg-type]
+    return Replay(home, tracking, FakeShelf(), FakeDrawing(), monotonic=now or Now(), rng=random.Random(1))  # type: ignore[arg-type]
 
 
 def fly(home: Path, mission_type: str = 'patrol') -> str:
@@ -119,6 +120,33 @@ def test_a_rotten_mission_does_not_stop_the_others(tmp_path: Path, caplog: pytes
         pass
     assert list(tracking.runs) == [whole]
     assert rotten in caplog.text
+
+
+def test_a_mission_that_arrived_long_ago_goes(tmp_path: Path) -> None:
+    """After a month, at the next start; one that is younger or has not arrived stays."""
+    old, young = fly(tmp_path), fly(tmp_path)
+    replay = new_replay(tmp_path, FakeTracking())
+    while replay.step():
+        pass
+    unsent = fly(tmp_path)
+    (tmp_path / FOLDER / unsent / 'sent.json').write_text('{}')
+    for mission_id in (old, unsent):
+        os.utime(tmp_path / FOLDER / mission_id / 'sent.json', (0, time.time() - KEEP_S - 60))
+    new_replay(tmp_path, FakeTracking(fail=lambda _: True)).step()
+    assert {folder.mission_id for folder in missions(tmp_path)} == {young, unsent}
+
+
+def test_the_default_store_is_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody but its owner reads the database and the artifacts of a home, whatever the umask."""
+    monkeypatch.delenv('MLFLOW_TRACKING_URI', raising=False)
+    monkeypatch.setattr('shadowhound_data_logger.missions.replay.MlflowTracking.open', lambda _: None)
+    before = os.umask(0)
+    try:
+        tracking = open_tracking(tmp_path, 'x')
+    finally:
+        os.umask(before)
+    assert tracking.where == f'sqlite:///{tmp_path}/mlflow.db'
+    assert [oct((tmp_path / name).stat().st_mode & 0o777) for name in ('mlflow.db', 'mlartifacts')] == ['0o600', '0o700']
 
 
 def test_a_deleted_run_is_told(tmp_path: Path) -> None:

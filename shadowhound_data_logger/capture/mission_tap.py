@@ -1,0 +1,137 @@
+"""What the node sees of the robot while a mission is active: read from batches that were just encoded, by the encoders' threads.
+
+Only what is logged is deserialized: one message a period of the battery's and the thermometer's topic, every pose that is kept.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
+from shadowhound_data_logger.config import MissionSettings, SensorSettings
+from shadowhound_data_logger.encode.image import encode_jpeg
+from shadowhound_data_logger.encode.payload import Job
+from shadowhound_data_logger.encode.records import ODOMETRY
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.errors import Rejected
+from shadowhound_data_logger.missions.node_log import Cloud, Fact, Frame, Reading
+from shadowhound_data_logger.missions.odometer import Pose
+from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE
+from shadowhound_data_logger.model import Batch, Sample
+from shadowhound_data_logger.options import POINT_CLOUD
+
+log = logging.getLogger(__name__)
+
+JPEG: Final = 'image/jpeg'
+FLOAT32: Final = 7
+"""sensor_msgs/msg/PointField."""
+
+
+class MissionTap:
+    """New; ``facts`` of each batch, on any thread. What cannot be read is said once a topic.
+
+    Two threads that have batches of one topic may both take a value of one period: there is one more then.
+    """
+
+    def __init__(self, settings: MissionSettings, sensors: Mapping[str, SensorSettings], robot: str, types: MessageTypes,
+                 clock: Clock, resolve: Callable[[str], str]) -> None:  # fmt: skip
+        """``resolve`` makes a topic's full name, as the node's namespace and remappings want it."""
+        self._sensors = sensors
+        self._robot = robot
+        self._types = types
+        self._clock = clock
+        self._period_ns = max(1, round(settings.period_s * SECOND))
+        self._frames = settings.frames
+        self._frame_ns = max(1, round(settings.frame_every_s * SECOND))
+        self._odometry = resolve(settings.odometry) if settings.odometry else ''
+        self._fields: dict[str, dict[str, list[str]]] = {}
+        for key, given in ((BATTERY, settings.battery), (TEMPERATURE, settings.temperature)):
+            if given:
+                topic, _, field = given.partition(':')
+                self._fields.setdefault(resolve(topic), {})[key] = field.split('.')
+        self._periods: dict[tuple[str, int], int] = {}
+        self._told: set[str] = set()
+
+    def facts(self, batch: Batch) -> Iterator[Fact]:
+        """What there is to log of a batch."""
+        try:
+            if batch.topic == self._odometry and batch.type == ODOMETRY:
+                yield from (self._pose(sample) for sample in batch.samples)
+            fields = self._fields.get(batch.topic)
+            if fields:
+                for sample in self._some(batch, self._period_ns):
+                    yield from self._readings(batch.type, sample, fields)
+            if batch.type == POINT_CLOUD:
+                yield from (cloud for sample in self._some(batch, SECOND) if (cloud := self._cloud(sample)))
+            if batch.sensor == self._frames:
+                for sample in self._some(batch, self._frame_ns):
+                    payload = encode_jpeg(Job(batch, self._sensors[batch.sensor], self._robot, self._types), sample)
+                    if payload.content_type == JPEG:
+                        yield Frame(self._time(sample), payload.body)
+        except Rejected as error:
+            self._tell(batch.topic, str(error))
+
+    def _some(self, batch: Batch, period_ns: int) -> Iterator[Sample]:
+        """The first message of each period."""
+        mark = batch.topic, period_ns
+        for sample in batch.samples:
+            period = sample.stamp_ns // period_ns
+            if period != self._periods.get(mark):
+                self._periods[mark] = period
+                yield sample
+
+    def _pose(self, sample: Sample) -> Pose:
+        message = self._types.deserialize(ODOMETRY, sample.cdr)
+        at, turn = message.pose.pose.position, message.pose.pose.orientation
+        yaw = math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y * turn.y + turn.z * turn.z))
+        return Pose(self._time(sample), at.x, at.y, yaw, at.z, message.header.frame_id)
+
+    def _cloud(self, sample: Sample) -> Cloud | None:
+        """None for a cloud without x, y and z as float32, or with gaps between its rows."""
+        message = self._types.deserialize(POINT_CLOUD, sample.cdr)
+        offsets = {field.name: field.offset for field in message.fields if field.datatype == FLOAT32}
+        size, data = message.point_step, message.data
+        if not {'x', 'y', 'z'} <= offsets.keys() or not size or data.size != message.width * message.height * size:
+            return None
+        at = [offsets[name] for name in 'xyz']
+        if max(at) + 4 > size:
+            return None
+        kind = '>f4' if message.is_bigendian else '<f4'
+        layout = np.dtype({'names': ['x', 'y', 'z'], 'formats': [kind] * 3, 'offsets': at, 'itemsize': size})
+        points = np.frombuffer(data, layout)
+        xyz = np.stack([points[name] for name in 'xyz'], axis=1).astype(np.float32)
+        return Cloud(self._time(sample), message.header.frame_id, xyz)
+
+    def _readings(self, type_name: str, sample: Sample, fields: Mapping[str, list[str]]) -> Iterator[Reading]:
+        message = self._types.deserialize(type_name, sample.cdr)
+        for key, path in fields.items():
+            value = _field(message, path)
+            if value is None:
+                self._tell(key, f'{type_name} has no number {".".join(path)}')
+            elif math.isfinite(value):
+                yield Reading(self._time(sample), key, value)
+
+    def _time(self, sample: Sample) -> int:
+        """UTC as far as it is known: a mission's own times are those of this machine's clock."""
+        return sample.stamp_ns if sample.stamp_ns >= EARLIEST_SANE_NS else self._clock.wall_ns()
+
+    def _tell(self, what: str, text: str) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            log.warning('%s is not logged to the mission: %s', what, text)
+
+
+def _field(message: Any, path: list[str]) -> float | None:
+    """The number at the end of the path; None where there is none."""
+    found = message
+    try:
+        for name in path:
+            found = found[int(name)] if name.isdigit() else getattr(found, name)
+        return float(found)
+    except (AttributeError, IndexError, TypeError, ValueError):
+        return None

@@ -1,0 +1,213 @@
+"""``shadowhound-data missions``: what was logged as missions on this machine, how far it is sent, and sending the rest."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any, Final
+
+import click
+from rich.console import Console, RenderableType
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.text import Text
+
+from shadowhound_data_logger.cli.tables import duration, number, plain, plain_table, show_whole
+from shadowhound_data_logger.clock import iso
+from shadowhound_data_logger.config import home
+from shadowhound_data_logger.missions.child import Replayer
+from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder
+from shadowhound_data_logger.missions.overview import ACTIVE, export, find, overview, overviews
+
+POLL_S: Final = 0.5
+STYLES: Final = {'FINISHED': 'green', ACTIVE: 'cyan'}
+"""Of results; any other wants a look."""
+COLUMNS: Final = ('time', 'kind', 'key', 'value', 'step', 'source')
+
+
+def _folder(_: click.Context, __: click.Parameter, wanted: str) -> MissionFolder:
+    found = find(home(os.environ), wanted)
+    if not found:
+        raise click.BadParameter(f'no mission here has the id {wanted!r}, nor has its run: shadowhound-data missions list')
+    if len(found) > 1:
+        raise click.BadParameter(f'{wanted!r} begins the ids of {len(found)} missions')
+    return found[0]
+
+
+_as_json = click.option('--json', 'as_json', is_flag=True, help='Print it as JSON.')
+_mission = click.argument('folder', metavar='ID', callback=_folder)
+
+
+@click.group()
+def missions() -> None:
+    """Missions that were logged on this machine. ID is a mission's id or that of its MLflow run, or how one begins."""
+
+
+@missions.command('list')
+@_as_json
+def list_(*, as_json: bool) -> int:
+    """One row a mission, the newest last. Exit code 1 when one that is over is not sent."""
+    where = home(os.environ)
+    found = overviews(where)
+    if as_json:
+        click.echo(json.dumps(found, indent=2))
+    elif not found:
+        click.echo(f'No mission has been logged in {where / FOLDER} yet. SHADOWHOUND_HOME names the folder above it.')
+    else:
+        show_whole([_table(found), *_verdict(found)], Console(highlight=False))
+    return 1 if _late(found) else 0
+
+
+@missions.command()
+@_as_json
+@_mission
+def show(*, folder: MissionFolder, as_json: bool) -> int:
+    """All there is to know of one mission, and what is not sent, and why. Exit code 1 when it is over and not sent."""
+    found = overview(folder)
+    if found is None:
+        raise click.UsageError(f'{folder.path} has no mission in it')
+    if as_json:
+        click.echo(json.dumps(found, indent=2))
+    else:
+        show_whole(list(_page(found)), Console(highlight=False))
+    return 1 if _late([found]) else 0
+
+
+@missions.command()
+@click.option('--deadline', type=click.FloatRange(0.0, 1e6), default=60.0, show_default=True, help='Seconds to wait.')
+@click.option('--experiment', default='thor_missions', show_default=True, help='The MLflow experiment of new runs.')
+def resume(*, deadline: float, experiment: str) -> int:
+    """Send what is unsent, and wait for it. Exit code 1 when something stays; it is tried on for ten minutes then."""
+    where = home(os.environ)
+    if not _late(overviews(where)):
+        click.echo('Nothing is left to send.')
+        return 0
+    replayer = Replayer(where, experiment, os.environ)
+    replayer.start()
+    try:
+        left = _wait(where, time.monotonic() + deadline)
+    finally:
+        replayer.let_go()
+    for each in left:
+        show_whole([*_reason(each)], Console(highlight=False, stderr=True))
+    click.echo(f'{number(len(left))} not sent within {deadline:g} s.' if left else 'All is sent.')
+    return 1 if left else 0
+
+
+@missions.command('export')
+@click.option('--format', 'kind', type=click.Choice(['json', 'csv']), default='json', show_default=True, help='What to write.')
+@click.option('--to', type=click.File('w', encoding='utf-8', lazy=True), default='-', help='The file  [default: standard output]')
+@_mission
+def export_(*, folder: MissionFolder, kind: str, to: IO[str]) -> int:
+    """Parameters, metric points and events of one mission, as they were logged on this machine."""
+    found = export(folder)
+    if kind == 'json':
+        json.dump(found, to, indent=2)
+        to.write('\n')
+    else:
+        rows = csv.writer(to, lineterminator='\n')
+        rows.writerow(COLUMNS)
+        rows.writerows(_rows(found))
+    return 0
+
+
+def _rows(found: Mapping[str, Any]) -> Iterator[tuple[object, ...]]:
+    started = found['params'].get('timestamp', '')
+    yield from ((started, 'param', name, value, '', 'agent') for name, value in found['params'].items())
+    for point in found['points']:
+        yield iso(point['time_ms'] * 1_000_000), 'metric', point['key'], point['value'], point['step'], point['source']
+    for event in found['events']:
+        yield event['time'], 'event', event['name'], json.dumps(event['data']), '', 'agent'
+
+
+def _late(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Those that are over and not sent."""
+    return [each for each in found if each['result'] != ACTIVE and not each['complete']]
+
+
+def _wait(where: Path, end_s: float) -> list[dict[str, Any]]:
+    """What is left in the end."""
+    console = Console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn('{task.description}'), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task('')
+        while (left := _late(overviews(where))) and time.monotonic() < end_s:
+            records = sum(each['unsent']['records'] for each in left)
+            progress.update(task, description=f'{number(len(left))} missions, {number(records)} records to send')
+            time.sleep(POLL_S)
+    return left
+
+
+def _table(found: list[dict[str, Any]]) -> RenderableType:
+    left = ('mission', 'type', 'started', 'result', 'run')
+    table = plain_table('Missions', ('mission', 'type', 'started', 'duration', 'result', 'unsent', 'run'), left)
+    for each in found:
+        table.add_row(plain(each['mission_id']), plain(each['type']), _when(each['started']), duration(each['duration_s']),
+                      _result(each), _unsent(each), plain(each['run_id'] or '-'))  # fmt: skip
+    return table
+
+
+def _verdict(found: list[dict[str, Any]]) -> Iterator[RenderableType]:
+    late = _late(found)
+    if late:
+        yield ''
+        yield Text(f'{number(len(late))} not sent whole: shadowhound-data missions resume sends it', 'yellow')
+        yield from _reason(late[-1])
+
+
+def _page(found: Mapping[str, Any]) -> Iterator[RenderableType]:
+    yield Text.assemble(plain(found['mission_id'], 'bold'), '  ', _result(found))
+    lines = {
+        'type': found['type'], 'command': found['command'], 'robot': found['robot'], 'started': _when(found['started']),
+        'ended': _when(found['ended']) if found['ended'] else '-', 'duration': duration(found['duration_s']),
+        'distance': '-' if found['distance_m'] is None else f'{found["distance_m"]:.2f} m',
+        'battery used': '-' if found['battery_consumed_pct'] is None else f'{found["battery_consumed_pct"]:.1f} %',
+        'MLflow run': found['run_id'] or '-', 'folder': found['folder'],
+    }  # fmt: skip
+    yield _pairs('', lines)
+    yield ''
+    yield _pairs('Logged', {name.replace('_', ' '): number(count) for name, count in found['counts'].items()})
+    if found['last']:
+        yield ''
+        yield _pairs('Last values', {name: f'{value:g}' for name, value in found['last'].items()})
+    yield from (plain(f'Error: {error}', 'red') for error in found['errors'])
+    yield from (plain(f'Left out: {count} by {reason}', 'yellow') for reason, count in found['refused'].items())
+    yield ''
+    yield from _reason(found)
+
+
+def _reason(found: Mapping[str, Any]) -> Iterator[RenderableType]:
+    """Whether it is sent, and if not, what is left and why."""
+    if found['complete']:
+        yield Text.assemble(('Sent', 'green'), ': the run and the spool have all of it.')
+    else:
+        unsent = ', '.join(f'{number(count)} {name}' for name, count in found['unsent'].items() if count) or 'the end of it'
+        yield plain(f'{found["mission_id"]}: not sent yet: {unsent}', 'yellow')
+    if found['refused_by_server']:
+        yield plain(f'Refused by the tracking server: {number(found["refused_by_server"])}', 'red')
+    if found['last_error']:
+        yield plain(f'Last error: {found["last_error"]}', 'red' if found['complete'] else 'yellow')
+
+
+def _pairs(title: str, lines: Mapping[str, Any]) -> RenderableType:
+    table = plain_table(title, ('', 'value'), ('', 'value'))
+    table.show_header = False
+    table.padding = (0, 2, 0, 0)
+    for name, value in lines.items():
+        table.add_row(plain(name, 'dim'), plain(value))
+    return table
+
+
+def _result(found: Mapping[str, Any]) -> Text:
+    return plain(found['result'], STYLES.get(found['result'], 'red'))
+
+
+def _unsent(found: Mapping[str, Any]) -> str:
+    return '-' if found['complete'] else number(sum(found['unsent'].values()))
+
+
+def _when(time_: str) -> str:
+    return f'{time_[:10]} {time_[11:19]}'

@@ -1,0 +1,102 @@
+"""``camera_summary.jpg``: frames of a mission on one sheet, 800 pixels wide, each with its id and time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from PIL import Image, ImageDraw, ImageFont
+
+from shadowhound_data_logger.clock import SECOND, utc
+
+WIDTH: Final = 800
+MOST: Final = 20
+"""Frames on a sheet: four columns, five rows."""
+GAP: Final = 8
+CAPTION: Final = 22
+HEAD: Final = 34
+QUALITY: Final = 88
+INK: Final = '#22303c'
+PALE: Final = '#6b7884'
+
+
+class Frame(NamedTuple):
+    """A frame that was logged."""
+
+    time_ns: int
+    number: int
+    path: Path
+
+
+class _Thumb(NamedTuple):
+    frame: Frame
+    image: Image.Image
+
+
+def contact_sheet(frames: Sequence[Frame], title: str, start_ns: int, target: Path) -> str:
+    """Write the JPEG; what there is to say about it: '' or how many frames are no pictures. Raises ValueError for none."""
+    if not frames:
+        raise ValueError('no camera frame was sampled')
+    count = min(MOST, len(frames))
+    chosen = [frames[round(place * (len(frames) - 1) / max(1, count - 1))] for place in range(count)]
+    columns = _columns(len(chosen))
+    width = (WIDTH - GAP) // columns - GAP
+    thumbs, broken = _thumbs(chosen, width)
+    if not thumbs:
+        raise ValueError(f'none of {len(chosen)} frames is a picture')
+    height = max(thumb.image.height for thumb in thumbs)
+    step_x, step_y = width + GAP, height + CAPTION + GAP
+    rows = -(-len(thumbs) // columns)
+    sheet = Image.new('RGB', (WIDTH, HEAD + rows * step_y), 'white')
+    pen = ImageDraw.Draw(sheet)
+    pen.text((GAP, 9), title, fill=INK, font=_font(15))
+    told = (
+        f'{len(thumbs)} of {len(frames)} frames' if len(thumbs) < len(frames) else f'{len(thumbs)} frame{"s"[: len(thumbs) > 1]}'
+    )
+    pen.text((WIDTH - GAP - pen.textlength(told, font=_font(12)), 12), told, fill=PALE, font=_font(12))
+    for place, thumb in enumerate(thumbs):
+        x, y = GAP + place % columns * step_x, HEAD + place // columns * step_y
+        sheet.paste(thumb.image, (x, y))
+        _caption(pen, (x, y + thumb.image.height + 3), width, thumb.frame, start_ns)
+    sheet.save(target, 'JPEG', quality=QUALITY, optimize=True)
+    return f'{broken} of {len(chosen)} frames are no pictures' if broken else ''
+
+
+def _columns(count: int) -> int:
+    """So that the sheet is full, and as few as the eye needs."""
+    return {1: 1, 2: 2, 4: 2}.get(count, 3 if count <= 9 else 4)
+
+
+def _thumbs(frames: Sequence[Frame], width: int) -> tuple[list[_Thumb], int]:
+    """The frames at a sheet's size, and how many of them could not be read."""
+    thumbs: list[_Thumb] = []
+    for frame in frames:
+        try:
+            with Image.open(frame.path) as image:
+                image.draft('RGB', (width, width))  # libjpeg scales while it decodes
+                height = min(2 * width, max(1, round(image.height * width / image.width)))
+                thumbs.append(_Thumb(frame, image.convert('RGB').resize((width, height), Image.Resampling.LANCZOS)))
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # all that Pillow calls a broken file
+            continue
+    return thumbs, len(frames) - len(thumbs)
+
+
+def _caption(pen: ImageDraw.ImageDraw, place: tuple[int, int], width: int, frame: Frame, start_ns: int) -> None:
+    """The id at the left, the time (UTC, and since the start where there is room) at the right."""
+    font = _font(12)
+    seconds = max(0, frame.time_ns - start_ns) // SECOND
+    time = f'{utc(frame.time_ns):%H:%M:%S}'
+    long = f'{time}   +{seconds // 60}:{seconds % 60:02d}'
+    name = f'frame {frame.number}'
+    room = width - pen.textlength(name, font=font) - 2 * GAP
+    told = long if pen.textlength(long, font=font) <= room else time
+    pen.text(place, name, fill=INK, font=font)
+    pen.text((place[0] + width - pen.textlength(told, font=font), place[1]), told, fill=PALE, font=font)
+
+
+def _font(size: int) -> Any:
+    try:
+        return ImageFont.load_default(size)
+    except TypeError:  # Pillow before 10.1 has one size
+        return ImageFont.load_default()

@@ -1,0 +1,133 @@
+"""What a mission is and how far it is sent, read from its folder by whoever asks, without MLflow and without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.clock import iso
+from shadowhound_data_logger.missions import journal
+from shadowhound_data_logger.missions.folder import MissionFolder, Sent, missions, read_json
+from shadowhound_data_logger.missions.report import report
+from shadowhound_data_logger.missions.story import Point, Story
+
+ACTIVE, UNFINISHED = 'active', 'unfinished'
+"""Results of missions without an end: the agent lives; it died, and no sender has closed the mission yet."""
+BRIEF: Final = (
+    'mission_id', 'run_id', 'type', 'command', 'robot', 'started', 'ended', 'duration_s', 'result', 'errors', 'distance_m',
+    'battery_consumed_pct', 'complete', 'unsent', 'refused_by_server', 'last_error', 'remedy', 'folder',
+)  # fmt: skip
+"""What a list says of each mission."""
+FILES: Final = frozenset({'frame', 'trajectory', 'artifact'})
+"""Records that have a file."""
+
+
+def overviews(home: Path) -> list[dict[str, Any]]:
+    """All missions of a home in the order of their starts, ``BRIEF`` of each. Raises OSError."""
+    found = [each for folder in missions(home) if (each := _summarized(folder) or overview(folder)) is not None]
+    return sorted(({name: each[name] for name in BRIEF} for each in found), key=lambda each: str(each['started']))
+
+
+def find(home: Path, wanted: str) -> list[MissionFolder]:
+    """The missions whose id, or whose run's id, begins with this; the one alone that has it exactly. Raises OSError."""
+    names = {folder: (folder.mission_id, run.run_id if (run := folder.run()) else '') for folder in missions(home)}
+    exact = [folder for folder, ids in names.items() if wanted in ids]
+    return exact or [folder for folder, ids in names.items() if any(name.startswith(wanted) for name in ids)]
+
+
+def overview(folder: MissionFolder) -> dict[str, Any] | None:
+    """What there is to say of a mission; None for a folder without the beginning of one. Raises OSError."""
+    story = told(folder)
+    if not story.start:
+        return None
+    sent, run, far = folder.sent(), folder.run(), report(folder)
+    return {
+        'mission_id': folder.mission_id, 'run_id': run.run_id if run else None, 'type': story.start['type'],
+        'command': story.start['command'], 'robot': story.start['robot'], 'started': iso(int(story.start['t'])),
+        'ended': iso(int(story.end['t'])) if story.end else None, 'duration_s': round(story.duration_s, 3),
+        'result': story.end.get('status') or (ACTIVE if _is_locked(folder) else UNFINISHED),
+        'errors': [*story.errors, *([story.end['error']] if story.end.get('error') else [])],
+        'distance_m': story.distance_m, 'battery_consumed_pct': story.battery_consumed_pct,
+        'last': dict(sorted(story.newest.items())), 'counts': _counts(story), 'refused': dict(story.refused),
+        'complete': sent.complete, 'unsent': _unsent(folder, sent), 'refused_by_server': sent.refused,
+        'last_error': far.last_error, 'remedy': far.remedy, 'folder': str(folder.path),
+    }  # fmt: skip
+
+
+def _summarized(folder: MissionFolder) -> dict[str, Any] | None:
+    """The same of a mission that is sent whole, by its summary: its journal may be long. None for any other."""
+    sent, summary = folder.sent(), read_json(folder.summary)
+    if not sent.complete:
+        return None
+    try:
+        return {
+            'type': summary['mission_type'], 'command': summary['mission_command'], 'started': summary['start'],
+            'ended': summary['end'], 'complete': True, 'unsent': _unsent(folder, sent), 'refused_by_server': sent.refused,
+            'last_error': sent.error, 'remedy': '', 'folder': str(folder.path),
+            **{name: summary[name] for name in ('mission_id', 'run_id', 'robot', 'duration_s', 'result', 'errors', 'distance_m',
+                                                'battery_consumed_pct')},
+        }  # fmt: skip
+    except KeyError:
+        return None
+
+
+def told(folder: MissionFolder) -> Story:
+    """The story of a mission as far as it is journalled, the node's with it."""
+    story = Story(node=Story())
+    for source, record in records(folder):
+        (story if source == 'agent' else story.node or story).add(record)
+    return story
+
+
+def records(folder: MissionFolder) -> Iterator[tuple[str, Mapping[str, Any] | None]]:
+    """``node`` or ``agent``, and what it logged; the node's first, because the agent's end sums up both."""
+    for source, path in (('node', folder.node.journal), ('agent', folder.journal)):
+        if path.exists():
+            yield from ((source, line.record) for line in journal.read(path))
+
+
+def export(folder: MissionFolder) -> dict[str, Any]:
+    """All that was logged: parameters, every metric point, events; the points of ``agent`` and ``node`` beside each other."""
+    story = Story(node=Story())
+    points: list[dict[str, Any]] = []
+    events: list[dict[str, Any]] = []
+    for source, record in records(folder):
+        found: list[Point] = (story if source == 'agent' else story.node or story).add(record)
+        points += [{**point._asdict(), 'source': source} for point in found]
+        if record and record.get('k') == 'event':
+            events.append({'time': iso(int(record['t'])), 'name': record['name'], 'data': record['data']})
+    points.sort(key=lambda point: point['time_ms'])
+    params = story.params() | (story.final_params() if story.end else {}) if story.start else {}
+    return {'mission': overview(folder), 'params': params, 'points': points, 'events': events,
+            'summary': read_json(folder.summary) or None}  # fmt: skip
+
+
+def _counts(story: Story) -> dict[str, int]:
+    node = story.node.counts if story.node else story.counts
+    return {
+        'metric_points': story.counts['points'] + node['points'], 'camera_frames': story.counts['frame'] or node['frame'],
+        'trajectories': story.counts['trajectory'] or int(node['poses'] > 0),
+        'artifacts': story.counts['artifact'], 'events': story.counts['event'],
+    }  # fmt: skip
+
+
+def _unsent(folder: MissionFolder, sent: Sent) -> dict[str, int]:
+    """Records that the run has not, and files that are not among its artifacts, or not in the spool."""
+    count = {'records': 0, 'artifacts': 0, 'objects': 0}
+    if sent.complete:
+        return count
+    for path, place in ((folder.journal, sent), (folder.node.journal, folder.node.sent())):
+        for line in journal.read(path) if path.exists() else ():
+            has_file = (line.record or {}).get('k') in FILES
+            count['records'] += line.end > place.metrics
+            count['artifacts'] += has_file and line.end > place.artifacts
+            count['objects'] += has_file and line.end > place.objects
+    return count
+
+
+def _is_locked(folder: MissionFolder) -> bool:
+    try:
+        return journal.is_locked(folder.journal)
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,161 @@
+"""The pictures of a mission that is over, made of what its folder has, by a process of their own.
+
+    camera_summary.jpg   trajectory.png   battery.png
+
+``python -m shadowhound_data_logger.missions.pictures FOLDER TITLE`` makes them in files/ and then writes pictures.json: each name
+with '' or what there is to say about it. One that cannot be made costs only itself.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.missions import journal
+from shadowhound_data_logger.missions.contact_sheet import Frame, contact_sheet
+from shadowhound_data_logger.missions.drawing import CHARGE, SHEET, TRAJECTORY
+from shadowhound_data_logger.missions.folder import MissionFolder, write_json
+from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE
+
+log = logging.getLogger(__name__)
+
+NS_SECONDS: Final = 1e17
+"""A timestamp above it is in nanoseconds: in seconds it would lie three billion years from now."""
+MOST_STATES: Final = 20_000
+
+
+@dataclass(slots=True)
+class Material:
+    """What the pictures are made of."""
+
+    start_ns: int = 0
+    frames: list[Frame] = field(default_factory=list)
+    states: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {BATTERY: [], TEMPERATURE: []})
+    """Of each metric: seconds since the start, and the value."""
+    trajectory: Path | None = None
+
+    def add(self, record: Mapping[str, Any], files: Path) -> None:
+        kind, time_ns = record.get('k'), int(record.get('t', 0))
+        if kind == 'start':
+            self.start_ns = self.start_ns or time_ns
+        elif kind == 'frame' and record.get('artifact'):
+            self.frames.append(Frame(time_ns, int(record['id']), files / record['file']))
+        elif kind == 'trajectory':
+            self.trajectory = files / record['file']
+        elif kind == 'metrics':
+            for key in self.states.keys() & record['m'].keys():
+                self.states[key].append(((time_ns - self.start_ns) / SECOND, record['m'][key]))
+
+
+def material_of(folder: MissionFolder) -> Material:
+    """From the agent's journal, and from the node's what the agent did not log. Raises OSError."""
+    found, node = Material(), Material()
+    for line in journal.read(folder.journal):
+        found.add(line.record or {}, folder.files)
+    if folder.node.journal.exists():
+        node.start_ns = found.start_ns
+        for line in journal.read(folder.node.journal):
+            node.add(line.record or {}, folder.node.files)
+    found.frames = sorted(found.frames or node.frames)
+    found.trajectory = found.trajectory or (folder.trajectory if folder.trajectory.exists() else None)
+    found.states = {key: points or node.states[key] for key, points in found.states.items()}
+    for key, points in found.states.items():
+        points.sort()
+        found.states[key] = points[:: 1 + len(points) // MOST_STATES]
+    return found
+
+
+def make(folder: MissionFolder, title: str) -> dict[str, str]:
+    """Make what can be made; each name with '' or what there is to say about it."""
+    material = material_of(folder)
+    return {
+        SHEET: _made(folder.files / SHEET, lambda target: contact_sheet(material.frames, title, material.start_ns, target)),
+        TRAJECTORY: _made(folder.files / TRAJECTORY, lambda target: _trajectory(material, folder.floor, title, target)),
+        CHARGE: _made(folder.files / CHARGE, lambda target: _battery(material, title, target)),
+    }
+
+
+def read_path(path: Path) -> list[tuple[float, float, float]]:
+    """Time (s), x and y (m) of a CSV file with the columns timestamp, x and y; lines that have no such numbers are left out.
+
+    Raises OSError, or ValueError for a file without these columns.
+    """
+    found: list[tuple[float, float, float]] = []
+    with path.open(encoding='utf-8', errors='replace', newline='') as file:
+        lines = csv.reader(line.replace('\0', '') for line in file)
+        names = [name.strip().lower() for name in next(lines, [])]
+        places = [names.index(name) for name in ('timestamp', 'x', 'y')]
+        for line in lines:
+            try:
+                pose = (_seconds(line[places[0]]), float(line[places[1]]), float(line[places[2]]))
+            except (ValueError, IndexError):
+                continue
+            if all(map(math.isfinite, pose)):
+                found.append(pose)
+    return found
+
+
+def _made(target: Path, draw: Callable[[Path], str | None]) -> str:
+    """Draw it; what there is to say about it. A file appears under its name only when it is whole."""
+    part = target.with_name(f'.{os.getpid()}.{target.name}')
+    try:
+        note = draw(part) or ''
+        os.replace(part, target)
+    except ValueError as error:  # there is nothing to show
+        note = f'not made: {error}'
+    except ImportError as error:
+        note = f'not made: {error} (pip install shadowhound_data_logger[missions])'
+    except Exception as error:  # a decoder or a plot can raise anything, and the other pictures have nothing to do with it
+        log.warning('%s', target, exc_info=error)
+        note = f'not made: {type(error).__name__}: {error}'
+    part.unlink(missing_ok=True)
+    return note
+
+
+def _trajectory(material: Material, floor: Path, title: str, target: Path) -> None:
+    if material.trajectory is None:
+        raise ValueError('no trajectory was logged')
+    import numpy as np  # noqa: PLC0415 - nobody else here needs it
+
+    from shadowhound_data_logger.missions import plots  # noqa: PLC0415 - a second, and not installed everywhere
+
+    path = np.array(read_path(material.trajectory)).reshape(-1, 3)
+    plots.trajectory(path, np.load(floor, allow_pickle=False) if floor.exists() else None, title, target)
+
+
+def _battery(material: Material, title: str, target: Path) -> None:
+    if max(map(len, material.states.values())) < 2:
+        raise ValueError('neither battery nor temperature was logged twice')
+    from shadowhound_data_logger.missions import plots  # noqa: PLC0415 - see _trajectory
+
+    plots.battery(material.states, title, target)
+
+
+def _seconds(text: str) -> float:
+    """Seconds since 1970 of a number (seconds or nanoseconds) or an ISO time."""
+    try:
+        number = float(text)
+    except ValueError:
+        stamp = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
+        return (stamp if stamp.tzinfo else stamp.replace(tzinfo=timezone.utc)).timestamp()
+    return number / SECOND if abs(number) > NS_SECONDS else number
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Make the pictures of the mission whose folder is given."""
+    folder = MissionFolder(Path(arguments[0]))
+    write_json(folder.pictures, make(folder, arguments[1]))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,219 @@
+"""The node's part in a mission: when it begins and ends, what is marked, what is logged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import simplejpeg
+from missions.fakes import journalling
+from missions.server import until
+from rosbags.typesys import Stores, get_typestore
+
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.capture.mission import MissionWatch
+from shadowhound_data_logger.capture.mission_tap import MissionTap
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.encode.queue import BatchQueue
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.missions import journal
+from shadowhound_data_logger.missions.folder import Run, missions
+from shadowhound_data_logger.missions.node_log import Frame, Reading
+from shadowhound_data_logger.missions.odometer import Pose
+from shadowhound_data_logger.model import Batch, DataObject, Sample
+
+SECOND = 10**9
+NOON_NS = 1_760_788_800 * SECOND
+STORE = get_typestore(Stores.LATEST)
+JPEG = simplejpeg.encode_jpeg(np.zeros((8, 8, 3), np.uint8))
+
+
+class Intake:
+    """Does at once what it is told."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def flush(self, _: float) -> bool:
+        self.asked.append('flush')
+        return True
+
+    def idle(self, _: float, *, idle: bool) -> bool:
+        self.asked.append('idle' if idle else 'busy')
+        return True
+
+    def begin_idle(self) -> None:
+        self.asked.append('begin idle')
+
+
+def given(parameters: Mapping[str, object], home: Path) -> Settings:
+    named = {f'mission.{name}': value for name, value in parameters.items()}
+    return Settings.load(named, {'SHADOWHOUND_HOME': str(home)})
+
+
+class Setting:
+    """A node's watch over the missions of a home."""
+
+    def __init__(self, home: Path, **parameters: object) -> None:
+        settings = given(parameters, home)
+        self.intake: Any = Intake()
+        self.told: list[dict[str, Any]] = []
+        queue = BatchQueue(settings.queue)
+        self.watch = MissionWatch(settings, self.intake, queue, new_tap(**parameters), lambda said: self.told.append(dict(said)))
+        self.watch.open()
+
+    def stop(self) -> None:
+        self.watch.stop()
+        self.watch.close()
+
+
+@pytest.fixture
+def opened() -> Iterator[ExitStack]:
+    """Closes what a test opens."""
+    with ExitStack() as stack:
+        yield stack
+
+
+def watching(opened: ExitStack, home: Path, **parameters: object) -> tuple[Setting, MissionDataLogger]:
+    logger = opened.enter_context(journalling(home))
+    setting = Setting(home, **parameters)
+    opened.callback(setting.stop)
+    return setting, logger
+
+
+def new_tap(**parameters: object) -> MissionTap:
+    settings = given(parameters, Path('nowhere'))
+    sensors = {sensor.name: sensor for sensor in settings.sensors}
+    return MissionTap(settings.mission, sensors, 'thor', MessageTypes(), SystemClock.of_this_machine(), lambda topic: f'/{topic}')
+
+
+def batch(sensor: str, topic: str, kind: str, *messages: Any, start_ns: int = NOON_NS, step_ns: int = SECOND // 10) -> Batch:
+    samples = tuple(
+        Sample(start_ns + number * step_ns, bytes(STORE.serialize_cdr(message, kind))) for number, message in enumerate(messages)
+    )
+    return Batch(sensor, topic, kind, samples, 1)
+
+
+def a_header(frame_id: str = '') -> Any:
+    return STORE.types['std_msgs/msg/Header'](STORE.types['builtin_interfaces/msg/Time'](0, 0), frame_id)
+
+
+def odometry(x: float, yaw: float) -> Any:
+    types = STORE.types
+    turn = types['geometry_msgs/msg/Quaternion'](0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
+    pose = types['geometry_msgs/msg/Pose'](types['geometry_msgs/msg/Point'](x, 2.0, 0.3), turn)
+    zero = types['geometry_msgs/msg/Vector3'](0, 0, 0)
+    header = a_header('odom')
+    return types['nav_msgs/msg/Odometry'](
+        header, 'base_link', types['geometry_msgs/msg/PoseWithCovariance'](pose, np.zeros(36)),
+        types['geometry_msgs/msg/TwistWithCovariance'](types['geometry_msgs/msg/Twist'](zero, zero), np.zeros(36)),
+    )  # fmt: skip
+
+
+def thing(t_start_ns: int) -> DataObject:
+    return DataObject(bucket='b', key='k', body=b'', content_type='', sensor='imu', topic='/imu', type='', samples=1,
+                      t_start_ns=t_start_ns, t_end_ns=t_start_ns, metadata={'robot': 'thor'})  # fmt: skip
+
+
+# -- when --------------------------------------------------------------------------------------------------------------
+
+
+def test_objects_of_the_missions_time_are_marked(tmp_path: Path, opened: ExitStack) -> None:
+    """With its id, and the run's once it is known; what began before the start is not, and nothing after the end."""
+    setting, logger = watching(opened, tmp_path)
+    assert setting.watch.mark(thing(NOON_NS)).metadata == {'robot': 'thor'}
+    mission_id = logger.start_mission('patrol', '')
+    until(setting.watch.status, 'the mission is noticed')
+    (folder,) = missions(tmp_path)
+    start_ns = int(journal.first(folder.journal)['t'])
+    assert setting.watch.mark(thing(start_ns)).metadata == {'robot': 'thor', 'mission_id': mission_id}
+    assert setting.watch.mark(thing(start_ns - 1)).metadata == {'robot': 'thor'}
+    folder.set_run(Run('run7', '1', ''))
+    until(lambda: setting.watch.mark(thing(start_ns)).metadata.get('run_id') == 'run7', 'the run is noticed')
+    logger.end_mission(True, 1.0, 1.0)
+    until(lambda: not setting.watch.status(), 'the end is noticed')
+    assert setting.watch.mark(thing(start_ns)).metadata == {'robot': 'thor'}
+    assert [told.get('run_id', 'none') for told in setting.told] == [None, 'run7', 'none']
+
+
+@pytest.mark.parametrize(('capture', 'asked'), [('always', ['flush', 'flush']), ('mission', ['begin idle', 'busy', 'idle'])])
+def test_batches_end_where_missions_begin_and_end(tmp_path: Path, opened: ExitStack, capture: str, asked: list[str]) -> None:
+    """No object is of a mission and of another time; with ``capture: mission`` nothing is stored outside of one."""
+    setting, logger = watching(opened, tmp_path, capture=capture)
+    logger.start_mission('patrol', '')
+    until(setting.watch.status, 'the mission is noticed')
+    logger.end_mission(True, 1.0, 1.0)
+    until(lambda: not setting.watch.status(), 'the end is noticed')
+    assert setting.intake.asked == asked
+
+
+def test_what_the_robot_says_is_journalled(tmp_path: Path, opened: ExitStack) -> None:
+    """From start to end, and the journal is let go of then; with ``join: false`` there is none."""
+    setting, logger = watching(opened, tmp_path)
+    logger.start_mission('patrol', '')
+    until(setting.watch.status, 'the mission is noticed')
+    (folder,) = missions(tmp_path)
+    start_ns = int(journal.first(folder.journal)['t'])
+    setting.watch.observe(batch('odom', '/odom', 'nav_msgs/msg/Odometry', odometry(0, 0), odometry(0.3, 1.0), start_ns=start_ns))
+    logger.end_mission(True, 1.0, 1.0)
+    until(lambda: not setting.watch.status(), 'the end is noticed')
+    assert not journal.is_locked(folder.node.journal)
+    points = [line.record['m'] for line in journal.read(folder.node.journal) if line.record and 'm' in line.record]
+    assert points[-1]['distance_traveled_m'] == pytest.approx(0.3)
+
+
+def test_it_joins_only_when_it_is_asked_to(tmp_path: Path, opened: ExitStack) -> None:
+    """Without ``join`` objects are marked all the same, and the mission's folder is left alone."""
+    setting, logger = watching(opened, tmp_path, join=False)
+    logger.start_mission('patrol', '')
+    until(setting.watch.status, 'the mission is noticed')
+    setting.watch.observe(batch('odom', '/odom', 'nav_msgs/msg/Odometry', odometry(0, 0)))
+    (folder,) = missions(tmp_path)
+    assert not folder.node.path.exists()
+
+
+# -- what --------------------------------------------------------------------------------------------------------------
+
+
+def test_poses_are_read_from_odometry() -> None:
+    """All that is kept of it, with the heading in radians."""
+    found = list(new_tap().facts(batch('odom', '/odom', 'nav_msgs/msg/Odometry', odometry(1, 0.5), odometry(1.5, -3.0))))
+    assert [pose for pose in found if isinstance(pose, Pose)] == [
+        Pose(NOON_NS, 1.0, 2.0, pytest.approx(0.5), 0.3, 'odom'),
+        Pose(NOON_NS + SECOND // 10, 1.5, 2.0, pytest.approx(-3.0), 0.3, 'odom'),
+    ]  # fmt: skip
+
+
+def test_a_field_is_read_once_a_period() -> None:
+    """Any number of any type, an array's element as well."""
+    tap = new_tap(battery='joint_states:position.1', temperature='')
+    joints = STORE.types['sensor_msgs/msg/JointState']
+    empty = np.zeros(0)
+    messages = [joints(a_header(), [], np.array([0.0, float(number)]), empty, empty) for number in range(25)]
+    found = list(tap.facts(batch('joints', '/joint_states', 'sensor_msgs/msg/JointState', *messages)))
+    assert found == [Reading(NOON_NS + number * SECOND // 10, 'battery_pct', float(number)) for number in (0, 10, 20)]
+
+
+def test_a_field_that_is_not_there_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    """The mission goes on without it."""
+    tap = new_tap(battery='talk:no.such', temperature='')
+    messages = [STORE.types['std_msgs/msg/String']('hi')] * 20
+    assert list(tap.facts(batch('talk', '/talk', 'std_msgs/msg/String', *messages))) == []
+    assert [record.getMessage() for record in caplog.records] == [
+        'battery_pct is not logged to the mission: std_msgs/msg/String has no number no.such'
+    ]
+
+
+def test_a_picture_is_taken_every_few_seconds() -> None:
+    """As the camera published it; other sensors' pictures are none of the mission's."""
+    tap, kind = new_tap(frame_every_s=5.0), 'sensor_msgs/msg/CompressedImage'
+    image = STORE.types[kind](a_header(), 'jpeg', np.frombuffer(JPEG, np.uint8))
+    batches = [batch('camera', '/c', kind, image, start_ns=NOON_NS + second * SECOND) for second in range(11)]
+    found = [fact for one in batches for fact in tap.facts(one)]
+    assert found == [Frame(NOON_NS + second * SECOND, JPEG) for second in (0, 5, 10)]
+    assert list(tap.facts(batch('other', '/c', kind, image))) == []

@@ -1,0 +1,174 @@
+"""``shadowhound-data missions`` on missions made here: what it says, its exit codes, and that it sends what is left."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+from missions.fakes import FakeShelf, FakeTracking, journalling
+
+from shadowhound_data_logger.cli.missions import missions
+from shadowhound_data_logger.errors import TrackingUnavailable
+from shadowhound_data_logger.missions.child import Replayer
+from shadowhound_data_logger.missions.delivery import Delivery
+from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, write_json
+from shadowhound_data_logger.missions.journal import Journal
+from shadowhound_data_logger.missions.overview import BRIEF, overview, overviews
+
+
+def run(home: Path, *arguments: str) -> Result:
+    return CliRunner().invoke(missions, arguments, env={'SHADOWHOUND_HOME': str(home), 'COLUMNS': '150'}, standalone_mode=False)
+
+
+def fly(home: Path, mission_type: str = 'patrol') -> str:
+    with journalling(home) as logger:
+        mission_id = logger.start_mission(mission_type, 'go round')
+        logger.log_metric('people_met', 2.0, step=3)
+        logger.log_event('door', state='open')
+        logger.log_camera_frame(b'\xff\xd8 a picture \xff\xd9', 0)
+        logger.end_mission(True, 12.5, 60.0)
+    return mission_id
+
+
+def see(home: Path, mission_id: str) -> None:
+    """What a node beside the agent logged."""
+    node = MissionFolder(home / FOLDER / mission_id).node
+    node.files.mkdir(parents=True)
+    writer = Journal(node.journal)
+    writer.create()
+    writer.append({'k': 'metrics', 't': 1_760_788_800 * 10**9, 'm': {'battery_pct': 77.0}, 's': 1})
+    writer.close()
+
+
+def deliver(home: Path, mission_id: str) -> None:
+    delivery = Delivery(MissionFolder(home / FOLDER / mission_id), FakeTracking(), FakeShelf())  # type: ignore[arg-type]
+    while not delivery.complete():
+        delivery.track()
+        delivery.attach()
+        delivery.shelve()
+
+
+def test_without_a_mission_it_says_where_it_looked(tmp_path: Path) -> None:
+    """That is fine, and no error."""
+    found = run(tmp_path, 'list')
+    assert found.return_value == 0
+    assert f'No mission has been logged in {tmp_path / FOLDER} yet' in found.output
+    assert json.loads(run(tmp_path, 'list', '--json').output) == []
+
+
+def test_the_list_tells_what_is_not_sent(tmp_path: Path) -> None:
+    """A mission that is over and not sent is a finding; one that is sent, or active, is none."""
+    mission_id = fly(tmp_path)
+    found = run(tmp_path, 'list')
+    assert found.return_value == 1
+    for text in (mission_id, 'FINISHED', '1 min', 'missions resume', '5 records, 1 artifacts, 1 objects'):
+        assert text in found.output
+    deliver(tmp_path, mission_id)
+    assert run(tmp_path, 'list').return_value == 0
+    with journalling(tmp_path) as logger:
+        logger.start_mission('inspection', '')
+        found = run(tmp_path, 'list', '--json')
+        assert found.return_value == 0
+        assert [each['result'] for each in json.loads(found.output)] == ['FINISHED', 'active']
+
+
+def test_a_list_does_not_read_what_is_sent(tmp_path: Path) -> None:
+    """A mission that is sent whole is told by its summary, in the same words as by its journal."""
+    mission_id = fly(tmp_path)
+    deliver(tmp_path, mission_id)
+    (before,) = overviews(tmp_path)
+    whole = overview(MissionFolder(tmp_path / FOLDER / mission_id))
+    assert whole is not None
+    assert before == {name: whole[name] for name in BRIEF}
+    (tmp_path / FOLDER / mission_id / 'journal').unlink()
+    assert overviews(tmp_path) == [before]
+
+
+@pytest.mark.parametrize('which', ['mission', 'run', 'beginning'])
+def test_either_id_finds_a_mission(tmp_path: Path, which: str) -> None:
+    """Its own, that of its run, or how one of them begins."""
+    mission_id = fly(tmp_path)
+    fly(tmp_path, 'inspection')
+    deliver(tmp_path, mission_id)
+    found = run(tmp_path, 'show', '--json', {'mission': mission_id, 'run': 'run0', 'beginning': 'patrol_2'}[which])
+    assert found.return_value == 0
+    said = json.loads(found.output)
+    assert (said['mission_id'], said['run_id'], said['complete']) == (mission_id, 'run0', True)
+
+
+@pytest.mark.parametrize('wanted', ['nobody', '', 'p'])
+def test_an_id_that_finds_none_or_several_is_bad_usage(tmp_path: Path, wanted: str) -> None:
+    """Exit code 2."""
+    for mission_type in ('patrol', 'parade'):
+        fly(tmp_path, mission_type)
+    ran = subprocess.run(
+        [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'missions', 'show', wanted],
+        env={'SHADOWHOUND_HOME': str(tmp_path), 'PYTHONPATH': ':'.join(sys.path)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (ran.returncode, 'mission' in ran.stderr) == (2, True)
+
+
+def test_a_page_tells_why_something_is_not_sent(tmp_path: Path) -> None:
+    """Parameters, last values, counts, and the last error with its remedy."""
+    mission_id = fly(tmp_path)
+    see(tmp_path, mission_id)
+    error = TrackingUnavailable('Tower is away', remedy='is it on?')
+    write_json(tmp_path / FOLDER / 'replay.json', {'errors': {'tracking': {'error': str(error), 'remedy': error.remedy}}})
+    found = run(tmp_path, 'show', mission_id)
+    assert found.return_value == 1
+    for text in (
+        'go round',
+        '12.50 m',
+        'people_met',
+        'battery_pct',
+        '77',
+        'Tower is away (is it on?)',
+        'not sent yet: 6 records',
+    ):
+        assert text in found.output
+
+
+def test_an_export_has_all_that_was_logged(tmp_path: Path) -> None:
+    """Params, points of agent and node, events; the same as CSV, to a file if one is named."""
+    mission_id = fly(tmp_path)
+    see(tmp_path, mission_id)
+    said = json.loads(run(tmp_path, 'export', mission_id).output)
+    assert said['params']['mission_type'] == 'patrol'
+    points = {(point['key'], point['value'], point['step'], point['source']) for point in said['points']}
+    assert {('people_met', 2.0, 3, 'agent'), ('battery_pct', 77.0, 1, 'node'), ('distance_m', 12.5, 0, 'agent')} <= points
+    assert [(event['name'], event['data']) for event in said['events']] == [('door', {'state': 'open'})]
+    target = tmp_path / 'out.csv'
+    assert run(tmp_path, 'export', '--format', 'csv', '--to', str(target), mission_id).return_value == 0
+    rows = list(csv.DictReader(io.StringIO(target.read_text())))
+    assert len(rows) == len(said['params']) + len(said['points']) + len(said['events'])
+    assert ('metric', 'people_met', '2.0', '3') in {(row['kind'], row['key'], row['value'], row['step']) for row in rows}
+
+
+def test_what_cannot_be_sent_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the deadline it says what is left, with exit code 1."""
+    monkeypatch.setattr(Replayer, 'start', lambda _: None)
+    mission_id = fly(tmp_path)
+    found = run(tmp_path, 'resume', '--deadline', '0.3')
+    assert found.return_value == 1
+    assert f'{mission_id}: not sent yet' in found.output
+    assert '1 not sent within 0.3 s' in found.output
+
+
+def test_what_is_left_is_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sender is started for it, and with nothing left nothing is."""
+    mission_id = fly(tmp_path)
+    started: list[Replayer] = []
+
+    def start(replayer: Replayer) -> None:
+        started.append(replayer)
+        deliver(tmp_path, mission_id)
+
+    monkeypatch.setattr(Replayer, 'start', start)
+    assert (run(tmp_path, 'resume').output, len(started)) == ('All is sent.\n', 1)
+    assert (run(tmp_path, 'resume').output, len(started)) == ('Nothing is left to send.\n', 1)

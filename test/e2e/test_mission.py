@@ -1,0 +1,90 @@
+"""A mission beside a running node: what the robot says is logged to it, and what is stored meanwhile carries its id."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from e2e.processes import Node, Processes, until
+from e2e.reading import Objects
+from e2e.station import NODE, Station
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.missions import journal
+from shadowhound_data_logger.missions.folder import MissionFolder, missions
+from shadowhound_data_logger.missions.overview import told
+from shadowhound_data_logger.sim.tower import Tower
+
+ENOUGH = 100
+PARAMETERS = {'mission.capture': 'mission', 'mission.frame_every_s': 1.0, 'lowstate.batch_s': 1.0}
+
+
+def total(node: Node, what: str) -> int:
+    """Over all topics of the ledger."""
+    rows = node.ledger()['topics'].values()
+    return sum(sum(row[what].values()) if isinstance(row[what], dict) else row[what] for row in rows)
+
+
+def heard(station: Station) -> list[dict[str, Any]]:
+    """What ``~/mission`` says, to one who comes late."""
+    found: list[str] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    subscription = station.node.create_subscription(
+        String, f'{NODE}/mission', lambda message: found.append(message.data), latched
+    )
+    try:
+        until(lambda: station._executor.spin_once(timeout_sec=0.1) or found, '~/mission says something')
+    finally:
+        station.node.destroy_subscription(subscription)
+    return [json.loads(text) if text else {} for text in found]
+
+
+def sees(folder: MissionFolder) -> bool:
+    """Whether the node logged all that it should by now."""
+    story = told(folder).node
+    assert story
+    return story.last.get('distance_traveled_m', 0.0) > 0.5 and 'battery_pct' in story.last and story.counts['frame'] >= 2
+
+
+def test_a_mission_has_its_data_and_nothing_else_is_stored(
+    processes: Processes, seaweed: Tower, stored: Callable[..., Objects], tmp_path: Path
+) -> None:
+    """With ``mission.capture: mission`` all objects are of the mission's time and say so; the rest is counted as skipped."""
+    node = processes.node(seaweed.environment(), PARAMETERS)
+    processes.sim('duration_s:=60.0')
+    station = Station(processes.environ)
+    logger = MissionDataLogger(home=node.home, robot=processes.robot, replay=False, start_timeout_s=0.0)
+    try:
+        until(lambda: node.topic('/imu').get('received', 0) > ENOUGH, 'the robot is heard')
+        assert total(node, 'stored') == 0
+        assert heard(station) == [{}]
+        mission_id = logger.start_mission('patrol', 'go round')
+        (folder,) = missions(node.home)
+        until(folder.node.journal.exists, 'the node joins in')
+        until(lambda: sees(folder), lambda: f'the node logs the robot: {told(folder).node}')
+        assert heard(station)[-1]['mission_id'] == mission_id
+        logger.end_mission(True, 0.0, 0.0)
+        logger.flush(0.0)
+        until(lambda: not journal.is_locked(folder.node.journal), 'the node leaves')
+        until(lambda: heard(station) == [{}], 'and says so')
+        node.received('/imu', node.topic('/imu')['received'] + ENOUGH)
+        until(lambda: not node.ledger()['objects']['pending'] and not total(node, 'open'), 'all is delivered')
+        count = total(node, 'stored')
+        node.received('/imu', node.topic('/imu')['received'] + ENOUGH)
+        assert total(node, 'stored') == count > 0
+    finally:
+        logger.close()
+        station.close()
+    ledger = node.stop()
+    assert ledger['balanced']
+    assert total(node, 'dropped') == 0
+    start_ns, end_ns = int(journal.first(folder.journal)['t']), int(journal.last(folder.journal)['t'])
+    objects = stored(processes.robot)
+    times = [(int(info.metadata['t_start_ns']), info.metadata.get('mission_id')) for info in objects.infos.values()]
+    assert {found for time_ns, found in times if start_ns <= time_ns <= end_ns} == {mission_id}
+    assert all(start_ns - 10**9 < time_ns < end_ns + 10**9 for time_ns, _ in times)
+    assert {key.split('/')[1] for key in objects.infos} >= {'camera', 'imu', 'lidar', 'lowstate', 'odom', 'states'}

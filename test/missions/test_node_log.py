@@ -1,0 +1,137 @@
+"""What the node logs beside the agent: in order, of the mission's time, and going on after a restart."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from missions.fakes import journalling
+
+from shadowhound_data_logger.missions import journal
+from shadowhound_data_logger.missions.active import Active, Lookout
+from shadowhound_data_logger.missions.floor import MOST, Floor
+from shadowhound_data_logger.missions.node_log import Cloud, Frame, NodeLog, Reading
+from shadowhound_data_logger.missions.odometer import Pose
+
+SECOND = 10**9
+JPEG = b'\xff\xd8 picture \xff\xd9'
+
+
+@pytest.fixture
+def mission(tmp_path: Path) -> Iterator[Active]:
+    """An active one."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        found = Lookout(tmp_path, 'thor').look()
+        assert found
+        yield found
+
+
+def opened(mission: Active) -> NodeLog:
+    made = NodeLog(mission, SECOND, 5.0)
+    made.open()
+    return made
+
+
+def records(mission: Active) -> list[dict[str, Any]]:
+    return [dict(line.record or {}) for line in journal.read(mission.folder.node.journal)]
+
+
+def walk(mission: Active, seconds: range) -> list[Pose]:
+    """One metre a second."""
+    return [Pose(mission.start_ns + second * SECOND, float(second), 0.0, 0.5) for second in seconds]
+
+
+def distances(mission: Active) -> list[float]:
+    return [record['m']['distance_traveled_m'] for record in records(mission) if 'distance_traveled_m' in record.get('m', {})]
+
+
+def test_poses_of_several_threads_come_into_order(mission: Active) -> None:
+    """Whichever encoder is faster: no way is counted twice and none is lost."""
+    node_log, poses = opened(mission), walk(mission, range(60))
+    rng = random.Random(1)
+    for start in range(0, 60, 2):
+        for pose in rng.sample(poses[start : start + 2], 2):
+            node_log.add(pose)
+        node_log.write()
+    node_log.close()
+    assert distances(mission)[-1] == pytest.approx(59.0)
+    written = [pose for record in records(mission) for pose in record.get('p', ())]
+    assert written == [[pose.stamp_ns, pose.x, pose.y, pose.yaw, pose.z] for pose in poses]
+
+
+def test_what_is_of_another_time_is_left_out(mission: Active) -> None:
+    """Before the start, and at the end after the end."""
+    node_log = opened(mission)
+    for second in (-1, 1, 9):
+        node_log.add(Reading(mission.start_ns + second * SECOND, 'battery_pct', float(second)))
+    node_log.close(Active(mission.folder, 'patrol', mission.start_ns, mission.start_ns + 5 * SECOND))
+    assert [(record['m'], record['s']) for record in records(mission)] == [({'battery_pct': 1.0}, 1)]
+
+
+def test_a_second_node_goes_on_where_the_first_was_killed(mission: Active) -> None:
+    """Distance and frames are counted on, and a torn record costs itself alone."""
+    first = opened(mission)
+    for fact in (*walk(mission, range(5)), Frame(mission.start_ns, JPEG)):
+        first.add(fact)
+    first.close()
+    with mission.folder.node.journal.open('ab') as file:
+        file.write(b'deadbeef {"k":"metr')
+    second = opened(mission)
+    for fact in (*walk(mission, range(10, 13)), Frame(mission.start_ns + SECOND, JPEG)):
+        second.add(fact)
+    second.close()
+    assert distances(mission)[-1] == pytest.approx(4.0 + 2.0)
+    frames = [record for record in records(mission) if record.get('k') == 'frame']
+    assert [(frame['id'], (mission.folder.node.files / frame['file']).read_bytes()) for frame in frames] == [(0, JPEG), (1, JPEG)]
+    assert records(mission).count({}) == 1
+
+
+def test_two_nodes_do_not_write_one_journal(mission: Active) -> None:
+    """The second is refused for as long as the first has it."""
+    first = opened(mission)
+    with pytest.raises(BlockingIOError):
+        NodeLog(mission, SECOND, 5.0).open()
+    first.close()
+    opened(mission).close()
+
+
+def test_the_floor_is_what_the_lidar_saw(mission: Active) -> None:
+    """Neither ground nor ceiling nor another frame's points, and a node that comes later adds to it."""
+    cloud = np.array([[1, 2, 0.5], [3, 4, 0.0], [5, 6, 2.0], [np.nan, 1, 1]], np.float32)
+    for second in range(2):
+        node_log, at_ns = opened(mission), mission.start_ns + second * SECOND
+        node_log.add(Pose(at_ns, 0.0, 0.0, 0.0, frame_id='odom'))
+        node_log.add(Cloud(at_ns, 'odom', cloud + second))
+        node_log.add(Cloud(at_ns, 'radar', cloud + 7))
+        node_log.close()
+    assert np.load(mission.folder.floor).tolist() == [[1, 2], [4, 5]]
+
+
+def test_the_floor_stays_small() -> None:
+    """However long the mission is; what remains is of all of it."""
+    floor, rng = Floor(), np.random.default_rng(1)
+    for second in range(500):
+        floor.add(np.column_stack([np.full(20_000, second), rng.random(20_000), np.ones(20_000)]).astype(np.float32))
+    kept = np.concatenate(floor._parts)
+    assert len(kept) <= MOST
+    assert set(kept[:, 0].tolist()) == set(map(float, range(500)))
+
+
+def test_a_full_disk_costs_a_warning(mission: Active, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """It is said once, and nothing is raised."""
+
+    def full(*_: object) -> None:
+        raise OSError('no space')
+
+    node_log = opened(mission)
+    monkeypatch.setattr(journal.Journal, 'append', full)
+    for second in range(2):
+        node_log.add(Reading(mission.start_ns + second, 'battery_pct', 1.0))
+        node_log.write()
+    node_log.close()
+    assert caplog.text.count('no space') == 1
