@@ -217,6 +217,7 @@ def check(rotten: Rotten, bodies: Mapping[str, bytes]) -> dict[str, int]:
     spool.close()
     again = new_spool(rotten.root)
     again.open()
-    assert not {what for what in again.recovery.counts if 'ledger' not in what}, f'what was repaired stays repaired: {again.recovery.counts}'
+    left = {what for what in again.recovery.counts if 'ledger' not in what}
+    assert not left, f'what was repaired stays repaired, but: {left}'
     again.close()
     return done
