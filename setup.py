@@ -35,7 +35,10 @@ setup(
         'rosbags>=0.11.9',
         'simplejpeg>=1.7',
     ],
-    extras_require={'missions': ['mlflow-skinny>=2.14'], 'test': ['pytest']},  # colcon runs pytest where a test extra names it
+    extras_require={
+        'missions': ['matplotlib>=3.6', 'mlflow-skinny>=2.14'],
+        'test': ['pytest'],  # colcon runs pytest where a test extra names it
+    },
     entry_points={
         'console_scripts': [
             'sensor_logger_node = shadowhound_data_logger.capture.sensor_logger_node:main',

@@ -10,7 +10,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from shadowhound_data_logger.sim.demo_pictures import AMBER, BLUE, DPI, INK, STYLE, TEAL
+from shadowhound_data_logger.missions.plots import AMBER, BLUE, DPI, INK, STYLE, TEAL
 
 GREY: Final = '#9aa7b2'
 Figures = Mapping[str, Any]

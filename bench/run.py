@@ -1,7 +1,7 @@
 """``make bench``: all benchmarks one after the other, then docs/performance.md with what they found.
 
-About ten minutes, half of them without the S3 server; ``--quick`` takes two or so and leaves docs/ alone. Exit code 1 when a bar
-is missed, or a benchmark fails (then docs/ stays as it is, too). Nothing else should run on the machine meanwhile.
+About fifteen minutes; ``--quick`` takes three or so and leaves docs/ alone. Exit code 1 when a bar is missed, or a benchmark
+fails (then docs/ stays as it is, too). Nothing else should run on the machine meanwhile.
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ STEPS: Final = (
     Step('full_rate', ('--seconds', '60', '--away', '300'), ('--seconds', '10', '--away', '10')),
     Step('latency', ('--seconds', '30'), ('--seconds', '8')),
     Step('drain', ('--rounds', '5', '--scale', '0.3'), ('--rounds', '2', '--scale', '0.1')),
+    Step('mission_calls', ('--seconds', '20'), ('--seconds', '3')),
+    Step('missions', quick=('--points', '10000')),
     Step('encode_formats'),
     Step('spool_commits', quick=None),
 )
