@@ -30,7 +30,7 @@ format: setup ## let ruff repair and format what it can
 	scripts/with-env ruff check --fix .
 	scripts/with-env ruff format .
 
-demo: setup ## a simulated Go2, an embedded Tower and one patrol mission, about a minute
+demo: setup ## a simulated Go2, an embedded Tower and one patrol mission, a minute and a half
 	scripts/with-env python -m shadowhound_data_logger.sim.demo
 
 bench: setup ## benchmarks against the baseline, as ratios, into docs/performance.md; BENCH_ARGS=--quick is shorter

@@ -19,12 +19,16 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
 from shadowhound_data_logger.capture.log_bridge import RosHandler
 from shadowhound_data_logger.capture.parameters import Parameters
 from shadowhound_data_logger.capture.pipeline import Pipeline
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
 
+USAGE = """\
+usage: sensor_logger_node [--ros-args [--params-file FILE] [-p NAME:=VALUE ...] [-r __ns:=/NAMESPACE] ...]
+What it is doing: shadowhound-data status. Without AWS_ENDPOINT_URL it stores to a folder, $SHADOWHOUND_HOME/store."""
 SPIN_S = 0.4
 """How long a signal may wait to be seen."""
 ARENAS, MMAP_THRESHOLD = (-8, 2), (-3, 1 << 20)
@@ -61,11 +65,23 @@ def bound_heap() -> None:
             mallopt(*option)
 
 
+def refuse(rest: list[str]) -> int:
+    """Answer arguments that are none of ROS; the exit code."""
+    if rest[0] in {'-h', '--help'}:
+        print(USAGE)  # noqa: T201
+        return 0
+    print(f'sensor_logger_node: {rest[0]!r} is no argument of it; settings follow --ros-args\n{USAGE}', file=sys.stderr)  # noqa: T201
+    return 2
+
+
 def main(args: list[str] | None = None) -> int:
     """The console script; ``args`` are ROS arguments without the program's name."""
+    arguments = sys.argv[1:] if args is None else args
     bound_heap()
     try:
-        rclpy.init(args=[sys.argv[0], *(sys.argv[1:] if args is None else args)], signal_handler_options=SignalHandlerOptions.NO)
+        if rest := remove_ros_args(arguments):  # a --params-file without --ros-args, say: rcl would ignore it
+            return refuse(rest)
+        rclpy.init(args=[sys.argv[0], *arguments], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # a parameter file or argument that rcl cannot parse; there is no logger yet
         print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201
         return 2

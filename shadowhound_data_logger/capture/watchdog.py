@@ -105,6 +105,8 @@ def _hanging(name: str, row: Mapping[str, Any]) -> str:
         return f'it takes no messages for {busy_s:.0f} s and they are being lost; start the node again if that lasts'
     if name == 'spool-writer':
         return f'a commit to the spool has taken {busy_s:.0f} s: its disk does not answer; look at dmesg and at its cable or card'
+    if name == 'mission':
+        return f'missions are not followed for {busy_s:.0f} s, neither their begin and end nor their logs; does the disk answer?'
     return f'one batch has taken {busy_s:.0f} s so far; others go on meanwhile if there are more encoder threads'
 
 

@@ -15,6 +15,7 @@ from rich.text import Text
 from shadowhound_data_logger.cli.tables import number, plain, plain_table, show_whole, volume
 from shadowhound_data_logger.config import home
 from shadowhound_data_logger.spool.ledger import imbalances, read
+from shadowhound_data_logger.spool.status import robots
 
 COLUMNS: Final = ('published', 'received', 'missed', 'skipped', 'rejected', 'dropped', 'stored', 'open')
 ALWAYS: Final = frozenset({'published', 'received', 'missed', 'skipped', 'stored'})
@@ -45,7 +46,7 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
         return verify(folder, deep=deep, again=again, as_json=as_json)
     if again:
         raise click.UsageError('--again is for --verify or --deep')
-    found = read(folder, os.environ.get('SHADOWHOUND_ROBOT') or 'thor')
+    found = read(folder, os.environ.get('SHADOWHOUND_ROBOT') or next(iter(robots(folder)), 'thor'))
     if as_json:
         click.echo(json.dumps(found, indent=2))
     else:

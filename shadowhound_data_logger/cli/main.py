@@ -17,7 +17,7 @@ from shadowhound_data_logger.errors import DataLoggerError
 def cli() -> None:
     """What became of a robot's data: ask its spool and its store.
 
-    SHADOWHOUND_HOME names the folder of the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT the robot (default thor).
+    SHADOWHOUND_HOME names the folder of the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT the robot (default: who ran).
     """
 
 

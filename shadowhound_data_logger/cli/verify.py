@@ -20,6 +20,7 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings, home, store_settings
 from shadowhound_data_logger.ship.audit import KINDS, THREADS, Audit, audit
 from shadowhound_data_logger.spool.deliveries import Deliveries
+from shadowhound_data_logger.spool.status import targets
 from shadowhound_data_logger.stores import open_store
 
 
@@ -33,6 +34,7 @@ def verify(spool: Path, *, deep: bool, again: bool, as_json: bool) -> int:
             task = bar.add_task('read back' if deep else 'asked for', total=known, completed=earlier)
             found = audit(deliveries, store, deep=deep, tell=lambda: bar.advance(task))
         said = _said(found, deliveries, store.describe(), deep=deep, earlier=earlier)
+        said['delivered_to'] = targets(spool)
         if found.away is None:
             deliveries.finish()
     if as_json:
@@ -73,7 +75,7 @@ def show(said: Mapping[str, Any], console: Console) -> None:
         lines += [plain(f'  {one["bucket"]}/{one["key"]}: {one["detail"]}') for one in piled['first']]
         if piled['count'] > len(piled['first']):
             lines.append(f'  ... and {number(piled["count"] - len(piled["first"]))} more')
-    show_whole([*lines, '', _verdict(said)], console)
+    show_whole([*lines, '', _verdict(said), *_doubt(said)], console)
 
 
 def _scope(said: Mapping[str, Any]) -> str:
@@ -86,8 +88,16 @@ def _scope(said: Mapping[str, Any]) -> str:
     return f'{text}; {number(forgotten)} older ones are not remembered (spool.remember_days).' if forgotten > 0 else f'{text}.'
 
 
+def _doubt(said: Mapping[str, Any]) -> list[RenderableType]:
+    """Where the node named another store than this shell does, that is the likeliest cause of what was found."""
+    if not said['findings'] or not said['delivered_to'] or said['store'] in said['delivered_to']:
+        return []
+    other = ' and '.join(said['delivered_to'])
+    return [plain(f'But the node delivered to {other}: is AWS_ENDPOINT_URL set here as it is for the node?', 'yellow')]
+
+
 def _verdict(said: Mapping[str, Any]) -> Text:
-    how = 'its content read back' if said['deep'] else 'by size and checksum'
+    how = 'every byte read back' if said['deep'] else 'by size and checksum'
     if said['unreachable']:
         left = max(said['known'] - said['asked'] - said['asked_earlier'], 0)
         reason = plain(f': {said["unreachable"]}. {number(left)} objects are not asked for yet: run it again to go on there.')

@@ -141,8 +141,9 @@ class Spool:
         """Give held objects their final (made unique) keys, all or none; returns those that may be shipped now.
 
         What is not held any more is left out. Raises NameRefused, OSError or sqlite3.OperationalError when nothing was bound.
+        Waits for a recovery, another process's start: that would take the files of what is not committed for its own.
         """
-        with self._lock:
+        with flock(self.root / 'recovery.lock'), self._lock:
             return self._ballast.work(lambda: binding.bind(self._index, self._tree, bindings, self._clock.wall_ns()))
 
     def pending_count(self) -> int:

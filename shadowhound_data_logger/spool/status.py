@@ -59,6 +59,12 @@ def robots(spool: Path) -> list[str]:
     return sorted(path.stem.removeprefix('status-') for path in spool.glob('status-*.json'))
 
 
+def targets(spool: Path) -> list[str]:
+    """The stores that the nodes of this spool delivered to when they last wrote a status, as a store describes itself."""
+    written = (_load(file(spool, robot)) for robot in robots(spool))
+    return sorted({one['store']['target'] for one in written if one} - {''})
+
+
 def read(spool: Path, robot: str, clock: Clock) -> dict[str, Any]:
     """The status of a robot's node, as ``shadowhound-data status --json`` prints it.
 

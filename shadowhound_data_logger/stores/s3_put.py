@@ -12,6 +12,7 @@ from typing import IO, Any, Final
 from urllib.parse import quote, urlsplit
 
 from botocore.awsrequest import (
+    AWSConnection,
     AWSHTTPConnection,
     AWSHTTPConnectionPool,
     AWSHTTPSConnection,
@@ -43,6 +44,7 @@ _SOCKET: Final = ((socket.IPPROTO_TCP, socket.TCP_NODELAY, 1), (socket.SOL_SOCKE
 _open_session: Any = URLLib3Session
 _prepared: Any = AWSPreparedRequest
 _create_parser: Any = create_parser
+_awaiting: Any = AWSConnection
 """Their stubs know less than they take."""
 
 
@@ -51,9 +53,9 @@ class ObjectPut:
 
     def __init__(self, session: Session, settings: StoreSettings, upload: UploadSettings, pace: Pace) -> None:
         url = urlsplit(settings.endpoint_url or '')
-        self._server = f'{url.scheme}://{url.netloc}'
+        self._host = url.netloc.rpartition('@')[2]  # a user name in the URL is no host's
+        self._server = f'{url.scheme}://{self._host}'
         self._root = url.path.rstrip('/')
-        self._host = url.netloc
         self._region = settings.region
         self._pace = pace
         self._credentials = session.get_credentials()
@@ -107,12 +109,24 @@ def _skip_headers(_: object, fp: IO[bytes]) -> None:
         pass
 
 
+def _send_output(connection: Any, *args: Any, **kwargs: Any) -> None:
+    """Once refused, botocore sends nothing of the body, but asks for each piece, which waits for its time under the cap.
+
+    urllib3 takes this error for what it says, and reads the answer.
+    """
+    _awaiting._send_output(connection, *args, **kwargs)
+    if connection._response_received:
+        raise BrokenPipeError
+
+
 class _Connection(AWSHTTPConnection):
     _consume_headers = _skip_headers
+    _send_output = _send_output
 
 
 class _TLSConnection(AWSHTTPSConnection):
     _consume_headers = _skip_headers
+    _send_output = _send_output
 
 
 class _Pool(AWSHTTPConnectionPool):

@@ -17,7 +17,8 @@ STATUS: dict[str, Any] = {
     'topics': {'/imu': TOPIC}, 'queue': {'batches': 0, 'finished': 0}, 'spool': {'pending': 0},
     'store': {'state': 'idle', 'delivered': 0, 'quarantined': 0, 'mbps': 0.0, 'in_flight': 0, 'deferred': 0, 'last_error': ''},
     'workers': {name: {**WORKER, 'patience_s': patience_s} for name, patience_s in
-                {'intake': 5.0, 'encode-0': 60.0, 'spool-writer': 12.0, 'upload-lock': None, 'upload-0': None}.items()},
+                {'intake': 5.0, 'encode-0': 60.0, 'spool-writer': 12.0, 'mission': 30.0, 'upload-lock': None,
+                 'upload-0': None}.items()},
 }  # fmt: skip
 
 
@@ -154,7 +155,7 @@ def test_an_intake_that_takes_nothing_is_the_one_cause(watch: Watch, trouble: di
 @pytest.mark.parametrize(
     ('name', 'busy_s', 'words'),
     [('intake', 5.1, 'takes no messages for 5 s'), ('spool-writer', 12.1, 'its disk does not answer'),
-     ('encode-0', 61.0, 'one batch has taken 61 s')],
+     ('encode-0', 61.0, 'one batch has taken 61 s'), ('mission', 31.0, 'missions are not followed for 31 s')],
 )  # fmt: skip
 def test_a_round_that_hangs(stages: Watch, name: str, busy_s: float, words: str) -> None:
     """Each thread has its own patience; for the one that holds the drain lock any length is fine."""

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
-from spool.making import make, new_spool, put, settle
+from spool.making import abandon, make, new_spool, put, settle
 
 from shadowhound_data_logger.cli.ledger import ledger, show
 from shadowhound_data_logger.cli.main import main
@@ -46,6 +46,19 @@ def test_the_default_topics_fit_into_80_columns() -> None:
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
     assert '/camera/camera_info  1,234,567  1,234,567' in text
     assert '…' not in text
+
+
+def test_the_robot_is_the_one_whose_node_ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node in a namespace has its name in the spool: the ledger is of that robot, unless the environment names another."""
+    monkeypatch.delenv('SHADOWHOUND_ROBOT', raising=False)
+    spool = new_spool(tmp_path)
+    spool.open()
+    (tmp_path / 'status-tachi.json').write_text('{}')
+    for robot in ('tachi', 'other'):
+        answer = CliRunner().invoke(ledger, ['--spool', str(tmp_path), '--json'], standalone_mode=False)
+        assert json.loads(answer.stdout)['robot'] == robot
+        monkeypatch.setenv('SHADOWHOUND_ROBOT', 'other')
+    abandon(spool)
 
 
 def test_a_pipe_gets_every_column_whole() -> None:

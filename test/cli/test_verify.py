@@ -76,6 +76,20 @@ def test_what_is_not_there_is_listed(home: Path) -> None:
     assert (said['asked'], said['sound'], said['known'], said['forgotten']) == (3, 1, 3, 0)
 
 
+def test_another_store_than_the_node_had(home: Path) -> None:
+    """Where objects are missing and the node named another store, the report says so; where it named this one, not."""
+    status = home / 'spool' / 'status-thor.json'
+    for path in (home / 'store').rglob('*'):
+        if path.is_file():
+            path.unlink()
+    for target, is_told in (('the S3 server at http://10.0.0.5:9000', True), (f'the folder {home}/store', False)):
+        status.write_text(json.dumps({'robot': 'thor', 'store': {'target': target}}))
+        text = ' '.join(run('--verify').stdout.split())
+        assert '3 not in the store' in text
+        assert (f'But the node delivered to {target}: is AWS_ENDPOINT_URL set here' in text) is is_told
+        assert as_json('--verify')['delivered_to'] == [target]
+
+
 def test_what_the_index_forgot_is_said(home: Path) -> None:
     """The report says how many it cannot ask for."""
     with closing(sqlite3.connect(home / 'spool/index.db')) as index:

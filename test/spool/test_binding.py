@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ from spool.making import BUCKET, NOON_NS, READY, FakeClock, assert_whole, files,
 
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.model import Binding, State
+from shadowhound_data_logger.spool import recovery
 from shadowhound_data_logger.spool.files import Tree, description_of
+from shadowhound_data_logger.spool.recovery import _follow_rows
 from shadowhound_data_logger.spool.spool import Spool
 
 HELD = f'held/clock/{BUCKET}'
@@ -188,6 +191,31 @@ def test_death_at_any_moment_of_a_binding(root: Path, moments: Moments) -> None:
         spool.close()
     assert seen == sorted(seen)
     assert set(seen) == {False, True}
+
+
+def test_a_start_of_another_process_keeps_out_of_a_binding(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its recovery would put back what is renamed and not committed yet, and delivery find no file under the final name."""
+    bindings = hold(spool, 'a', 'b')
+    other = new_spool(root)
+    start, looked = threading.Thread(target=other.open), threading.Event()
+
+    def follows(*arguments: Any) -> None:
+        _follow_rows(*arguments)
+        looked.set()
+
+    def syncs(tree: Tree) -> None:
+        start.start()
+        assert not looked.wait(0.5)
+
+    monkeypatch.setattr(recovery, '_follow_rows', follows)
+    monkeypatch.setattr(Tree, 'sync_incoming', syncs)
+    bound = spool.bind(bindings)
+    start.join(10.0)
+    assert looked.is_set()
+    assert not other.recovery.found_anything
+    other.close()
+    assert [item.path.read_bytes() for item in bound] == [b'a', b'b']
+    assert_whole(root)
 
 
 def test_a_binding_that_a_dead_process_began_is_gone_on_with(opened: Open, root: Path) -> None:

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from typing import Any
 
 import pytest
 from cryptography import x509
@@ -192,3 +193,22 @@ def test_https_to_a_plain_port(opened: Callable[..., S3Store]) -> None:
     with served(FakeS3()) as server:
         said = error_of(StoreUnavailable, opened(server.url.replace('http:', 'https:')).probe)
     assert 'no TLS connection' in said
+
+
+def test_a_name_and_a_password_in_the_url_are_not_sent(
+    opened: Callable[..., S3Store], spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are none of the host's name, which stands in each request for all to read; a path is part of every one."""
+    with served(FakeS3()) as server:
+        asked: list[tuple[str, str]] = []
+        handler = server.RequestHandlerClass
+        told = handler._told  # type: ignore[attr-defined]
+
+        def tells(request: Any) -> bool:
+            asked.append((request.headers['Host'], request.path.rpartition('/')[0].split('/')[1]))
+            return bool(told(request))
+
+        monkeypatch.setattr(handler, '_told', tells)
+        store = opened(f'{server.url.replace("://", "://name:password@")}/base')
+        assert store.put(spool('a', b'x')) is Put.CREATED
+        assert set(asked) == {(server.url.removeprefix('http://'), 'base')}

@@ -167,12 +167,17 @@ def test_only_a_large_body_waits_for_leave(wire: Wire, spool: Spool, proved: S3S
     assert sum(count for _, count in wire.arrivals) == size
 
 
-def test_a_large_body_that_is_refused_stays_here(wire: Wire, spool: Spool, proved: S3Store) -> None:
-    """The server says so before anything of it left."""
+@pytest.mark.parametrize('max_mbps', [0.0, 0.1])
+def test_a_large_body_that_is_refused_stays_here(wire: Wire, spool: Spool, proved: S3Store, max_mbps: float) -> None:
+    """The server says so before anything of it left, and nothing of it counts: it takes none of the time under a cap."""
     wire.refuse_early = True
+    proved.pace.set(max_mbps)
+    counted, began = proved.pace.sent_bytes, time.monotonic()
     with pytest.raises(ForeignObject):
         proved.put(spool('there', bytes(4 * UNASKED_BYTES)))
     assert wire.arrivals == []
+    assert proved.pace.sent_bytes == counted
+    assert time.monotonic() - began < 10.0  # at this cap it would be 84 s
 
 
 def test_a_put_that_is_given_up_breaks_off(wire: Wire, spool: Spool, proved: S3Store) -> None:
