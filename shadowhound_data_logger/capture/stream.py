@@ -16,7 +16,7 @@ from shadowhound_data_logger.model import Batch, Sample
 from shadowhound_data_logger.spool.accounts import EXACT, PAUSED, Accounts
 
 MAX_RECENT: Final = 10_000
-"""Messages without numbers that are remembered, to know what a second subscription delivers again."""
+"""Messages without a sender's gid that are remembered, to know what a second subscription delivers again."""
 Offer = Callable[[Batch], None]
 
 
@@ -90,8 +90,8 @@ class Stream:
         with self._accounts.entry(self._topic) as account:
             for cdr, source_ns, gid, number in taken:
                 publisher = gid or senders.name(number, source_ns)
-                numbered = number is not None and publisher is not None and account.accounting == EXACT
-                if not numbered and self._is_repeat(source_ns, cdr):
+                is_named = gid is not None and number is not None and account.accounting == EXACT
+                if not is_named and self._is_repeat(source_ns, crc32(cdr) if number is None else number):
                     continue
                 if not account.receive(publisher, number, reported=lost is not None):
                     continue
@@ -110,9 +110,12 @@ class Stream:
             account.lose(lost)
         return kept
 
-    def _is_repeat(self, source_ns: int, cdr: bytes) -> bool:
-        """Whether a message without a number came by another of our subscriptions already: same time, same content."""
-        mark = (source_ns, crc32(cdr))
+    def _is_repeat(self, source_ns: int, which: int) -> bool:
+        """Whether a message came by another of our subscriptions already: sent at the same time, same number or content.
+
+        Asked also while the graph knows one sender, whose name the middleware does not give: a second one may appear.
+        """
+        mark = (source_ns, which)
         if mark in self._recent:
             return True
         self._recent[mark] = None

@@ -181,3 +181,15 @@ def test_what_two_subscriptions_deliver_is_counted_once() -> None:
             talk.add(part, lost=0)
         assert talk.account.received == 3
         assert talk.kept() == [1, 2, 3]
+
+
+def test_a_history_that_comes_again_when_a_second_sender_appears() -> None:
+    """What was taken while one sender was known is known again by its time and number, though nobody can say whose it is."""
+    talk = Talk()
+    talk.senders.look(['a'])
+    taken = talk.messages(3, publisher=None)
+    talk.add(taken, lost=0)
+    talk.senders.look(['a', 'b'])
+    talk.add([*talk.messages(1, publisher=None), *taken], lost=0)
+    assert talk.account.received == 4
+    assert talk.kept() == [1, 2, 3, 4]
