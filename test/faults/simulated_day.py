@@ -83,7 +83,7 @@ class Process:
         self._end()
         parts: Any = self.spool
         parts._index.close()
-        os.close(parts._session_lock)
+        os.close(parts._session._lock)
 
     def stop(self) -> None:
         """In order, with everything durable."""
