@@ -74,7 +74,7 @@ def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, m
     with Tower(folder / 'tower', mlflow=mlflow) as tower:
         console.print(f'  S3 server  {tower.endpoint_url}')
         if mlflow:
-            console.print(f'  MLflow     {tower.tracking_uri}  (empty: missions are not logged yet)')
+            console.print(f'  MLflow     {tower.tracking_uri}  (empty: this patrol is no mission)')
         record = _patrol(folder, tower, duration_s, outage_s, console)
         console.print('\nReading everything back from the S3 server ...\n')
         store = open_store(tower.store_settings(), UploadSettings())
