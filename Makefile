@@ -1,10 +1,11 @@
 # Every target makes the environment first (see scripts/setup); with nothing to do that takes milliseconds.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-matrix torture check format demo bench docs lock clean
+.PHONY: help setup test test-matrix torture check format demo bench docs lock tower tower-secrets clean
 
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
+TOWER_ARGS ?=
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 13
@@ -41,6 +42,12 @@ docs: setup ## write docs/parameters.md anew from the code
 
 lock: setup ## write requirements/*.txt anew from requirements/*.in; LOCK_ARGS=--upgrade renews the pins
 	scripts/lock $(LOCK_ARGS)
+
+tower-secrets: ## credentials of a Tower, once; TOWER_ARGS="--host 192.168.1.10 --robot thor" is handed on
+	python3 tower/make_secrets.py $(TOWER_ARGS)
+
+tower: setup ## a Tower without Docker (SeaweedFS, PostgreSQL or SQLite, MLflow), until it is interrupted
+	scripts/with-env python tower/run.py $(TOWER_ARGS)
 
 clean: ## remove the environment and everything that was built
 	rm -rf .venv .cache build install log demo .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -1,0 +1,38 @@
+"""A server whose users are those that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import boto3
+import pytest
+from tower_scripts import make_secrets, prepare
+
+from shadowhound_data_logger.sim.tower import Tower
+
+
+@pytest.fixture(scope='session')
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tower]:
+    """SeaweedFS with the users of make_secrets.py, prepared by prepare.py."""
+    users = {name: make_secrets.actions(name) for name in ('mlflow', 'spark', 'thor', 'tachi')}
+    with Tower(tmp_path_factory.mktemp('tower'), users=users) as tower:
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in tower.environment().items():
+                patch.setenv(name, value)
+            assert prepare.main(['--robot', 'thor', '--robot', 'tachi']) == 0
+        yield tower
+
+
+@pytest.fixture(scope='session')
+def as_user(server: Tower) -> Callable[[str], Any]:
+    """An S3 client with the keys of a user."""
+
+    def connect(user: str) -> Any:
+        environ = server.environment(user)
+        return boto3.client(
+            's3', endpoint_url=environ['AWS_ENDPOINT_URL'], aws_access_key_id=environ['AWS_ACCESS_KEY_ID'],
+            aws_secret_access_key=environ['AWS_SECRET_ACCESS_KEY'], region_name='us-east-1',
+        )  # fmt: skip
+
+    return connect

@@ -1,0 +1,82 @@
+"""compose.yaml, as far as it can be checked without an engine: what it starts, with what, and who can reach it."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from tower_scripts import TOWER, make_secrets
+
+from shadowhound_data_logger.sim.servers import find_program
+
+
+@pytest.fixture(scope='module')
+def services() -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load((TOWER / 'compose.yaml').read_text(encoding='utf-8'))['services']
+    return found
+
+
+def test_every_image_is_pinned(services: dict[str, Any]) -> None:
+    """An image has a tag that says its version; what is built installs exact versions."""
+    for service in services.values():
+        assert re.fullmatch(r'[\w./-]+:\d+\.\d+[\w.-]*', service['image'])
+    built = (TOWER / 'Dockerfile.mlflow').read_text(encoding='utf-8')
+    assert re.search(r'^FROM python:3\.12', built, re.MULTILINE)
+    packages = [word for word in built.split() if word.startswith(('mlflow', 'psycopg2', 'boto3')) and '=' in word]
+    assert [package.partition('==')[0] for package in packages] == ['mlflow', 'psycopg2-binary', 'boto3']
+
+
+def test_servers_are_watched_and_come_back(services: dict[str, Any]) -> None:
+    """Each server has a health check and is started again; the one that prepares the buckets runs to its end."""
+    for name, service in services.items():
+        if name == 'prepare':
+            assert service['restart'].startswith('on-failure')
+        else:
+            assert service['healthcheck']['test'][0] == 'CMD'
+            assert service['restart'] == 'unless-stopped'
+    assert services['mlflow']['depends_on']['prepare']['condition'] == 'service_completed_successfully'
+
+
+def test_they_listen_where_they_are_told(services: dict[str, Any], tmp_path: Path) -> None:
+    """Ports are bound to TOWER_HOST, which is 127.0.0.1 until somebody names an address; the database has none."""
+    ports = {name: service['ports'] for name, service in services.items() if 'ports' in service}
+    assert set(ports) == {'s3', 'mlflow'}
+    assert all(port.startswith('${TOWER_HOST:?') for one in ports.values() for port in one)
+    assert [port.split('}')[1] for one in ports.values() for port in one] == [':9000:8333', ':5001:5000']
+    make_secrets.make(tmp_path, None, ['thor'])
+    assert make_secrets.read_env(tmp_path / '.env')['TOWER_HOST'] == '127.0.0.1'
+
+
+def test_every_variable_is_in_the_file_that_is_made(tmp_path: Path) -> None:
+    """make_secrets.py writes all that compose.yaml asks for, and no secret stands in it."""
+    text = (TOWER / 'compose.yaml').read_text(encoding='utf-8')
+    make_secrets.make(tmp_path, None, ['thor'])
+    assert set(re.findall(r'\$\{(\w+)', text)) <= set(make_secrets.read_env(tmp_path / '.env'))
+    named = re.findall(r'\./(secrets/[\w.]+)', text)
+    assert named
+    assert all((tmp_path / name).is_file() for name in named)
+    assert all(value.startswith('${') for value in re.findall(r'(?:SECRET\w*|PASSWORD): (\S+)', text))
+
+
+@pytest.mark.seaweedfs
+def test_the_server_knows_its_options(services: dict[str, Any]) -> None:
+    """Every option of the S3 server is one of `weed server`, of the version that the image has."""
+    weed = find_program('weed', '')
+    command = shlex.split(services['s3']['command'])
+    told = subprocess.run([weed, command[0], '-h'], capture_output=True, text=True, check=False)
+    known = set(re.findall(r'^  -([\w.]+)', told.stderr + told.stdout, re.MULTILINE))
+    assert {option.lstrip('-').partition('=')[0] for option in command[1:]} <= known
+    version = subprocess.run([weed, 'version'], capture_output=True, text=True, check=True).stdout
+    assert f' {services["s3"]["image"].partition(":")[2]} ' in version
+
+
+def test_mlflow_knows_its_options(services: dict[str, Any]) -> None:
+    """Every option of the MLflow server is one of `mlflow server`."""
+    told = subprocess.run([find_program('mlflow', ''), 'server', '--help'], capture_output=True, text=True, check=True)
+    words = services['mlflow']['command'].split()
+    assert {word for word in words if word.startswith('--')} <= set(re.findall(r'--[\w-]+', told.stdout))

@@ -1,0 +1,74 @@
+"""The credentials of a Tower: who may read them, that they stay, and how one is changed."""
+
+from __future__ import annotations
+
+import json
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tower_scripts import TOWER, make_secrets
+
+
+def _modes(folder: Path) -> set[str]:
+    return {oct(stat.S_IMODE(path.stat().st_mode)) for path in folder.rglob('*') if path.is_file()}
+
+
+def _key(folder: Path, user: str) -> str:
+    return str(make_secrets.read_env(folder / 'secrets' / f'{user}.env')['AWS_SECRET_ACCESS_KEY'])
+
+
+def test_only_their_owner_can_read_them(tmp_path: Path) -> None:
+    """Every file has mode 600 and the folder 700, whatever the umask."""
+    code = 'import os, sys; os.umask(0); sys.path.insert(0, sys.argv[1]); import make_secrets; make_secrets.main(sys.argv[2:])'
+    subprocess.run([sys.executable, '-c', code, str(TOWER), '--folder', str(tmp_path)], check=True, capture_output=True)
+    assert _modes(tmp_path) == {'0o600'}
+    assert stat.S_IMODE((tmp_path / 'secrets').stat().st_mode) == 0o700
+
+
+def test_what_is_there_stays(tmp_path: Path) -> None:
+    """A second run changes no key and no password; a new robot and the address are added."""
+    make_secrets.make(tmp_path, None, ['thor'])
+    before = {path: path.read_text() for path in tmp_path.rglob('*.env')}
+    make_secrets.make(tmp_path, None, ['thor'])
+    assert {path: path.read_text() for path in tmp_path.rglob('*.env')} == before
+    make_secrets.make(tmp_path, '192.168.1.10', ['tachi'])
+    settings = make_secrets.read_env(tmp_path / '.env')
+    assert settings['TOWER_HOST'] == '192.168.1.10'
+    assert settings['POSTGRES_PASSWORD'] in before[tmp_path / '.env']
+    tachi = make_secrets.read_env(tmp_path / 'secrets' / 'tachi.env')
+    assert tachi['AWS_ENDPOINT_URL'] == 'http://192.168.1.10:9000'
+    assert tachi['SHADOWHOUND_ROBOT'] == 'tachi'
+
+
+def test_nothing_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What the script prints holds no key and no password."""
+    assert make_secrets.main(['--folder', str(tmp_path)]) == 0
+    printed = ''.join(capsys.readouterr())
+    secret = {value for name, value in make_secrets.read_env(tmp_path / '.env').items() if 'SECRET' in name or 'PASSWORD' in name}
+    assert len(secret) == 3
+    assert not [value for value in secret if value in printed]
+
+
+def test_a_key_is_changed_without_a_gap(tmp_path: Path) -> None:
+    """Rotating adds a key in front of the old one, which goes when it is retired; other users keep theirs."""
+    make_secrets.make(tmp_path, None, ['thor'])
+    old, spark = _key(tmp_path, 'thor'), _key(tmp_path, 'spark')
+    make_secrets.make(tmp_path, None, [], rotate=['thor'])
+    new = _key(tmp_path, 'thor')
+    identities = {one['name']: one for one in json.loads((tmp_path / 'secrets' / 's3.json').read_text())['identities']}
+    assert [key['secretKey'] for key in identities['thor']['credentials']] == [new, old]
+    make_secrets.make(tmp_path, None, [], retire=['thor'])
+    assert [key['secretKey'] for key in make_secrets.load_users(tmp_path / 'secrets' / 'users.json')['thor']] == [new]
+    assert _key(tmp_path, 'spark') == spark
+    assert old != new
+
+
+@pytest.mark.parametrize('name', ['../thor', 'thor*', 'Thor', '', 'a b', '-x'])
+def test_a_name_that_is_a_pattern_is_refused(tmp_path: Path, name: str) -> None:
+    """A robot's name becomes part of what it may do: no wildcard and no path gets in."""
+    with pytest.raises(make_secrets.Refused):
+        make_secrets.make(tmp_path, None, [name])
+    assert make_secrets.main(['--folder', str(tmp_path), '--rotate', 'nobody']) == 2

@@ -1,0 +1,131 @@
+"""What the users of a Tower may do, asked of a real SeaweedFS."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from botocore.exceptions import ClientError
+from tower_scripts import make_secrets, prepare
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import AccessDenied, ForeignObject
+from shadowhound_data_logger.model import Put, SpooledObject
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.s3 import S3Store
+
+pytestmark = pytest.mark.seaweedfs
+Connect = Callable[[str], Any]
+
+
+def _is_denied(call: Callable[..., Any], **arguments: Any) -> bool:
+    try:
+        call(**arguments)
+    except ClientError as error:
+        return bool(error.response['ResponseMetadata']['HTTPStatusCode'] == 403)
+    return False
+
+
+def _object(folder: Path, key: str, body: bytes) -> SpooledObject:
+    path = folder / key.replace('/', '_')
+    path.write_bytes(body)
+    sha256 = hashlib.sha256(body).hexdigest()
+    return SpooledObject(1, 'sensor-data', key, path, len(body), sha256, 'text/plain', {'sha256': sha256}, 5, 0)
+
+
+def test_the_logger_works_with_a_robots_keys(server: Tower, tmp_path: Path) -> None:
+    """All that delivery asks of the store is allowed, and the condition is honoured on a bucket that keeps versions."""
+    store = S3Store(server.store_settings('thor'), UploadSettings())
+    store.open()
+    try:
+        store.probe()
+        item = _object(tmp_path, 'thor/camera/a.txt', b'one')
+        assert store.put(item) is Put.CREATED
+        assert store.put(item) is Put.IDENTICAL
+        with pytest.raises(ForeignObject):
+            store.put(_object(tmp_path, 'thor/camera/a.txt', b'two'))
+        info = store.head('sensor-data', 'thor/camera/a.txt')
+        assert info
+        assert info.sha256 == item.sha256
+        assert store.head('sensor-data', 'thor/camera/none.txt') is None
+        with pytest.raises(AccessDenied):
+            store.put(_object(tmp_path, 'tachi/camera/a.txt', b'one'))
+    finally:
+        store.close()
+
+
+def test_a_robot_cannot_delete(as_user: Connect) -> None:
+    """Neither one object, nor many at once, nor a version; and it cannot lift the rule."""
+    thor = as_user('thor')
+    thor.put_object(Bucket='sensor-data', Key='thor/keep', Body=b'one')
+    version = as_user('tower').list_object_versions(Bucket='sensor-data', Prefix='thor/keep')['Versions'][0]['VersionId']
+    assert _is_denied(thor.delete_object, Bucket='sensor-data', Key='thor/keep')
+    assert _is_denied(thor.delete_object, Bucket='sensor-data', Key='thor/keep', VersionId=version)
+    answer = thor.delete_objects(Bucket='sensor-data', Delete={'Objects': [{'Key': 'thor/keep'}]})
+    assert not answer.get('Deleted')
+    assert _is_denied(thor.delete_bucket_policy, Bucket='sensor-data')
+    assert _is_denied(thor.put_bucket_policy, Bucket='sensor-data', Policy='{"Version": "2012-10-17", "Statement": []}')
+    rules = {'Rules': [{'ID': 'x', 'Status': 'Enabled', 'Filter': {'Prefix': ''}, 'Expiration': {'Days': 1}}]}
+    assert _is_denied(thor.put_bucket_lifecycle_configuration, Bucket='sensor-data', LifecycleConfiguration=rules)
+    assert _is_denied(thor.put_bucket_versioning, Bucket='sensor-data', VersioningConfiguration={'Status': 'Suspended'})
+    assert as_user('spark').get_object(Bucket='sensor-data', Key='thor/keep')['Body'].read() == b'one'
+
+
+def test_what_a_robot_replaces_is_kept(as_user: Connect) -> None:
+    """The server cannot refuse a PUT without a condition, but the first version stays, and the robot cannot remove it."""
+    thor, tower = as_user('thor'), as_user('tower')
+    thor.put_object(Bucket='trajectories', Key='thor/path.csv', Body=b'one')
+    thor.put_object(Bucket='trajectories', Key='thor/path.csv', Body=b'two')
+    versions = tower.list_object_versions(Bucket='trajectories', Prefix='thor/path.csv')['Versions']
+    first = next(version['VersionId'] for version in versions if not version['IsLatest'])
+    assert _is_denied(thor.delete_object, Bucket='trajectories', Key='thor/path.csv', VersionId=first)
+    assert tower.get_object(Bucket='trajectories', Key='thor/path.csv', VersionId=first)['Body'].read() == b'one'
+
+
+def test_a_robot_sees_nothing_but_its_own(as_user: Connect) -> None:
+    """It can neither read, write, copy nor list what belongs to others, nor make a bucket."""
+    as_user('tachi').put_object(Bucket='sensor-data', Key='tachi/secret', Body=b'one')
+    thor = as_user('thor')
+    assert _is_denied(thor.get_object, Bucket='sensor-data', Key='tachi/secret')
+    assert _is_denied(thor.put_object, Bucket='sensor-data', Key='tachi/other', Body=b'two')
+    assert _is_denied(thor.copy_object, Bucket='sensor-data', Key='thor/copy', CopySource='sensor-data/tachi/secret')
+    assert _is_denied(thor.list_objects_v2, Bucket='sensor-data')
+    assert _is_denied(thor.put_object, Bucket='mlflow', Key='thor/x', Body=b'two')
+    assert _is_denied(thor.get_object, Bucket='lerobot', Key='thor/x')
+    assert _is_denied(thor.create_bucket, Bucket='thors-own')
+
+
+def test_spark_reads_everything_and_changes_nothing(as_user: Connect) -> None:
+    """It lists and reads all buckets, and can neither write nor delete."""
+    as_user('thor').put_object(Bucket='sensor-data', Key='thor/for-spark', Body=b'one')
+    spark = as_user('spark')
+    listed = [entry['Key'] for entry in spark.list_objects_v2(Bucket='sensor-data', Prefix='thor/for-spark')['Contents']]
+    assert listed == ['thor/for-spark']
+    assert spark.get_object(Bucket='sensor-data', Key='thor/for-spark')['Body'].read() == b'one'
+    assert _is_denied(spark.put_object, Bucket='sensor-data', Key='thor/x', Body=b'two')
+    assert _is_denied(spark.delete_object, Bucket='sensor-data', Key='thor/for-spark')
+    assert {bucket['Name'] for bucket in spark.list_buckets()['Buckets']} == {'sensor-data', 'trajectories', 'lerobot', 'mlflow'}
+
+
+def test_mlflow_has_its_bucket_alone(as_user: Connect) -> None:
+    """It reads, writes and deletes artifacts, and nothing else."""
+    mlflow = as_user('mlflow')
+    mlflow.put_object(Bucket='mlflow', Key='1/a', Body=b'one')
+    mlflow.delete_object(Bucket='mlflow', Key='1/a')
+    assert _is_denied(mlflow.list_objects_v2, Bucket='sensor-data')
+
+
+def test_preparing_again_does_no_harm(server: Tower, as_user: Connect, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A second run leaves the data, and the robots are those of the file that make_secrets.py writes."""
+    as_user('thor').put_object(Bucket='sensor-data', Key='thor/stays', Body=b'one')
+    for name, value in server.environment().items():
+        monkeypatch.setenv(name, value)
+    make_secrets.make(tmp_path, None, ['thor', 'tachi'])
+    assert prepare.robots_of(tmp_path / 'secrets' / 'users.json') == ['thor', 'tachi']
+    assert prepare.main(['--users', str(tmp_path / 'secrets' / 'users.json')]) == 0
+    assert _is_denied(as_user('tachi').delete_object, Bucket='sensor-data', Key='tachi/any')
+    rules = as_user('tower').get_bucket_lifecycle_configuration(Bucket='sensor-data')['Rules']
+    assert {rule['ID'] for rule in rules} == {'unfinished-uploads', 'old-versions'}

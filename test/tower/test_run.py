@@ -1,0 +1,124 @@
+"""A Tower of plain processes: all of it answers, a key is changed while it runs, and nothing is left behind."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import boto3
+import pytest
+from botocore.exceptions import ClientError
+from tower_scripts import TOWER, make_secrets
+
+pytestmark = [
+    pytest.mark.seaweedfs,
+    pytest.mark.skipif('SHADOWHOUND_TEST_LONG' not in os.environ, reason='half a minute: set SHADOWHOUND_TEST_LONG=1'),
+]
+START_S: Final = 120.0
+PORTS: Final = (9000, 5001, 5432, 9333, 8080, 8888, 23646)
+
+
+@pytest.fixture(scope='module')
+def offset() -> int:
+    """Something to add to all ports so that none of them is taken."""
+    for number in random.sample(range(500, 3000), 50):
+        sockets = [socket.socket() for _ in PORTS]
+        try:
+            for one, port in zip(sockets, PORTS, strict=True):
+                one.bind(('127.0.0.1', port + number))
+            return number
+        except OSError:
+            continue
+        finally:
+            for one in sockets:
+                one.close()
+    raise AssertionError('no free ports')
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory: pytest.TempPathFactory, offset: int) -> Iterator[Path]:
+    """Of a Tower that runs."""
+    folder = tmp_path_factory.mktemp('plain')
+    command = [sys.executable, str(TOWER / 'run.py'), '--folder', str(folder), '--offset', str(offset)]
+    with (folder / 'log').open('w', encoding='utf-8') as log, subprocess.Popen(command, stdout=log, stderr=log) as tower:
+        try:
+            _until(lambda: 'credentials' in (folder / 'log').read_text() or tower.poll() is not None, START_S)
+            assert tower.poll() is None, (folder / 'log').read_text()
+            yield folder
+        finally:
+            tower.send_signal(signal.SIGTERM)
+            assert tower.wait(60) == 0
+    _until(lambda: not _processes(folder), 10)
+
+
+def _until(ready: Callable[[], bool], seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while not ready():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def _processes(folder: Path) -> list[int]:
+    """Those whose command line names the folder."""
+    found: list[int] = []
+    for entry in Path('/proc').iterdir():
+        try:
+            if entry.name.isdigit() and str(folder) in (entry / 'cmdline').read_text():
+                found.append(int(entry.name))
+        except OSError:
+            continue
+    return found
+
+
+def _works(folder: Path, offset: int, key: dict[str, str]) -> bool:
+    s3 = boto3.client('s3', endpoint_url=f'http://127.0.0.1:{9000 + offset}', aws_access_key_id=key['accessKey'],
+                      aws_secret_access_key=key['secretKey'], region_name='us-east-1')  # fmt: skip
+    try:
+        s3.put_object(Bucket='sensor-data', Key='thor/probe', Body=b'1')
+    except ClientError:
+        return False
+    return True
+
+
+def test_artifacts_go_through_mlflow_to_the_store(folder: Path, offset: int) -> None:
+    """What is put to MLflow's artifact service lies in the bucket mlflow; the sender needs no key for it."""
+    url = f'http://127.0.0.1:{5001 + offset}/api/2.0/mlflow-artifacts/artifacts/1/hello.txt'
+    request = urllib.request.Request(url, data=b'hello', method='PUT')
+    with urllib.request.urlopen(request, timeout=60) as answer:  # noqa: S310 - http, by us
+        assert answer.status == 200
+    key = make_secrets.load_users(folder / 'secrets' / 'users.json')['tower'][0]
+    s3: Any = boto3.client('s3', endpoint_url=f'http://127.0.0.1:{9000 + offset}', aws_access_key_id=key['accessKey'],
+                           aws_secret_access_key=key['secretKey'], region_name='us-east-1')  # fmt: skip
+    assert s3.get_object(Bucket='mlflow', Key='1/hello.txt')['Body'].read() == b'hello'
+
+
+def test_a_key_is_changed_while_it_runs(folder: Path, offset: int) -> None:
+    """After SIGHUP the new key works beside the old one, and once that is retired it does not work any more."""
+    users = folder / 'secrets' / 'users.json'
+    old = make_secrets.load_users(users)['thor'][0]
+    assert _works(folder, offset, old)
+    make_secrets.make(folder, None, [], rotate=['thor'])
+    new = make_secrets.load_users(users)['thor'][0]
+    assert not _works(folder, offset, new)
+    _reload(folder)
+    _until(lambda: _works(folder, offset, new), 20)
+    assert _works(folder, offset, old)
+    make_secrets.make(folder, None, [], retire=['thor'])
+    _reload(folder)
+    _until(lambda: not _works(folder, offset, old), 20)
+    assert _works(folder, offset, new)
+
+
+def _reload(folder: Path) -> None:
+    for number in _processes(folder):
+        if Path(f'/proc/{number}/cmdline').read_text().partition('\0')[0].endswith('weed'):
+            os.kill(number, signal.SIGHUP)

@@ -1,0 +1,164 @@
+#!/usr/bin/env python3
+"""Makes the credentials of a Tower, once, in files that their owner alone can read; the standard library is all it needs.
+
+    .env                  what compose.yaml and run.py read: passwords, the address to listen on
+    secrets/users.json    the S3 users, their keys (the newest first) and what they may do: the one place where keys stand
+    secrets/s3.json       the same as SeaweedFS reads it
+    secrets/NAME.env      what a robot or Spark puts into its environment: copy it there, mode 600
+
+What is there already stays: running it again adds what is missing. ``--rotate NAME`` gives a user a new key beside the old one,
+so that nothing stops; ``--retire NAME`` ends the old one once the new one is in use.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import secrets
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+READ_BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
+ROBOT_BUCKETS = ('sensor-data', 'trajectories')
+ADMIN = ('Admin', 'Read', 'Write', 'List', 'Tagging')
+NAME = re.compile(r'[a-z0-9][a-z0-9_-]{0,62}')
+"""A robot's name leads its keys, and is part of a pattern here: no wildcard may be in it."""
+OWN_USERS = ('tower', 'mlflow', 'spark')
+
+
+class Refused(Exception):
+    """An argument cannot be followed; the text says why."""
+
+
+def actions(user: str) -> list[str]:
+    """What a user may do, in SeaweedFS's words (https://github.com/seaweedfs/seaweedfs/wiki/Amazon-S3-API)."""
+    if user == 'tower':
+        return list(ADMIN)
+    if user == 'mlflow':
+        return [f'{action}:mlflow' for action in ('Read', 'Write', 'List', 'Tagging')]
+    if user == 'spark':
+        return [f'{action}:{bucket}' for bucket in READ_BUCKETS for action in ('Read', 'List')]
+    return [f'{action}:{bucket}/{user}/*' for bucket in ROBOT_BUCKETS for action in ('Read', 'Write')]
+
+
+def new_key() -> dict[str, str]:
+    """An access key of 20 characters and a secret of 256 bits."""
+    return {'accessKey': secrets.token_hex(10).upper(), 'secretKey': secrets.token_urlsafe(32)}
+
+
+def write(path: Path, text: str) -> None:
+    """Under its name only when it is whole, and never readable by others, not even for an instant."""
+    part = path.with_name(f'{path.name}.part')
+    part.unlink(missing_ok=True)
+    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), 'w', encoding='utf-8') as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def read_env(path: Path) -> dict[str, str]:
+    """NAME=value lines; empty without a file."""
+    if not path.is_file():
+        return {}
+    lines = (line.partition('=') for line in path.read_text(encoding='utf-8').splitlines() if '=' in line and line[:1] != '#')
+    return {name.strip(): value.strip() for name, _, value in lines}
+
+
+def load_users(path: Path) -> dict[str, list[dict[str, str]]]:
+    """User -> keys, the newest first."""
+    if not path.is_file():
+        return {}
+    found: dict[str, list[dict[str, str]]] = json.loads(path.read_text(encoding='utf-8'))
+    return found
+
+
+def seaweed(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
+    """The identities as ``weed s3 -config`` reads them."""
+    identities = [{'name': user, 'credentials': list(keys), 'actions': actions(user)} for user, keys in users.items()]
+    return json.dumps({'identities': identities}, indent=1) + '\n'
+
+
+def environment(user: str, key: Mapping[str, str], host: str, scheme: str) -> str:
+    """What a machine needs to reach this Tower as this user, for a shell and for systemd's EnvironmentFile alike."""
+    store = f'{scheme}://{host}:9000'
+    values = {
+        'AWS_ENDPOINT_URL': store, 'AWS_ACCESS_KEY_ID': key['accessKey'], 'AWS_SECRET_ACCESS_KEY': key['secretKey'],
+        'AWS_DEFAULT_REGION': 'us-east-1', 'MLFLOW_TRACKING_URI': f'{scheme}://{host}:5001', 'MLFLOW_S3_ENDPOINT_URL': store,
+    }  # fmt: skip
+    if user not in OWN_USERS:
+        values['SHADOWHOUND_ROBOT'] = user
+    return ''.join(f'{name}={value}\n' for name, value in values.items())
+
+
+def own_settings(folder: Path, host: str | None, users: Mapping[str, Sequence[Mapping[str, str]]]) -> dict[str, str]:
+    """What the servers themselves need; passwords that exist stay."""
+    before = read_env(folder / '.env')
+    tower, mlflow = users['tower'][0], users['mlflow'][0]
+    return {
+        'TOWER_HOST': host or before.get('TOWER_HOST') or '127.0.0.1',
+        'TOWER_SCHEME': before.get('TOWER_SCHEME') or 'http',
+        'POSTGRES_PASSWORD': before.get('POSTGRES_PASSWORD') or secrets.token_hex(24),
+        'TOWER_ACCESS_KEY_ID': tower['accessKey'], 'TOWER_SECRET_ACCESS_KEY': tower['secretKey'],
+        'MLFLOW_ACCESS_KEY_ID': mlflow['accessKey'], 'MLFLOW_SECRET_ACCESS_KEY': mlflow['secretKey'],
+    }  # fmt: skip
+
+
+def make(
+    folder: Path, host: str | None, robots: Sequence[str], rotate: Sequence[str] = (), retire: Sequence[str] = ()
+) -> list[str]:
+    """Write all files anew from what is there and what is asked for; returns the users. Raises Refused for a bad name."""
+    hidden = folder / 'secrets'
+    hidden.mkdir(mode=0o700, parents=True, exist_ok=True)
+    hidden.chmod(0o700)
+    users = load_users(hidden / 'users.json')
+    for name in robots:
+        if not NAME.fullmatch(name):
+            raise Refused(f'{name!r} is no name for a robot: lower-case letters, digits, "-" and "_"')
+    for name in dict.fromkeys((*OWN_USERS, *robots)):
+        users.setdefault(name, [new_key()])
+    for name in (*rotate, *retire):
+        if name not in users:
+            raise Refused(f'there is no user {name}; there are {", ".join(users)}')
+    for name in rotate:
+        users[name].insert(0, new_key())
+    for name in retire:
+        del users[name][1:]
+    settings = own_settings(folder, host, users)
+    write(hidden / 'users.json', json.dumps(users, indent=1) + '\n')
+    write(hidden / 's3.json', seaweed(users))
+    write(folder / '.env', ''.join(f'{name}={value}\n' for name, value in settings.items()))
+    for name, keys in users.items():
+        write(hidden / f'{name}.env', environment(name, keys[0], settings['TOWER_HOST'], settings['TOWER_SCHEME']))
+    return list(users)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description='Make the credentials of a Tower. What is there already stays.')
+    parser.add_argument('--folder', type=Path, default=HERE, help='where .env and secrets/ go (default: beside this script)')
+    parser.add_argument('--host', help='the address that Thor and Spark reach this Tower at; without one it listens on 127.0.0.1')
+    parser.add_argument(
+        '--robot', action='append', default=[], metavar='NAME', help='a robot (default: thor); more than one allowed'
+    )
+    parser.add_argument('--rotate', action='append', default=[], metavar='USER', help='a new key beside the old one')
+    parser.add_argument('--retire', action='append', default=[], metavar='USER', help='only the newest key stays')
+    options: Any = parser.parse_args(arguments)
+    try:
+        users = make(options.folder, options.host, options.robot or ['thor'], options.rotate, options.retire)
+    except (Refused, OSError, ValueError) as error:
+        print(f'make_secrets: {error}', file=sys.stderr)
+        return 2
+    print(f'users {", ".join(users)}: {options.folder / "secrets"}/NAME.env is what each puts into its environment (mode 600)')
+    if options.rotate or options.retire:
+        print('the S3 server reads it on SIGHUP: docker compose kill -s HUP s3')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

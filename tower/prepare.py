@@ -1,0 +1,134 @@
+#!/usr/bin/env python3
+"""Prepares a Tower's S3 server: its buckets, and that a robot's keys can neither delete nor replace what they stored.
+
+It needs boto3 alone, takes AWS_ENDPOINT_URL and the keys of the user ``tower`` from the environment, and can be run again at any
+time. Replacing: SeaweedFS knows no condition that could refuse a PUT without If-None-Match, so versions are kept: the first
+one stays below a second one, and a robot may delete neither. What a server refuses of this is said, and is no failure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import boto3
+from botocore.config import Config
+from botocore.exceptions import BotoCoreError, ClientError
+
+BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
+ROBOT_BUCKETS = ('sensor-data', 'trajectories')
+OWN_USERS = ('tower', 'mlflow', 'spark')
+ACCOUNT = '000000000000'
+"""Of every user of a SeaweedFS server, in a policy's ARN."""
+OLD_VERSION_DAYS = 30
+UNFINISHED_DAYS = 7
+"""A robot that stays away for longer begins a large upload anew."""
+
+
+def policy(bucket: str, robots: Sequence[str]) -> str:
+    """These users may not delete, whatever their actions say: SeaweedFS's ``Write`` includes it."""
+    return json.dumps({
+        'Version': '2012-10-17',
+        'Statement': [{
+            'Sid': 'RobotsDoNotDelete',
+            'Effect': 'Deny',
+            'Principal': {'AWS': [f'arn:aws:iam::{ACCOUNT}:user/{name}' for name in robots]},
+            'Action': ['s3:DeleteObject', 's3:DeleteObjectVersion'],
+            'Resource': [f'arn:aws:s3:::{bucket}/*'],
+        }],
+    })  # fmt: skip
+
+
+def rules(bucket: str) -> dict[str, Any]:
+    """Parts of uploads that were never finished go, and so do versions that were replaced long ago."""
+    everything = {'Filter': {'Prefix': ''}, 'Status': 'Enabled'}
+    found = [
+        {'ID': 'unfinished-uploads', 'AbortIncompleteMultipartUpload': {'DaysAfterInitiation': UNFINISHED_DAYS}, **everything}
+    ]
+    if bucket in ROBOT_BUCKETS:
+        found += [{'ID': 'old-versions', 'NoncurrentVersionExpiration': {'NoncurrentDays': OLD_VERSION_DAYS}, **everything}]
+    return {'Rules': found}
+
+
+def robots_of(users: Path) -> list[str]:
+    """The users of a users.json that are robots."""
+    return [name for name in json.loads(users.read_text(encoding='utf-8')) if name not in OWN_USERS]
+
+
+def connect() -> Any:
+    """An S3 client that waits for no one for long."""
+    settings = Config(connect_timeout=3, read_timeout=15, retries={'total_max_attempts': 2}, s3={'addressing_style': 'path'})
+    return boto3.client('s3', endpoint_url=os.environ['AWS_ENDPOINT_URL'], region_name='us-east-1', config=settings)
+
+
+def wait(s3: Any, seconds: float) -> None:
+    """Until the server answers; raises what it said last."""
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            s3.list_buckets()
+        except (BotoCoreError, ClientError):
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.5)
+        else:
+            return
+
+
+def prepare(s3: Any, robots: Sequence[str]) -> list[str]:
+    """Make it so; returns a sentence for each thing that the server does not do. Raises ClientError when there are no buckets."""
+    missing: list[str] = []
+    present = {bucket['Name'] for bucket in s3.list_buckets()['Buckets']}
+    for bucket in BUCKETS:
+        if bucket not in present:
+            s3.create_bucket(Bucket=bucket)
+        steps = {'lifecycle rules': partial(s3.put_bucket_lifecycle_configuration, LifecycleConfiguration=rules(bucket))}
+        if bucket in ROBOT_BUCKETS:
+            steps['versions'] = partial(s3.put_bucket_versioning, VersioningConfiguration={'Status': 'Enabled'})
+            steps['a policy against deleting'] = partial(s3.put_bucket_policy, Policy=policy(bucket, robots))
+        for what, step in steps.items():
+            try:
+                step(Bucket=bucket)
+            except ClientError as error:
+                missing.append(f'{bucket}: the server does not take {what}: {error.response["Error"].get("Code")}')
+    return missing
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description="Prepare a Tower's S3 server: buckets, versions, policy, lifecycle.")
+    parser.add_argument(
+        '--robot', action='append', default=[], metavar='NAME', help='a robot that must not delete (default: thor)'
+    )
+    parser.add_argument('--users', type=Path, metavar='FILE', help='take the robots from users.json of make_secrets.py')
+    parser.add_argument('--wait', type=float, default=60.0, metavar='S', help='how long to wait for the server')
+    options = parser.parse_args(arguments)
+    if not os.environ.get('AWS_ENDPOINT_URL'):
+        print('prepare: AWS_ENDPOINT_URL is not set', file=sys.stderr)
+        return 2
+    try:
+        robots = options.robot or (robots_of(options.users) if options.users else ['thor'])
+        s3 = connect()
+        wait(s3, options.wait)
+        missing = prepare(s3, robots)
+    except (OSError, ValueError) as error:
+        print(f'prepare: {options.users}: {error}', file=sys.stderr)
+        return 2
+    except (BotoCoreError, ClientError) as error:
+        print(f'prepare: {os.environ["AWS_ENDPOINT_URL"]}: {error}', file=sys.stderr)
+        return 1
+    for text in missing:
+        print(f'prepare: {text}', file=sys.stderr)
+    print(f'prepared: {", ".join(BUCKETS)}')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
