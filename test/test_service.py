@@ -13,7 +13,7 @@ import pytest
 from shadowhound_data_logger.options import ShutdownSettings
 
 ROOT = Path(__file__).resolve().parents[1]
-UNIT = ROOT / 'launch_configs' / 'shadowhound-logger.service'
+UNIT = ROOT / 'launch_configs' / 'shadowhound-data-logger.service'
 CLOSE_S = 5.0
 """What capture/pipeline.py allows for making durable what is in memory."""
 

@@ -110,7 +110,11 @@ class Pipeline:
         opened.callback(self._diagnostics.close)
         self.control.open()
         opened.callback(self.control.close)
-        log.info('logging %s to %s, spool %s', ' '.join(self.intake.topics), self._store.describe(), self.spool.root)
+        log.info(self.describe())
+
+    def describe(self) -> str:
+        """What goes where, in one line."""
+        return f'logging {" ".join(self.intake.topics)} to {self._store.describe()}, spool {self.spool.root}'
 
     def close(self) -> None:
         """Close the open batches, make all durable, deliver for at most ``shutdown.drain_s``, leave the rest in the spool."""

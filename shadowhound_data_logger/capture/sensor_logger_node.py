@@ -24,6 +24,7 @@ from rclpy.utilities import remove_ros_args
 from shadowhound_data_logger.capture.log_bridge import RosHandler
 from shadowhound_data_logger.capture.parameters import Parameters
 from shadowhound_data_logger.capture.pipeline import Pipeline
+from shadowhound_data_logger.capture.service import Service
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
 
 USAGE = """\
@@ -107,9 +108,11 @@ def main(args: list[str] | None = None) -> int:
 
 def run(node: Node, stop: StopSignals) -> None:
     """Log until a signal comes."""
+    service = Service(os.environ)
     parameters = Parameters(node)
     pipeline = Pipeline(node, parameters.load())
     pipeline.open()
+    service.ready(pipeline.describe())
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
@@ -118,7 +121,9 @@ def run(node: Node, stop: StopSignals) -> None:
             if settings := parameters.changed():
                 pipeline.apply(settings)
             pipeline.tick()
+            service.alive()
     finally:
+        service.stopping()
         node.get_logger().info('closing: open batches are finished and delivered')
         pipeline.close()
         executor.shutdown()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import struct
 import time
 from collections.abc import Callable
@@ -42,6 +43,21 @@ def test_a_signal_closes_the_open_batches(
     assert ledger['topics']['/talk']['open'] == 0
     assert ledger['topics']['/talk']['stored_in']['delivered'] == COUNT
     assert stored(processes.robot).numbers('talk') == list(range(COUNT))
+
+
+def test_systemd_knows_how_it_is(processes: Processes, seaweed: Tower, tmp_path: Path) -> None:
+    """As a service it says when it is ready, that it lives, and that it stops."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / 'notify'))
+        systemd.settimeout(60.0)
+        watched = {'NOTIFY_SOCKET': str(tmp_path / 'notify'), 'WATCHDOG_USEC': '1500000'}
+        node = processes.node({**seaweed.environment(), **watched}, TALK)
+        assert systemd.recv(1000).decode().startswith('READY=1\nSTATUS=logging /talk to the S3 server')
+        assert [systemd.recv(1000) for _ in range(2)] == [b'WATCHDOG=1'] * 2
+        node.stop()
+        said = [systemd.recv(1000)]
+        while not said[-1].startswith(b'STOPPING=1'):
+            said.append(systemd.recv(1000))
 
 
 def test_what_is_left_is_delivered_by_the_next_start(
