@@ -82,3 +82,15 @@ class TrackingUnavailable(TrackingError):
 
 class TrackingRefused(TrackingError):
     """Terminal for what was sent: the server will never take it."""
+
+
+class BagError(DataLoggerError):
+    """A bag, or a file that should be one, does not allow what is asked."""
+
+
+class BagDamaged(BagError):
+    """A file of a bag is not whole, or its content contradicts itself; ``data['path']`` names it."""
+
+
+class LakeError(DataLoggerError):
+    """What was asked of the catalogue cannot be answered: a question that is none, or a catalogue that contradicts itself."""

@@ -16,6 +16,17 @@ class Sample(NamedTuple):
     cdr: bytes
 
 
+class Taken(NamedTuple):
+    """A serialized message with what the middleware knows of it; None where it does not say."""
+
+    cdr: bytes
+    source_ns: int
+    publisher: str | None
+    number: int | None
+    received_ns: int = 0
+    """When the middleware of this machine had it, Unix nanoseconds; 0 where it does not say."""
+
+
 @dataclass(frozen=True, slots=True)
 class Batch:
     """The samples of one sensor that become one object; ``samples`` is never empty and of one type."""
@@ -29,13 +40,30 @@ class Batch:
 
 
 @dataclass(frozen=True, slots=True)
+class FileBody:
+    """A finished file, synced by its writer, as the content of an object: the spool takes it over without reading it.
+
+    It has to be closed for good. Where ``path`` is on the spool's file system it is linked, else copied; it is removed once
+    the object is durable, and stays where that never happened.
+    """
+
+    path: Path
+    size: int
+    sha256: str
+    """Lower-case hex of the content."""
+
+    def __len__(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, slots=True)
 class DataObject:
     """A finished object on its way into the spool: where it wants to go, its bytes, and what it is."""
 
     bucket: str
     key: str
     """The wanted key; the spool makes it unique (``_1``, ``_2``, ...)."""
-    body: bytes
+    body: bytes | FileBody
     content_type: str
     sensor: str
     topic: str | None
@@ -52,8 +80,14 @@ class DataObject:
     """Why it has no final name yet; None when it may be shipped."""
     metadata: Mapping[str, str] = field(default_factory=dict)
     """Further S3 user metadata: lower-case names, printable ASCII values."""
+    counts: Mapping[str, int] = field(default_factory=dict)
+    """Messages by account (``spool.accounts``) of an object that holds those of several; ``topic`` is None then."""
+    dedup: bool = False
+    """Not stored where its content is that of the object which its sensor stored before it (``spool.repeats``)."""
     key_pattern: str | None = None
     """The wanted key with its time left open (``keys.dated``), should that not be known yet."""
+    catalogues: tuple[int, ...] = ()
+    """A part of the catalogue: the ids of the objects that it has rows of. It is left out where another part has one of them."""
 
 
 class State(str, Enum):

@@ -1,5 +1,7 @@
 """All messages of a batch in one zip or tar: a file for each message, and beside it a JSON with what is known of it.
 
+With ``dedup`` a file equal to the one before it is left out: its JSON stays, and ``repeat_of`` in it names the file.
+
 The names are WebDataset's: files of one sample share their name up to the first dot and follow each other
 (https://github.com/webdataset/webdataset). Here that name is the message's time in ns since 1970: samples are in the order of
 time, and unlike those of other objects, unless two publishers share a stamp. The same batch gives the same bytes.
@@ -11,6 +13,7 @@ import tarfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from io import BytesIO
+from itertools import pairwise
 from typing import Final, NamedTuple
 from zipfile import ZIP_STORED, ZipFile, ZipInfo
 
@@ -57,7 +60,8 @@ def archive(pack: Callable[[Iterable[Member]], bytes], ext: str, content_type: s
         if not files:
             return None
         kept = tuple(sample for file in files for sample in file.kept)
-        return Payload(pack(_members(job, files)), kept, ext, content_type)
+        repeats = _repeats(files) if job.sensor.dedup else 0
+        return Payload(pack(_members(job, files)), kept, ext, content_type, {'repeats': repeats} if repeats else {})
 
     return encoder
 
@@ -66,18 +70,33 @@ def _members(job: Job, files: Sequence[Payload]) -> Iterator[Member]:
     """Each file and its JSON, in the order of time; a second message of the same time is numbered."""
     same: Counter[int] = Counter()
     has_header = job.types.has_header(job.batch.type)
-    for file in sorted(files, key=lambda file: file.kept[0].stamp_ns):
+    last, last_name = b'', ''
+    for file in _in_order(files):
         sample = file.kept[0]
         stamp_ns = sample.stamp_ns
         name = f'{stamp_ns:019d}' + (f'_{same[stamp_ns]}' if same[stamp_ns] else '')
         same[stamp_ns] += 1
-        yield Member(f'{name}.{file.ext}', stamp_ns, file.body)
-        yield Member(f'{name}.json', stamp_ns, _description(job, sample, file, has_header=has_header))
+        described = _description(job, sample, file, has_header=has_header)
+        if job.sensor.dedup and last_name and file.body == last:
+            described |= {'repeat_of': last_name}
+        else:
+            last, last_name = file.body, f'{name}.{file.ext}'
+            yield Member(last_name, stamp_ns, file.body)
+        yield Member(f'{name}.json', stamp_ns, orjson.dumps(described))
 
 
-def _description(job: Job, sample: Sample, file: Payload, *, has_header: bool) -> bytes:
+def _in_order(files: Sequence[Payload]) -> list[Payload]:
+    return sorted(files, key=lambda file: file.kept[0].stamp_ns)
+
+
+def _repeats(files: Sequence[Payload]) -> int:
+    """How many files are equal to the one before."""
+    return sum(one.body == next_one.body for one, next_one in pairwise(_in_order(files)))
+
+
+def _description(job: Job, sample: Sample, file: Payload, *, has_header: bool) -> dict[str, object]:
     frame = {'frame_id': header_frame_id(sample.cdr)} if has_header else {}
-    return orjson.dumps({'stamp_ns': sample.stamp_ns, **frame, 'topic': job.batch.topic, 'type': job.batch.type, **file.facts})
+    return {'stamp_ns': sample.stamp_ns, **frame, 'topic': job.batch.topic, 'type': job.batch.type, **file.facts}
 
 
 def pack_tar(members: Iterable[Member]) -> bytes:

@@ -86,6 +86,7 @@ def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, 
         t_start_ns=start_ns,
         t_end_ns=end_ns,
         priority=sensor.priority,
+        dedup=sensor.dedup,
         metadata={**{name: _text(fact) for name, fact in payload.facts.items()}, **metadata},
         key_pattern=pattern,
     )

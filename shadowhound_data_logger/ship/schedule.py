@@ -26,6 +26,8 @@ FRESH_PROBE_EVERY: Final = 16
 ENOUGH_S: Final = 0.5
 """Bodies under way for so long at the cap: another one would only make them slower, for round trips are shorter."""
 SHORTEST_REST_S: Final = 0.01
+LARGE_BYTES: Final = 4 << 20
+"""From here on an object keeps a thread for seconds or, over a slow link, minutes."""
 
 
 class Schedule:
@@ -231,8 +233,13 @@ class Schedule:
         return not outage or (self._ahead.has_looked_since(outage.retry_at) and not self._ahead.holds(item.bucket))
 
     def _has_room(self, item: SpooledObject) -> bool:
-        """Where a cap has enough to do, one thread is kept for what is more important than all that is under way."""
+        """Large objects have half of the threads, so that none of what is live waits for one of them to end.
+
+        Where a cap has enough to do, one thread is kept for what is more important than all that is under way.
+        """
         ours = [each for each, _ in self._in_flight.values()]
+        if item.size >= LARGE_BYTES and sum(each.size >= LARGE_BYTES for each in ours) >= max(self._threads // 2, 1):
+            return False
         if not ours or len(ours) + 1 < self._threads or sum(each.size for each in ours) <= self._bytes_in(ENOUGH_S):
             return True
         return item.priority < min(each.priority for each in ours)

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
+from shadowhound_data_logger.spool.account_rows import PublisherRow, Snapshot, TopicRow, Totals
 from shadowhound_data_logger.spool.span import Span
 
 PAUSED: Final = 'paused'
@@ -20,6 +21,12 @@ PAUSED: Final = 'paused'
 EXACT, REPORTED, RECEIVED_ONLY = 'exact', 'reported', 'received-only'
 GRADES: Final = (EXACT, REPORTED, RECEIVED_ONLY)
 """How good a topic's accounting is, best first; over several sessions the worst counts."""
+BAG: Final = 'bag:'
+"""Before the name of a topic: its account with the bags, a sink of its own. No name of ROS has a colon."""
+EVENT: Final = 'event:'
+"""The same with the bags of events."""
+SINKS: Final = (BAG, EVENT)
+"""What is open there is in files, which the next start finds."""
 TOPIC_WIDE: Final = ''
 """Instead of a publisher, for the span of a topic whose losses the middleware reports without saying whose they are."""
 
@@ -75,68 +82,20 @@ class TopicAccount:
             elif count:
                 self._span(TOPIC_WIDE).lose(count)
 
+    def find(self, count: int) -> None:
+        """Messages of the session before, of which its accounts did not know yet, turned up in a file of it."""
+        self.received += count
+        if self.accounting != RECEIVED_ONLY:
+            spans = list(self.publishers.values()) or [self._span(TOPIC_WIDE)]
+            for span in spans:
+                count -= span.find(count)
+            spans[-1].late(count)
+
     def _span(self, publisher: str) -> Span:
         span = self.publishers.get(publisher)
         if span is None:
             span = self.publishers[publisher] = Span()
         return span
-
-
-@dataclass(frozen=True, slots=True)
-class PublisherRow:
-    """A durable Span."""
-
-    topic: str
-    publisher: str
-    first: int | None
-    last: int | None
-    published: int
-    received: int
-    missed: Mapping[str, int]
-
-
-@dataclass(frozen=True, slots=True)
-class TopicRow:
-    """A durable TopicAccount."""
-
-    topic: str
-    type: str
-    accounting: str
-    received: int
-    skipped: int
-    stored: int
-    rejected: Mapping[str, int]
-    dropped: Mapping[str, int]
-    last_kept_ns: int
-
-    @property
-    def open(self) -> int:
-        return self.received - self.skipped - self.stored - sum(self.rejected.values()) - sum(self.dropped.values())
-
-
-@dataclass(frozen=True, slots=True)
-class Totals:
-    """A topic of this session at one instant, as sums."""
-
-    type: str
-    accounting: str
-    received: int
-    stored: int
-    skipped: int
-    rejected: int
-    dropped: int
-    """Without those of a pause, which somebody asked for."""
-    paused: int
-    missed: int | None
-    open: int
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """The accounts at one instant, as a group commit writes them."""
-
-    topics: tuple[TopicRow, ...]
-    publishers: tuple[PublisherRow, ...]
 
 
 class Accounts:
@@ -148,6 +107,7 @@ class Accounts:
         self._dirty = False
         self._written: list[Span] = []
         self._inherited: dict[str, dict[str, Span]] = {}
+        self._carried = Counter[str]()
         self._last_kept = dict(last_kept or {})
         for row in inherited:
             spans = self._inherited.setdefault(row.topic, {})
@@ -176,12 +136,43 @@ class Accounts:
                 account.stored += count
                 account.last_kept_ns = max(account.last_kept_ns, newest_ns)
 
+    def carry(self, rows: Iterable[TopicRow]) -> None:
+        """Take over what an earlier session left open (the commit that says so is the caller's): it may turn up in files."""
+        with self._lock:
+            for row in rows:
+                account = self._account(row.topic)
+                account.type, account.accounting = row.type, row.accounting
+                account.received += row.received
+                self._carried[row.topic] += row.received
+
+    def find(self, counts: Mapping[str, int]) -> None:
+        """Messages of an earlier session turned up in a file that is about to be spooled."""
+        with self._lock:
+            for topic, count in counts.items():
+                known = min(count, self._carried[topic])
+                self._carried[topic] -= known
+                if count > known:
+                    self._account(topic).find(count - known)
+                    self._dirty = True
+
+    def drop_carried(self, reason: str) -> int:
+        """What did not turn up is lost. Returns how many messages that are."""
+        with self._lock:
+            carried, self._carried = +self._carried, Counter()
+            for topic, count in carried.items():
+                self._account(topic).dropped[reason] += count
+                self._dirty = True
+            return carried.total()
+
     def drop_open(self, reason: str) -> int:
-        """At the end: whatever has no outcome yet will never have one. Returns how many messages that were."""
+        """At the end: whatever has no outcome yet will never have one. Returns how many messages that were.
+
+        Those of bags are in files, which the next start finds.
+        """
         with self._lock:
             lost = 0
-            for account in self._topics.values():
-                if account.open > 0:
+            for topic, account in self._topics.items():
+                if account.open > 0 and not topic.startswith(SINKS):
                     lost += account.open
                     account.dropped[reason] += account.open
                     self._dirty = True
@@ -200,15 +191,26 @@ class Accounts:
             for span in (account.publishers if account else self._inherited.get(topic, {})).values():
                 span.rebase()
 
-    def totals(self) -> dict[str, Totals]:
-        """Every topic of this session as it stands now."""
+    def rebase_all(self, sink: str) -> None:
+        """As ``rebase``, of every account whose name begins so."""
+        with self._lock:
+            for topic, account in self._topics.items():
+                if topic.startswith(sink):
+                    for span in account.publishers.values():
+                        span.rebase()
+            for topic, spans in self._inherited.items():
+                if topic.startswith(sink):
+                    for span in spans.values():
+                        span.rebase()
+
+    def totals(self, sink: str = '') -> dict[str, Totals]:
+        """Every topic of this session as it stands now; with ``sink`` (BAG, EVENT) what became of it there."""
         with self._lock:
             return {
-                topic: Totals(account.type, account.accounting, account.received, account.stored, account.skipped,
-                              account.rejected.total(), account.dropped.total() - (paused := account.dropped[PAUSED]), paused,
-                              account.missed, account.open)
+                topic.removeprefix(sink): _totals(account)
                 for topic, account in self._topics.items()
-            }  # fmt: skip
+                if (topic.startswith(sink) if sink else not topic.startswith(SINKS))
+            }
 
     def snapshot(self, stored: Mapping[str, tuple[int, int]]) -> Snapshot | None:
         """The state as it will be once ``stored`` is durable; None when nothing changed since the last one."""
@@ -254,3 +256,11 @@ class Accounts:
             topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
             dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
         )  # fmt: skip
+
+
+def _totals(account: TopicAccount) -> Totals:
+    paused = account.dropped[PAUSED]
+    return Totals(
+        account.type, account.accounting, account.received, account.stored, account.skipped, account.rejected.total(),
+        account.dropped.total() - paused, paused, account.missed, account.open,
+    )  # fmt: skip

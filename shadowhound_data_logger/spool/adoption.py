@@ -6,7 +6,6 @@ What a file says of itself is believed only as far as it makes sense; a file tha
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import sqlite3
@@ -17,15 +16,15 @@ from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_key, check_name
-from shadowhound_data_logger.model import DataObject, State
-from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY, Snapshot, TopicRow
-from shadowhound_data_logger.spool.files import Tree, description_of
+from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.spool.account_rows import Snapshot, TopicRow
+from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
+from shadowhound_data_logger.spool.files import Tree, description_of, fingerprint
 from shadowhound_data_logger.spool.index import MISSING, Index
 
 log = logging.getLogger(__name__)
 
 GROUP_FILES: Final = 256
-GROUP_BYTES: Final = 32 << 20
 """Files adopted in one transaction: one at a time, 100,000 of them would take minutes of syncing."""
 _IN_SPOOL: Final = frozenset({State.PENDING.value, State.HELD.value, State.QUARANTINED.value})
 _LARGEST: Final = (1 << 63) - 1
@@ -78,21 +77,20 @@ class Adoption:
             if row is not None and row[1] in _IN_SPOOL and row[2] != MISSING:
                 continue
             try:
-                body = path.read_bytes()
+                size, sha256 = fingerprint(path)
             except FileNotFoundError:
                 continue  # another process has delivered it meanwhile
             except OSError as error:
                 log.warning('cannot read %s: %s', path, error)
                 self._report.counts['unreadable files left alone'] += 1
                 continue
-            sha256 = hashlib.sha256(body).hexdigest()
             if row is not None:
                 self._known(row, sha256, path, self._tree.path(State.PENDING, None, bucket, key))
-            elif (item := _described(path, bucket, key, body, sha256)) is None:
+            elif (item := _described(bucket, key, FileBody(path, size, sha256))) is None:
                 self._foreign(path)
             else:
                 self._group.append(_Found(state, reason, item, sha256, path))
-                if len(self._group) >= GROUP_FILES or sum(len(found.item.body) for found in self._group) >= GROUP_BYTES:
+                if len(self._group) >= GROUP_FILES:
                     self._adopt()
         self._adopt()
 
@@ -136,8 +134,8 @@ class Adoption:
                     self._foreign(found.path)  # the same key lies in two folders: the first one counts
                     continue
                 self._index.insert(item, item.key, found.sha256, found.state, found.reason, item.metadata, self._now_ns)
-                if item.topic is not None:
-                    self._topics[item.topic] = _more(self._topics.get(item.topic), item.topic, item)
+                for account, count in {item.topic: item.samples}.items() if item.topic is not None else item.counts.items():
+                    self._topics[account] = _more(self._topics.get(account), account, count, item)
                 self._report.counts['files adopted'] += 1
             self._index.write(self._session, Snapshot(tuple(self._topics.values()), ()))
             self._index.end_session(self._session, self._now_ns)
@@ -148,7 +146,7 @@ def place_said(tree: Tree, part: Path) -> Path | None:
     """Where a part belongs by its own description; None when its content is not what that says, or the place is taken."""
     said = description_of(part)
     bucket, key, held = _word(said, 'bucket', ''), _word(said, 'key', ''), _word(said, 'held', '')
-    if not _can_be_named(bucket, key) or hashlib.sha256(part.read_bytes()).hexdigest() != said.get('sha256'):
+    if not _can_be_named(bucket, key) or fingerprint(part)[1] != said.get('sha256'):
         return None
     place = tree.path(State.HELD if held else State.PENDING, held, bucket, key)
     return None if os.path.lexists(place) else place
@@ -163,12 +161,12 @@ def _can_be_named(bucket: str, key: str) -> bool:
     return True
 
 
-def _described(path: Path, bucket: str, key: str, body: bytes, sha256: str) -> DataObject | None:
+def _described(bucket: str, key: str, body: FileBody) -> DataObject | None:
     """The object that a file says it is; None when its content is not what it says."""
-    said = description_of(path)
+    said, sha256 = description_of(body.path), body.sha256
     if _word(said, 'sha256', sha256) != sha256:
         return None
-    changed_ns = path.stat().st_mtime_ns
+    changed_ns = body.path.stat().st_mtime_ns
     metadata = said.get('metadata')
     words = metadata.items() if isinstance(metadata, dict) else ()
     return DataObject(
@@ -177,7 +175,7 @@ def _described(path: Path, bucket: str, key: str, body: bytes, sha256: str) -> D
         samples=_number(said, 'samples', 0), t_start_ns=_number(said, 't_start_ns', changed_ns),
         t_end_ns=_number(said, 't_end_ns', changed_ns), priority=min(_number(said, 'priority', 5), 9),
         protected=said.get('protected') is True,
-        metadata={**{name: value for name, value in words if isinstance(value, str)}, 'sha256': sha256},
+        metadata={**{name: value for name, value in words if isinstance(value, str)}, 'sha256': sha256}, counts=_counts(said),
     )  # fmt: skip
 
 
@@ -191,8 +189,16 @@ def _number(said: dict[str, Any], name: str, default: int) -> int:
     return value if type(value) is int and 0 <= value <= _LARGEST else default
 
 
-def _more(row: TopicRow | None, topic: str, item: DataObject) -> TopicRow:
-    """The topic's account with the samples of one more file."""
+def _counts(said: dict[str, Any]) -> dict[str, int]:
+    """By account; empty for an object of one topic."""
+    found = said.get('counts')
+    if not isinstance(found, dict) or _word(said, 'topic', ''):
+        return {}
+    return {name: _number(found, name, 0) for name in found if name and name.isprintable()}
+
+
+def _more(row: TopicRow | None, topic: str, samples: int, item: DataObject) -> TopicRow:
+    """The account with the samples of one more file."""
     count, newest_ns = (row.stored, row.last_kept_ns) if row else (0, 0)
-    count += item.samples
+    count += samples
     return TopicRow(topic, item.type, RECEIVED_ONLY, count, 0, count, {}, {}, max(newest_ns, item.t_end_ns))

@@ -17,7 +17,7 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.keys import check_key, unique
 from shadowhound_data_logger.model import Binding, HeldObject, SpooledObject, State
 from shadowhound_data_logger.spool.files import Tree, describe
-from shadowhound_data_logger.spool.index import Index, spooled
+from shadowhound_data_logger.spool.index import MISSING, Index, spooled
 
 
 def held(index: Index, reason: str, limit: int) -> list[HeldObject]:
@@ -65,6 +65,16 @@ def free_key(index: Index, bucket: str, wanted: str, own: str | None = None) -> 
     while index.has(bucket, key := unique(wanted, attempt)) and key != own:
         attempt += 1
     return key
+
+
+def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:
+    """Whether this content was given the wanted key, or one of its ``_1``, ``_2``, ..., and its file is not missing."""
+    attempt = 0
+    while rows := index.rows('bucket = ? AND key = ?', (bucket, unique(wanted, attempt))):
+        if rows[0]['sha256'] == sha256 and rows[0]['reason'] != MISSING:
+            return True
+        attempt += 1
+    return False
 
 
 def _row(index: Index, number: int) -> sqlite3.Row | None:

@@ -1,6 +1,7 @@
 """The spool's tree: where a file lies says what it is. ``ready/<bucket>/<key>`` can be rescued with ``aws s3 sync``.
 
     incoming/<id>.part                 written and synced, its row not yet committed or its rename not yet done
+    incoming/<session>-<any>.body      a whole file that is about to become a part (staging.py)
     ready/<bucket>/<key>               waits for delivery under its final name
     held/<reason>/<bucket>/<key>       has no final name yet
     quarantine/<reason>/<bucket>/<key> will not be delivered as it is
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import json
 import logging
 import os
@@ -23,7 +25,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.model import DataObject, State
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.model import DataObject, FileBody, State
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +38,9 @@ of the bytes, too.
 _UNSAFE: Final = re.compile(r'^\.+|[^A-Za-z0-9_.-]+')
 _PART: Final = re.compile(r'[1-9][0-9]{0,17}\.part')
 _SESSION: Final = re.compile(r'[1-9][0-9]{0,17}')
+_BODY: Final = re.compile(r'([1-9][0-9]{0,17})-[0-9a-f]{32}\.body')
+READ_BYTES: Final = 1 << 20
+"""Of a file at a time: it may be larger than the memory."""
 _FOLDERS: Final = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine'}
 
 
@@ -82,6 +88,19 @@ class Tree:
         except OSError:
             path.unlink(missing_ok=True)
             raise
+
+    def take_part(self, number: int, source: Path, said: Mapping[str, Any]) -> None:
+        """Make a whole and synced file of this file system the part; raises OSError, and the file may then still be there."""
+        path = self.part(number)
+        if os.path.lexists(path):
+            self.set_aside(path)
+        descriptor = os.open(source, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            describe(descriptor, said)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        os.replace(source, path)
 
     def sync_incoming(self) -> None:
         """Make the names of the written parts durable."""
@@ -147,6 +166,10 @@ class Tree:
             if _PART.fullmatch(path.name) and self.size(path) is not None:
                 yield int(path.stem), path
 
+    def staged(self) -> Iterator[tuple[int, Path]]:
+        """(session, path) of every file that is about to become a part."""
+        return ((int(found[1]), path) for path in sorted(self.incoming.iterdir()) if (found := _BODY.fullmatch(path.name)))
+
     def is_ready(self, bucket: str, key: str, size: int) -> bool:
         """Whether the file of a pending object lies whole in its place; without a Path, for a start asks it of each one."""
         try:
@@ -196,13 +219,38 @@ class Tree:
         return status.f_bavail * status.f_frsize
 
 
+def fingerprint(path: Path) -> tuple[int, str]:
+    """Bytes and SHA-256 (hex) of a file, read in bounded memory. Raises OSError."""
+    digest, size = hashlib.sha256(), 0
+    with path.open('rb', buffering=0) as file:
+        while chunk := file.read(READ_BYTES):
+            digest.update(chunk)
+            size += len(chunk)
+    return size, digest.hexdigest()
+
+
+def content_sha256(body: bytes | FileBody) -> str:
+    """Hex; that of a file is known."""
+    return hashlib.sha256(body).hexdigest() if isinstance(body, bytes) else body.sha256
+
+
+def facts(item: DataObject) -> dict[str, str]:
+    """What an object says of itself in the store, in its own words first: enough to make its row of the catalogue again."""
+    said = {'sensor': item.sensor}
+    if item.topic is not None:
+        said |= {'topic': item.topic, 'type': item.type, 'count': str(item.samples)}
+    if item.t_start_ns >= EARLIEST_SANE_NS:
+        said |= {'t_start_ns': str(item.t_start_ns), 't_end_ns': str(item.t_end_ns)}
+    return {**said, **item.metadata}
+
+
 def description(item: DataObject, key: str, sha256: str, metadata: Mapping[str, str]) -> dict[str, object]:
     """What a file must say of itself so that its row can be made again."""
     return {
         'bucket': item.bucket, 'key': key, 'sha256': sha256, 'content_type': item.content_type, 'sensor': item.sensor,
         'topic': item.topic, 'type': item.type, 'samples': item.samples, 't_start_ns': item.t_start_ns,
         't_end_ns': item.t_end_ns, 'priority': item.priority, 'protected': item.protected, 'held': item.held,
-        'metadata': dict(metadata),
+        'metadata': dict(metadata), **({'counts': dict(item.counts)} if item.counts else {}),
     }  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from typing import Final
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
-from shadowhound_data_logger.spool.accounts import PublisherRow, Snapshot, TopicRow
+from shadowhound_data_logger.spool.account_rows import PublisherRow, Snapshot, TopicRow
 from shadowhound_data_logger.spool.schema import definitions, expected, prepare
 
 FORGET_STEP: Final = 10_000
@@ -108,7 +108,11 @@ class Index:
              item.samples, len(item.body), sha256, item.content_type, json.dumps(dict(metadata)),
              item.t_start_ns, item.t_end_ns, now_ns),
         )  # fmt: skip
-        return int(cursor.lastrowid or 0)
+        number = int(cursor.lastrowid or 0)
+        if item.counts:
+            rows = ((number, account, count) for account, count in item.counts.items())
+            self.db.executemany('INSERT INTO contents VALUES (?,?,?)', rows)
+        return number
 
     def move(self, ids: Iterable[int], state: State, reason: str | None, now_ns: int) -> None:
         """Give objects another state; the totals follow.
@@ -188,11 +192,14 @@ class Index:
     def forget(self, before_ns: int) -> bool:
         """Drop rows of objects that left the spool before then, totals stay; False when there may be more of them.
 
+        What the catalogue has no row of yet stays as well.
+
         Rows of a time before the clock was set stay: the next boot may begin at that time again, and their keys are taken.
         """
         cursor = self.db.execute(
             "DELETE FROM objects WHERE id IN (SELECT id FROM objects WHERE state IN ('delivered', 'deduplicated', 'evicted')"
-            ' AND settled_ns BETWEEN ? AND ? LIMIT ?)', (EARLIEST_SANE_NS, before_ns, FORGET_STEP),
+            ' AND settled_ns BETWEEN ? AND ? AND id NOT IN (SELECT id FROM uncatalogued) LIMIT ?)',
+            (EARLIEST_SANE_NS, before_ns, FORGET_STEP),
         )  # fmt: skip
         return cursor.rowcount < FORGET_STEP
 

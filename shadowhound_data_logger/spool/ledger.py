@@ -11,7 +11,7 @@ from typing import Any, Final
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import clock_record
-from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
+from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY, SINKS
 from shadowhound_data_logger.spool.index import Index
 
 STATES: Final = tuple(state.value for state in State)
@@ -47,9 +47,13 @@ def of_index(index: Index, robot: str) -> dict[str, Any]:
         index.db.execute('COMMIT')
     names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
     accounts = {topic: _topic(topic, topics, publishers, tally) for topic in sorted(names)}
+    sensors = {topic: row for topic, row in accounts.items() if not topic.startswith(SINKS)}
+    bags, events = ({topic.removeprefix(sink): row for topic, row in accounts.items() if topic.startswith(sink)} for sink in SINKS)
     objects = {what: sum(row[2] for row in tally if row[1] == what) for what in ('spooled', *STATES)}
     volume = {what: sum(row[3] for row in tally if row[1] == what) for what in ('spooled', *STATES)}
-    ledger: dict[str, Any] = {'robot': robot, 'balanced': True, 'topics': accounts, 'objects': objects, 'bytes': volume}
+    ledger: dict[str, Any] = {
+        'robot': robot, 'balanced': True, 'topics': sensors, 'bags': bags, 'events': events, 'objects': objects, 'bytes': volume,
+    }  # fmt: skip
     ledger['balanced'] = not imbalances(ledger)
     return ledger
 
@@ -57,7 +61,8 @@ def of_index(index: Index, robot: str) -> dict[str, Any]:
 def imbalances(ledger: Mapping[str, Any]) -> list[str]:
     """One sentence for each identity that does not hold; empty when the ledger closes."""
     found: list[str] = []
-    for topic, row in ledger['topics'].items():
+    in_files = [(f'{topic} in {sink}', row) for sink in ('bags', 'events') for topic, row in ledger.get(sink, {}).items()]
+    for topic, row in (*ledger['topics'].items(), *in_files):
         settled = row['skipped'] + sum(row['rejected'].values()) + sum(row['dropped'].values()) + row['stored'] + row['open']
         if row['received'] != settled or row['open'] < 0:
             found.append(f'{topic}: received {row["received"]}, but skipped + rejected + dropped + stored + open = {settled}')

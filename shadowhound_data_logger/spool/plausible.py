@@ -16,6 +16,7 @@ _NUMBERS: Final = {
     'accounts': ('session', 'received', 'skipped', 'stored', 'last_kept_ns'),
     'publishers': ('session', 'first', 'last', 'published', 'received'),
     'tally': ('objects', 'bytes', 'samples'),
+    'contents': ('id', 'samples'),
     'sqlite_sequence': ('seq',),
 }
 _COUNTS: Final = frozenset({'id', 'samples', 'bytes', 'received', 'skipped', 'stored', 'published', 'objects', 'seq', 'session'})
@@ -27,6 +28,7 @@ _TEXTS: Final = {
     'accounts': ('topic', 'type', 'accounting', 'rejected', 'dropped'),
     'publishers': ('topic', 'publisher', 'missed'),
     'tally': ('topic', 'state'),
+    'contents': ('topic',),
     'sqlite_sequence': ('name',),
 }
 _JSON: Final = {'accounts': ('rejected', 'dropped'), 'publishers': ('missed',), 'objects': ('metadata',)}
@@ -37,7 +39,9 @@ _UNSAFE: Final = (
 )
 _IN_SPOOL: Final = """
 SELECT ifnull(topic, '') AS name, state, count(*), sum(bytes), sum(samples) FROM objects
-WHERE state IN ('pending', 'held', 'quarantined') GROUP BY name, state"""
+WHERE state IN ('pending', 'held', 'quarantined') GROUP BY name, state
+UNION ALL SELECT contents.topic, state, 0, 0, sum(contents.samples) FROM contents JOIN objects USING (id)
+WHERE state IN ('pending', 'held', 'quarantined') GROUP BY contents.topic, state HAVING sum(contents.samples)"""
 _TALLY: Final = """
 SELECT topic, state, objects, bytes, samples FROM tally
 WHERE state IN ('pending', 'held', 'quarantined') AND (objects OR bytes OR samples)"""
@@ -47,7 +51,7 @@ def check(db: sqlite3.Connection) -> None:
     """Raises sqlite3.DatabaseError for a value that cannot be."""
     for table in _NUMBERS:
         query = f'SELECT rowid FROM {table} WHERE {_wrong(table)} LIMIT 1'  # noqa: S608 - own constants only
-        if table in {'accounts', 'publishers', 'tally'}:  # these have no rowid
+        if table in {'accounts', 'publishers', 'tally', 'contents'}:  # these have no rowid
             query = query.replace('rowid', 'topic')
         found = db.execute(query).fetchone()
         if found is not None:
@@ -56,8 +60,12 @@ def check(db: sqlite3.Connection) -> None:
 
 def uncounted(db: sqlite3.Connection) -> Iterator[str]:
     """A sentence for each total that is not that of the objects in the spool."""
-    counted = {row[:2]: row[2:] for row in db.execute(_IN_SPOOL)}
-    said = {row[:2]: row[2:] for row in db.execute(_TALLY)}
+    db.execute('BEGIN')  # other processes commit meanwhile: both of one moment
+    try:
+        counted = {row[:2]: row[2:] for row in db.execute(_IN_SPOOL)}
+        said = {row[:2]: row[2:] for row in db.execute(_TALLY)}
+    finally:
+        db.execute('COMMIT')
     for what in sorted(counted.keys() | said.keys()):
         if counted.get(what) != said.get(what):
             yield f'{what[0] or "bookkeeping"}: {what[1]} {said.get(what)}, but in the spool {counted.get(what)}'

@@ -23,7 +23,8 @@ from typing import Final
 
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import plausible
-from shadowhound_data_logger.spool.accounts import Snapshot, TopicRow
+from shadowhound_data_logger.spool.account_rows import Snapshot, TopicRow
+from shadowhound_data_logger.spool.accounts import SINKS
 from shadowhound_data_logger.spool.adoption import Adoption, Recovery, place_said
 from shadowhound_data_logger.spool.ballast import says_full
 from shadowhound_data_logger.spool.binding import renew
@@ -103,6 +104,10 @@ def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery, *, has_log
     for session in set(tree.sessions()).difference(index.sessions(ended=False)):
         if _is_dead(tree, session):
             tree.remove(tree.session(session))
+    for session, body in tree.staged():
+        if _is_dead(tree, session):
+            tree.remove(body)
+            report.counts['files not committed'] += 1
     for sentence in imbalances(of_index(index, '')) or plausible.uncounted(index.db):
         log.error('the ledger of %s does not close, its index was damaged: %s', tree.root, sentence)
         report.counts['sums of the ledger that do not close'] += 1
@@ -188,6 +193,8 @@ def _settle_session(index: Index, session: int, now_ns: int, report: Recovery) -
     """Close the accounts of a process that died: what was open is lost, and the ledger says so."""
     rows: list[TopicRow] = []
     for row in index.topics(session):
+        if row.topic.startswith(SINKS):  # what is open there is in files, which the node looks for (Spool.carry)
+            continue
         dropped = {**row.dropped, 'restart': row.dropped.get('restart', 0) + row.open}
         rows.append(replace(row, dropped=dropped) if row.open else row)
         report.counts['messages lost with an open batch'] += row.open

@@ -10,7 +10,7 @@ from typing import Final
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.model import DataObject, State
+from shadowhound_data_logger.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 
@@ -42,7 +42,8 @@ def make_room(index: Index, tree: Tree, settings: SpoolSettings, objects: Sequen
     one of their own for each round.
     """
     needed = sum(map(_cost, objects))
-    if needed <= leaving or (over := _over(index, tree, settings, needed - leaving)) <= 0:
+    there = sum(len(item.body) for item in objects if isinstance(item.body, FileBody))
+    if needed <= leaving or (over := _over(index, tree, settings, needed - leaving, there)) <= 0:
         return Room()
     free, evictable = needed - over, index.evictable_bytes()
     taken, given_up = 0, set[int]()
@@ -55,14 +56,14 @@ def make_room(index: Index, tree: Tree, settings: SpoolSettings, objects: Sequen
             given_up.add(place)
     evicted = 0
     if taken and taken - free <= sum(evictable.values()):
-        evicted = _evict(index, tree, settings, taken - leaving, now_ns)
+        evicted = _evict(index, tree, settings, taken - leaving, there, now_ns)
     return Room(frozenset(given_up), evicted)
 
 
-def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, now_ns: int) -> int:
+def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, there: int, now_ns: int) -> int:
     """Evict the least important, of these the oldest, until ``needed`` bytes fit; returns how many objects that took."""
     evicted = 0
-    while (over := _over(index, tree, settings, needed)) > 0 and (rows := index.evictable(EVICTION_STEP)):
+    while (over := _over(index, tree, settings, needed, there)) > 0 and (rows := index.evictable(EVICTION_STEP)):
         count = 0
         while count < len(rows) and over > 0:
             over -= rows[count]['bytes']
@@ -80,9 +81,10 @@ def _cost(item: DataObject) -> int:
     return len(item.body) + OVERHEAD_BYTES
 
 
-def _over(index: Index, tree: Tree, settings: SpoolSettings, needed: int) -> int:
-    """Bytes too many with ``needed`` more, by the quota or by the file system, whichever is worse."""
-    return max(index.payload_bytes() + needed - settings.max_bytes, settings.min_free_bytes + needed - tree.free_bytes())
+def _over(index: Index, tree: Tree, settings: SpoolSettings, needed: int, there: int) -> int:
+    """Bytes too many with ``needed`` more, by quota or file system, whichever is worse; ``there`` lie in it already."""
+    free = tree.free_bytes() + there
+    return max(index.payload_bytes() + needed - settings.max_bytes, settings.min_free_bytes + needed - free)
 
 
 class Shortage:

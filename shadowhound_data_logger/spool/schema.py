@@ -10,7 +10,9 @@ from typing import Final
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 
-SCHEMA_VERSION: Final = 2
+SCHEMA_VERSION: Final = 3
+CATALOGUE: Final = '_catalog'
+"""The sensor of the catalogue's own objects, which have no rows in it."""
 VERSION_LIMIT: Final = 1000
 """A version from here on is damage, not a future."""
 _STATES: Final = ', '.join(f"'{state.value}'" for state in State)
@@ -20,6 +22,41 @@ CREATE INDEX waiting ON objects (bucket, id) WHERE state = 'pending';
 """
 """Each bucket in both orders: while one takes nothing, however much waits for it, the others are found as fast."""
 _BY_REASON: Final = "CREATE INDEX held ON objects (reason, id) WHERE state = 'held';"
+_ARRIVED: Final = f"state IN ('{State.DELIVERED.value}', '{State.DEDUPLICATED.value}')"
+_CATALOGUE: Final = f"""
+CREATE TABLE uncatalogued (id INTEGER PRIMARY KEY);
+CREATE TRIGGER arrived AFTER UPDATE OF state ON objects
+    WHEN NEW.{_ARRIVED} AND OLD.state <> NEW.state AND NEW.sensor <> '{CATALOGUE}' BEGIN
+  INSERT OR IGNORE INTO uncatalogued VALUES (NEW.id);
+END;
+CREATE TRIGGER known AFTER INSERT ON objects WHEN NEW.{_ARRIVED} AND NEW.sensor <> '{CATALOGUE}' BEGIN
+  INSERT OR IGNORE INTO uncatalogued VALUES (NEW.id);
+END;
+CREATE TRIGGER forgotten AFTER DELETE ON objects BEGIN
+  DELETE FROM uncatalogued WHERE id = OLD.id;
+END;
+"""  # noqa: S608 - own constants only
+"""What the store holds and no part of the catalogue has a row of (uncatalogued.py)."""
+_CONTENTS: Final = """
+CREATE TABLE contents (
+  id INTEGER NOT NULL, topic TEXT NOT NULL, samples INTEGER NOT NULL, PRIMARY KEY (id, topic)) WITHOUT ROWID;
+CREATE TRIGGER contained AFTER INSERT ON contents BEGIN
+  INSERT INTO tally VALUES (NEW.topic, 'spooled', 0, 0, NEW.samples)
+    ON CONFLICT DO UPDATE SET samples = samples + NEW.samples;
+  INSERT INTO tally VALUES (NEW.topic, (SELECT state FROM objects WHERE id = NEW.id), 0, 0, NEW.samples)
+    ON CONFLICT DO UPDATE SET samples = samples + NEW.samples;
+END;
+CREATE TRIGGER contents_moved AFTER UPDATE OF state ON objects WHEN OLD.state <> NEW.state AND NEW.topic IS NULL BEGIN
+  UPDATE tally SET samples = samples - (SELECT samples FROM contents WHERE id = OLD.id AND topic = tally.topic)
+    WHERE state = OLD.state AND topic IN (SELECT topic FROM contents WHERE id = OLD.id);
+  INSERT INTO tally SELECT topic, NEW.state, 0, 0, samples FROM contents WHERE id = NEW.id
+    ON CONFLICT DO UPDATE SET samples = samples + excluded.samples;
+END;
+CREATE TRIGGER contents_forgotten AFTER DELETE ON objects WHEN OLD.topic IS NULL BEGIN
+  DELETE FROM contents WHERE id = OLD.id;
+END;
+"""
+"""What an object of several topics holds of each; the totals follow it."""
 SCHEMA: Final = f"""
 CREATE TABLE objects (
   id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -65,9 +102,14 @@ CREATE TABLE publishers (
   session INTEGER NOT NULL, topic TEXT NOT NULL, publisher TEXT NOT NULL, first INTEGER, last INTEGER,
   published INTEGER NOT NULL, received INTEGER NOT NULL, missed TEXT NOT NULL,
   PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
+{_CATALOGUE}
+{_CONTENTS}
 PRAGMA user_version = {SCHEMA_VERSION};
 """  # noqa: S608 - own constants only
-MIGRATIONS: Final = {1: f'DROP INDEX pending; DROP INDEX waiting; {_BY_BUCKET} {_BY_REASON}'}
+MIGRATIONS: Final = {
+    1: f'DROP INDEX pending; DROP INDEX waiting; {_BY_BUCKET} {_BY_REASON}',
+    2: f'{_CONTENTS} {_CATALOGUE} INSERT INTO uncatalogued SELECT id FROM objects WHERE {_ARRIVED};',  # noqa: S608 - own constants only
+}
 """Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
 
 

@@ -6,7 +6,7 @@ import fcntl
 import os
 
 from shadowhound_data_logger.clock import Clock
-from shadowhound_data_logger.spool.accounts import Snapshot
+from shadowhound_data_logger.spool.account_rows import Snapshot
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 

@@ -31,6 +31,8 @@ class Span:
     _rebased: bool = False
     changed: bool = False
     """Since the last snapshot."""
+    _late: int = 0
+    """Messages after the inherited ``last`` that are counted already: they are no part of the gap that follows."""
 
     def __post_init__(self) -> None:
         self._base = self.first
@@ -46,7 +48,7 @@ class Span:
             self.inherited = self._rebased = False
         elif number in self._holes:
             cause = self._holes.pop(number)
-            if cause:
+            if cause and self.missed[cause] > 0:
                 self.missed[cause] -= 1
                 self.published -= 1
         elif number < self._base and number not in self._early:
@@ -72,6 +74,22 @@ class Span:
         self.published += count
         self.changed = True
 
+    def find(self, count: int) -> int:
+        """So many of what a restart cost were recorded after all; returns how many could be among them."""
+        found = min(count, self.missed['restart'])
+        self.missed['restart'] -= found
+        self.received += found
+        self.changed = self.changed or bool(found)
+        return found
+
+    def late(self, count: int) -> None:
+        """Count messages after the inherited ``last``, whose numbers are not known."""
+        if count:
+            self.received += count
+            self.published += count
+            self._late += count if self.inherited else 0
+            self.changed = True
+
     def rebase(self) -> None:
         """What is published until the next new message was not listened to on purpose: that gap is not missed."""
         self._rebased = True
@@ -80,8 +98,10 @@ class Span:
         """Count the numbers of a gap as missed, unless nobody listened, and remember them: they may come late."""
         cause = '' if self._rebased else 'restart' if self.inherited else 'transport'
         if cause:
-            self.missed[cause] += stop - start
-            self.published += stop - start
+            known = min(self._late, stop - start)
+            self._late -= known
+            self.missed[cause] += stop - start - known
+            self.published += stop - start - known
         self._holes.update(dict.fromkeys(range(max(start, stop - MAX_REMEMBERED), stop), cause))
         while len(self._holes) > MAX_REMEMBERED:
             del self._holes[next(iter(self._holes))]

@@ -7,32 +7,32 @@ is the only commit point, so objects and ledger cannot disagree; a rename that d
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import sqlite3
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, SpooledObject, State
-from shadowhound_data_logger.spool import binding
+from shadowhound_data_logger.spool import binding, carrying
 from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.adding import Adding
 from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.ballast import Ballast
-from shadowhound_data_logger.spool.binding import free_key
-from shadowhound_data_logger.spool.files import Tree, description, flock
+from shadowhound_data_logger.spool.files import Tree, flock
 from shadowhound_data_logger.spool.index import Index, spooled
 from shadowhound_data_logger.spool.piles import Piles, look
 from shadowhound_data_logger.spool.recovery import open_recovered
-from shadowhound_data_logger.spool.retention import NO_ROOM, OVERHEAD_BYTES, Shortage, make_room
+from shadowhound_data_logger.spool.repeats import Repeats
+from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, make_room
 from shadowhound_data_logger.spool.session import Session
+from shadowhound_data_logger.spool.staging import remove_sources, staged
+from shadowhound_data_logger.spool.uncatalogued import take
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +63,7 @@ class Spool:
         self._forgot_ns = 0
         self._shortage = Shortage(root)
         self._ballast = Ballast(root / 'ballast')
+        self._repeats = Repeats()
 
     def open(self) -> None:
         """Create or recover the spool and begin a session. Raises SpoolError naming the folder and what to do."""
@@ -101,14 +102,23 @@ class Spool:
 
         ``durable`` gets them as well, before the files of delivered objects are removed: that may take as long as the commit.
         Raises OSError or sqlite3.OperationalError when nothing of it became durable; the caller tries again. Objects
-        for which there is no room at all are recorded as evicted (D9).
+        for which there is no room at all are recorded as evicted (D9), those whose file is gone as quarantined.
         """
-        with self._lock:
-            placed = self._ballast.work(lambda: self._commit(objects, outcomes))
-            self._ballast.keep(self._tree.free_bytes, self._settings.min_free_bytes)
-        durable(placed)
-        self._settle(outcomes)
+        with staged(self._tree, self._session.number if self._session else 0, objects) as ready:
+            with self._lock:
+                placed = self._ballast.work(lambda: self._commit(ready, outcomes))
+                self._ballast.keep(self._tree.free_bytes, self._settings.min_free_bytes)
+            durable(placed)
+            self._settle(outcomes)
+            remove_sources(self._tree, objects, ready)
         return placed
+
+    def knows(self, bucket: str, key: str, sha256: str) -> bool:
+        """Whether this content was spooled under this (wanted) key, whatever became of it: a source of it is not needed any more.
+
+        Waits for no commit; what left the spool ``remember_days`` ago is forgotten. Raises sqlite3.Error.
+        """
+        return binding.knows(self._view, bucket, key, sha256)
 
     def unwritable(self, error: OSError | sqlite3.Error) -> SpoolError:
         """What a failed commit means to an operator."""
@@ -132,6 +142,22 @@ class Spool:
                 path = self._tree.path(State.PENDING, None, bucket, key) if placed else self._tree.waiting(number, bucket, key)
                 found.append(spooled(row, path))
         return found
+
+    def has(self, bucket: str, key: str) -> bool:
+        """Whether the name is taken. Waits for no commit; raises sqlite3.Error."""
+        return self._view.has(bucket, key)
+
+    def free_bytes(self) -> int:
+        """What this user may still write to the spool's file system. Raises OSError."""
+        return self._tree.free_bytes()
+
+    def carry(self, sink: str) -> None:
+        """Take over what this robot's ended sessions left open in a sink. Once, before anything is counted there."""
+        with self._lock:
+            if self._session is not None:
+                with self._index.transaction():
+                    rows = carrying.carry(self._index, self._session.number, self._robot, sink)
+                self.accounts.carry(rows)
 
     def held(self, reason: str, limit: int = 256) -> list[HeldObject]:
         """What has no final name yet for this reason, the oldest first; waits for no commit. Raises sqlite3.Error."""
@@ -198,13 +224,13 @@ class Spool:
         self._shortage.note(room, now_ns)
         stored = _count(objects)
         snapshot = self.accounts.snapshot(stored)
-        added: list[tuple[SpooledObject, State]] = []
+        adding = Adding(self._index, self._tree, self._repeats, now_ns)
         try:
-            with self._index.transaction(undo=lambda: self._discard(added)):
+            with self._index.transaction(undo=adding.discard):
                 for place, item in enumerate(objects):
-                    added += [self._add(item, now_ns, place not in room.given_up)]  # undo needs those before a failure
-                if added:
-                    self._tree.sync_incoming()
+                    if take(self._index, item.catalogues):
+                        adding.add(item, fits=place not in room.given_up)
+                adding.sync()
                 for outcome in outcomes:
                     self._index.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
                 if snapshot is not None and self._session is not None:
@@ -214,38 +240,7 @@ class Spool:
             self.accounts.mark_dirty()
             raise
         self.accounts.store(stored)
-        return self._place(added)
-
-    def _add(self, item: DataObject, now_ns: int, fits: bool) -> tuple[SpooledObject, State]:
-        """Row and part of one object, inside the transaction."""
-        state, reason = (State.HELD, item.held) if item.held else (State.PENDING, None)
-        if not fits and not item.protected:
-            state, reason = State.EVICTED, NO_ROOM
-        key = free_key(self._index, item.bucket, check_key(item.key))
-        sha256 = hashlib.sha256(item.body).hexdigest()
-        metadata = {**item.metadata, 'sha256': sha256}
-        number = self._index.insert(item, key, sha256, state, reason, metadata, now_ns)
-        path = self._tree.part(number)
-        if state is not State.EVICTED:
-            self._tree.write_part(number, item.body, description(item, key, sha256, metadata))
-            path = self._tree.path(state, reason, item.bucket, key)
-        return SpooledObject(number, item.bucket, key, path, len(item.body), sha256, item.content_type, metadata,
-                             item.priority, now_ns), state  # fmt: skip
-
-    def _discard(self, added: Iterable[tuple[SpooledObject, State]]) -> None:
-        """Remove the parts of a transaction that is rolled back: on a full disk they would keep it full."""
-        for item, _ in added:
-            self._tree.remove(self._tree.part(item.id))
-
-    def _place(self, added: Iterable[tuple[SpooledObject, State]]) -> list[SpooledObject]:
-        """Give the files their names; returns the objects that may be shipped."""
-        pending: list[SpooledObject] = []
-        for item, state in added:
-            if state is State.PENDING:
-                pending.append(replace(item, path=self._tree.waiting(item.id, item.bucket, item.key)))
-            elif state is not State.EVICTED:
-                self._tree.place(self._tree.part(item.id), item.path)
-        return pending
+        return adding.place()
 
     def _settle(self, outcomes: Iterable[Outcome]) -> None:
         """Let the files follow their rows."""
@@ -274,10 +269,10 @@ def _continued(index: Index) -> Accounts:
 
 
 def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, int]]:
-    """By topic: (samples, stamp of the newest)."""
+    """By account: (samples, stamp of the newest)."""
     counts: dict[str, tuple[int, int]] = {}
     for item in objects:
-        if item.topic is not None:
-            count, newest_ns = counts.get(item.topic, (0, 0))
-            counts[item.topic] = (count + item.samples, max(newest_ns, item.t_end_ns))
+        for account, samples in {item.topic: item.samples}.items() if item.topic is not None else item.counts.items():
+            count, newest_ns = counts.get(account, (0, 0))
+            counts[account] = (count + samples, max(newest_ns, item.t_end_ns))
     return counts

@@ -61,7 +61,7 @@ class SpoolWriter:
             if wait:
                 self._changed.wait_for(lambda: self._bytes < MAX_WAITING_BYTES or self.worker.stopping)
             self._objects.append(item)
-            self._bytes += len(item.body)
+            self._bytes += _in_memory(item)
             self._added += 1
             self._changed.notify_all()
 
@@ -120,7 +120,7 @@ class SpoolWriter:
         """All of it is durable: let it go and tell who waits for that."""
         with self._changed:
             for _ in objects:
-                self._bytes -= len(self._objects.popleft().body)
+                self._bytes -= _in_memory(self._objects.popleft())
             for _ in outcomes:
                 self._outcomes.popleft()
             self._done += len(objects) + len(outcomes)
@@ -131,3 +131,7 @@ class SpoolWriter:
             self._settled({outcome.item.id for outcome in outcomes})
         if spooled:
             self._spooled(spooled)
+
+
+def _in_memory(item: DataObject) -> int:
+    return len(item.body) if isinstance(item.body, bytes) else 0

@@ -43,6 +43,15 @@ class ObjectStore(Protocol):
     def get(self, bucket: str, key: str) -> bytes:
         """The whole content. Raises ObjectRefused when there is none."""
 
+    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes:
+        """So many bytes from ``start`` on: fewer where the object ends before, none at its end or behind it.
+
+        Raises ObjectRefused when there is no such object.
+        """
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
+        """The content from ``start`` on, in pieces of at most a megabyte. Raises as ``get_range``, at any piece."""
+
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
         """The objects under a prefix, in key order (``sha256`` and metadata may be left out)."""
 

@@ -7,7 +7,6 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.errors import ForeignObject, NameRefused, ObjectRefused, StoreUnavailable
@@ -35,37 +34,45 @@ def chunks(item: SpooledObject) -> Iterator[bytes]:
     The verdict comes after the last piece: nothing of it is final before the iterator ended.
     """
     digest, size = hashlib.sha256(), 0
+    with opened(item) as file:
+        while size <= item.size:
+            wanted = min(CHUNK_BYTES, item.size - size + 1)
+            if not (chunk := os.read(file, wanted)):
+                break
+            size += len(chunk)
+            digest.update(chunk)
+            yield chunk
+            if size == item.size and len(chunk) < wanted:
+                break
+    check_content(item, size, digest.hexdigest())
+
+
+def check_content(item: SpooledObject, size: int, sha256: str) -> None:
+    """Raises ObjectRefused where what was read is not the item's content."""
+    if size != item.size:
+        raise _damaged(item, f'it has not {item.size} bytes')
+    if sha256 != item.sha256:
+        raise _damaged(item, 'its SHA-256 is another')
+
+
+@contextmanager
+def opened(item: SpooledObject) -> Iterator[int]:
+    """A descriptor, not a file object: that asks the system twice as often, and each time other threads may go first.
+
+    An OSError within is the file's: it is ObjectRefused (``damaged``), or StoreUnavailable where it may pass.
+    """
     try:
-        with _opened(item.path) as file:
-            while size <= item.size:
-                wanted = min(CHUNK_BYTES, item.size - size + 1)
-                if not (chunk := os.read(file, wanted)):
-                    break
-                size += len(chunk)
-                digest.update(chunk)
-                yield chunk
-                if size == item.size and len(chunk) < wanted:
-                    break
+        descriptor = os.open(item.path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            yield descriptor
+        finally:
+            os.close(descriptor)
     except FileNotFoundError as error:
         raise _damaged(item, 'it is gone') from error
     except OSError as error:
         if error.errno in _PASSING:
             raise StoreUnavailable(f'the spooled file {item.path} cannot be read now: {error.strerror}') from error
         raise _damaged(item, f'it cannot be read: {error.strerror}') from error
-    if size != item.size:
-        raise _damaged(item, f'it has not {item.size} bytes')
-    if digest.hexdigest() != item.sha256:
-        raise _damaged(item, 'its SHA-256 is another')
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[int]:
-    """A descriptor, not a file object: that asks the system twice as often, and each time other threads may go first."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
 
 
 def object_metadata(item: SpooledObject) -> dict[str, str]:

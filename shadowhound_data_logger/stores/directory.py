@@ -15,7 +15,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
@@ -77,12 +77,18 @@ class DirectoryStore:
             return self._info(bucket, key) if self._path(bucket, key).is_file() else None
 
     def get(self, bucket: str, key: str) -> bytes:
-        check_target(bucket, key)
-        with self._touching(bucket, key):
-            try:
-                return self._path(bucket, key).read_bytes()
-            except FileNotFoundError as error:
-                raise ObjectRefused(f'there is no {bucket}/{key}', reason='missing', bucket=bucket, key=key) from error
+        with self._opened(bucket, key) as file:
+            return file.read()
+
+    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes:
+        with self._opened(bucket, key) as file:
+            return os.pread(file.fileno(), length, start)
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
+        with self._opened(bucket, key) as file:
+            file.seek(start)
+            while chunk := file.read(CHUNK_BYTES):
+                yield chunk
 
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
         check_target(bucket, 'any')
@@ -109,6 +115,17 @@ class DirectoryStore:
             yield
         except OSError as error:
             raise _translated(error, self._directory, bucket, key) from error
+
+    @contextmanager
+    def _opened(self, bucket: str, key: str) -> Iterator[IO[bytes]]:
+        check_target(bucket, key)
+        with self._touching(bucket, key):
+            try:
+                file = self._path(bucket, key).open('rb', buffering=0)
+            except FileNotFoundError as error:
+                raise ObjectRefused(f'there is no {bucket}/{key}', reason='missing', bucket=bucket, key=key) from error
+            with file:
+                yield file
 
     @contextmanager
     def _part(self) -> Iterator[Path]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.stores.content import check_target, chunks, identical_or_foreign, object_metadata
+from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_target, chunks, identical_or_foreign, object_metadata
 from shadowhound_data_logger.stores.pace import Pace
 
 
@@ -60,6 +60,13 @@ class MemoryStore:
         if found is None:
             raise ObjectRefused(f'there is no {bucket}/{key}', reason='missing', bucket=bucket, key=key)
         return found[1]
+
+    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes:
+        return self.get(bucket, key)[start : start + length]
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
+        body = self.get(bucket, key)
+        yield from (body[place : place + CHUNK_BYTES] for place in range(start, len(body), CHUNK_BYTES))
 
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
         with self._lock:

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import IO, Final
+from typing import Final, Protocol
 
 PIECE_S: Final = 0.02
 """Time on the radio that one piece takes at the cap: what a control message may have to wait for."""
@@ -24,12 +24,20 @@ LONGEST_EVERY: Final = 4
 BYTES_PER_MEGABIT: Final = 125_000
 
 
+class Body(Protocol):
+    """What is sent: a file, or a part of one."""
+
+    def seek(self, place: int, /) -> int: ...
+
+    def read(self, size: int, /) -> bytes: ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Waiter:
     """One body that wants to send its next piece."""
 
-    priority: int
-    order: int
+    rank: tuple[int, bool, int]
+    """Priority, whether it stands back, order of arrival: the smallest goes first."""
     turn: threading.Condition
 
 
@@ -75,11 +83,14 @@ class Pace:
         with self._lock:
             self._sent_bytes += size
 
-    def pieces(self, body: bytes | IO[bytes], priority: int) -> Iterator[bytes]:
-        """The whole body, each piece when it may leave. Raises ConnectionAbortedError after a later ``abandon``."""
+    def pieces(self, body: bytes | Body, priority: int, *, stands_back: bool = False) -> Iterator[bytes]:
+        """The whole body, each piece when it may leave. Raises ConnectionAbortedError after a later ``abandon``.
+
+        One that ``stands_back`` comes after all others of its priority, for it is one of very many.
+        """
         with self._lock:
             self._bodies += 1
-            return self._leave(body, priority, self._bodies, self._abandoned)
+            return self._leave(body, (priority, stands_back, self._bodies), self._abandoned)
 
     def abandon(self) -> None:
         """No piece leaves any more of the bodies that are under way."""
@@ -87,17 +98,17 @@ class Pace:
             self._abandoned += 1
             self._wake_all()
 
-    def _leave(self, body: bytes | IO[bytes], priority: int, order: int, abandoned: int) -> Iterator[bytes]:
+    def _leave(self, body: bytes | Body, rank: tuple[int, bool, int], abandoned: int) -> Iterator[bytes]:
         file = io.BytesIO(body) if isinstance(body, bytes) else body
         file.seek(0)
         while piece := file.read(self._piece_bytes()):
-            self._take(len(piece), priority, order, abandoned)
+            self._take(len(piece), rank, abandoned)
             yield piece
 
-    def _take(self, size: int, priority: int, order: int, abandoned: int) -> None:
+    def _take(self, size: int, rank: tuple[int, bool, int], abandoned: int) -> None:
         """Wait until so many bytes of the body may leave."""
         with self._lock:
-            waiter = _Waiter(priority, order, threading.Condition(self._lock))
+            waiter = _Waiter(rank, threading.Condition(self._lock))
             self._waiting.append(waiter)
             try:
                 while self._abandoned == abandoned:
@@ -123,7 +134,7 @@ class Pace:
     def _next(self) -> _Waiter:
         if self._pieces % LONGEST_EVERY == LONGEST_EVERY - 1:
             return self._waiting[0]
-        return min(self._waiting, key=lambda waiter: (waiter.priority, waiter.order))
+        return min(self._waiting, key=lambda waiter: waiter.rank)
 
     def _grant(self, size: int) -> None:
         self._sent_bytes += size

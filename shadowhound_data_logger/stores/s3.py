@@ -2,6 +2,7 @@
 
 Guarantees: a put is one PUT with ``If-None-Match: *``, a CRC32 that the server verifies and ``sha256`` as metadata, and whether
 the server honours the condition is proved before it is relied on: MinIO before 2024 and some others ignore it and overwrite.
+Of a large object it is a multipart upload (s3_multipart.py), which looks twice and sends the condition as well.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ForeignO
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.content import check_target, chunks, identical_or_foreign
 from shadowhound_data_logger.stores.pace import Pace
+from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES, Multipart
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 
-STREAM_BYTES: Final = 64 << 20
-"""Larger objects are read twice from the disk (hash, send) instead of once into memory."""
+STREAM_BYTES: Final = 4 << 20
+"""Larger objects are read twice from the disk (hash, send) instead of once into memory, of which each thread takes so much."""
 BUCKET_PAUSE_S: Final = 10.0
 """A bucket that could not be created is not asked for again sooner: each of its objects would ask."""
 
@@ -45,6 +47,7 @@ class S3Store:
 
     def __init__(self, settings: StoreSettings, upload: UploadSettings) -> None:
         self._s3 = S3Requests(settings, upload)
+        self._multipart = Multipart(self._s3)
         self._lock = threading.Lock()
         self._condition = _Condition.UNPROVED
         self._refused: dict[str, tuple[float, BucketMissing]] = {}
@@ -70,12 +73,12 @@ class S3Store:
 
     def put(self, item: SpooledObject) -> Put:
         check_target(item.bucket, item.key)
-        with _verified(item) as (body, crc32):
-            try:
-                return self._put(item, body, crc32)
-            except BucketMissing as error:
-                self._create_bucket(item.bucket, error)
-                return self._put(item, body, crc32)
+        put = self._put_in_parts if item.size > MULTIPART_BYTES else self._put_whole
+        try:
+            return put(item)
+        except BucketMissing as error:
+            self._create_bucket(item.bucket, error)
+            return put(item)
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
         check_target(bucket, key)
@@ -85,12 +88,33 @@ class S3Store:
         check_target(bucket, key)
         return b''.join(self._s3.content(bucket, key))
 
+    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes:
+        check_target(bucket, key)
+        return b''.join(self._s3.content(bucket, key, start, length)) if length > 0 else b''
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
+        check_target(bucket, key)
+        yield from self._s3.content(bucket, key, start)
+
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
         check_target(bucket, 'any')
         yield from sorted(self._s3.list(bucket, prefix), key=lambda info: info.key)
 
     def probe(self) -> None:
         self._s3.probe()
+
+    def _put_in_parts(self, item: SpooledObject) -> Put:
+        """It looks first: an answer that was lost, or a key that is taken, is known before megabytes are sent in vain."""
+        held = self._look(item)
+        if held is not None:
+            return self._judge(item, held)
+        if self._multipart.put(item, lambda: self._look(item) is not None):
+            return Put.CREATED
+        return self._judge(item, self._s3.head(item.bucket, item.key))
+
+    def _put_whole(self, item: SpooledObject) -> Put:
+        with _verified(item) as (body, crc32):
+            return self._put(item, body, crc32)
 
     def _put(self, item: SpooledObject, body: bytes | IO[bytes], crc32: str) -> Put:
         """One confirmed put; it looks before it leaps as long as the server's word on the condition is not proved."""

@@ -1,12 +1,14 @@
-"""The PUT of an object, on botocore's HTTP session and parser but without its client: two thirds of a put's CPU were there.
+"""The PUT of an object or of a part of one, on botocore's HTTP session and parser.
 
-The body leaves at the store's pace, its SHA-256 (known since it was spooled) is signed, and the server verifies its CRC32.
+Without its client: two thirds of a put's CPU were there. The body leaves at the store's pace, its SHA-256 (of a whole object
+known since it was spooled) is signed, and the server verifies its CRC32, of a part its MD5.
 """
 
 from __future__ import annotations
 
+import base64
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime, timezone
 from typing import IO, Any, Final
 from urllib.parse import quote, urlsplit
@@ -28,7 +30,8 @@ from botocore.utils import get_environ_proxies
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.stores.content import object_metadata
-from shadowhound_data_logger.stores.pace import Pace
+from shadowhound_data_logger.stores.pace import Body, Pace
+from shadowhound_data_logger.stores.parts import Part
 from shadowhound_data_logger.stores.sigv4 import signed
 
 AGENT: Final = 'shadowhound-data-logger'
@@ -38,6 +41,8 @@ UNASKED_BYTES: Final = 256 << 10
 A server that refuses a request reads so much of an unwanted body to keep the connection (net/http of Go, which MinIO and
 SeaweedFS are built on: maxPostHandlerReadBytes); of a larger one nothing is sent in vain.
 """
+UNSIGNED: Final = 'UNSIGNED-PAYLOAD'
+"""Instead of a part's SHA-256: its MD5 is among the signed headers, and two hashes of each byte are enough."""
 _SOCKET: Final = ((socket.IPPROTO_TCP, socket.TCP_NODELAY, 1), (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1))
 """What botocore's client sets for us as well."""
 
@@ -70,21 +75,32 @@ class ObjectPut:
     def close(self) -> None:
         self._session.close()
 
-    def put(self, item: SpooledObject, body: bytes | IO[bytes], crc32: str, *, conditional: bool) -> Mapping[str, str]:
+    def put(self, item: SpooledObject, body: bytes | Body, crc32: str, *, conditional: bool) -> Mapping[str, str]:
         """One request; ``crc32`` in base64. Returns the headers of an answer that is no error."""
+        return self._send(item, '', self._headers(item, crc32, conditional), item.sha256, self._pace.pieces(body, item.priority))
+
+    def put_part(self, item: SpooledObject, upload: str, number: int, part: Part) -> Mapping[str, str]:
+        """One request for one part of an upload; returns the headers of an answer that is no error."""
+        headers = {
+            'host': self._host, 'content-length': str(part.size), 'content-md5': base64.b64encode(part.md5).decode('ascii'),
+        }  # fmt: skip
+        query = f'partNumber={number}&uploadId={quote(upload, safe="")}'
+        return self._send(item, query, headers, UNSIGNED, self._pace.pieces(part, item.priority, stands_back=True))
+
+    def _send(self, item: SpooledObject, query: str, headers: Mapping[str, str], sha256: str,
+              pieces: Iterator[bytes]) -> Mapping[str, str]:  # fmt: skip
         if self._credentials is None:
             raise NoCredentialsError
-        path = f'{self._root}/{item.bucket}/{quote(item.key)}'
-        headers = signed('PUT', path, self._headers(item, crc32, conditional), item.sha256, now=datetime.now(timezone.utc),
-                         credentials=self._credentials.get_frozen_credentials(), region=self._region)  # fmt: skip
-        sent: dict[str, Any] = {**headers, 'user-agent': AGENT}
-        if item.size > UNASKED_BYTES:
+        target = f'{self._root}/{item.bucket}/{quote(item.key)}{"?" if query else ""}{query}'
+        full = signed('PUT', target, headers, sha256, now=datetime.now(timezone.utc),
+                      credentials=self._credentials.get_frozen_credentials(), region=self._region)  # fmt: skip
+        sent: dict[str, Any] = {**full, 'user-agent': AGENT}
+        if int(headers['content-length']) > UNASKED_BYTES:
             sent['Expect'] = b'100-continue'  # botocore's connection looks for exactly this
-        pieces = self._pace.pieces(body, item.priority)
-        answer = self._session.send(_prepared('PUT', f'{self._server}{path}', sent, pieces, stream_output=False))
+        answer = self._session.send(_prepared('PUT', f'{self._server}{target}', sent, pieces, stream_output=False))
         if answer.status_code >= 300:
             response = {'status_code': answer.status_code, 'headers': answer.headers, 'body': answer.content}
-            raise ClientError(self._parser.parse(response, None), 'PutObject')
+            raise ClientError(self._parser.parse(response, None), 'UploadPart' if query else 'PutObject')
         fields: Mapping[str, str] = answer.headers
         return fields
 

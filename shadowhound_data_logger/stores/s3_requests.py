@@ -6,9 +6,9 @@ Stays inside the subset that MinIO, SeaweedFS and AWS share. An answer that did 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from enum import Enum
-from typing import IO, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import botocore
 from botocore.config import Config
@@ -16,10 +16,11 @@ from botocore.exceptions import BotoCoreError, ClientError
 from botocore.session import Session
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.errors import SettingError, StoreUnavailable
+from shadowhound_data_logger.errors import AccessDenied, SettingError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.stores.content import CHUNK_BYTES
-from shadowhound_data_logger.stores.pace import Pace
+from shadowhound_data_logger.stores.pace import Body, Pace
+from shadowhound_data_logger.stores.parts import Part
 from shadowhound_data_logger.stores.s3_errors import REQUEST_ERRORS, Request, classify, code_of, public_url, status_of
 from shadowhound_data_logger.stores.s3_put import AGENT, ObjectPut
 
@@ -67,7 +68,7 @@ class S3Requests:
             if held is not None:
                 held.close()
 
-    def put(self, item: SpooledObject, body: bytes | IO[bytes], crc32: str, *, conditional: bool) -> Sent:
+    def put(self, item: SpooledObject, body: bytes | Body, crc32: str, *, conditional: bool) -> Sent:
         """One PUT; ``crc32`` in base64. Returns Sent.CREATED only when the server confirmed it."""
         with self._asking(item.bucket, item.key, self._put) as sender:
             try:
@@ -78,8 +79,15 @@ class S3Requests:
                 if conditional and status_of(error) == 501:
                     return Sent.NOT_IMPLEMENTED
                 raise
-        self._confirm(answer, item.bucket, item.key)
+        self.confirm(answer, item.bucket, item.key)
         return Sent.CREATED
+
+    def put_part(self, item: SpooledObject, upload: str, number: int, part: Part) -> str:
+        """One part of a multipart upload, verified by the server; returns its ETag."""
+        with self._asking(item.bucket, item.key, self._put) as sender:
+            answer = sender.put_part(item, upload, number, part)
+        self.confirm(answer, item.bucket, item.key)
+        return answer['ETag']
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
         with self._asking(bucket, key, self._client) as client:
@@ -94,18 +102,29 @@ class S3Requests:
                     if status_of(reason) == status_of(error):  # else it is another trouble, or over: there is no such key, say
                         raise
                 raise
-        self._confirm(answer, bucket, key)
+        self.confirm(answer, bucket, key)
         if 'ContentLength' not in answer:
             raise self._not_s3(bucket, key)
         metadata = answer.get('Metadata', {})
         return ObjectInfo(bucket, key, answer['ContentLength'], metadata.get('sha256'), metadata, answer.get('ContentType', ''))
 
-    def content(self, bucket: str, key: str) -> Iterator[bytes]:
-        """The object in pieces. Raises ObjectRefused when there is none."""
+    def content(self, bucket: str, key: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
+        """The object, or a part of it, in pieces. Raises ObjectRefused when there is none."""
+        wanted = {}
+        if start or length is not None:
+            wanted = {'Range': f'bytes={start}-{"" if length is None else start + length - 1}'}
         with self._asking(bucket, key, self._client) as client:
-            answer = client.get_object(Bucket=bucket, Key=key)
-            self._confirm(answer, bucket, key)
-            yield from answer['Body'].iter_chunks(CHUNK_BYTES)
+            try:
+                answer = client.get_object(Bucket=bucket, Key=key, **wanted)
+            except ClientError as error:
+                if wanted and status_of(error) == 416:  # it ends before
+                    return
+                raise
+            self.confirm(answer, bucket, key)
+            if wanted and not answer.get('ContentRange', '').startswith(f'bytes {start}-'):
+                raise self._not_s3(bucket, key)
+            with closing(answer['Body']) as body:
+                yield from body.iter_chunks(CHUNK_BYTES)
 
     def list(self, bucket: str, prefix: str) -> Iterator[ObjectInfo]:
         """The objects under a prefix, page by page; none when there is no such bucket.
@@ -140,19 +159,32 @@ class S3Requests:
                 if code_of(error) not in {'BucketAlreadyOwnedByYou', 'BucketAlreadyExists'}:
                     raise
 
-    def probe(self) -> None:
-        """Lists the buckets; credentials that may not do that are valid all the same."""
+    def delete(self, bucket: str, key: str) -> None:
+        """Returns also where there is no such object. No stage of ours deletes; the doctor asks whether Tower's own keys may."""
+        with self._asking(bucket, key, self._client) as client:
+            client.delete_object(Bucket=bucket, Key=key)
+
+    def buckets(self) -> tuple[str, ...]:
+        """The names of all buckets."""
         with self._asking('', '', self._client) as client:
-            try:
-                answer = client.list_buckets()
-            except ClientError as error:
-                if code_of(error) == 'AccessDenied':
-                    return
-                raise
+            answer = client.list_buckets()
         if 'Buckets' not in answer:
             raise self._not_s3('', '')
+        return tuple(entry['Name'] for entry in answer['Buckets'] or ())
 
-    def _confirm(self, answer: Mapping[str, Any], bucket: str, key: str) -> None:
+    def probe(self) -> None:
+        """Lists the buckets; credentials that may not do that are valid all the same."""
+        try:
+            self.buckets()
+        except AccessDenied as error:
+            if error.data['code'] != 'AccessDenied':
+                raise
+
+    def asking(self, bucket: str, key: str) -> AbstractContextManager[Any]:
+        """The client of botocore; nothing but a StoreError leaves."""
+        return self._asking(bucket, key, self._client)
+
+    def confirm(self, answer: Mapping[str, Any], bucket: str, key: str) -> None:
         """A captive portal answers 200 to anything, too; only an S3 server sends the ETag of an object."""
         if not answer.get('ETag'):
             raise self._not_s3(bucket, key)

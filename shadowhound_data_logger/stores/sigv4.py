@@ -17,12 +17,12 @@ from botocore.credentials import ReadOnlyCredentials
 ALGORITHM: Final = 'AWS4-HMAC-SHA256'
 
 
-def signed(method: str, path: str, headers: Mapping[str, str], sha256: str, *, credentials: ReadOnlyCredentials, region: str,
+def signed(method: str, target: str, headers: Mapping[str, str], sha256: str, *, credentials: ReadOnlyCredentials, region: str,
            now: datetime) -> dict[str, str]:  # fmt: skip
     """The headers with a signature over all of them; ``host`` has to be among them.
 
-    ``path`` is percent-encoded, as it stands in the request line; ``headers`` have lower-case names; ``sha256`` is the body's,
-    in hex; ``now`` is UTC.
+    ``target`` is percent-encoded, as it stands in the request line, its query (if any) by the names in order; ``headers`` have
+    lower-case names; ``sha256`` is the body's, in hex; ``now`` is UTC.
     """
     stamp = now.strftime('%Y%m%dT%H%M%SZ')
     full = {**headers, 'x-amz-date': stamp, 'x-amz-content-sha256': sha256}
@@ -31,7 +31,8 @@ def signed(method: str, path: str, headers: Mapping[str, str], sha256: str, *, c
     names = sorted(full)
     lines = [f'{name}:{" ".join(full[name].split())}' for name in names]
     which = ';'.join(names)
-    canonical = '\n'.join([method, path, '', *lines, '', which, sha256])
+    path, _, query = target.partition('?')
+    canonical = '\n'.join([method, path, query, *lines, '', which, sha256])
     scope = f'{stamp[:8]}/{region}/s3/aws4_request'
     text = '\n'.join([ALGORITHM, stamp, scope, hashlib.sha256(canonical.encode()).hexdigest()])
     key = f'AWS4{credentials.secret_key}'.encode()

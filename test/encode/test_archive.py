@@ -181,3 +181,19 @@ def test_the_files_are_plain(ros: Any) -> None:
     with zipfile.ZipFile(io.BytesIO(pack(ros, COMPRESSED, cdr, format_name='zip').object.body)) as packed:
         entries = packed.infolist()
     assert [(entry.compress_type, entry.external_attr >> 16) for entry in entries] == [(zipfile.ZIP_STORED, 0o644)] * 2
+
+
+@ARCHIVES
+def test_equal_frames_are_packed_once(ros: Any, format_name: str) -> None:
+    """With ``dedup`` each message keeps its JSON, which names the file that it repeats; one that comes back later is a file."""
+    same, other = jpeg(10), jpeg(200)
+    frames = [same, same, same, other, same]
+    made = pack(ros, COMPRESSED, *(frame(ros, data) for data in frames), format_name=format_name, dedup=True).object
+    found = list(samples(made).items())
+    assert [sample.get('jpg') for _, sample in found] == [same, None, None, other, same]
+    first = f'{found[0][0]}.jpg'
+    assert [json.loads(sample['json']).get('repeat_of') for _, sample in found] == [None, first, first, None, None]
+    assert (made.samples, made.metadata['repeats']) == (5, '2')
+    plain = pack(ros, COMPRESSED, *(frame(ros, data) for data in frames), format_name=format_name).object
+    assert [sample['jpg'] for sample in samples(plain).values()] == frames
+    assert 'repeats' not in plain.metadata

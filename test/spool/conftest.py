@@ -18,7 +18,7 @@ from shadowhound_data_logger.spool.spool import Spool
 Open = Callable[..., Spool]
 Moments = Callable[[Callable[[], None]], list[Path]]
 CALLS = frozenset({
-    'open', 'write', 'flush', 'fsync', 'replace', 'unlink', 'mkdir', 'rmdir', 'setxattr', 'flock', 'close', 'execute',
+    'open', 'write', 'flush', 'fsync', 'link', 'replace', 'unlink', 'mkdir', 'rmdir', 'setxattr', 'flock', 'close', 'execute',
     'executemany', 'executescript',
 })  # fmt: skip
 """Built-in functions that change a spool, or stand between two that do."""

@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shadowhound_data_logger.spool import span as module
-from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts, PublisherRow, TopicAccount
+from shadowhound_data_logger.spool.account_rows import PublisherRow
+from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts, TopicAccount
 from shadowhound_data_logger.spool.span import Span
 
 

@@ -99,15 +99,15 @@ def test_a_file_that_may_not_be_read(opened: Open, root: Path, used: dict[str, b
     """Somebody else's unreadable file is left where it is."""
     path = root / READY / 'thor/theirs.bin'
     path.write_bytes(b'x')
-    read_bytes = Path.read_bytes
+    open_file = Path.open
 
-    def refuse(file: Path) -> bytes:
+    def refuse(file: Path, *arguments: object, **more: object) -> object:
         if file == path:
             raise PermissionError(errno.EACCES, 'Permission denied')
-        return read_bytes(file)
+        return open_file(file, *arguments, **more)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, 'read_bytes', refuse)
+        patch.setattr(Path, 'open', refuse)
         spool = opened()
     assert dict(spool.recovery.counts) == {'unreadable files left alone': 1}
     assert path.exists()

@@ -19,6 +19,8 @@ FEW, MANY = 300, 15_000
 STEP = 20
 VERSION_1 = """
 DROP INDEX pending; DROP INDEX waiting; DROP INDEX held;
+DROP TABLE contents; DROP TRIGGER contents_moved; DROP TRIGGER contents_forgotten;
+DROP TABLE uncatalogued; DROP TRIGGER arrived; DROP TRIGGER known; DROP TRIGGER forgotten;
 CREATE INDEX pending ON objects (priority, id) WHERE state = 'pending';
 CREATE INDEX waiting ON objects (id) WHERE state = 'pending';
 PRAGMA user_version = 1;

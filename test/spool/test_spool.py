@@ -14,17 +14,21 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.keys import MAX_SEGMENT_BYTES
 from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool import uncatalogued
 from shadowhound_data_logger.spool.spool import Outcome, Spool
 
 DAY_NS = 24 * 3600 * SECOND
 
 
 def test_a_commit_is_on_disk_under_its_final_name(spool: Spool, root: Path) -> None:
-    """What commit returns lies whole under ready/<bucket>/<key>, with the hash as metadata."""
+    """What commit returns lies whole under ready/<bucket>/<key>, with the hash and what it is as metadata."""
     (item,) = put(spool, make(metadata={'robot': 'thor'}))
     assert item.path == root / 'ready' / BUCKET / KEY
     assert item.path.read_bytes() == b'content'
-    assert item.metadata == {'robot': 'thor', 'sha256': item.sha256}
+    assert item.metadata == {
+        'robot': 'thor', 'sensor': 'camera', 'topic': '/camera', 'type': 'sensor_msgs/msg/CompressedImage', 'count': '1',
+        't_start_ns': str(NOON_NS), 't_end_ns': str(NOON_NS), 'sha256': item.sha256,
+    }  # fmt: skip
     objects = assert_whole(root)['objects']
     assert (objects['spooled'], objects['pending']) == (1, 1)
 
@@ -144,6 +148,10 @@ def test_old_deliveries_are_forgotten_and_totals_stay(spool: Spool, root: Path, 
     before = assert_whole(root)
     clock.now_ns += 31 * DAY_NS
     spool.commit()
+    assert len(rows(root)) == 2, 'the catalogue has no row of it yet'
+    uncatalogued.clear(root)
+    clock.now_ns += DAY_NS
+    spool.commit()
     assert [row['id'] for row in rows(root)] == [kept.id]
     assert assert_whole(root) == before
 
@@ -153,6 +161,7 @@ def test_forgetting_keeps_up(spool: Spool, root: Path, clock: FakeClock, monkeyp
     monkeypatch.setattr('shadowhound_data_logger.spool.index.FORGET_STEP', 2)
     items = put(spool, *(make(str(number)) for number in range(5)))
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
+    uncatalogued.clear(root)
     clock.now_ns += 31 * DAY_NS
     left = []
     for _ in range(3):

@@ -120,8 +120,8 @@ class Failing:
         self.asked.append(key)
         return self._store.head(bucket, key)
 
-    def get(self, bucket: str, key: str) -> bytes:
-        return self._store.get(bucket, key)
+    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
+        return self._store.content(bucket, key, start)
 
     def probe(self) -> None:
         self._answers -= 1

@@ -96,6 +96,21 @@ def test_the_most_important_body_goes_first_and_starves_nobody() -> None:
     assert 0.2 < share < 0.8
 
 
+def test_a_body_that_stands_back_goes_after_its_equals() -> None:
+    """A part of a slice that was there first gets no more beside a live object than each fourth piece."""
+    pace, log = Pace(4.0), list[str]()
+    part = Sender(pace.pieces(bytes(2_000_000), 5, stands_back=True), log, 'part')
+    part.start()
+    until(lambda: log)
+    live = Sender(pace.pieces(bytes(300_000), 5), log, 'live')
+    live.start()
+    live.join(2 * QUICK_S)
+    pace.abandon()
+    part.join(QUICK_S)
+    span = log[log.index('live') :]
+    assert span[: len(span) - span[::-1].index('live')].count('part') / span.count('live') < 0.8
+
+
 def test_of_bodies_alike_the_first_one_is_finished_first() -> None:
     """Sharing would make all of them late."""
     pace, log = Pace(4.0), list[str]()

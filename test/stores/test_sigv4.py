@@ -45,3 +45,16 @@ def test_same_as_botocore(key: str, headers: dict[str, str], token: str | None, 
         _KnownHash(keys, 's3', region).add_auth(theirs)
     assert ours['authorization'] == theirs.headers['Authorization']
     assert {name.lower(): value for name, value in theirs.headers.items()} == ours
+
+
+def test_a_query_is_signed_as_botocore_signs_it() -> None:
+    """That of a part, whose upload has an id with every kind of character."""
+    keys = Credentials('AKIDEXAMPLE', 'wJalrXUtnFEMI/K7MDENG+bPxRfiCYEXAMPLEKEY')
+    target = f'/sensor-data/thor/x.mcap?partNumber=12&uploadId={quote("aB3_-.~/+= ", safe="")}'
+    ours = signed('PUT', target, {'content-md5': 'x==', 'host': 'tower:9000'}, hashlib.sha256(BODY).hexdigest(), now=NOW,
+                  credentials=keys.get_frozen_credentials(), region='us-east-1')  # fmt: skip
+    theirs = AWSRequest(method='PUT', url=f'http://tower:9000{target}', headers={'content-md5': 'x==', 'Host': 'tower:9000'},
+                        data=BODY)  # fmt: skip
+    with mock.patch('botocore.auth.get_current_datetime', return_value=NOW.replace(tzinfo=None)):
+        _KnownHash(keys, 's3', 'us-east-1').add_auth(theirs)
+    assert ours['authorization'] == theirs.headers['Authorization']

@@ -1,0 +1,72 @@
+"""Equal content that follows itself is kept once: a camera that shows the same picture for minutes.
+
+A repeat is a row of the index in state deduplicated, with its own time, and ``content_key`` in its metadata names the object that
+holds the content; so does its row in the catalogue. No file of it is written and nothing of it is sent. What was sent cannot
+be changed, so the first object with another content tells, as metadata, how many repeats there were before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+from shadowhound_data_logger.model import DataObject, State
+from shadowhound_data_logger.spool.index import Index
+
+CONTENT_KEY: Final = 'content_key'
+"""Metadata of a repeat: the key of the object that holds its content, in the same bucket."""
+REPEATS, REPEATS_OF, REPEATS_UNTIL = 'repeats', 'repeats_of', 'repeats_until_ns'
+"""Metadata of the object after repeats: how many there were, of which key, and when the last one ended."""
+_HOLDS: Final = frozenset({State.PENDING.value, State.DELIVERED.value})
+
+
+@dataclass(frozen=True, slots=True)
+class _Last:
+    """What a sensor stored last."""
+
+    key: str
+    sha256: str
+    repeats: int = 0
+    until_ns: int = 0
+
+
+class Repeats:
+    """Guarded by the spool's lock. It knows what this process stored: the first object after a start is always stored."""
+
+    def __init__(self) -> None:
+        self._last: dict[tuple[str, str, str | None], _Last] = {}
+        self._next: dict[tuple[str, str, str | None], _Last] = {}
+
+    def begin(self) -> None:
+        """A commit begins: what is told from here on counts once it is durable."""
+        self._next = dict(self._last)
+
+    def keep(self) -> None:
+        """It is durable."""
+        self._last = self._next
+
+    def content_key(self, index: Index, item: DataObject, sha256: str) -> str | None:
+        """The key that holds this content already, if it is what the sensor stored last and is still on its way or there."""
+        last = self._next.get(_source(item))
+        if not item.dedup or item.held or last is None or last.sha256 != sha256:
+            return None
+        rows = index.rows('bucket = ? AND key = ?', (item.bucket, last.key))
+        if not rows or rows[0]['state'] not in _HOLDS or rows[0]['sha256'] != sha256:
+            return None  # evicted, say: a repeat of it would be lost with it
+        self._next[_source(item)] = replace(last, repeats=last.repeats + 1, until_ns=item.t_end_ns)
+        return last.key
+
+    def stored(self, item: DataObject, key: str, sha256: str) -> Mapping[str, str]:
+        """The sensor stored this; returns what is to be said of the repeats before it."""
+        if not item.dedup or item.held:
+            return {}
+        last = self._next.get(_source(item))
+        self._next[_source(item)] = _Last(key, sha256)
+        if last is None or not last.repeats:
+            return {}
+        return {REPEATS: str(last.repeats), REPEATS_OF: last.key, REPEATS_UNTIL: str(last.until_ns)}
+
+
+def _source(item: DataObject) -> tuple[str, str, str | None]:
+    return item.bucket, item.sensor, item.topic

@@ -1,0 +1,118 @@
+"""Large objects to an S3 server, in parts: whatever ends a try, the next one sends the parts that the server has not.
+
+It keeps no state: which upload to take up, and what of it is there, is asked of the server. So it makes no difference
+whether a connection broke, the process was killed or the robot was without power. Each part is sent with its MD5, which the
+server verifies and tells again as the part's ETag (MinIO only where it was sent). That all parts together are the spooled
+content, by its SHA-256, is certain before the server is asked to make them the object.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Final
+
+from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
+from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.stores.content import check_content, opened
+from shadowhound_data_logger.stores.parts import Part, parts
+from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
+from shadowhound_data_logger.stores.s3_uploads import HeldPart, Uploads
+
+MULTIPART_BYTES: Final = 16 << 20
+"""Larger objects are sent in parts: what is smaller is sent again as a whole after a broken connection."""
+_LOST: Final = frozenset({'InvalidPart', 'InvalidPartOrder', 'EntityTooSmall'})
+"""The server says that it has not what it said that it has: only a new upload can mend that."""
+
+_log = logging.getLogger(__name__)
+
+
+class Multipart:
+    """Thread-safe. Two that send one object at a time take each other's upload up, or abort it: neither does harm."""
+
+    def __init__(self, s3: S3Requests) -> None:
+        self._s3 = s3
+        self._uploads = Uploads(s3)
+
+    def put(self, item: SpooledObject, is_taken: Callable[[], bool]) -> bool:
+        """One try; True once the server confirmed the object, False where its key is taken by then.
+
+        ``is_taken`` is asked right before the end as well, for a server that knows no condition there.
+        """
+        with opened(item) as file:
+            check_content(item, os.fstat(file).st_size, item.sha256)  # its content is known at the end, but this at once
+            upload, held = self._taken_up(item, file)
+            try:
+                etags = self._send(item, file, upload, held)
+            except ObjectRefused:
+                self._give_up(item, upload)
+                raise
+            return self._complete(item, upload, etags, is_taken)
+
+    def _taken_up(self, item: SpooledObject, file: int) -> tuple[str, Mapping[int, HeldPart]]:
+        """An upload of this very content with the parts that it has, or a new one. Others of the same key are aborted."""
+        found: tuple[str, Mapping[int, HeldPart]] | None = None
+        for upload in self._under_way(item):
+            held = {} if found else self._held(item, upload)
+            if held and _is_of(held, file, item.size):
+                _log.debug('the upload of %s/%s goes on: %d parts are there', item.bucket, item.key, len(held))
+                found = upload, held
+            else:
+                self._give_up(item, upload)
+        return found or (self._uploads.begin(item), {})
+
+    def _under_way(self, item: SpooledObject) -> list[str]:
+        try:
+            return self._uploads.of(item)
+        except AccessDenied:
+            return []  # credentials that may write only: a try that ended is left to the server's own clean-up
+
+    def _held(self, item: SpooledObject, upload: str) -> Mapping[int, HeldPart]:
+        try:
+            return self._uploads.parts(item, upload)
+        except (AccessDenied, StoreUnavailable) as error:
+            if isinstance(error, StoreUnavailable) and error.data.get('reason') != 'NoSuchUpload':
+                raise
+            return {}
+
+    def _send(self, item: SpooledObject, file: int, upload: str, held: Mapping[int, HeldPart]) -> dict[int, str]:
+        """Every part that is not there yet; returns the ETags of all. Raises ObjectRefused for a file that is another one."""
+        whole, size, etags = hashlib.sha256(), 0, dict[int, str]()
+        for number, part in enumerate(parts(file, item.size, whole), 1):
+            there = held.get(number)
+            etags[number] = there.etag if there and _is_same(there, part) else self._s3.put_part(item, upload, number, part)
+            size += part.size
+        check_content(item, size, whole.hexdigest())
+        return etags
+
+    def _complete(self, item: SpooledObject, upload: str, etags: Mapping[int, str], is_taken: Callable[[], bool]) -> bool:
+        try:
+            if not is_taken() and self._uploads.complete(item, upload, etags) is Sent.CREATED:
+                return True
+        except StoreError as error:
+            if error.data.get('reason') in _LOST:
+                self._give_up(item, upload)
+            raise
+        self._give_up(item, upload)
+        return False
+
+    def _give_up(self, item: SpooledObject, upload: str) -> None:
+        """Its parts take room on the server until then. Where that fails the server's own clean-up has to."""
+        with suppress(StoreError):
+            self._uploads.abort(item, upload)
+
+
+def _is_of(held: Mapping[int, HeldPart], file: int, size: int) -> bool:
+    """Whether the first part that is there is the file's: another content under the same key has another one."""
+    first = min(held)
+    for number, part in enumerate(parts(file, size, hashlib.sha256()), 1):
+        if number == first:
+            return _is_same(held[first], part)
+    return False
+
+
+def _is_same(held: HeldPart, part: Part) -> bool:
+    return held.size == part.size and held.etag.strip('"') == part.md5.hex()

@@ -1,0 +1,175 @@
+"""Objects that hold messages of several topics, in accounts of a sink of its own, and what an earlier session left open there."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pytest
+from spool.conftest import Open
+from spool.making import FakeClock, make, new_spool, receive, settle
+
+from shadowhound_data_logger.model import DataObject, State
+from shadowhound_data_logger.spool import ledger, plausible, uncatalogued
+from shadowhound_data_logger.spool.accounts import BAG
+from shadowhound_data_logger.spool.spool import Spool
+
+ODOM, IMU = f'{BAG}/odom', f'{BAG}/imu'
+
+
+def a_slice(number: int, **counts: int) -> DataObject:
+    """Of a bag, with so many messages of each topic."""
+    accounts = {f'{BAG}/{name}': count for name, count in counts.items()}
+    return make(f'thor/rosbags/b/b_{number}.mcap', b'%d' % number, sensor='bag', topic=None, samples=sum(counts.values()),
+                counts=accounts)  # fmt: skip
+
+
+def bags(root: Path) -> dict[str, tuple[int, int, dict[str, int], int]]:
+    """Topic -> (received, stored, dropped, open), of a ledger that balances and agrees with the files."""
+    found = ledger.read(root, 'thor')
+    assert ledger.imbalances(found) == []
+    with sqlite3.connect(root / 'index.db') as db:
+        assert list(plausible.uncounted(db)) == []
+    return {topic: (row['received'], row['stored'], row['dropped'], row['open']) for topic, row in found['bags'].items()}
+
+
+def stored_in(root: Path, topic: str) -> dict[str, int]:
+    row = ledger.read(root, 'thor')['bags'][topic]
+    return {state: count for state, count in row['stored_in'].items() if count}
+
+
+def die(spool: Spool, root: Path) -> Path:
+    """What another process would find after a SIGKILL of this one."""
+    copy = root.with_name(f'{root.name}-copy')
+    shutil.copytree(root, copy)
+    return copy
+
+
+def test_a_slice_counts_for_each_of_its_topics(spool: Spool, root: Path) -> None:
+    """Its messages are stored in the bags' accounts, none in the sensors', and follow the object from state to state."""
+    receive(spool, 3, IMU)
+    receive(spool, 2, ODOM)
+    first, second = spool.commit([a_slice(0, imu=2, odom=2), a_slice(1, imu=1)])
+    assert bags(root) == {'/imu': (3, 3, {}, 0), '/odom': (2, 2, {}, 0)}
+    assert stored_in(root, '/imu') == {'pending': 3}
+    settle(spool, first, State.DELIVERED)
+    settle(spool, second, State.QUARANTINED, 'refused')
+    assert stored_in(root, '/imu') == {'delivered': 2, 'quarantined': 1}
+    assert stored_in(root, '/odom') == {'delivered': 2}
+    assert ledger.read(root, 'thor')['topics'] == {}
+
+
+def test_totals_stay_when_slices_are_forgotten(opened: Open, root: Path, clock: FakeClock) -> None:
+    """The rows of what was delivered long ago go, with what they held, and the sums do not change."""
+    spool = opened(remember_days=1.0)
+    receive(spool, 3, IMU)
+    (item,) = spool.commit([a_slice(0, imu=3)])
+    settle(spool, item, State.DELIVERED)
+    uncatalogued.clear(root)
+    clock.now_ns += 3 * 24 * 3600 * 10**9
+    spool.commit()
+    with sqlite3.connect(root / 'index.db') as db:
+        assert db.execute('SELECT (SELECT count(*) FROM objects), (SELECT count(*) FROM contents)').fetchone() == (0, 0)
+    assert stored_in(root, '/imu') == {'delivered': 3}
+    assert bags(root) == {'/imu': (3, 3, {}, 0)}
+
+
+def test_a_lost_index_is_rebuilt_with_what_slices_hold(opened: Open, root: Path) -> None:
+    """Their files tell it."""
+    spool = opened()
+    receive(spool, 3, IMU)
+    spool.commit([a_slice(0, imu=3)])
+    spool.close()
+    for path in root.glob('index.db*'):
+        path.unlink()
+    opened()
+    assert bags(root) == {'/imu': (3, 3, {}, 0)}
+    assert stored_in(root, '/imu') == {'pending': 3}
+
+
+@pytest.mark.parametrize(('recorded', 'expected'), [
+    (0, (10, 0, {'restart': 10}, 0)), (7, (10, 7, {'restart': 3}, 0)), (10, (10, 10, {}, 0)), (12, (12, 12, {}, 0)),
+])  # fmt: skip
+def test_what_a_dead_session_left_open_is_settled_by_what_its_files_hold(
+    opened: Open, root: Path, clock: FakeClock, recorded: int, expected: tuple[object, ...]
+) -> None:
+    """Found again it is stored, else lost by the restart; what the accounts had not known yet is received as well."""
+    spool = opened()
+    receive(spool, 10, IMU)
+    spool.commit()
+    left = die(spool, root)
+    after = new_spool(left, clock)
+    after.open()
+    after.carry(BAG)
+    assert bags(left) == {'/imu': (10, 0, {}, 10)}
+    if recorded:
+        item = a_slice(0, imu=recorded)
+        after.accounts.find(item.counts)
+        after.commit([item])
+    assert after.accounts.drop_carried('restart') == max(0, 10 - recorded)
+    after.close()
+    assert bags(left) == {'/imu': expected}
+
+
+def test_a_death_in_the_middle_of_settling_costs_nothing(opened: Open, root: Path, clock: FakeClock) -> None:
+    """What one session carried and did not settle is carried by the next."""
+    spool = opened()
+    receive(spool, 10, IMU)
+    spool.commit()
+    first = die(spool, root)
+    after = new_spool(first, clock)
+    after.open()
+    after.carry(BAG)
+    item = a_slice(0, imu=4)
+    after.accounts.find(item.counts)
+    after.commit([item])
+    second = die(after, first)
+    after.close()
+    last = new_spool(second, clock)
+    last.open()
+    last.carry(BAG)
+    item = a_slice(1, imu=5)
+    last.accounts.find(item.counts)
+    last.commit([item])
+    assert last.accounts.drop_carried('restart') == 1
+    last.close()
+    assert bags(second) == {'/imu': (10, 9, {'restart': 1}, 0)}
+
+
+def test_what_is_open_at_a_stop_waits_for_the_next_start(opened: Open, root: Path) -> None:
+    """A slice that could not be spooled in time is not lost; messages of sensors have nobody who looks for them."""
+    spool = opened()
+    receive(spool, 5, IMU)
+    receive(spool, 2, '/imu')
+    spool.close()
+    assert bags(root) == {'/imu': (5, 0, {}, 5)}
+    assert ledger.read(root, 'thor')['topics']['/imu']['dropped'] == {'shutdown': 2}
+    after = opened()
+    after.carry(BAG)
+    assert after.accounts.drop_carried('restart') == 5
+
+
+@pytest.mark.parametrize('found_first', [True, False])
+def test_a_recorded_message_is_not_missed_as_well(opened: Open, root: Path, clock: FakeClock, found_first: bool) -> None:
+    """Numbers that the accounts of the dead session did not reach are in its file: the gap before the next one is shorter."""
+    spool = opened()
+    receive(spool, 10, IMU)
+    spool.commit()
+    left = die(spool, root)
+    after = new_spool(left, clock)
+    after.open()
+    after.carry(BAG)
+    item = a_slice(0, imu=14)
+    if found_first:
+        after.accounts.find(item.counts)
+    with after.accounts.entry(IMU) as account:
+        assert account.receive('p', 31)
+    if not found_first:
+        after.accounts.find(item.counts)
+    after.commit([item])
+    after.close()
+    found = ledger.read(left, 'thor')
+    row = found['bags']['/imu']
+    assert (row['published'], row['received'], row['missed_by']) == (31, 15, {'restart': 16})
+    assert ledger.imbalances(found) == []

@@ -1,0 +1,158 @@
+"""The list of what no part of the catalogue has yet: nothing leaves it but with a part, and then once."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from spool.conftest import Moments, Open
+from spool.making import FakeClock, abandon, assert_whole, make, new_spool, put, rows, settle
+
+from shadowhound_data_logger.model import DataObject, Outcome, State
+from shadowhound_data_logger.spool import uncatalogued
+from shadowhound_data_logger.spool.files import Tree
+from shadowhound_data_logger.spool.spool import Spool
+
+ALL = 1000
+
+
+def listed(root: Path) -> list[str]:
+    return [item.key for item in uncatalogued.waiting(root, ALL)]
+
+
+def part(root: Path, name: str, *keys: str) -> DataObject:
+    """A part with rows of all that is listed, or of these."""
+    ids = tuple(item.id for item in uncatalogued.waiting(root, ALL) if not keys or item.key in keys)
+    return make(f'thor/_catalog/{name}.parquet', name.encode(), sensor='_catalog', topic=None, protected=True, catalogues=ids)
+
+
+def delivered(spool: Spool, *keys: str) -> None:
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in put(spool, *(make(key, key.encode()) for key in keys))])
+
+
+def test_what_the_store_holds_is_listed(spool: Spool, root: Path) -> None:
+    """Delivered objects are, the oldest first, with what they say of themselves; whatever else became of an object, it is not."""
+    items = put(spool, *(make(name, name.encode()) for name in 'abcd'))
+    settle(spool, items[1], State.QUARANTINED, 'refused')
+    settle(spool, items[2], State.EVICTED)
+    assert listed(root) == []
+    settle(spool, items[3], State.DELIVERED)
+    settle(spool, items[0], State.DELIVERED)
+    assert listed(root) == ['a', 'd']
+    (first, _) = uncatalogued.waiting(root, ALL)
+    assert first == (items[0].id, 'sensor-data', 'a', 1, 'image/jpeg', items[0].metadata)
+    settle(spool, items[2], State.DELIVERED)  # it was on its way when it was evicted
+    assert listed(root) == ['a', 'c', 'd']
+    assert [item.key for item in uncatalogued.waiting(root, 2)] == ['a', 'c']
+
+
+def test_a_part_takes_its_rows_off(spool: Spool, root: Path) -> None:
+    """What it has rows of, and nothing else; the part itself is never listed."""
+    delivered(spool, 'a', 'b')
+    (item,) = spool.commit([part(root, 'one', 'a')])
+    assert listed(root) == ['b']
+    settle(spool, item, State.DELIVERED)
+    assert listed(root) == ['b']
+    assert_whole(root)
+
+
+def test_a_row_is_in_one_part(spool: Spool, root: Path) -> None:
+    """Of two parts that have one of their rows in common, the second is left out as a whole, in the same commit or later."""
+    delivered(spool, 'a', 'b')
+    one, two = part(root, 'one'), part(root, 'two', 'a')
+    assert [item.key for item in spool.commit([one, two, make('c', topic=None)])] == [one.key, 'c']
+    assert spool.commit([two]) == []
+    assert [row['key'] for row in rows(root)] == ['a', 'b', one.key, 'c']
+    assert_whole(root)
+
+
+def refuse(_: Tree) -> None:
+    raise OSError(28, 'full')
+
+
+def test_a_commit_that_fails_takes_nothing_off(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a full disk the rows stay listed, and the same part goes when there is room."""
+    delivered(spool, 'a')
+    made = part(root, 'one')
+    with monkeypatch.context() as full:
+        full.setattr(Tree, 'sync_incoming', refuse)
+        with pytest.raises(OSError, match='full'):
+            spool.commit([made])
+    assert listed(root) == ['a']
+    assert len(spool.commit([made])) == 1
+    assert listed(root) == []
+
+
+def test_death_at_any_moment_of_a_part(root: Path, moments: Moments) -> None:
+    """After a kill every delivered object is listed, or in a part that is there to be delivered: never both, never neither."""
+    spool = new_spool(root)
+    spool.open()
+    items = put(spool, make('a', b'a'), make('b', b'b'))
+    spool.close()
+
+    def work() -> None:
+        spool = new_spool(root)
+        spool.open()
+        spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
+        spool.commit([part(root, 'one')])
+        spool.commit([make('c', topic=None)])
+        abandon(spool)
+
+    seen = []
+    for copy in moments(work):
+        spool = new_spool(copy)
+        spool.open()
+        assert_whole(copy)
+        state = {row['key']: row['state'] for row in rows(copy)}
+        has_part = state.get('thor/_catalog/one.parquet') == 'pending'
+        expected = ['a', 'b'] if state['a'] == 'delivered' and not has_part else []
+        assert listed(copy) == expected
+        seen.append((state['a'], has_part))
+        spool.close()
+    assert set(seen) == {('pending', False), ('delivered', False), ('delivered', True)}
+    assert seen == sorted(seen, key=lambda state: (state[0] == 'delivered', state[1]))
+
+
+def test_what_is_listed_is_not_forgotten(opened: Open, root: Path, clock: FakeClock) -> None:
+    """However old it is; once nobody wants its row, it is."""
+    spool = opened()
+    delivered(spool, 'a')
+    clock.now_ns += 10**18
+    spool.commit()
+    assert [row['key'] for row in rows(root)] == listed(root) == ['a']
+    uncatalogued.clear(root)
+    assert listed(root) == []
+    clock.now_ns += 10**14
+    spool.commit()
+    assert rows(root) == []
+
+
+def test_a_spool_from_before_the_catalogue(opened: Open, root: Path) -> None:
+    """What version 2 delivered and still remembers is listed when a robot is updated."""
+    spool = opened()
+    delivered(spool, 'a')
+    put(spool, make('b'))
+    spool.close()
+    with closing(sqlite3.connect(root / 'index.db')) as connection:
+        connection.executescript(
+            'DROP TABLE contents; DROP TRIGGER contents_moved; DROP TRIGGER contents_forgotten; DROP TABLE uncatalogued;'
+            ' DROP TRIGGER arrived; DROP TRIGGER known; DROP TRIGGER forgotten; PRAGMA user_version = 2;'
+        )
+    assert not opened().recovery.found_anything
+    assert listed(root) == ['a']
+
+
+def test_an_object_says_what_its_row_needs(spool: Spool) -> None:
+    """Sensor, topic, type, count and times are in the metadata of each, but no time of a clock that is not set."""
+    (frame,) = put(spool, make('a', topic=None, type='', samples=0, sensor='missions', metadata={'robot': 'thor'}))
+    assert {name: frame.metadata.get(name) for name in ('sensor', 'topic', 'count')} == {
+        'sensor': 'missions', 'topic': None, 'count': None,
+    }  # fmt: skip
+    assert int(frame.metadata['t_start_ns']) == make().t_start_ns
+    (early,) = put(spool, replace(make('b'), t_start_ns=5, t_end_ns=6))
+    assert not early.metadata.keys() & {'t_start_ns', 't_end_ns'}
+    (own,) = put(spool, make('c', metadata={'sensor': 'front', 'count': '9'}))
+    assert (own.metadata['sensor'], own.metadata['count']) == ('front', '9')
