@@ -1,0 +1,5 @@
+"""Bags: full-rate recordings in rosbag2's own format, in slices that are whole one by one."""
+
+from shadowhound_data_logger.bags.record import Recorded, record_and_upload_rosbag
+
+__all__ = ['Recorded', 'record_and_upload_rosbag']

@@ -1,0 +1,167 @@
+"""A piece of a bag as a bag of its own: a span of time and some of the topics, message by message as they were recorded.
+
+Of an MCAP slice in a store only the summary and the chunks that hold something wanted are read. What is no plain MCAP (SQLite, or
+compressed outside the storage) is downloaded first.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Final, Protocol
+
+from shadowhound_data_logger.bags.channel import Channel
+from shadowhound_data_logger.bags.description import METADATA, of_metadata
+from shadowhound_data_logger.bags.fetch import fetch, on_disk
+from shadowhound_data_logger.bags.mcap_messages import Message, Wanted
+from shadowhound_data_logger.bags.metadata import metadata_yaml
+from shadowhound_data_logger.bags.packed import Packed
+from shadowhound_data_logger.bags.plain import Plain, is_plain
+from shadowhound_data_logger.bags.ranges import LocalFile, Meter, StoredFile
+from shadowhound_data_logger.bags.remote import BUCKET, Listing, RemoteBag, natural
+from shadowhound_data_logger.bags.slice_writer import SliceWriter
+from shadowhound_data_logger.bags.span import when
+from shadowhound_data_logger.clock import iso
+from shadowhound_data_logger.errors import BagError, SettingError
+from shadowhound_data_logger.keys import check_name
+
+UNFINISHED: Final = '.part'
+SOURCE: Final = 'source'
+"""Of what has to be downloaded whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What to cut out. Times as ``span.when`` takes them: from ``start``, before ``end``; empty for the bag's own."""
+
+    start: str = ''
+    end: str = ''
+    topics: Sequence[str] = ()
+    regex: str = ''
+    """A topic that it is found in is taken as well; without both, all are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """What came of it."""
+
+    folder: Path
+    messages: int
+    topics: int
+    bytes: int
+    t_start_ns: int
+    t_end_ns: int
+    """Of the messages in it."""
+    read_bytes: int
+    read_requests: int
+    bag_bytes: int
+
+
+class Material(Protocol):
+    """Where the messages come from."""
+
+    def span(self) -> tuple[int, int]:
+        """Log times of the first and the last message."""
+
+    def topics(self) -> set[str]: ...
+
+    def messages(self, wanted: Wanted) -> Iterator[Message]: ...
+
+
+def cut_remote(store: Listing, bag: RemoteBag, out: Path, choice: Choice) -> Cut:
+    """Into the new folder ``out``. Raises BagError, BagDamaged, SettingError, StoreError."""
+    if bag.is_archive:
+        raise BagError(f'{bag.name} is an archive, of which no part can be read', remedy='fetch it, unpack it and cut the folder')
+    meter = Meter()
+    file = bag.file(METADATA)
+    told = of_metadata(store.get(BUCKET, file.key), file.key) if file else None
+    with _new_folder(out) as folder:
+        if is_plain(told, [each.name for each in bag.slices]):
+            sources = [StoredFile(store, BUCKET, each.key, each.size, meter) for each in bag.slices]
+            return _cut(Plain(sources, told), folder, out, choice, meter, bag.size)
+        fetched = fetch(store, bag, folder / SOURCE)
+        meter.add(fetched.downloaded)
+        return _cut(Packed(fetched.folder), folder, out, choice, meter, bag.size)
+
+
+def cut_folder(folder: Path, out: Path, choice: Choice) -> Cut:
+    """Of a bag on the disk. Raises BagError, BagDamaged, SettingError."""
+    meter = Meter()
+    names = sorted((path.name for path in folder.glob('*.*') if path.is_file()), key=natural)
+    told = of_metadata((folder / METADATA).read_bytes(), str(folder / METADATA)) if METADATA in names else None
+    slices = [name for name in names if name.endswith('.mcap')]
+    size = sum((folder / name).stat().st_size for name in names)
+    with _new_folder(out) as new:
+        if is_plain(told, slices):
+            return _cut(Plain([LocalFile(folder / name, meter) for name in slices], told), new, out, choice, meter, size)
+        return _cut(Packed(folder), new, out, choice, meter, size)
+
+
+def _cut(source: Material, folder: Path, out: Path, choice: Choice, meter: Meter, bag_bytes: int) -> Cut:
+    first_ns, last_ns = source.span()
+    start_ns = when(choice.start, first_ns, last_ns, '--start') if choice.start else first_ns
+    end_ns = when(choice.end, first_ns, last_ns, '--end') if choice.end else last_ns + 1
+    if end_ns <= start_ns:
+        raise SettingError('--end', choice.end, f'a time after --start, which is {iso(start_ns)}')
+    writer = SliceWriter(folder / f'{out.name}_0.mcap')
+    try:
+        for message in source.messages(Wanted(start_ns, end_ns, _chosen(choice))):
+            writer.write(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
+        info = writer.close()
+    finally:
+        writer.abort()
+    if not info.messages:
+        raise _nothing(source, choice, start_ns, end_ns)
+    (folder / METADATA).write_bytes(metadata_yaml([info], ros_distro=''))
+    return Cut(out, info.messages, sum(count > 0 for count in info.counts.values()), info.bytes, info.t_start_ns, info.t_end_ns,
+               meter.bytes, meter.requests, bag_bytes)  # fmt: skip
+
+
+def _chosen(choice: Choice) -> Callable[[Channel], bool]:
+    """Raises SettingError for a regular expression that is none."""
+    names = {'/' + name.lstrip('/') for name in choice.topics}
+    try:
+        pattern = re.compile(choice.regex) if choice.regex else None
+    except re.error as error:
+        raise SettingError('--regex', choice.regex, f'a regular expression ({error})') from error
+    if not names and pattern is None:
+        return lambda _: True
+    return lambda channel: channel.topic in names or (pattern is not None and pattern.search(channel.topic) is not None)
+
+
+def _nothing(source: Material, choice: Choice, start_ns: int, end_ns: int) -> BagError:
+    """Says which topics there are, or which times."""
+    topics = sorted(source.topics())
+    first_ns, last_ns = source.span()
+    for name in choice.topics:
+        if '/' + name.lstrip('/') not in topics:
+            near = get_close_matches(name, topics, cutoff=0.3) or topics
+            return BagError(f'the bag has no topic {name}', remedy=f'it has {", ".join(near)}')
+    if choice.regex and not any(re.search(choice.regex, topic) for topic in topics):
+        return BagError(f'no topic of the bag matches {choice.regex}', remedy=f'it has {", ".join(topics)}')
+    text = f'nothing of that was recorded between {iso(start_ns)} and {iso(end_ns)}'
+    return BagError(text, remedy=f'the bag goes from {iso(first_ns)} to {iso(last_ns)}')
+
+
+@contextmanager
+def _new_folder(out: Path) -> Iterator[Path]:
+    """A folder that becomes ``out`` when all went well, and is gone otherwise."""
+    if out.exists():
+        raise BagError(f'{out} is there already', remedy='choose a new folder')
+    check_name(out.name, 'the new bag')
+    part = out.with_name(out.name + UNFINISHED)
+    with on_disk(out):
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        try:
+            yield part
+            shutil.rmtree(part / SOURCE, ignore_errors=True)
+            os.replace(part, out)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)

@@ -1,0 +1,137 @@
+"""What a bag holds: its topics, times and files, from its metadata.yaml or, of MCAP, from the summaries of its slices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from shadowhound_data_logger.bags.mcap_index import McapIndex
+from shadowhound_data_logger.bags.slice_info import SliceInfo
+from shadowhound_data_logger.errors import BagDamaged
+
+METADATA: Final = 'metadata.yaml'
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One topic of one type."""
+
+    name: str
+    type: str
+    messages: int
+    qos: Sequence[Mapping[str, Any]]
+    """The offered QoS profiles, as rosbag2 keeps them; empty where they are not known."""
+    type_hash: str
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One file of a bag. Times are log times, Unix nanoseconds, both inclusive; None where they are not known."""
+
+    name: str
+    messages: int | None
+    t_start_ns: int | None
+    t_end_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """The contents of a bag."""
+
+    storage: str
+    """``mcap`` or ``sqlite3``."""
+    compression: str
+    """Of files or messages, as rosbag2 does it outside the storage: ``zstd file``; empty without."""
+    distro: str
+    topics: tuple[Topic, ...]
+    parts: tuple[Part, ...]
+    messages: int
+    t_start_ns: int
+    t_end_ns: int
+
+    @property
+    def duration_s(self) -> float:
+        return max(self.t_end_ns - self.t_start_ns, 0) / 1e9
+
+
+def of_metadata(content: bytes, name: str) -> Description:
+    """From a metadata.yaml of any version of rosbag2. Raises BagDamaged for what is none."""
+    try:
+        found = YAML(typ='safe').load(content.decode())['rosbag2_bagfile_information']
+        return _described(found)
+    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise BagDamaged(f'{name} is no metadata of a rosbag2 bag: {type(error).__name__} {error}', path=name) from error
+
+
+def of_slices(slices: Sequence[SliceInfo]) -> Description:
+    """From what the slices themselves say."""
+    counts: dict[tuple[str, str], int] = {}
+    found: dict[tuple[str, str], Topic] = {}
+    for one in slices:
+        types = [channel.topic for channel in one.channels]
+        for channel in one.channels:
+            key = (channel.topic, channel.type)
+            counts[key] = counts.get(key, 0) + one.counts.get(channel.topic, 0) // types.count(channel.topic)
+            found.setdefault(key, Topic(*key, 0, profiles(channel.qos), channel.type_hash))
+    filled = [one for one in slices if one.messages]
+    return Description(
+        storage='mcap', compression='', distro='',
+        topics=tuple(Topic(topic.name, topic.type, counts[key], topic.qos, topic.type_hash) for key, topic in found.items()),
+        parts=tuple(Part(one.path.name, one.messages, one.t_start_ns, one.t_end_ns) for one in slices),
+        messages=sum(one.messages for one in slices),
+        t_start_ns=min((one.t_start_ns for one in filled), default=0), t_end_ns=max((one.t_end_ns for one in filled), default=0),
+    )  # fmt: skip
+
+
+def slice_info(index: McapIndex, path: Path, size: int, sha256: str = '') -> SliceInfo:
+    """A slice as its own summary tells it."""
+    counts: dict[str, int] = {channel.topic: 0 for channel in index.channels.values()}
+    for number, count in index.counts.items():
+        counts[index.channels[number].topic] += count
+    return SliceInfo(path, size, sha256, index.t_start_ns, index.t_end_ns, index.messages, counts, tuple(index.channels.values()))
+
+
+def profiles(qos: object) -> Sequence[Mapping[str, Any]]:
+    """Offered QoS profiles: rosbag2 keeps them as a list, before its version 9 as the YAML of one."""
+    if isinstance(qos, str):
+        try:
+            qos = YAML(typ='safe').load(qos) if qos else []
+        except YAMLError:
+            return ()
+    return tuple(each for each in qos if isinstance(each, Mapping)) if isinstance(qos, list) else ()
+
+
+def _described(found: Mapping[str, Any]) -> Description:
+    start = int(found['starting_time']['nanoseconds_since_epoch'])
+    paths = [PurePosixPath(path).name for path in found['relative_file_paths']]
+    told = {PurePosixPath(each['path']).name: each for each in found.get('files') or ()}
+    compression = ' '.join(str(found.get(name) or '') for name in ('compression_format', 'compression_mode')).strip()
+    messages = int(found['message_count'])
+    return Description(
+        storage=str(found['storage_identifier']), compression='' if compression.lower() == 'none' else compression.lower(),
+        distro=str(found.get('ros_distro') or ''), topics=tuple(_topics(found['topics_with_message_count'] or ())),
+        parts=tuple(_part(path, told.get(path)) for path in paths), messages=messages,
+        t_start_ns=start if messages else 0, t_end_ns=start + int(found['duration']['nanoseconds']) if messages else 0,
+    )  # fmt: skip
+
+
+def _topics(found: Iterable[Mapping[str, Any]]) -> Iterable[Topic]:
+    for each in found:
+        told = each['topic_metadata']
+        yield Topic(
+            str(told['name']), str(told['type']), int(each['message_count']), profiles(told.get('offered_qos_profiles')),
+            str(told.get('type_description_hash') or ''),
+        )  # fmt: skip
+
+
+def _part(path: str, told: Mapping[str, Any] | None) -> Part:
+    if told is None:
+        return Part(path, None, None, None)
+    start = int(told['starting_time']['nanoseconds_since_epoch'])
+    messages = int(told['message_count'])
+    return Part(path, messages, start if messages else None, start + int(told['duration']['nanoseconds']) if messages else None)

@@ -1,0 +1,302 @@
+"""Events: a trigger makes a bag of the seconds before it and after it, from the ring, written by a thread of its own.
+
+A trigger while an event goes on makes it last longer, and is told in its manifest; what would be longer than an event may be
+follows in one of its own, without a message between them or in both. The writer takes from the ring piece by piece what it
+writes: there is no second copy of it, and the intake never waits.
+
+Counted are the messages that an event asks for, in accounts of their own (EVENT): they are stored, dropped (``ring_full``: gone
+before they were written; ``paused``; what the disk refused) or open. What nobody asks for is in no account.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+from shadowhound_data_logger.bags.manifest import EventOf, MissionOf, TriggerOf
+from shadowhound_data_logger.bags.naming import bag_name
+from shadowhound_data_logger.bags.notes import Notes, discard
+from shadowhound_data_logger.bags.recorder import SYNC_S, Answer, Place
+from shadowhound_data_logger.bags.recording import UNWRITABLE, Outlet, Recording
+from shadowhound_data_logger.bags.ring import Held, Ring
+from shadowhound_data_logger.clock import SECOND, iso
+from shadowhound_data_logger.missions.folder import safe_type
+from shadowhound_data_logger.options import BagSettings, EventSettings
+from shadowhound_data_logger.spool.accounts import EVENT
+from shadowhound_data_logger.worker import Worker
+
+log = logging.getLogger(__name__)
+
+PREFIX: Final = 'event_'
+NOTICE_S: Final = 1.0
+"""What the ring keeps beyond the time before a trigger: for so long a trigger may be on its way."""
+STEP_S: Final = 0.2
+IDLE_S: Final = 60.0
+RETRY_S: Final = 5.0
+"""Between two tries to begin a bag on a disk that takes nothing."""
+FLUSH_S: Final = 5.0
+PATIENCE_S: Final = 30.0
+RING_FULL: Final = 'ring_full'
+"""Why messages are dropped that had to go from the ring before an event that asked for them could write them."""
+
+
+@dataclass(frozen=True, slots=True)
+class EventStatus:
+    """Ring and events at one instant."""
+
+    enabled: bool
+    seconds: float = 0.0
+    """In the ring, from the oldest message to the newest."""
+    bytes: int = 0
+    max_bytes: int = 0
+    bag: str = ''
+    """Which is written now."""
+    refused: str = ''
+    """Why the disk takes nothing of it now."""
+    triggers: int = 0
+    written: int = 0
+    """Events that ended."""
+    last: Mapping[str, str] = field(default_factory=dict)
+    """The last trigger: name, by, time, bag."""
+
+
+@dataclass(slots=True)
+class _Event:
+    """One that goes on. ``bag``, ``of`` and ``until_s`` change under the lock; ``recording`` is the writer's."""
+
+    bag: str
+    of: EventOf
+    until_s: float
+    at_most_s: float
+    recording: Recording | None = None
+    again_s: float = 0.0
+    refused: str = ''
+
+
+class Events:
+    """Life: New; open once; ``trigger``, ``lose`` and ``status`` from any thread; ``close`` after the intake is closed.
+
+    ``_lock`` guards which event goes on and what is asked of it; the writing belongs to the thread ``event-writer``.
+    """
+
+    def __init__(self, settings: EventSettings, bag: BagSettings, place: Place, ring: Ring, outlet: Outlet, poll_s: float,
+                 monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
+        """``poll_s``: how late the intake may take a message."""
+        self._settings = settings
+        self._bag = bag
+        self._place = place
+        self._ring = ring
+        self._outlet = outlet
+        self._poll_s = poll_s
+        self._monotonic = monotonic
+        self._lock = threading.Lock()
+        self._wake = threading.Event()
+        self._current: _Event | None = None
+        self._waiting: list[TriggerOf] = []
+        self._mission: MissionOf | None = None
+        self._closed = False
+        self._ended = threading.Event()
+        self._ended.set()
+        self._due_s = 0.0
+        self._triggers = self._written = 0
+        self._last: Mapping[str, str] = {}
+        self._worker = Worker('event-writer', self._step, patience_s=PATIENCE_S)
+
+    @property
+    def workers(self) -> Sequence[Worker]:
+        return [self._worker] if self._settings.enabled else []
+
+    def open(self) -> None:
+        if self._settings.enabled:
+            self._worker.start()
+
+    def close(self, deadline_s: float) -> bool:
+        """End the event that goes on, with what the ring has; False when that took too long: the next start goes on with it."""
+        end_s = time.monotonic() + deadline_s
+        with self._lock:
+            self._closed = True
+            self._waiting.clear()
+            if self._current is not None:
+                self._current.until_s = min(self._current.until_s, self._monotonic() - self._poll_s)
+        self._wake.set()
+        is_whole = self._ended.wait(max(0.0, deadline_s))
+        self._worker.stop()
+        self._wake.set()
+        return self._worker.join(max(0.1, end_s - time.monotonic())) and is_whole
+
+    def update(self, settings: EventSettings) -> None:
+        """Go on by other settings, as far as they are live."""
+        self._settings = settings
+        self._ring.max_bytes, self._ring.keep_s = settings.max_bytes, settings.pre_s + NOTICE_S
+
+    def on_mission(self, told: Mapping[str, Any]) -> None:
+        """Which mission is active now (``MissionWatch.status``); empty for none."""
+        self._mission = MissionOf(told['type'], told['mission_id'], told.get('run_id')) if told else None
+
+    def status(self) -> EventStatus:
+        """From any thread."""
+        if not self._settings.enabled:
+            return EventStatus(enabled=False)
+        event, ring = self._current, self._ring
+        refused = '' if event is None else event.refused or (event.recording.refused if event.recording is not None else '')
+        return EventStatus(
+            enabled=True, seconds=round(ring.seconds, 1), bytes=ring.bytes, max_bytes=ring.max_bytes,
+            bag=event.bag if event is not None else '', refused=refused, triggers=self._triggers, written=self._written,
+            last=self._last,
+        )  # fmt: skip
+
+    def trigger(self, name: str, by: str, detail: str | None = None, age_s: float = 0.0) -> Answer:
+        """Something happened, so long ago: begin an event, or make the one that goes on last longer. Names the bag."""
+        said = TriggerOf(name, by, self._place.clock.wall_ns() - round(age_s * SECOND), detail)
+        with self._lock:
+            if not self._settings.enabled:
+                return False, 'no events: neither events.topics nor events.regex names a topic to keep'
+            if self._closed:
+                return False, 'no events any more: the node is closing'
+            self._triggers += 1
+            now_s, event = self._monotonic(), self._current
+            if event is None:
+                event = self._current = self._begin([said], now_s - age_s)
+                self._ended.clear()
+                text = f'{event.bag} begins'
+            elif now_s - age_s + self._settings.post_s <= event.at_most_s:
+                event.of = replace(event.of, triggers=(*event.of.triggers, said))
+                event.until_s = max(event.until_s, now_s - age_s + self._settings.post_s)
+                text = f'{event.bag} lasts longer'
+            else:
+                self._waiting.append(said)
+                text = f'another event follows {event.bag}, which is as long as it may be'
+            self._last = {'name': name, 'by': by, 'time': iso(said.at_ns), 'bag': event.bag}
+            self._wake.set()
+        log.info('event %s (%s): %s', name, by, text)
+        return True, text
+
+    def lose(self, held: Iterable[Held], reason: str = RING_FULL) -> None:
+        """What an event asked for and cannot have."""
+        for each in held:
+            fresh = self._receive(each)
+            self._outlet.accounts.drop(f'{EVENT}{each.lot.topic}', reason, len(fresh))
+
+    # -- under the lock --------------------------------------------------------------------------------------------
+
+    def _begin(self, triggers: Sequence[TriggerOf], at_s: float, since_s: float | None = None) -> _Event:
+        """An event about a moment; ``since_s`` is the end of the one that it follows."""
+        settings = self._settings
+        oldest_s = self._ring.claim(at_s - settings.pre_s if since_s is None else since_s)
+        held_s = 0.0 if oldest_s is None or since_s is not None else min(max(0.0, at_s - oldest_s), settings.pre_s)
+        name = safe_type(triggers[0].name)
+        if since_s is None:
+            self._outlet.accounts.rebase_all(EVENT)
+        root, is_known = self._place.root, self._place.is_known
+        bag = bag_name(f'{PREFIX}{name}', triggers[0].at_ns, lambda bag: (root / bag).exists() or is_known(bag))
+        of = EventOf(name, settings.pre_s, round(held_s, 3), settings.post_s, tuple(triggers))
+        return _Event(bag, of, at_s + settings.post_s, at_s + settings.max_s)
+
+    def _end(self, event: _Event) -> bool:
+        """Whether the event is over; if so another one that waits begins, or the ring is nobody's again."""
+        with self._lock:
+            now_s = self._monotonic()
+            if now_s < event.until_s + self._poll_s:
+                return False
+            waiting, self._waiting = self._waiting, []
+            if waiting:
+                self._current = self._begin(waiting, now_s, event.until_s)
+                self._wake.set()
+            else:
+                self._ring.release()
+                self._current = None
+                self._ended.set()
+            return True
+
+    # -- the thread ------------------------------------------------------------------------------------------------
+
+    def _step(self) -> None:
+        """Wait until there is something to write, and write it; sync when it is time."""
+        self._wake.wait(STEP_S if self._current is not None else IDLE_S)
+        self._wake.clear()
+        event = self._current
+        if event is None:
+            return
+        is_over = self._monotonic() >= event.until_s + self._poll_s
+        if event.recording is None and not self._open_bag(event):
+            if is_over:
+                self._give_up(event)
+            return
+        self._write(event)
+        if is_over and self._end(event):
+            self._close_bag(event)
+
+    def _open_bag(self, event: _Event) -> bool:
+        """Make the bag's folder; False while the disk takes nothing."""
+        now_s = self._monotonic()
+        if now_s < event.again_s:
+            return False
+        try:
+            notes = Notes.begin(self._place.root / event.bag, self._place.robot, self._mission, event.of)
+        except OSError as error:
+            event.again_s = now_s + RETRY_S
+            discard(self._place.root / event.bag)
+            if not event.refused:
+                log.error('nothing of %s is written while the disk takes nothing: %s', event.bag, error)  # noqa: TRY400 - an operator's
+            event.refused = UNWRITABLE
+            return False
+        event.refused = ''
+        event.recording = Recording(notes, self._bag, self._outlet)
+        self._due_s = now_s + SYNC_S
+        return True
+
+    def _write(self, event: _Event) -> None:
+        """All that the ring has of the event until now."""
+        recording = event.recording
+        assert recording is not None
+        self._tell_triggers(event, recording.notes)
+        while held := self._ring.next(event.until_s + self._poll_s):
+            fresh = self._receive(held)
+            if fresh:
+                recording.write(held.lot._replace(messages=fresh))
+            self._sync(recording)
+        self._sync(recording)
+
+    def _sync(self, recording: Recording) -> None:
+        if self._monotonic() >= self._due_s:
+            recording.tick()
+            self._due_s = self._monotonic() + SYNC_S
+
+    def _tell_triggers(self, event: _Event, notes: Notes) -> None:
+        if notes.event is not event.of:
+            try:
+                notes.set_event(event.of)
+            except OSError as error:
+                log.warning('bag %s: %s', event.bag, error)
+
+    def _close_bag(self, event: _Event) -> None:
+        recording = event.recording
+        assert recording is not None
+        notes, mission = recording.notes, self._mission
+        self._tell_triggers(event, notes)
+        if mission is not None and notes.mission is not None and notes.mission.mission_id == mission.mission_id:
+            recording.set_mission(mission)
+        is_whole = recording.close(FLUSH_S)
+        self._written += 1
+        log.log(logging.INFO if is_whole else logging.WARNING, '%s: %d messages%s', event.bag, recording.messages,
+                '' if is_whole else '; the next start makes it whole')  # fmt: skip
+
+    def _give_up(self, event: _Event) -> None:
+        """The disk took nothing for as long as it lasted."""
+        while held := self._ring.next(event.until_s + self._poll_s):
+            self.lose([held], UNWRITABLE)
+        if self._end(event):
+            log.error('%s is lost: the disk took nothing', event.bag)
+
+    def _receive(self, held: Held) -> list[Any]:
+        """Count messages as asked for, repeats left out."""
+        with self._outlet.accounts.entry(f'{EVENT}{held.lot.topic}') as account:
+            account.type = held.lot.type
+            receive, reported = account.receive, held.lost is not None
+            fresh = [each for each in held.lot.messages if receive(each.publisher, each.number, reported=reported)]
+            account.lose(held.lost)
+        return fresh

@@ -1,0 +1,178 @@
+"""A bag out of the store into a folder: several files at a time, each verified, each under its name only once it is whole.
+
+What is there already and right is not asked for again; a file that a kill cut off goes on where it ended.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.bags.description import METADATA, slice_info
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.mcap_index import read_index
+from shadowhound_data_logger.bags.metadata import metadata_yaml
+from shadowhound_data_logger.bags.ranges import LocalFile, Meter
+from shadowhound_data_logger.bags.recovery import file_digest
+from shadowhound_data_logger.bags.remote import BUCKET, MANIFEST, Listing, RemoteBag, RemoteFile, missing_of
+from shadowhound_data_logger.errors import BagDamaged, BagError, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.keys import check_key
+from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.ship.retry import backoff
+from shadowhound_data_logger.stores.download import UNFINISHED, download
+
+THREADS: Final = 4
+TRIES: Final = 6
+CAP_S: Final = 5.0
+"""Of the pause between two tries: a store that is away for good is told within half a minute."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fetched:
+    """What came of it."""
+
+    folder: Path
+    files: int
+    bytes: int
+    """Of all files of the bag."""
+    downloaded: int
+    """Bytes that came over the network."""
+    is_complete: bool
+    """Whether the manifest was there and all that it promises; else the bag is growing, or foreign."""
+    unverified: tuple[str, ...]
+    """Files of a foreign writer, of which no checksum is known."""
+
+
+class Told:
+    """Hears how far a fetch has come; any thread calls it."""
+
+    def begin(self, total: int) -> None:
+        """All bytes there are to have."""
+
+    def have(self, count: int) -> None:
+        """So many more are here, downloaded or there already; negative where they turned out wrong."""
+
+
+def fetch(store: Listing, bag: RemoteBag, to: Path, *, threads: int = THREADS, told: Told | None = None) -> Fetched:
+    """Raises BagError, BagDamaged for what does not arrive as it was sent, StoreError, OSError; what is whole by then stays."""
+    with on_disk(to):
+        return _fetch(store, bag, to, threads, told or Told())
+
+
+@contextmanager
+def on_disk(folder: Path) -> Iterator[None]:
+    """What the disk refuses is a BagError."""
+    try:
+        yield
+    except OSError as error:
+        where = error.filename or folder
+        raise BagError(f'{where} cannot be used: {error.strerror}', remedy='is there space, and may you write there?') from error
+
+
+def _fetch(store: Listing, bag: RemoteBag, to: Path, threads: int, told: Told) -> Fetched:
+    folder = to if bag.is_archive else to / bag.name
+    folder.mkdir(parents=True, exist_ok=True)
+    meter = Meter()
+    told.begin(bag.size)
+    manifest = None
+    if (file := bag.file(MANIFEST)) is not None:
+        _have(store, file, folder, None, meter, told)
+        manifest = Manifest.from_json((folder / MANIFEST).read_bytes(), file.key)
+    others = [file for file in bag.files if file.name != MANIFEST]
+    promised = {each.file: each.sha256 for each in manifest.slices} if manifest else {}
+
+    def one(file: RemoteFile) -> str:
+        return _have(store, file, folder, promised.get(file.name), meter, told)
+
+    checksums = dict(zip((file.name for file in others), _side_by_side(one, others, threads), strict=True))
+    if not bag.is_archive and not bag.file(METADATA):
+        _describe(folder, bag)
+    return Fetched(
+        folder / bag.files[0].name if bag.is_archive else folder, len(bag.files), bag.size, meter.bytes,
+        is_complete=manifest is not None and not missing_of(bag, manifest),
+        unverified=tuple(name for name, known in checksums.items() if not known),
+    )  # fmt: skip
+
+
+def _side_by_side(one: Callable[[RemoteFile], str], files: Sequence[RemoteFile], threads: int) -> Iterable[str]:
+    """In the order of the files; after a failure no other file is begun."""
+    pool = ThreadPoolExecutor(threads, 'bag-fetch')
+    try:
+        yield from [each.result() for each in [pool.submit(one, file) for file in files]]
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _have(store: Listing, file: RemoteFile, folder: Path, promised: str | None, got: Meter, told: Told) -> str:
+    """Make it be there; returns the SHA-256 that it was checked against, empty where none is known."""
+    path = folder / check_key(file.name)
+    sha256 = promised or _recorded(store, file)
+    if path.is_file() and path.stat().st_size == file.size and (not sha256 or file_digest(path) == sha256):
+        told.have(file.size)
+        return sha256
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+    def tell(count: int) -> None:
+        got.add(count)
+        told.have(count)
+
+    with _alone(path) as resumed:
+        told.have(resumed)
+        try:
+            info = _steadily(lambda: download(store, BUCKET, file.key, path, tell=tell))
+        except ObjectRefused as error:
+            if not resumed or error.data.get('reason') != 'damaged':
+                raise
+            told.have(-file.size)  # a power cut may leave a file of the right length without its content
+            info = _steadily(lambda: download(store, BUCKET, file.key, path, tell=tell))
+    if promised and info.sha256 != promised and file_digest(path) != promised:
+        path.unlink()
+        raise BagDamaged(f'{file.key} is not in the store what was recorded: its SHA-256 is not {promised}',
+                         remedy='shadowhound-data bag verify tells of all files', path=file.key)  # fmt: skip
+    return sha256
+
+
+def _recorded(store: Listing, file: RemoteFile) -> str:
+    held = store.head(BUCKET, file.key)
+    return (held.sha256 if held else None) or ''
+
+
+def _steadily(ask: Callable[[], ObjectInfo]) -> ObjectInfo:
+    """The answer, after a few tries where the store is away in passing; what arrived until then is kept."""
+    rng = random.Random()
+    for attempt in range(1, TRIES):
+        try:
+            return ask()
+        except StoreUnavailable:
+            time.sleep(backoff(attempt, CAP_S, rng))
+    return ask()
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[int]:
+    """The bytes that are there already, of which no other process writes more meanwhile. Raises BagError when one does."""
+    with path.with_name(path.name + UNFINISHED).open('ab') as part:
+        try:
+            fcntl.flock(part, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BagError(f'another process fetches {path} already', path=str(path)) from error
+        yield os.fstat(part.fileno()).st_size
+
+
+def _describe(folder: Path, bag: RemoteBag) -> None:
+    """Of a bag that is still growing, so that players open what is there of it; the real one replaces it later."""
+    slices = [file for file in bag.slices if file.name.endswith('.mcap')]
+    infos = [slice_info(read_index(LocalFile(folder / file.name)), folder / file.name, file.size) for file in slices]
+    if infos:
+        path = folder / METADATA
+        part = path.with_name(METADATA + UNFINISHED)
+        part.write_bytes(metadata_yaml(infos, ros_distro=''))
+        os.replace(part, path)

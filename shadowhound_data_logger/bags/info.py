@@ -1,0 +1,120 @@
+"""All there is to know of one bag without its messages: from a few short reads, also where its slices lie in a store."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.bags.description import METADATA, Description, of_metadata, of_slices, slice_info
+from shadowhound_data_logger.bags.local import LocalFile as Waiting
+from shadowhound_data_logger.bags.local import local_files
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.mcap_index import read_index
+from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile
+from shadowhound_data_logger.bags.remote import (
+    BUCKET,
+    FOREIGN,
+    GROWING,
+    MANIFEST,
+    Listing,
+    RemoteBag,
+    RemoteFile,
+    find_bag,
+    missing_of,
+    natural,
+    state_of,
+)
+from shadowhound_data_logger.bags.slice_info import SliceInfo
+from shadowhound_data_logger.errors import BagError
+
+THREADS: Final = 8
+
+
+@dataclass(frozen=True, slots=True)
+class BagInfo:
+    """A bag, described."""
+
+    robot: str
+    """Empty of a folder."""
+    bag: str
+    state: str
+    description: Description
+    files: Mapping[str, tuple[int, str]]
+    """Name -> bytes, and where it is."""
+    manifest: Manifest | None
+    missing: Sequence[str]
+    """Slices that the manifest promises and that are nowhere."""
+    read_bytes: int
+    """So many were enough."""
+
+    @property
+    def bytes(self) -> int:
+        return sum(size for size, _ in self.files.values())
+
+
+def info_of(store: Listing, robot: str, name: str, home: Path) -> BagInfo:
+    """Of a bag in the store or still on this robot. Raises BagError, BagDamaged, StoreError, SpoolError."""
+    waiting = {file.name: file for file in local_files(home, robot).values() if file.bag == name}
+    try:
+        bag = find_bag(store, robot, name)
+    except BagError:
+        if not waiting:
+            raise
+        bag = RemoteBag(robot, name, ())
+    if bag.is_archive:
+        raise BagError(f'{name} is an archive of {bag.size} bytes; what is in it shows when it is unpacked',
+                       remedy=f'shadowhound-data bag fetch {name} --to .')  # fmt: skip
+    meter = Meter()
+    sources: dict[str, Ranged] = {
+        file.name: LocalFile(file.path, meter) for file in waiting.values() if file.path is not None and file.path.is_file()
+    }
+    sources |= {file.name: StoredFile(store, BUCKET, file.key, file.size, meter) for file in bag.files}
+    where = {file.name: (file.size, file.where) for file in waiting.values()}
+    where |= {file.name: (file.size, 'store') for file in bag.files}
+    return _info(robot, name, sources, where, meter, tags=_tags(store, bag, waiting))
+
+
+def info_folder(folder: Path) -> BagInfo:
+    """Of a bag on the disk. Raises BagError, BagDamaged."""
+    meter = Meter()
+    paths = [path for path in sorted(folder.iterdir()) if path.is_file()] if folder.is_dir() else [folder]
+    sources: dict[str, Ranged] = {path.name: LocalFile(path, meter) for path in paths}
+    where = {path.name: (path.stat().st_size, 'folder') for path in paths if path.is_file()}
+    return _info('', folder.name, sources, where, meter, tags={})
+
+
+def _info(robot: str, name: str, sources: Mapping[str, Ranged], where: Mapping[str, tuple[int, str]], meter: Meter,
+          tags: Mapping[str, str]) -> BagInfo:  # fmt: skip
+    files = RemoteBag(robot, name, tuple(RemoteFile(each, '', where[each][0]) for each in sorted(where, key=natural)))
+    manifest = Manifest.from_json(_whole(sources[MANIFEST]), sources[MANIFEST].name) if MANIFEST in sources else None
+    if METADATA in sources:
+        description = of_metadata(_whole(sources[METADATA]), sources[METADATA].name)
+    else:
+        slices = [sources[each.name] for each in files.slices if each.name.endswith('.mcap') and each.name in sources]
+        if not slices:
+            raise BagError(f'{name} has neither {METADATA} nor a whole MCAP slice', remedy='is it a bag, or only beginning?')
+        with ThreadPoolExecutor(THREADS, 'bag-info') as pool:
+            description = of_slices(list(pool.map(_slice, slices)))
+    state = GROWING if any(each.endswith('.open') for each in where) else state_of(files, manifest, tags)
+    missing = missing_of(files, manifest) if manifest else []
+    return BagInfo(robot, name, state if robot or manifest else FOREIGN, description,
+                   {file.name: where[file.name] for file in files.files}, manifest, missing, meter.bytes)  # fmt: skip
+
+
+def _slice(source: Ranged) -> SliceInfo:
+    return slice_info(read_index(source), Path(source.name), source.size)
+
+
+def _whole(source: Ranged) -> bytes:
+    return source.read(0, source.size)
+
+
+def _tags(store: Listing, bag: RemoteBag, waiting: Mapping[str, Waiting]) -> Mapping[str, str]:
+    """What was written beside one slice: enough to tell whose it is."""
+    for file in waiting.values():
+        return file.metadata or {'bag': bag.name}
+    held = store.head(BUCKET, bag.slices[0].key) if bag.slices and not bag.file(MANIFEST) else None
+    return held.metadata if held else {}

@@ -1,0 +1,78 @@
+"""Files of bags that are still on the robot: in its spool, waiting for the store, or in the folder of what is being recorded."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.bags.naming import FOLDER
+from shadowhound_data_logger.bags.remote import BUCKET, prefix_of
+from shadowhound_data_logger.bags.slice_writer import OPEN
+from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.spool.index import Index
+
+RECORDS: Final = 'records'
+"""In SHADOWHOUND_HOME: what is being recorded by hand (``bag record``); the node's bags lie in naming.FOLDER."""
+SPOOL: Final = 'spool'
+QUARANTINE: Final = 'quarantine'
+"""Refused by the store for good."""
+RECORDING: Final = 'recording'
+
+
+@dataclass(frozen=True, slots=True)
+class LocalFile:
+    """A file of a bag that the store does not have yet."""
+
+    bag: str
+    name: str
+    where: str
+    """SPOOL, QUARANTINE or RECORDING."""
+    size: int
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    path: Path | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is still being written."""
+        return self.name.endswith(OPEN)
+
+
+def local_files(home: Path, robot: str) -> dict[tuple[str, str], LocalFile]:
+    """By bag and name; what lies in the spool and in the recording folder is in the spool. Raises SpoolError."""
+    found = {(file.bag, file.name): file for folder in (FOLDER, RECORDS) for file in _recording(home / folder / robot)}
+    try:
+        found |= {(file.bag, file.name): file for file in _spooled(home / 'spool', robot)}
+    except sqlite3.Error as error:
+        raise SpoolError(f'the spool {home / "spool"} cannot be read: {error}', remedy='shadowhound-data status') from error
+    return found
+
+
+def _recording(folder: Path) -> Iterator[LocalFile]:
+    for path in sorted(folder.glob('*/*')):
+        if path.name.endswith(('.mcap', f'.mcap{OPEN}')):
+            try:
+                yield LocalFile(path.parent.name, path.name, RECORDING, path.stat().st_size, path=path)
+            except FileNotFoundError:
+                continue  # closed or spooled meanwhile
+
+
+def _spooled(spool: Path, robot: str) -> Iterator[LocalFile]:
+    if not (spool / 'index.db').exists():
+        return
+    prefix = prefix_of(robot)
+    index = Index(spool / 'index.db', read_only=True)
+    index.open()
+    with closing(index):
+        condition = "bucket = ? AND key >= ? AND key < ? AND state IN ('pending', 'held', 'quarantined') ORDER BY id"
+        rows = index.rows(condition, (BUCKET, prefix, prefix[:-1] + chr(ord('/') + 1)))
+    for row in rows:
+        bag, _, name = row['key'][len(prefix) :].partition('/')
+        is_refused = row['state'] == 'quarantined'
+        path = None if is_refused else spool / 'ready' / BUCKET / row['key']
+        where = QUARANTINE if is_refused else SPOOL
+        yield LocalFile(bag, name or bag, where, row['bytes'], json.loads(row['metadata']), path)

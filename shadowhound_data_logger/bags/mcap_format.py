@@ -1,0 +1,181 @@
+"""MCAP as rosbag2 writes it: the bytes of its records, without files. The format is https://mcap.dev/spec."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from array import array
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.bags.channel import Channel
+from shadowhound_data_logger.bags.slice_info import Damage, SliceInfo
+
+MAGIC: Final = b'\x89MCAP0\r\n'
+LIBRARY: Final = 'shadowhound_data_logger'
+RECORD: Final = struct.Struct('<BQ')
+MESSAGE: Final = struct.Struct('<BQHIQQ')
+"""A message up to its data: opcode and length, channel, sequence, log time, publish time."""
+MESSAGE_FIELDS: Final = MESSAGE.size - RECORD.size
+CHUNK: Final = struct.Struct('<QQQI')
+"""Start, end, uncompressed size, CRC; then follow the name of the compression and the data."""
+_STATISTICS: Final = struct.Struct('<QHIIIIQQ')
+_FOOTER: Final = struct.Struct('<QQI')
+_PLACE: Final = struct.Struct('<HQ')
+_COUNTED: Final = struct.Struct('<HI')
+CDR: Final = 'cdr'
+
+
+class Op(IntEnum):
+    """The first byte of a record."""
+
+    HEADER = 0x01
+    FOOTER = 0x02
+    SCHEMA = 0x03
+    CHANNEL = 0x04
+    MESSAGE = 0x05
+    CHUNK = 0x06
+    MESSAGE_INDEX = 0x07
+    CHUNK_INDEX = 0x08
+    STATISTICS = 0x0B
+    METADATA = 0x0C
+    METADATA_INDEX = 0x0D
+    SUMMARY_OFFSET = 0x0E
+    DATA_END = 0x0F
+
+
+def record(op: int, *parts: bytes) -> bytes:
+    """One record, its length in front."""
+    body = b''.join(parts)
+    return RECORD.pack(op, len(body)) + body
+
+
+def text(value: str) -> bytes:
+    """A string, its length in front. What is no UTF-8 (a lone surrogate) is replaced."""
+    encoded = value.encode(errors='replace')
+    return struct.pack('<I', len(encoded)) + encoded
+
+
+def mapping(values: Mapping[str, str]) -> bytes:
+    """A map of strings."""
+    body = b''.join(text(key) + text(value) for key, value in values.items())
+    return struct.pack('<I', len(body)) + body
+
+
+def head() -> bytes:
+    """What a slice begins with: always the same, so that recovery knows where the records begin."""
+    return MAGIC + record(Op.HEADER, text('ros2'), text(LIBRARY))
+
+
+@dataclass(slots=True)
+class Track:
+    """A channel while its slice is written: messages of whole chunks, and the index of the open chunk (time, offset, ...)."""
+
+    number: int
+    channel: Channel
+    count: int = 0
+    index: array[int] = field(default_factory=lambda: array('Q'))
+
+
+def span(tracks: Sequence[Track]) -> tuple[int, int]:
+    """The first and the last log time in the open chunk, which has messages in each of these tracks."""
+    return min(min(track.index[::2]) for track in tracks), max(max(track.index[::2]) for track in tracks)
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """How a chunk's records lie in the file."""
+
+    compression: str
+    compressed: int
+    size: int
+
+
+@dataclass(slots=True)
+class Contents:
+    """What a slice holds so far; becomes the summary at its end. Owned by the thread that writes the slice."""
+
+    tracks: dict[int, Track] = field(default_factory=dict)
+    schemas: dict[int, bytes] = field(default_factory=dict)
+    """Record by schema id."""
+    declared: dict[int, bytes] = field(default_factory=dict)
+    """Record of each channel."""
+    chunks: list[bytes] = field(default_factory=list)
+    """Chunk index records, in the order of the file."""
+    messages: int = 0
+    t_start_ns: int = 0
+    t_end_ns: int = 0
+    _schema_ids: dict[tuple[str, str, str], int] = field(default_factory=dict)
+
+    def declare(self, channel: Channel) -> tuple[Track, bytes]:
+        """A channel of its own, with the records that must precede its first message."""
+        schema, records = (channel.type, channel.encoding, channel.definition), b''
+        number = self._schema_ids.get(schema)
+        if number is None:
+            number = self._schema_ids[schema] = len(self.schemas) + 1
+            records = record(Op.SCHEMA, struct.pack('<H', number), *map(text, schema))
+            self.schemas[number] = records
+        track = Track(len(self.tracks) + 1, channel)
+        said = mapping({'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash})
+        declared = record(Op.CHANNEL, struct.pack('<HH', track.number, number), text(channel.topic), text(CDR), said)
+        self.tracks[track.number], self.declared[track.number] = track, declared
+        return track, records + declared
+
+    def chunk(self, at: int, packed: Packed, tracks: Sequence[Track]) -> bytes:
+        """Take in a chunk that begins at the offset ``at``: the message index records that follow it, one for each track."""
+        start, end = span(tracks)
+        length = RECORD.size + CHUNK.size + 4 + len(packed.compression) + 8 + packed.compressed
+        indexes, offsets, messages = bytearray(), bytearray(), self.messages
+        for track in tracks:
+            offsets += _PLACE.pack(track.number, at + length + len(indexes))
+            entries = track.index.tobytes()
+            indexes += record(Op.MESSAGE_INDEX, _COUNTED.pack(track.number, len(entries)), entries)
+            track.count += len(track.index) // 2
+            messages += len(track.index) // 2
+            track.index = array('Q')
+        self.t_start_ns, self.t_end_ns = (min(self.t_start_ns, start), max(self.t_end_ns, end)) if self.messages else (start, end)
+        self.messages = messages
+        self.chunks.append(record(
+            Op.CHUNK_INDEX, struct.pack('<QQQQI', start, end, at, length, len(offsets)), bytes(offsets),
+            struct.pack('<Q', len(indexes)), text(packed.compression), struct.pack('<QQ', packed.compressed, packed.size),
+        ))  # fmt: skip
+        return bytes(indexes)
+
+    def info(self, path: Path, size: int = 0, sha256: str = '', damage: Damage | None = None) -> SliceInfo:
+        """What is known of the slice, its channels in the order in which they were declared."""
+        counts: dict[str, int] = {}
+        for track in self.tracks.values():
+            counts[track.channel.topic] = counts.get(track.channel.topic, 0) + track.count
+        channels = tuple(track.channel for track in self.tracks.values())
+        return SliceInfo(path, size, sha256, self.t_start_ns, self.t_end_ns, self.messages, counts, channels, damage)
+
+    def ending(self, at: int, metadata: str) -> bytes:
+        """All that follows the last chunk, which ends at the offset ``at``: rosbag2's metadata, the summary, the footer."""
+        said = record(Op.METADATA, text('rosbag2'), mapping({'serialized_metadata': metadata}))
+        data = said + record(Op.DATA_END, struct.pack('<I', 0))
+        groups = {
+            Op.SCHEMA: b''.join(self.schemas.values()),
+            Op.CHANNEL: b''.join(self.declared.values()),
+            Op.STATISTICS: self._statistics(),
+            Op.CHUNK_INDEX: b''.join(self.chunks),
+            Op.METADATA_INDEX: record(Op.METADATA_INDEX, struct.pack('<QQ', at, len(said)), text('rosbag2')),
+        }
+        start = position = at + len(data)
+        summary, offsets = b'', b''
+        for op, group in groups.items():
+            if group:
+                offsets += record(Op.SUMMARY_OFFSET, struct.pack('<BQQ', op, position, len(group)))
+                summary += group
+                position += len(group)
+        tail = summary + offsets + RECORD.pack(Op.FOOTER, _FOOTER.size) + struct.pack('<QQ', start, position)
+        return data + tail + struct.pack('<I', zlib.crc32(tail)) + MAGIC
+
+    def _statistics(self) -> bytes:
+        counted = b''.join(_PLACE.pack(number, track.count) for number, track in self.tracks.items())
+        body = _STATISTICS.pack(
+            self.messages, len(self.schemas), len(self.tracks), 0, 1, len(self.chunks), self.t_start_ns, self.t_end_ns
+        )
+        return record(Op.STATISTICS, body, struct.pack('<I', len(counted)), counted)

@@ -1,0 +1,143 @@
+"""``metadata.yaml`` as rosbag2 writes it: what ``ros2 bag info`` and ``ros2 bag play`` read before any slice.
+
+Version 8 of the format, QoS in numbers: the newest that Humble reads too (9 made QoS a sequence, on which Humble's reader
+fails); Jazzy and Kilted tell the two forms apart. Source: rosbag2_storage, metadata_io.cpp of Humble, yaml.hpp of Jazzy.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from shadowhound_data_logger.bags.channel import Channel
+from shadowhound_data_logger.bags.slice_info import SliceInfo
+
+VERSION: Final = 8
+STORAGE: Final = 'mcap'
+SERIALIZATION: Final = 'cdr'
+_INFINITE_NS: Final = (1 << 63) - 1
+_PLAIN: Final = re.compile(r'(?!(true|false|null|yes|no|on|off|y|n)$)[a-z_]+')
+"""Keys that need no quotes: YAML 1.1 reads the others as something else, or may."""
+
+
+def metadata_yaml(slices: Sequence[SliceInfo], *, ros_distro: str, custom_data: Mapping[str, str] | None = None) -> bytes:
+    """The whole file for a bag of these slices, in their order; ``ros_distro`` is empty where it is not known."""
+    said = bagfile_information(slices, ros_distro=ros_distro, custom_data=custom_data)
+    return to_yaml({'rosbag2_bagfile_information': said}).encode()
+
+
+def bagfile_information(
+    slices: Sequence[SliceInfo], *, ros_distro: str, custom_data: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """What rosbag2 calls BagMetadata. A topic with messages of two types appears once with each."""
+    start = min((one.t_start_ns for one in slices if one.messages), default=0)
+    end = max((one.t_end_ns for one in slices if one.messages), default=0)
+    return {
+        'version': VERSION,
+        'storage_identifier': STORAGE,
+        'duration': {'nanoseconds': end - start},
+        'starting_time': {'nanoseconds_since_epoch': start},
+        'message_count': sum(one.messages for one in slices),
+        'topics_with_message_count': _topics(slices),
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [one.path.name for one in slices],
+        'files': [
+            {
+                'path': one.path.name,
+                'starting_time': {'nanoseconds_since_epoch': one.t_start_ns},
+                'duration': {'nanoseconds': one.t_end_ns - one.t_start_ns},
+                'message_count': one.messages,
+            }
+            for one in slices
+        ],
+        'custom_data': dict(custom_data or {}),
+        'ros_distro': ros_distro,
+    }
+
+
+def offered_qos(profiles: Iterable[Any]) -> str:
+    """The QoS of a topic's publishers (rclpy's QoSProfile, or what looks like one) as rosbag2 keeps it with the topic."""
+    described = [_profile(profile) for profile in profiles]
+    return '\n'.join(_sequence(described)) if described else ''
+
+
+def to_yaml(value: Mapping[str, Any]) -> str:
+    """Mappings, sequences, strings and integers as block YAML; strings in double quotes, so that none is misread."""
+    return ''.join(f'{line}\n' for line in _mapping(value))
+
+
+def _topics(slices: Sequence[SliceInfo]) -> list[dict[str, Any]]:
+    counts: dict[str, int] = {}
+    channels: dict[str, Channel] = {}
+    for one in slices:
+        for topic, count in one.counts.items():
+            counts[topic] = counts.get(topic, 0) + count
+        for channel in one.channels:
+            channels.setdefault(channel.topic, channel)
+    return [
+        {
+            'topic_metadata': {
+                'name': channel.topic,
+                'type': channel.type,
+                'serialization_format': SERIALIZATION,
+                'offered_qos_profiles': channel.qos,
+                'type_description_hash': channel.type_hash,
+            },
+            'message_count': counts.get(channel.topic, 0),
+        }
+        for channel in channels.values()
+    ]
+
+
+def _profile(profile: Any) -> dict[str, Any]:
+    return {
+        'history': int(profile.history),
+        'depth': int(profile.depth),
+        'reliability': int(profile.reliability),
+        'durability': int(profile.durability),
+        'deadline': _duration(profile.deadline.nanoseconds),
+        'lifespan': _duration(profile.lifespan.nanoseconds),
+        'liveliness': int(profile.liveliness),
+        'liveliness_lease_duration': _duration(profile.liveliness_lease_duration.nanoseconds),
+        'avoid_ros_namespace_conventions': bool(profile.avoid_ros_namespace_conventions),
+    }
+
+
+def _duration(nanoseconds: int) -> dict[str, int]:
+    """A duration of 0 means that none was set, which rosbag2 writes as rmw's infinity: both mean the default."""
+    seconds, rest = divmod(nanoseconds or _INFINITE_NS, 10**9)
+    return {'sec': seconds, 'nsec': rest}
+
+
+def _mapping(value: Mapping[str, Any]) -> Iterator[str]:
+    for key, inner in value.items():
+        yield from _entry(f'{key if _PLAIN.fullmatch(key) else _scalar(key)}:', inner)
+
+
+def _sequence(value: Sequence[Any]) -> Iterator[str]:
+    for inner in value:
+        if isinstance(inner, Mapping) and inner:
+            lines = _mapping(inner)
+            yield f'- {next(lines)}'
+            yield from (f'  {line}' for line in lines)
+        else:
+            yield from _entry('-', inner)
+
+
+def _entry(head: str, value: Any) -> Iterator[str]:
+    if isinstance(value, Mapping) and value:
+        yield head
+        yield from (f'  {line}' for line in _mapping(value))
+    elif isinstance(value, list) and value:
+        yield head
+        yield from (f'  {line}' for line in _sequence(value))
+    else:
+        yield f'{head} {_scalar(value)}'
+
+
+def _scalar(value: Any) -> str:
+    """JSON's scalars and its empty mapping and sequence are YAML's. Outside ASCII no escapes: YAML's differ from JSON's."""
+    return json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,48 @@
+"""Names of bags, their files and their keys: ``<robot>/rosbags/<bag>/<bag>_<N>.mcap``, as rosbag2 numbers them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+from typing import Final
+
+from shadowhound_data_logger.clock import utc
+from shadowhound_data_logger.errors import NameRefused
+from shadowhound_data_logger.keys import check_name
+
+BUCKET: Final = 'sensor-data'
+FOLDER: Final = 'bags'
+"""Of what is being recorded, in SHADOWHOUND_HOME."""
+RECORDING: Final = 'recording'
+"""What a bag of no mission is called by."""
+METADATA, MANIFEST = 'metadata.yaml', 'manifest.json'
+
+
+def bag_name(what: str, now_ns: int, is_taken: Callable[[str], bool]) -> str:
+    """``patrol_20251018_120000``, in UTC; ``_1``, ``_2``, ... when it is taken: two bags may begin in a second.
+
+    ``what`` is a mission's type; one that cannot be part of a key is left out, as is an empty one.
+    """
+    try:
+        check_name(what, 'the mission type')
+    except NameRefused:
+        what = RECORDING
+    wanted = f'{what}_{utc(now_ns):%Y%m%d_%H%M%S}'
+    names = (f'{wanted}_{number}' if number else wanted for number in count())
+    return next(name for name in names if not is_taken(name))
+
+
+def slice_file(bag: str, number: int) -> str:
+    """The name of a slice."""
+    return f'{bag}_{number}.mcap'
+
+
+def slice_number(bag: str, file: str) -> int | None:
+    """Of ``<bag>_<N>.mcap``, whatever follows; None for another file."""
+    head, found, _ = file.removeprefix(f'{bag}_').partition('.mcap')
+    return int(head) if found and file.startswith(f'{bag}_') and head.isascii() and head.isdigit() else None
+
+
+def key_of(robot: str, bag: str, file: str) -> str:
+    """In the bucket of the bags."""
+    return f'{robot}/rosbags/{bag}/{file}'

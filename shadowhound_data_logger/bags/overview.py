@@ -1,0 +1,174 @@
+"""One line of facts a bag, put together from the store, the spool and the folder of what is being recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.bags.description import METADATA, of_metadata
+from shadowhound_data_logger.bags.local import LocalFile, local_files
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.remote import (
+    ARCHIVE,
+    BUCKET,
+    GROWING,
+    MANIFEST,
+    Listing,
+    RemoteBag,
+    RemoteFile,
+    find_bags,
+    missing_of,
+    read_manifest,
+    state_of,
+)
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.errors import BagDamaged, ObjectRefused
+from shadowhound_data_logger.model import ObjectInfo
+
+THREADS: Final = 8
+STORE: Final = 'store'
+
+
+@dataclass(frozen=True, slots=True)
+class BagRow:
+    """A bag at a glance; None for what is not known without opening its slices."""
+
+    robot: str
+    bag: str
+    state: str
+    slices: int
+    bytes: int
+    messages: int | None
+    topics: int | None
+    t_start_ns: int | None
+    t_end_ns: int | None
+    where: Mapping[str, int]
+    """Place -> files of the bag there: ``store``, ``spool``, ``recording``, ``quarantine``."""
+    finding: str
+    """What is wrong with it; empty when nothing is."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Facts:
+    messages: int | None = None
+    topics: int | None = None
+    t_start_ns: int | None = None
+    t_end_ns: int | None = None
+
+
+class NoStore:
+    """A store that is away, for who wants to see what is on this machine."""
+
+    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:  # noqa: ARG002
+        return iter(())
+
+    def head(self, bucket: str, key: str) -> ObjectInfo | None:  # noqa: ARG002
+        return None
+
+    def get(self, bucket: str, key: str) -> bytes:
+        raise ObjectRefused(f'there is no {bucket}/{key}', reason='missing')
+
+    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes:  # noqa: ARG002
+        return self.get(bucket, key)
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:  # noqa: ARG002
+        return iter((self.get(bucket, key),))
+
+    def describe(self) -> str:
+        return 'no store'
+
+
+def overview(store: Listing, robot: str, home: Path, *, since_ns: int = 0) -> list[BagRow]:
+    """All bags of a robot that began at ``since_ns`` or later, the newest last. Raises StoreError, SpoolError."""
+    remote = {bag.name: bag for bag in find_bags(store, robot)}
+    local: dict[str, list[LocalFile]] = {}
+    for file in local_files(home, robot).values():
+        local.setdefault(file.bag, []).append(file)
+    names = [name for name in sorted({*remote, *local}) if (named_ns(name) or since_ns) >= since_ns - SECOND]
+
+    def row(name: str) -> BagRow:
+        return _row(store, remote.get(name) or RemoteBag(robot, name, ()), local.get(name, []))
+
+    with ThreadPoolExecutor(THREADS, 'bag-list') as pool:
+        rows = [each for each in pool.map(row, names) if each.t_start_ns is None or each.t_start_ns >= since_ns]
+    return sorted(rows, key=lambda each: (each.t_start_ns or named_ns(each.bag) or 0, each.bag))
+
+
+def named_ns(bag: str) -> int | None:
+    """The time in the name of a bag, ``..._YYYYMMDD_HHMMSS``; None where there is none."""
+    stamp = '_'.join(bag.removesuffix(ARCHIVE).split('_')[-2:])
+    try:
+        when = datetime.strptime(stamp, '%Y%m%d_%H%M%S').replace(tzinfo=timezone.utc)
+    except ValueError:
+        return None
+    return int(when.timestamp()) * SECOND
+
+
+def _row(store: Listing, bag: RemoteBag, local: list[LocalFile]) -> BagRow:
+    kept = [file for file in local if bag.file(file.name) is None]  # delivered already: the spool is about to let go of it
+    files = RemoteBag(bag.robot, bag.name, (*bag.files, *(RemoteFile(file.name, '', file.size) for file in kept)))
+    finding = '; '.join(f'{file.name} is refused by the store' for file in kept if file.where == 'quarantine')
+    manifest, tags, facts = None, {}, _Facts()
+    try:
+        manifest = _manifest(store, bag, kept)
+        if manifest is None:
+            tags = _tags(store, bag, kept)
+        facts = _facts(store, bag, manifest, tags.values())
+    except BagDamaged as error:
+        finding = str(error)
+    state = state_of(files, manifest, next(iter(tags.values()), {}))
+    if manifest is not None and (missing := missing_of(files, manifest)):
+        finding = finding or f'{len(missing)} of {len(manifest.slices)} slices are not here yet'
+    places: dict[str, int] = {STORE: len(bag.files)} if bag.files else {}
+    for file in kept:
+        places[file.where] = places.get(file.where, 0) + 1
+    slices = len(files.slices) + sum(file.is_open for file in kept)
+    return BagRow(bag.robot, bag.name, GROWING if any(file.is_open for file in kept) else state, slices, files.size,
+                  facts.messages, facts.topics, facts.t_start_ns, facts.t_end_ns, places, finding)  # fmt: skip
+
+
+def _manifest(store: Listing, bag: RemoteBag, local: Iterable[LocalFile]) -> Manifest | None:
+    for file in local:
+        if file.name == MANIFEST and file.path is not None:
+            try:
+                return Manifest.from_json(file.path.read_bytes(), str(file.path))
+            except OSError:
+                continue  # on its way out of the spool
+    return read_manifest(store, bag)
+
+
+def _tags(store: Listing, bag: RemoteBag, local: Iterable[LocalFile]) -> dict[str, Mapping[str, str]]:
+    """What was written beside each slice, by its name; of a foreign bag nothing is, so one of its slices is asked for."""
+    found: dict[str, Mapping[str, str]] = {file.name: file.metadata for file in local if file.metadata}
+    for file in bag.slices:
+        held = store.head(BUCKET, file.key)
+        if held is None or 'bag' not in held.metadata:
+            break
+        found[file.name] = held.metadata
+    return found
+
+
+def _facts(store: Listing, bag: RemoteBag, manifest: Manifest | None, tags: Iterable[Mapping[str, str]]) -> _Facts:
+    if manifest is not None:
+        filled = [each for each in manifest.slices if each.messages]
+        topics = {topic for each in manifest.slices for topic in each.counts}
+        return _span(sum(each.messages for each in filled), len(topics), [(each.t_start_ns, each.t_end_ns) for each in filled])
+    if file := bag.file(METADATA):
+        told = of_metadata(store.get(BUCKET, file.key), file.key)
+        return _span(told.messages, len({topic.name for topic in told.topics}), [(told.t_start_ns, told.t_end_ns)])
+    try:
+        told_of = [{name: int(tag[name]) for name in ('messages', 't_start_ns', 't_end_ns')} for tag in tags]
+    except (KeyError, ValueError):
+        return _Facts()
+    spans = [(each['t_start_ns'], each['t_end_ns']) for each in told_of if each['messages']]
+    return _span(sum(each['messages'] for each in told_of), None, spans) if told_of else _Facts()
+
+
+def _span(messages: int, topics: int | None, spans: list[tuple[int, int]]) -> _Facts:
+    if not messages:
+        return _Facts(messages, topics)
+    return _Facts(messages, topics, min(start for start, _ in spans), max(end for _, end in spans))

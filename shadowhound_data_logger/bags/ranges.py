@@ -1,0 +1,98 @@
+"""Files that are read in pieces, wherever they lie: on the disk or in a store. What was read is counted."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+from typing import Protocol
+
+from shadowhound_data_logger.errors import BagDamaged
+
+
+class Ranged(Protocol):
+    """A file of ``size`` bytes."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+
+    @property
+    def size(self) -> int: ...
+
+    def read(self, start: int, length: int) -> bytes:
+        """Exactly these bytes. Raises BagDamaged where the file does not have them, StoreError where it cannot be asked."""
+
+
+class RangedStore(Protocol):
+    """What is asked of a store (stores/base.py)."""
+
+    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes: ...
+
+
+class Meter:
+    """Counts requests and bytes, from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.bytes = 0
+        self.requests = 0
+
+    def add(self, count: int) -> None:
+        with self._lock:
+            self.bytes += count
+            self.requests += 1
+
+
+class LocalFile:
+    """A file on the disk. Raises BagDamaged for one that cannot be opened."""
+
+    def __init__(self, path: Path, meter: Meter | None = None) -> None:
+        self.path = path
+        self._meter = meter or Meter()
+        try:
+            self.size = path.stat().st_size
+        except OSError as error:
+            raise BagDamaged(f'{path} cannot be read: {error.strerror}', path=str(path)) from error
+
+    @property
+    def name(self) -> str:
+        return str(self.path)
+
+    def read(self, start: int, length: int) -> bytes:
+        try:
+            with self.path.open('rb', buffering=0) as file:
+                found = os.pread(file.fileno(), length, start)
+        except OSError as error:
+            raise BagDamaged(f'{self.path} cannot be read: {error.strerror}', path=str(self.path)) from error
+        self._meter.add(len(found))
+        return whole(found, length, self.name, start)
+
+
+class StoredFile:
+    """An object of a store, of a size that is known already."""
+
+    def __init__(self, store: RangedStore, bucket: str, key: str, size: int, meter: Meter | None = None) -> None:
+        self.size = size
+        self._store = store
+        self._bucket = bucket
+        self._key = key
+        self._meter = meter or Meter()
+
+    @property
+    def name(self) -> str:
+        return f'{self._bucket}/{self._key}'
+
+    def read(self, start: int, length: int) -> bytes:
+        if length <= 0:
+            return b''
+        found = self._store.get_range(self._bucket, self._key, start, length)
+        self._meter.add(len(found))
+        return whole(found, length, self.name, start)
+
+
+def whole(found: bytes, length: int, name: str, start: int) -> bytes:
+    """The bytes, if they are as many as were asked for; raises BagDamaged."""
+    if len(found) != length:
+        raise BagDamaged(f'{name} ends early: of {length} bytes at {start} there are {len(found)}', path=name)
+    return found

@@ -1,0 +1,84 @@
+"""Record a bag for some time and have it in the store: the integration guide's ``record_and_upload_rosbag``, without its holes.
+
+    from shadowhound_data_logger.bags import record_and_upload_rosbag
+    record_and_upload_rosbag('patrol', 60)
+
+It leaves the robot slice by slice while it records, and what Tower cannot take now waits in the spool. A process of its own
+does it (``capture/bag_process.py``), so neither rclpy nor its signals get into the caller's.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import BagError
+
+PROGRAM: Final = 'shadowhound_data_logger.capture.bag_process'
+DEADLINE_S: Final = 60.0
+"""For the rest of it after the recording; most of a bag is delivered by then."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A bag that is whole, and safe."""
+
+    robot: str
+    bag: str
+    messages: int
+    slices: int
+    bytes: int
+    topics: Mapping[str, int]
+    """Topic -> messages."""
+    dropped: int
+    """Messages that this machine was too slow to write, or had no disk for."""
+    delivered: bool
+    """Whether the store has all of it; else the spool does, and it is delivered later."""
+    last_error: str
+    """Why it does not, where that is known."""
+
+    @property
+    def where(self) -> str:
+        """What it is in the store, or will be."""
+        return f's3://sensor-data/{self.robot}/rosbags/{self.bag}/'
+
+
+def record_and_upload_rosbag(mission_name: str, duration_s: int) -> Recorded:
+    """Record the robot's sensors for so many seconds as ``<mission_name>_YYYYMMDD_HHMMSS`` and upload it.
+
+    Recorded is what the node logs by default, each topic at full rate. Raises BagError when nothing could be recorded. A Tower
+    that is away is no error: ``delivered`` says so.
+    """
+    found = record(mission_name, duration_s)
+    print(f'Uploaded: {found.where}' if found.delivered else f'Waits in the spool: {found.where}')  # noqa: T201 - as the guide's
+    return found
+
+
+def record(name: str, duration_s: float, *, topics: Sequence[str] = (), regex: str = '', robot: str = 'thor',
+           deadline_s: float = DEADLINE_S) -> Recorded:  # fmt: skip
+    """As above, of these topics and those in which ``regex`` is found. SIGINT ends it early. Raises BagError."""
+    command = [sys.executable, '-m', PROGRAM, f'--duration={duration_s}', f'--deadline={deadline_s}', f'--robot={robot}']
+    command += [f'--topic={topic}' for topic in topics] + ([f'--regex={regex}'] if regex else []) + ['--', name]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        try:
+            output, _ = process.communicate()
+        except KeyboardInterrupt:  # a terminal tells the child as well; else it is told here, and ends the bag
+            process.send_signal(signal.SIGINT)
+            output, _ = process.communicate()
+    said = _last_line(output, process.returncode)
+    if 'error' in said:
+        raise BagError(said['error'])
+    return Recorded(**said)
+
+
+def _last_line(output: bytes, code: int) -> dict[str, Any]:
+    try:
+        return dict(json.loads(output.splitlines()[-1]))
+    except (IndexError, ValueError) as error:
+        remedy = 'is ROS sourced? what it said stands above'
+        raise BagError(f'the recorder ended with exit code {code} and without a word', remedy=remedy) from error

@@ -1,0 +1,289 @@
+"""Which bag is recorded, and the one thread that writes it: started and stopped by service, by missions, or with the node.
+
+What the intake hands over lies in a bounded queue; starts, splits and stops lie in it as well, so that each comes between the
+very messages where it was asked for. Nothing runs before the first recording.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.bags.manifest import MissionOf
+from shadowhound_data_logger.bags.naming import bag_name
+from shadowhound_data_logger.bags.notes import Notes
+from shadowhound_data_logger.bags.queue import BagQueue, Lot
+from shadowhound_data_logger.bags.recording import Outlet, Recording
+from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.clock import Clock
+from shadowhound_data_logger.options import BagSettings
+from shadowhound_data_logger.spool.accounts import BAG
+from shadowhound_data_logger.worker import Worker
+
+log = logging.getLogger(__name__)
+
+SYNC_S: Final = 0.5
+"""Between two syncs: with a poll of the intake before it a message is less than a second from the disk."""
+IDLE_S: Final = 60.0
+PATIENCE_S: Final = 30.0
+"""A round that lasts longer hangs in the disk."""
+STOP_S: Final = 5.0
+SERVICE, MISSION, ALWAYS = 'service', 'mission', 'always'
+"""Who began a recording; also the settings' words for when one begins."""
+Answer = tuple[bool, str]
+"""Whether it was done, and what, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagStatus:
+    """The recording at one instant; all but ``recording`` and ``error`` are of the bag that is recorded."""
+
+    recording: bool
+    paused: bool = False
+    bag: str = ''
+    slice: int = 0
+    """Number of the newest one, from 0."""
+    messages: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    duration_s: float = 0.0
+    queue_bytes: int = 0
+    refused: str = ''
+    """Why the disk takes nothing now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where bags begin, and what they are named by."""
+
+    root: Path
+    """The robot's folder of bags."""
+    robot: str
+    clock: Clock
+    is_known: Callable[[str], bool]
+    """Whether a bag's name is taken in the spool."""
+
+
+@dataclass(slots=True)
+class _Current:
+    """A recording with who began it and when."""
+
+    recording: Recording
+    by: str
+    began_s: float
+    dropped_before: int
+
+
+class Recorder:
+    """Life: New; open once; start, stop, ... from any thread; ``close`` before the intake is closed.
+
+    ``_control`` makes each of these one step; the recording itself belongs to the thread ``bag-writer``.
+    """
+
+    def __init__(self, settings: BagSettings, place: Place, queue: BagQueue, outlet: Outlet, salvage: Salvage,
+                 listen: Callable[[bool, float], bool]) -> None:  # fmt: skip
+        """``listen`` has the intake begin (True) or end, and says whether that was done within so many seconds."""
+        self._settings = settings
+        self._place = place
+        self._queue = queue
+        self._outlet = outlet
+        self._salvage = salvage
+        self._listen = listen
+        self._control = threading.Lock()
+        self._current: _Current | None = None
+        self._mission: MissionOf | None = None
+        self._writing: Recording | None = None
+        self._due_s = 0.0
+        self._started = False
+        self._worker = Worker('bag-writer', self._step, patience_s=PATIENCE_S)
+
+    @property
+    def workers(self) -> Sequence[Worker]:
+        """Those that have something to do."""
+        return *([self._worker] if self._started else []), *([self._salvage.worker] if self._salvage.is_busy else [])
+
+    def open(self) -> None:
+        """After the intake: make whole what was cut off, and begin if that is wanted."""
+        self._salvage.open()
+        if self._settings.record == ALWAYS:
+            self._begin_by(ALWAYS)
+
+    def close(self, deadline_s: float) -> bool:
+        """End the bag and the threads; False when that took too long, and the next start goes on with it."""
+        end_s = time.monotonic() + deadline_s
+        with self._control:
+            ended = self._current is None or self._stop(deadline_s)[0]
+            self._salvage.close(max(0.0, end_s - time.monotonic()))
+            self._worker.stop()
+            self._queue.mark(lambda: None)
+            return self._worker.join(max(0.1, end_s - time.monotonic())) and ended
+
+    def status(self) -> BagStatus:
+        """From any thread."""
+        current = self._current
+        if current is None:
+            return BagStatus(recording=False)
+        recording = current.recording
+        return BagStatus(
+            recording=True, paused=self._queue.paused, bag=recording.notes.bag, slice=max(0, recording.number),
+            messages=recording.messages, bytes=recording.bytes,
+            dropped=recording.dropped + self._queue.dropped - current.dropped_before,
+            duration_s=round(time.monotonic() - current.began_s, 1), queue_bytes=self._queue.bytes, refused=recording.refused,
+        )  # fmt: skip
+
+    # -- what can be asked -----------------------------------------------------------------------------------------
+
+    def start(self) -> Answer:
+        """Begin a bag, of the mission where one is active."""
+        with self._control:
+            if self._current is not None:
+                return False, f'{self._current.recording.notes.bag} is recorded already'
+            return self._start(SERVICE)
+
+    def stop(self, deadline_s: float = STOP_S) -> Answer:
+        """End the bag; it is whole in the spool then."""
+        with self._control:
+            if self._current is None:
+                return False, 'nothing is recorded'
+            return self._stop(deadline_s)
+
+    def split(self, deadline_s: float = STOP_S) -> Answer:
+        """End the slice; the next message begins another."""
+        with self._control:
+            if self._current is None:
+                return False, 'nothing is recorded'
+            recording, done = self._current.recording, threading.Event()
+
+            def split() -> None:
+                recording.split()
+                done.set()
+
+            self._queue.mark(split)
+            if not done.wait(deadline_s):
+                return False, f'the slice was not closed within {deadline_s:g} s; it is as soon as that is possible'
+            return True, f'{recording.notes.bag} has {recording.number + 1} slices that are closed'
+
+    def pause(self, *, paused: bool) -> Answer:
+        """Begin or end a pause: what comes meanwhile is counted, and dropped."""
+        with self._control:
+            if self._current is None:
+                return False, 'nothing is recorded'
+            self._queue.paused = paused
+            return True, f'{self._current.recording.notes.bag} is {"paused" if paused else "recorded"}'
+
+    def on_mission(self, told: Mapping[str, Any]) -> None:
+        """Which mission is active now (``MissionWatch.status``); empty for none."""
+        mission = MissionOf(told['type'], told['mission_id'], told.get('run_id')) if told else None
+        with self._control:
+            before, self._mission = self._mission, mission
+            current = self._current
+            if mission is None and before is None:
+                return
+            if mission is not None and before is not None and before.mission_id == mission.mission_id:
+                if current is not None and current.recording.notes.mission is not None:
+                    recording = current.recording
+                    self._queue.mark(lambda: recording.set_mission(mission))
+            elif self._settings.record != SERVICE and (current is None or current.by != SERVICE):
+                self._turn(mission)
+
+    # -- starts and stops, under the lock --------------------------------------------------------------------------
+
+    def _turn(self, mission: MissionOf | None) -> None:
+        """A mission began or ended, and bags follow missions. One bag follows the other without a message between them."""
+        current = self._current
+        if mission is None and self._settings.record == MISSION:
+            if current is not None:
+                self._stop(STOP_S)
+            return
+        if current is None and self._settings.record == ALWAYS:
+            return  # somebody stopped it
+        if current is not None:
+            self._end_after(current.recording, STOP_S)
+            self._current = None
+        self._start(ALWAYS if mission is None else MISSION, listening=current is not None)
+
+    def _begin_by(self, by: str) -> None:
+        with self._control:
+            self._start(by)
+
+    def _start(self, by: str, *, listening: bool = False) -> Answer:
+        mission = self._mission
+        what = mission.type if mission is not None else ''
+        place = self._place
+        name = bag_name(what, place.clock.wall_ns(), lambda bag: (place.root / bag).exists() or place.is_known(bag))
+        try:
+            notes = Notes.begin(place.root / name, place.robot, mission)
+        except OSError as error:
+            log.error('no bag is recorded: %s', error)  # noqa: TRY400 - an operator's matter
+            if listening:
+                self._listen(False, STOP_S)
+            return False, f'no bag can be made in {place.root}: {error.strerror}'
+        goes_on = by == ALWAYS or listening or (mission is not None and mission.mission_id in self._salvage.missions)
+        if not goes_on:
+            self._outlet.accounts.rebase_all(BAG)
+        recording = Recording(notes, self._settings, self._outlet)
+        self._current = _Current(recording, by, time.monotonic(), self._queue.dropped)
+        self._queue.paused = False
+        if not self._started:
+            self._started = True
+            self._worker.start()
+        self._queue.mark(lambda: self._write_to(recording))
+        if not listening and not self._listen(True, STOP_S):
+            log.warning('the intake did not begin to record within %.0f s; it does as soon as it can', STOP_S)
+        log.info('bag %s is recorded', name)
+        return True, name
+
+    def _stop(self, deadline_s: float) -> Answer:
+        current, end_s = self._current, time.monotonic() + deadline_s
+        assert current is not None
+        if not self._listen(False, deadline_s):
+            log.warning('the intake did not end the recording within %.1f s', deadline_s)
+        done = self._end_after(current.recording, max(0.5, end_s - time.monotonic()))
+        self._current = None
+        recording = current.recording
+        if not done.wait(max(0.0, end_s - time.monotonic())):
+            return False, f'{recording.notes.bag} is not whole within {deadline_s:g} s; it is as soon as that is possible'
+        text = f'{recording.notes.bag}: {recording.messages:,} messages in {len(recording.notes.slices)} slices'
+        log.info('%s', text)
+        return True, text
+
+    def _end_after(self, recording: Recording, deadline_s: float) -> threading.Event:
+        """Have the thread end a bag after all that waits for it."""
+        done = threading.Event()
+
+        def end() -> None:
+            self._writing = None
+            if recording.close(deadline_s):
+                done.set()
+
+        self._queue.mark(end)
+        return done
+
+    # -- the thread ------------------------------------------------------------------------------------------------
+
+    def _write_to(self, recording: Recording) -> None:
+        self._writing = recording
+        self._due_s = time.monotonic() + SYNC_S
+
+    def _step(self) -> None:
+        """Wait until there is something to write, and write it; sync when it is time."""
+        self._queue.wait(self._due_s - time.monotonic() if self._writing is not None else IDLE_S)
+        while (item := self._queue.next()) is not None:
+            if not isinstance(item, Lot):
+                item()
+            elif self._writing is not None:
+                self._writing.write(item)
+            else:
+                self._outlet.accounts.drop(f'{BAG}{item.topic}', 'stopped', len(item.messages))
+            self._sync()
+        self._sync()
+
+    def _sync(self) -> None:
+        if self._writing is not None and time.monotonic() >= self._due_s:
+            self._writing.tick()
+            self._due_s = time.monotonic() + SYNC_S

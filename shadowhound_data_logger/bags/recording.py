@@ -1,0 +1,242 @@
+"""One bag while it records: messages into slices, slices into the spool, and at the end what makes it whole.
+
+A disk that takes nothing costs the messages of that time, which are counted as dropped; the recording goes on as soon as it can.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.bags.channel import Channel
+from shadowhound_data_logger.bags.definitions import describe
+from shadowhound_data_logger.bags.manifest import Missing, MissionOf
+from shadowhound_data_logger.bags.naming import slice_file
+from shadowhound_data_logger.bags.notes import Notes
+from shadowhound_data_logger.bags.objects import ending_objects, slice_object
+from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.recovery import recover
+from shadowhound_data_logger.bags.slice_info import SliceInfo
+from shadowhound_data_logger.bags.slice_writer import OPEN, SliceWriter
+from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.options import BagSettings
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.retention import NO_ROOM
+
+log = logging.getLogger(__name__)
+
+RETRY_S: Final = 5.0
+"""Between two tries to write to a disk that took nothing."""
+UNWRITABLE: Final = 'unwritable'
+"""Why messages are dropped that the disk refuses."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outlet:
+    """Where a bag goes."""
+
+    accounts: Accounts
+    put: Callable[[DataObject], None]
+    """Into the spool, soon."""
+    flush: Callable[[float], bool]
+    """Whether all of it became durable within so many seconds."""
+    has_room: Callable[[], bool]
+    """Whether the disk has space to record into."""
+
+
+class Recording:
+    """New; ``write``, ``tick`` and ``split`` any number of times; ``close`` once. Owned by the thread that writes bags."""
+
+    def __init__(
+        self, notes: Notes, settings: BagSettings, outlet: Outlet, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.notes = notes
+        self.number = -1
+        """Of the newest slice."""
+        self.messages = self.dropped = 0
+        self.refused = ''
+        """Why nothing is written now; empty while all is well."""
+        self._settings = settings
+        self._outlet = outlet
+        self._monotonic = monotonic
+        self._writer: SliceWriter | None = None
+        self._channels: dict[tuple[str, str], Channel] = {}
+        self._written = Counter[str]()  # into the open slice
+        self._broken: list[tuple[Path, Counter[str]]] = []
+        self._closed_bytes = 0
+        self._began_s = self._again_s = 0.0
+
+    @property
+    def bytes(self) -> int:
+        """Of all slices, those that have left this disk as well."""
+        writer = self._writer
+        return self._closed_bytes + (writer.size if writer is not None else 0)
+
+    def write(self, lot: Lot) -> None:
+        """Record messages, or drop and count them while the disk takes nothing."""
+        if self._writer is None and not self._begin():
+            self._drop(lot.topic, len(lot.messages))
+            return
+        writer = self._writer
+        assert writer is not None
+        self._written[lot.topic] += len(lot.messages)
+        self.messages += len(lot.messages)
+        channel, count = self._channel(lot), self._written[lot.topic]
+        try:
+            for cdr, source_ns, _, number, received_ns in lot.messages:
+                writer.write(channel, received_ns, source_ns, count if number is None else number, cdr)
+        except OSError as error:
+            self._break(error)
+        else:
+            if writer.size >= self._settings.slice_bytes:
+                self.split()
+
+    def tick(self) -> None:
+        """Make durable what was written; end the slice whose time is over, or when the disk has no room."""
+        if self._writer is None:
+            return
+        try:
+            self._writer.sync()
+        except OSError as error:
+            self._break(error)
+            return
+        if not self._outlet.has_room():
+            self.split()
+            self._refuse(NO_ROOM, 'there is no room')
+        elif self._monotonic() - self._began_s >= self._settings.slice_s:
+            self.split()
+
+    def split(self) -> None:
+        """End the slice, if one is open; the next message begins another."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        try:
+            info = writer.close()
+        except OSError as error:
+            self._writer = writer
+            self._break(error)
+        else:
+            self._written.clear()
+            self._hand_over(info)
+
+    def close(self, deadline_s: float) -> bool:
+        """End the bag; False when it is left to the next start to make it whole."""
+        self.split()
+        self._again_s = 0.0
+        if not self._mend():
+            return False
+        notes = self.notes
+        try:
+            if notes.slices or notes.missing:
+                notes.end()
+                for item in ending_objects(notes):
+                    self._outlet.put(item)
+                if not self._outlet.flush(deadline_s):
+                    return False
+            notes.remove()
+        except OSError as error:
+            log.warning('the folder of bag %s is left to the next start: %s', notes.bag, error)
+            return False
+        return True
+
+    def set_mission(self, mission: MissionOf) -> None:
+        """More is known of the mission that it is recorded in."""
+        try:
+            self.notes.set_mission(mission)
+        except OSError as error:
+            log.warning('bag %s: %s', self.notes.bag, error)
+
+    # -- slices ----------------------------------------------------------------------------------------------------
+
+    def _channel(self, lot: Lot) -> Channel:
+        channel = self._channels.get((lot.topic, lot.type))
+        if channel is None:
+            encoding, definition, type_hash = describe(lot.type)
+            channel = Channel(lot.topic, lot.type, encoding, definition, type_hash, lot.qos)
+            self._channels[lot.topic, lot.type] = channel
+        return channel
+
+    def _begin(self) -> bool:
+        """Open the next slice; False while the disk takes nothing."""
+        now_s = self._monotonic()
+        if now_s < self._again_s:
+            return False
+        if not self._outlet.has_room():
+            self._refuse(NO_ROOM, 'there is no room')
+            return False
+        if not self._mend():
+            return False
+        path = self.notes.folder / slice_file(self.notes.bag, self.number + 1)
+        try:
+            path.with_name(path.name + OPEN).unlink(missing_ok=True)  # what a try that failed has left
+            self._writer = SliceWriter(path, compression=self._settings.compression, chunk_bytes=self._settings.chunk_bytes)
+        except OSError as error:
+            self._refuse(UNWRITABLE, str(error))
+            return False
+        self.number += 1
+        self._began_s = now_s
+        if self.refused:
+            log.info('bag %s goes on', self.notes.bag)
+        self.refused = ''
+        return True
+
+    def _break(self, error: OSError) -> None:
+        """The disk refused a part of the open slice: what it has of it is saved as soon as it lets."""
+        writer, self._writer = self._writer, None
+        assert writer is not None
+        writer.abort()
+        self._broken.append((writer.path.with_name(writer.path.name + OPEN), self._written))
+        self._written = Counter()
+        self._refuse(UNWRITABLE, str(error))
+
+    def _mend(self) -> bool:
+        """Make whole slices of those that broke; what is not in them is dropped. False where the disk still refuses."""
+        while self._broken:
+            path, written = self._broken[0]
+            try:
+                final = path.with_name(path.name.removesuffix(OPEN))
+                info = recover(path) if path.exists() else None
+            except OSError as error:
+                self._refuse(UNWRITABLE, str(error))
+                return False
+            self._broken.pop(0)
+            lost = written - Counter(info.counts if info else {})
+            for topic, count in lost.items():
+                self._drop(topic, count, UNWRITABLE)
+            self._note(Missing(final.name, 'the disk did not take it', lost.total()))
+            if info is not None and info.messages:
+                self._hand_over(replace(info, damage=None))
+            elif info is not None:
+                info.path.unlink(missing_ok=True)
+        return True
+
+    def _hand_over(self, info: SliceInfo) -> None:
+        """A whole slice to the spool, which takes the file."""
+        self._closed_bytes += info.bytes
+        try:
+            self.notes.add_slice(info)
+        except OSError as error:
+            log.warning('bag %s: %s', self.notes.bag, error)
+        self._outlet.put(slice_object(self.notes, info, self._settings.priority))
+
+    def _note(self, missing: Missing) -> None:
+        try:
+            self.notes.add_missing(missing)
+        except OSError as error:
+            log.warning('bag %s: %s', self.notes.bag, error)
+
+    def _drop(self, topic: str, count: int, reason: str = '') -> None:
+        self.dropped += count
+        self._outlet.accounts.drop(f'{self.notes.sink}{topic}', reason or self.refused or UNWRITABLE, count)
+
+    def _refuse(self, reason: str, text: str) -> None:
+        self._again_s = self._monotonic() + RETRY_S
+        if not self.refused:
+            log.error('bag %s: nothing is recorded while the disk takes nothing: %s', self.notes.bag, text)
+        self.refused = reason

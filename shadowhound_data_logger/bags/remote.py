@@ -1,0 +1,143 @@
+"""Bags in a store: which there are, what files each has, and how far each has come.
+
+A bag is a folder ``<robot>/rosbags/<bag>/`` of slices; its ``manifest.json`` is written last, so one without is still growing. An
+archive ``<robot>/rosbags/<bag>.tar.gz`` is a bag of that name as well, of which nothing is known but its size.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from shadowhound_data_logger.bags.description import METADATA
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.errors import BagError
+from shadowhound_data_logger.model import ObjectInfo
+
+BUCKET: Final = 'sensor-data'
+MANIFEST: Final = 'manifest.json'
+ARCHIVE: Final = '.tar.gz'
+GROWING: Final = 'growing'
+FOREIGN: Final = 'foreign'
+"""Not uploaded by this package: nothing says what should be in it."""
+SLICES: Final = ('.mcap', '.db3', '.zstd')
+"""What the name of a file with messages ends with."""
+
+
+class Listing(Protocol):
+    """What is asked of a store (stores/base.py)."""
+
+    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]: ...
+
+    def head(self, bucket: str, key: str) -> ObjectInfo | None: ...
+
+    def get(self, bucket: str, key: str) -> bytes: ...
+
+    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes: ...
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]: ...
+
+    def describe(self) -> str: ...
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteFile:
+    """One object of a bag."""
+
+    name: str
+    """In the bag's folder."""
+    key: str
+    size: int
+
+    @property
+    def is_slice(self) -> bool:
+        return self.name.endswith(SLICES)
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteBag:
+    """A bag as the listing of its store tells it."""
+
+    robot: str
+    name: str
+    files: tuple[RemoteFile, ...]
+    """In the order of their numbers."""
+
+    @property
+    def is_archive(self) -> bool:
+        return self.name.endswith(ARCHIVE)
+
+    @property
+    def slices(self) -> tuple[RemoteFile, ...]:
+        return tuple(file for file in self.files if file.is_slice)
+
+    @property
+    def size(self) -> int:
+        return sum(file.size for file in self.files)
+
+    def file(self, name: str) -> RemoteFile | None:
+        return next((file for file in self.files if file.name == name), None)
+
+
+def prefix_of(robot: str, bag: str = '') -> str:
+    """Of the keys of a robot's bags, or of one of them."""
+    return f'{robot}/rosbags/{bag}/' if bag else f'{robot}/rosbags/'
+
+
+def find_bags(store: Listing, robot: str) -> list[RemoteBag]:
+    """All bags of a robot, by name. Raises StoreError."""
+    found: dict[str, list[RemoteFile]] = {}
+    prefix = prefix_of(robot)
+    for info in store.list(BUCKET, prefix):
+        bag, slash, name = info.key[len(prefix) :].partition('/')
+        if not slash and not bag.endswith(ARCHIVE):
+            continue
+        found.setdefault(bag, []).append(RemoteFile(name or bag, info.key, info.size))
+    return [RemoteBag(robot, bag, _ordered(files)) for bag, files in sorted(found.items())]
+
+
+def find_bag(store: Listing, robot: str, bag: str) -> RemoteBag:
+    """One of them. Raises BagError naming similar ones where there is none, StoreError."""
+    prefix = prefix_of(robot, bag)
+    if bag.endswith(ARCHIVE):
+        held = store.head(BUCKET, prefix[:-1])
+        files = [RemoteFile(bag, held.key, held.size)] if held else []
+    else:
+        files = [RemoteFile(info.key[len(prefix) :], info.key, info.size) for info in store.list(BUCKET, prefix)]
+    if not files:
+        known = [each.name for each in find_bags(store, robot)]
+        near = difflib.get_close_matches(bag, known, cutoff=0.4) or known[-3:]
+        remedy = f'there is {", ".join(near)}' if near else f'no bag of {robot} is there; --robot names another'
+        raise BagError(f'there is no bag {bag} of {robot} in {store.describe()}', remedy=remedy, bag=bag, robot=robot)
+    return RemoteBag(robot, bag, _ordered(files))
+
+
+def read_manifest(store: Listing, bag: RemoteBag) -> Manifest | None:
+    """None when there is none. Raises BagDamaged for one that says nothing, StoreError."""
+    file = bag.file(MANIFEST)
+    return Manifest.from_json(store.get(BUCKET, file.key), file.key) if file else None
+
+
+def missing_of(bag: RemoteBag, manifest: Manifest) -> list[str]:
+    """The slices that the manifest promises and the bag does not have."""
+    there = {file.name for file in bag.files}
+    return [entry.file for entry in manifest.slices if entry.file not in there]
+
+
+def state_of(bag: RemoteBag, manifest: Manifest | None, slice_metadata: Mapping[str, str]) -> str:
+    """The state; ``slice_metadata`` is that of any of its slices, where there is no manifest."""
+    if manifest is not None:
+        return GROWING if missing_of(bag, manifest) else manifest.state
+    return GROWING if 'bag' in slice_metadata and not bag.file(METADATA) else FOREIGN
+
+
+def _ordered(files: Iterable[RemoteFile]) -> tuple[RemoteFile, ...]:
+    return tuple(sorted(files, key=lambda file: natural(file.name)))
+
+
+def natural(name: str) -> list[str | int]:
+    """A sort key in which ``bag_10`` comes after ``bag_9``."""
+    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r'(\d+)', name, flags=re.ASCII))]

@@ -1,0 +1,112 @@
+"""The last seconds of some topics, serialized as they came: bounded in bytes, filled by the intake, which never waits for it.
+
+It holds references to what was taken, never a copy. An event claims what is in it and what comes, and takes it out piece by
+piece: what an event has taken is in the ring no more, so that no message is in two events' bags.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.model import Taken
+
+MESSAGE_BYTES: Final = 256
+"""What CPython needs for a message beside its content: a tuple of five, its bytes' head, three integers, a place in a list."""
+PIECE_BYTES: Final = 1 << 20
+"""A lot that is larger is kept in pieces: what goes, goes by pieces, and what is written as well."""
+
+
+class Held(NamedTuple):
+    """A piece of what one drain took of a topic."""
+
+    lot: Lot
+    lost: int | None
+    """What the middleware reports to have lost with it; None where it reports nothing."""
+    at_s: float
+    """When it was drained, by the monotonic clock."""
+    size: int
+
+
+class Ring:
+    """Thread-safe. ``put`` by the intake; ``claim``, ``next`` and ``release`` by whoever writes events."""
+
+    def __init__(self, max_bytes: int, keep_s: float) -> None:
+        self.max_bytes = max_bytes
+        self.keep_s = keep_s
+        """For how long what nobody claimed stays, as far as its bytes have room."""
+        self._lock = threading.Lock()
+        self._items: deque[Held] = deque()
+        self._claimed = False
+        self.bytes = 0
+        """Of the messages in it, with what Python needs for them."""
+
+    @property
+    def claimed(self) -> bool:
+        """Whether an event asks for all that is in it."""
+        return self._claimed
+
+    @property
+    def seconds(self) -> float:
+        """From the oldest to the newest."""
+        with self._lock:
+            return self._items[-1].at_s - self._items[0].at_s if self._items else 0.0
+
+    def put(self, lot: Lot, lost: int | None, now_s: float) -> list[Held]:
+        """Take in messages; whatever is too old or too much goes, the oldest first. What an event asked for of that."""
+        pieces = list(_pieces(lot, lost, now_s))
+        with self._lock:
+            for piece in pieces:
+                self._items.append(piece)
+                self.bytes += piece.size
+            gone = []
+            while self.bytes > self.max_bytes:
+                gone.append(self._pop())
+            if self._claimed:
+                return gone
+            self._age(now_s - self.keep_s)
+            return []
+
+    def claim(self, since_s: float) -> float | None:
+        """All of ``since_s`` and after is asked for now; returns the time of the oldest, None for an empty ring."""
+        with self._lock:
+            self._age(since_s)
+            self._claimed = True
+            return self._items[0].at_s if self._items else None
+
+    def next(self, until_s: float) -> Held | None:
+        """Take out the oldest piece; None when there is none that was drained until then."""
+        with self._lock:
+            return self._pop() if self._items and self._items[0].at_s <= until_s else None
+
+    def release(self) -> None:
+        """Nobody asks for what is left in it."""
+        with self._lock:
+            self._claimed = False
+
+    def _age(self, since_s: float) -> None:
+        while self._items and self._items[0].at_s < since_s:
+            self._pop()
+
+    def _pop(self) -> Held:
+        held = self._items.popleft()
+        self.bytes -= held.size
+        return held
+
+
+def _pieces(lot: Lot, lost: int | None, now_s: float) -> Iterator[Held]:
+    """A lot in parts of about ``PIECE_BYTES``; what was lost belongs to the last of them."""
+    part: list[Taken] = []
+    size = 0
+    for message in lot.messages:
+        cost = len(message.cdr) + MESSAGE_BYTES
+        if part and size + cost > PIECE_BYTES:
+            yield Held(lot._replace(messages=part), None if lost is None else 0, now_s, size)
+            part, size = [], 0
+        part.append(message)
+        size += cost
+    if part:
+        yield Held(lot._replace(messages=part), lost, now_s, size)

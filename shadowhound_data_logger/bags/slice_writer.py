@@ -1,0 +1,181 @@
+"""Writes one slice of a bag: an MCAP file as rosbag2 writes it, whole on disk up to the last ``sync`` whatever happens then."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from backports import zstd
+
+from shadowhound_data_logger.bags.channel import Channel
+from shadowhound_data_logger.bags.mcap_format import (
+    CHUNK,
+    MESSAGE,
+    MESSAGE_FIELDS,
+    RECORD,
+    Contents,
+    Op,
+    Packed,
+    Track,
+    head,
+    span,
+    text,
+)
+from shadowhound_data_logger.bags.metadata import bagfile_information, to_yaml
+from shadowhound_data_logger.bags.slice_info import SliceInfo
+
+OPEN: Final = '.open'
+"""Ends the name of a slice that is being written."""
+DEFAULT_CHUNK_BYTES: Final = 1 << 20
+_MESSAGE: Final = int(Op.MESSAGE)
+
+
+class SliceWriter:
+    """New; ``write`` and ``sync`` any number of times; ``close`` or ``abort`` once. One thread at a time.
+
+    The file is ``<path>.open`` until ``close`` gives it its name. Disk errors are OSErrors; after one, only ``abort`` is left,
+    and recovery makes a whole slice of what was written before.
+    """
+
+    def __init__(
+        self, path: Path, *, compression: str = 'zstd', chunk_bytes: int = DEFAULT_CHUNK_BYTES, ros_distro: str = ''
+    ) -> None:
+        self.path = path
+        self._ros_distro = ros_distro
+        if compression not in _COMPRESSORS:
+            raise ValueError(f'compression is {compression!r} and must be one of {", ".join(_COMPRESSORS)}')
+        self._compress = _COMPRESSORS[compression]
+        self._compression = compression if compression != 'none' else ''
+        self._chunk_bytes = chunk_bytes
+        self._contents = Contents()
+        self._tracks: dict[str, Track] = {}
+        self._chunk = bytearray(chunk_bytes)
+        self._view = memoryview(self._chunk)
+        self._used = 0
+        self._declared = b''
+        """Written before the chunk, not into it: when that one is damaged, those after it still have their channels."""
+        self._digest = hashlib.sha256()
+        if path.exists():
+            raise FileExistsError(f'{path} is there already')
+        self._open_path = path.with_name(path.name + OPEN)
+        self._file = os.open(self._open_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        self._written = 0
+        try:
+            self._append(head())
+            sync_folder(path.parent)  # a file that was synced is lost all the same while its folder does not know it
+        except OSError:
+            self.abort()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file and in the open chunk, before compression."""
+        return self._written + self._used
+
+    def write(self, channel: Channel, log_ns: int, publish_ns: int, sequence: int, cdr: bytes) -> None:
+        """Add a message, a copy of ``cdr``. A topic keeps what its first channel says of QoS.
+
+        Stamps are Unix nanoseconds; where the publisher's is not known (0 or less), it is the log time, as MCAP wants it.
+        """
+        track = self._tracks.get(channel.topic)
+        if track is None or (track.channel is not channel and track.channel.type != channel.type):
+            track = self._declare(channel)
+        log_ns = max(log_ns, 0)
+        if publish_ns <= 0:
+            publish_ns = log_ns
+        length, at = len(cdr), self._used
+        after = at + MESSAGE.size + length
+        if after > self._chunk_bytes:
+            at, after = 0, self._make_room(MESSAGE.size + length)
+        size = length + MESSAGE_FIELDS
+        MESSAGE.pack_into(self._chunk, at, _MESSAGE, size, track.number, sequence & 0xFFFFFFFF, log_ns, publish_ns)
+        self._view[at + MESSAGE.size : after] = cdr
+        track.index.append(log_ns)
+        track.index.append(at)
+        self._used = after
+
+    def sync(self) -> None:
+        """End the chunk and wait until the disk has it."""
+        self._end_chunk()
+        os.fdatasync(self._file)
+
+    def close(self) -> SliceInfo:
+        """End the file and give it its name; it is on disk when this returns."""
+        self._end_chunk()
+        contents = self._contents
+        said = bagfile_information([contents.info(self.path)], ros_distro=self._ros_distro)
+        self._append(contents.ending(self._written, to_yaml(said)))
+        os.fsync(self._file)
+        os.close(self._file)
+        self._file = -1
+        os.replace(self._open_path, self.path)
+        sync_folder(self.path.parent)
+        return contents.info(self.path, self._written, self._digest.hexdigest())
+
+    def abort(self) -> None:
+        """Let go of the file as it is, for recovery; the open chunk is lost. No effect after ``close``."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+    def _declare(self, channel: Channel) -> Track:
+        """The track of a topic's type, which another type of the same topic may have taken the place of."""
+        tracks = self._contents.tracks.values()
+        track = next((one for one in tracks if (one.channel.topic, one.channel.type) == (channel.topic, channel.type)), None)
+        if track is None:
+            track, records = self._contents.declare(channel)
+            self._declared += records
+        self._tracks[channel.topic] = track
+        return track
+
+    def _make_room(self, size: int) -> int:
+        """End the chunk; a message larger than a chunk may be becomes one by itself."""
+        self._end_chunk()
+        if size > len(self._chunk):
+            self._chunk = bytearray(size)
+            self._view = memoryview(self._chunk)
+        return size
+
+    def _end_chunk(self) -> None:
+        tracks = [track for track in self._contents.tracks.values() if track.index]
+        if not tracks:
+            return
+        raw, compression = self._view[: self._used], self._compression
+        data = self._compress(raw)
+        if len(data) >= len(raw):
+            data, compression = raw, ''
+        fields = CHUNK.pack(*span(tracks), len(raw), zlib.crc32(raw)) + text(compression) + struct.pack('<Q', len(data))
+        at = self._written + len(self._declared)
+        indexes = self._contents.chunk(at, Packed(compression, len(data), len(raw)), tracks)
+        declared, self._declared = self._declared, b''
+        self._used = 0
+        self._append(declared + RECORD.pack(Op.CHUNK, len(fields) + len(data)) + fields, data, indexes)
+
+    def _append(self, *parts: bytes | memoryview) -> None:
+        for part in parts:
+            self._digest.update(part)
+            view = memoryview(part)
+            while view:
+                view = view[os.write(self._file, view) :]
+            self._written += len(part)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder durable."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _zstd(raw: memoryview) -> bytes:
+    return zstd.compress(raw, 1)
+
+
+_COMPRESSORS: Final[dict[str, Callable[[memoryview], bytes | memoryview]]] = {'zstd': _zstd, 'none': lambda raw: raw}

@@ -1,0 +1,35 @@
+"""Which topics a bag holds, decided from the settings, the sensors and the graph. Plain Python."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+from shadowhound_data_logger.options import BagSettings
+
+
+class Choice:
+    """New for each set of settings; ``wanted`` again and again, because sensors and graph change."""
+
+    def __init__(self, settings: BagSettings, named: Iterable[str]) -> None:
+        """``named`` are the settings' topics as full names."""
+        self._named = frozenset(named)
+        self._regex = re.compile(settings.regex) if settings.regex else None
+        self._exclude = re.compile(settings.exclude) if settings.exclude else None
+
+    @property
+    def asks_graph(self) -> bool:
+        return self._regex is not None
+
+    def wanted(self, sensors: Iterable[str], graph: Iterable[str]) -> frozenset[str]:
+        """Full names; ``sensors`` are the topics that sensors take, ``graph`` all that there are (asked for a regex only)."""
+        if self._regex is None:
+            return self._named or frozenset(sensors)
+        return self._named | {topic for topic in graph if self._matches(topic)}
+
+    def _matches(self, topic: str) -> bool:
+        """As rosbag2: any part of the name has to match; hidden topics (a part begins with ``_``) are left out."""
+        assert self._regex is not None
+        if '/_' in topic or not self._regex.search(topic):
+            return False
+        return self._exclude is None or not self._exclude.search(topic)

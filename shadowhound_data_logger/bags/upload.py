@@ -1,0 +1,249 @@
+"""A finished bag from a folder into the store: through the spool, where it is safe until it is delivered, or past it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import shutil
+import sqlite3
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Protocol
+
+from shadowhound_data_logger.bags.fetch import Told, on_disk
+from shadowhound_data_logger.bags.parcel import Outgoing, Parcel, archive_of, finished, parcel_of
+from shadowhound_data_logger.bags.remote import BUCKET, MANIFEST
+from shadowhound_data_logger.clock import Clock
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.errors import BagError, ForeignObject, StoreUnavailable
+from shadowhound_data_logger.model import DataObject, FileBody, ObjectInfo, Put, SpooledObject, State
+from shadowhound_data_logger.ship.retry import backoff
+from shadowhound_data_logger.ship.uploader import Uploader
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
+
+SENDING: Final = 'sending'
+"""The folder of bags on their way into the spool, in SHADOWHOUND_HOME."""
+PRIORITY: Final = 8
+"""As slices that the node records: after all that is smaller."""
+FACTS_PRIORITY: Final = 4
+POLL_S: Final = 0.2
+CLOSE_S: Final = 5.0
+THREADS: Final = 4
+CAP_S: Final = 10.0
+
+
+class Heads(Protocol):
+    """What is asked of a store to know that it has something."""
+
+    def head(self, bucket: str, key: str) -> ObjectInfo | None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Uploaded:
+    """How far it came."""
+
+    robot: str
+    bag: str
+    files: int
+    bytes: int
+    delivered: int
+    """Files that the store confirmed; the others wait in the spool."""
+    last_error: str
+    """Why they do, where that is known."""
+
+    @property
+    def is_delivered(self) -> bool:
+        return self.delivered == self.files
+
+
+@contextmanager
+def parcel(folder: Path, robot: str, bag: str, home: Path, *, is_archive: bool) -> Iterator[Parcel]:
+    """The bag as objects; what had to be made for it is gone afterwards. Raises BagError, BagDamaged, NameRefused."""
+    finished(folder)  # before a folder is made for it
+    with on_disk(home):
+        (home / SENDING).mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f'{bag[:64]}-', dir=home / SENDING))
+        try:
+            with (work / 'lock').open('wb') as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                _sweep(home / SENDING)
+                yield (archive_of if is_archive else parcel_of)(folder, robot, bag, work)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+
+
+def upload_now(store: ObjectStore, sent: Parcel, *, deadline_s: float, told: Told | None = None) -> Uploaded:
+    """Without the spool: returns when the store confirmed all of it. Raises BagError, StoreError."""
+    told = told or Told()
+    told.begin(sent.size)
+    end_s = time.monotonic() + deadline_s
+
+    def put(place: int) -> None:
+        file = sent.files[place]
+        item = SpooledObject(place, BUCKET, file.key, file.path, file.size, file.sha256, file.content_type,
+                             {**file.metadata, 'sha256': file.sha256}, PRIORITY, 0)  # fmt: skip
+        _steadily(lambda: store.put(item), end_s, sent.bag)
+        told.have(file.size)
+
+    with ThreadPoolExecutor(THREADS, 'bag-upload') as pool:
+        list(pool.map(put, range(len(sent.files) - 1)))
+    put(len(sent.files) - 1)  # the manifest says that all the others are there
+    return Uploaded(sent.robot, sent.bag, len(sent.files), sent.size, len(sent.files), '')
+
+
+def spool_parcel(sent: Parcel, spool: Spool) -> None:
+    """Make it durable in the spool; what is or was there already is left out. The bag's own files stay.
+
+    Raises BagError where there is no room or another bag has the name, SpoolError.
+    """
+    objects = []
+    with tempfile.TemporaryDirectory(dir=sent.files[-1].path.parent) as work:
+        try:
+            _check_names(spool, sent)
+            for place, file in enumerate(sent.files):
+                if spool.knows(BUCKET, file.key, file.sha256):
+                    continue
+                link = Path(work) / str(place)
+                _link_or_copy(file.path, link)
+                objects.append(_object(file, link))
+            placed = spool.commit(objects)
+        except sqlite3.Error as error:
+            raise spool.unwritable(error) from error
+    if len(placed) < len(objects):
+        remedy = 'raise spool.max_bytes, or send it with --now, past the spool'
+        raise BagError(f'the spool {spool.root} has no room for {sent.bag}: {sent.size} bytes', remedy=remedy)
+
+
+@contextmanager
+def opened_spool(settings: Settings, clock: Clock) -> Iterator[Spool]:
+    """Raises SpoolError."""
+    spool = Spool(settings.spool_path, settings.spool, clock, settings.robot)
+    spool.open()
+    with closing(spool):
+        yield spool
+
+
+def deliver(settings: Settings, spool: Spool, sent: Parcel, *, deadline_s: float, told: Told | None = None) -> Uploaded:
+    """Wait until the store has it, delivering where no node does. Raises BagError for what the store refuses, SettingError."""
+    told = told or Told()
+    told.begin(sent.size)
+    store = open_store(settings.store, settings.upload)
+    writer = SpoolWriter(spool, settings.spool.commit_s, settled=lambda ids: uploader.settled(ids))  # noqa: PLW0108 - made below
+    uploader = Uploader(spool, store, settings.upload, writer.settle)
+    writer.open()
+    uploader.open()
+    try:
+        return _wait(spool, sent, uploader, time.monotonic() + deadline_s, told)
+    finally:
+        uploader.close(CLOSE_S)
+        writer.close(CLOSE_S)
+        store.close()
+
+
+def is_confirmed(store: Heads, files: Sequence[tuple[str, int, str]]) -> bool:
+    """Whether the store says of every (key, size, SHA-256) that it holds it. Raises StoreError."""
+    for key, size, sha256 in files:
+        held = store.head(BUCKET, key)
+        if held is None or (held.size, held.sha256) != (size, sha256):
+            return False
+    return True
+
+
+def _wait(spool: Spool, sent: Parcel, uploader: Uploader, end_s: float, told: Told) -> Uploaded:
+    done: set[str] = set()
+    while True:
+        rows = _rows(spool, sent)
+        for file in sent.files:
+            if file.key not in done and _is_done(rows.get(file.key), sent.bag):
+                done.add(file.key)
+                told.have(file.size)
+        if len(done) == len(sent.files) or time.monotonic() >= end_s:
+            return Uploaded(sent.robot, sent.bag, len(sent.files), sent.size, len(done), uploader.status().last_error)
+        time.sleep(POLL_S)
+
+
+def _is_done(row: sqlite3.Row | None, bag: str) -> bool:
+    """Whether it was delivered, as also what the index has forgotten. Raises BagError where it never will be."""
+    if row is None or row['state'] in {State.DELIVERED.value, State.DEDUPLICATED.value}:
+        return True
+    if row['reason'] == 'foreign':
+        raise _taken(bag, row['key'])
+    if row['state'] in {State.EVICTED.value, State.QUARANTINED.value}:
+        text = f'{row["key"]} is {row["state"]} ({row["reason"]}), so the spool does not deliver it'
+        raise BagError(text, remedy='send it with --now, past the spool', key=row['key'])
+    return False
+
+
+def _rows(spool: Spool, sent: Parcel) -> dict[str, sqlite3.Row]:
+    """What the spool's index says of its keys."""
+    index = Index(spool.root / 'index.db', read_only=True)
+    index.open()
+    with closing(index):
+        return {row['key']: row for file in sent.files for row in index.rows('bucket = ? AND key = ?', (BUCKET, file.key))}
+
+
+def _check_names(spool: Spool, sent: Parcel) -> None:
+    rows = _rows(spool, sent)
+    for file in sent.files:
+        if file.key in rows and rows[file.key]['sha256'] != file.sha256:
+            raise _taken(sent.bag, file.key)
+
+
+def _object(file: Outgoing, path: Path) -> DataObject:
+    is_slice = file.name != MANIFEST and 'messages' in file.metadata
+    return DataObject(
+        bucket=BUCKET, key=file.key, body=FileBody(path, file.size, file.sha256), content_type=file.content_type,
+        sensor='rosbags', topic=None, type='', samples=0, t_start_ns=file.t_start_ns, t_end_ns=file.t_end_ns,
+        priority=PRIORITY if is_slice else FACTS_PRIORITY, metadata=file.metadata,
+    )  # fmt: skip
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    """A second name where that works, so that the spool takes it without reading it."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def _taken(bag: str, key: str) -> BagError:
+    remedy = f'is it another bag? then send it under another name: --name {bag}_b'
+    return BagError(f'{key} is there already with other content', remedy=remedy, key=key)
+
+
+def _steadily(put: Callable[[], Put], end_s: float, bag: str) -> None:
+    """Try again while the store is away. Raises StoreError in the end, BagError where another bag has the name."""
+    rng, attempt = random.Random(), 0
+    while True:
+        try:
+            put()
+            return
+        except ForeignObject as error:
+            raise _taken(bag, str(error.data.get('key'))) from error
+        except StoreUnavailable:
+            attempt += 1
+            pause = backoff(attempt, CAP_S, rng)
+            if time.monotonic() + pause >= end_s:
+                raise
+            time.sleep(pause)
+
+
+def _sweep(sending: Path) -> None:
+    """Remove what a process left that was killed: nobody holds its lock."""
+    for lock in sending.glob('*/lock'):
+        with lock.open('rb') as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            shutil.rmtree(lock.parent, ignore_errors=True)

@@ -1,0 +1,261 @@
+"""Whether a bag is what its writer says: every promised file, its size and checksum; every chunk on request.
+
+Without a manifest there is nobody to compare with: what the metadata.yaml names must be there, and open.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from hashlib import sha256 as sha256_new
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.bags.description import METADATA, Description, of_metadata
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.mcap_format import Op
+from shadowhound_data_logger.bags.mcap_index import read_index, records
+from shadowhound_data_logger.bags.mcap_messages import unpack, walk
+from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile
+from shadowhound_data_logger.bags.remote import (
+    BUCKET,
+    FOREIGN,
+    MANIFEST,
+    Listing,
+    RemoteBag,
+    RemoteFile,
+    state_of,
+)
+from shadowhound_data_logger.errors import BagDamaged, BagError
+
+THREADS: Final = 4
+PIECE_BYTES: Final = 8 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One file; ``finding`` is empty when it is sound."""
+
+    name: str
+    finding: str
+    checked: str
+    """What was compared: ``presence``, ``size``, ``sha256`` (the store's word), ``summary``, ``content``, with it ``chunks``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """What came of it."""
+
+    bag: str
+    state: str
+    checks: tuple[Check, ...]
+    read_bytes: int
+
+    @property
+    def findings(self) -> tuple[Check, ...]:
+        return tuple(check for check in self.checks if check.finding)
+
+    @property
+    def is_sound(self) -> bool:
+        return not self.findings
+
+
+Telling = Callable[[int], None]
+"""Hears how many more bytes were read."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Expected:
+    """What a file should be; None where nobody says."""
+
+    name: str
+    size: int | None
+    sha256: str | None
+    messages: int | None
+
+
+def verify_remote(store: Listing, bag: RemoteBag, *, deep: bool = False, told: Telling = lambda _: None) -> Verified:
+    """``deep`` reads everything; else what the store says of each file is compared. Raises StoreError."""
+    meter = Meter()
+    manifest, described, early = _writers_word(lambda name: _stored(store, bag, name))
+    expected = _expected(manifest, described, {file.name: file.size for file in bag.files})
+
+    def one(each: _Expected) -> Check:
+        file = bag.file(each.name)
+        if file is None:
+            return Check(each.name, 'is not in the store', 'presence')
+        return _check_remote(store, file, each, meter, deep, told)
+
+    with ThreadPoolExecutor(THREADS, 'bag-verify') as pool:
+        checks = tuple(pool.map(one, expected))
+    tags = {} if manifest or described else _tags(store, bag)
+    return Verified(bag.name, state_of(bag, manifest, tags), (*early, *checks), meter.bytes)
+
+
+def verify_folder(folder: Path, *, deep: bool = False, told: Telling = lambda _: None) -> Verified:
+    """Reads every file that a manifest knows. Raises BagError where there is no bag."""
+    files = {str(path.relative_to(folder)): path.stat().st_size for path in sorted(folder.rglob('*')) if path.is_file()}
+    if not files:
+        raise BagError(f'{folder} holds no bag', path=str(folder))
+    bag = RemoteBag('', folder.name, tuple(RemoteFile(name, '', size) for name, size in files.items()))
+    manifest, described, early = _writers_word(lambda name: _local(folder / name))
+    if manifest is None and described is None and not bag.slices:
+        raise BagError(f'{folder} holds no bag: neither {METADATA} nor a slice is in it', path=str(folder))
+    checks = [_check_local(folder / each.name, each, deep, told) for each in _expected(manifest, described, files)]
+    state = state_of(bag, manifest, {}) if manifest else FOREIGN
+    return Verified(folder.name, state, (*early, *checks), sum(files.values()))
+
+
+def _writers_word(get: Callable[[str], bytes | None]) -> tuple[Manifest | None, Description | None, tuple[Check, ...]]:
+    """Manifest and metadata, and what is wrong with them."""
+    manifest, described, findings = None, None, []
+    try:
+        if (content := get(MANIFEST)) is not None:
+            manifest = Manifest.from_json(content, MANIFEST)
+    except BagDamaged as error:
+        findings.append(Check(MANIFEST, str(error), 'content'))
+    try:
+        if (content := get(METADATA)) is not None:
+            described = of_metadata(content, METADATA)
+        elif manifest is not None:
+            findings.append(Check(METADATA, 'is missing', 'presence'))
+    except BagDamaged as error:
+        findings.append(Check(METADATA, str(error), 'content'))
+    return manifest, described, tuple(findings)
+
+
+def _expected(manifest: Manifest | None, described: Description | None, there: Mapping[str, int]) -> list[_Expected]:
+    """By the manifest, else by the metadata, else by what is there."""
+    if manifest is not None:
+        found = {each.file: _Expected(each.file, each.bytes, each.sha256, each.messages) for each in manifest.slices}
+    elif described is not None:
+        found = {each.name: _Expected(each.name, None, None, each.messages) for each in described.parts}
+    else:
+        found = {}
+    slices = RemoteBag('', '', tuple(RemoteFile(name, '', size) for name, size in there.items())).slices
+    return [*found.values(), *(_Expected(file.name, None, None, None) for file in slices if file.name not in found)]
+
+
+def _check_remote(store: Listing, file: RemoteFile, expected: _Expected, meter: Meter, deep: bool, told: Telling) -> Check:
+    if expected.size is not None and file.size != expected.size:
+        return Check(file.name, f'has {file.size} bytes, {expected.size} were recorded', 'size')
+    held = store.head(BUCKET, file.key)
+    if held is None:
+        return Check(file.name, 'is not in the store', 'presence')
+    if held.sha256 and expected.sha256 and held.sha256 != expected.sha256:
+        return Check(file.name, f'has the SHA-256 {held.sha256}, {expected.sha256} was recorded', 'sha256')
+    source = StoredFile(store, BUCKET, file.key, file.size, meter)
+    if deep:
+        return _check_content(source, replace(expected, sha256=expected.sha256 or held.sha256), deep, told)
+    return _check_summary(source, expected, 'sha256' if held.sha256 else 'size')
+
+
+def _check_local(path: Path, expected: _Expected, deep: bool, told: Telling) -> Check:
+    if not path.is_file():
+        return Check(expected.name, 'is missing', 'presence')
+    size = path.stat().st_size
+    if expected.size is not None and size != expected.size:
+        return Check(expected.name, f'has {size} bytes, {expected.size} were recorded', 'size')
+    source = LocalFile(path)
+    if deep or expected.sha256:
+        found = _check_content(source, expected, deep, told)
+        if found.finding or path.suffix != '.db3':
+            return found
+    return _check_sqlite(path, expected) if path.suffix == '.db3' else _check_summary(source, expected, 'summary')
+
+
+def _check_summary(source: Ranged, expected: _Expected, checked: str) -> Check:
+    if not expected.name.endswith('.mcap'):
+        return Check(expected.name, '', checked)
+    try:
+        index = read_index(source)
+    except BagDamaged as error:
+        return Check(expected.name, str(error), checked)
+    if index.is_indexed and expected.messages not in {None, index.messages}:
+        return Check(expected.name, f'has {index.messages} messages, {expected.messages} were recorded', checked)
+    return Check(expected.name, '', checked)
+
+
+def _check_content(source: Ranged, expected: _Expected, deep: bool, told: Telling) -> Check:
+    """Reads all of it once; ``deep`` unpacks every chunk on the way, which checks its CRC-32, and counts."""
+    once = _Once(source, told)
+    checked = 'content' if expected.sha256 else 'size'
+    if deep and expected.name.endswith('.mcap'):
+        checked += ' and chunks'
+        try:
+            index = read_index(source)
+            count = sum(_messages(kind, start, content, source.name) for kind, start, content in walk(once, index.data_end))
+        except BagDamaged as error:
+            return Check(expected.name, str(error), checked)
+        promised = expected.messages if expected.messages is not None else index.messages if index.is_indexed else count
+        if count != promised:
+            return Check(expected.name, f'has {count} messages, {promised} were recorded', checked)
+    found = once.rest()
+    if expected.sha256 and found != expected.sha256:
+        return Check(expected.name, f'has content of the SHA-256 {found}, {expected.sha256} was recorded', checked)
+    return Check(expected.name, '', checked)
+
+
+def _messages(kind: int, start: int, content: memoryview, name: str) -> int:
+    """In one record."""
+    if kind == Op.CHUNK:
+        where = f'the chunk at {start} of {name}'
+        return sum(inner == Op.MESSAGE for inner, _, _ in records(unpack(content, where), where))
+    return int(kind == Op.MESSAGE)
+
+
+class _Once:
+    """A file that is read from its beginning to its end, and hashed on the way."""
+
+    def __init__(self, source: Ranged, told: Telling) -> None:
+        self.name = source.name
+        self.size = source.size
+        self._source = source
+        self._told = told
+        self._digest = sha256_new()
+        self._at = 0
+
+    def read(self, start: int, length: int) -> bytes:
+        found = self._source.read(start, length)
+        assert start == self._at, 'out of order'
+        self._digest.update(found)
+        self._at += length
+        self._told(length)
+        return found
+
+    def rest(self) -> str:
+        """Reads on to the end; the SHA-256 of all of it."""
+        while self._at < self.size:
+            self.read(self._at, min(PIECE_BYTES, self.size - self._at))
+        return self._digest.hexdigest()
+
+
+def _check_sqlite(path: Path, expected: _Expected) -> Check:
+    try:
+        with sqlite3.connect(f'{path.absolute().as_uri()}?mode=ro&immutable=1', uri=True) as database:
+            answer = database.execute('PRAGMA quick_check(1)').fetchone()[0]
+            count = database.execute('SELECT count(*) FROM messages').fetchone()[0]
+        database.close()
+    except sqlite3.Error as error:
+        return Check(expected.name, f'is no SQLite bag: {error}', 'content')
+    if answer != 'ok':
+        return Check(expected.name, f'is damaged: {answer}', 'content')
+    if expected.messages not in {None, count}:
+        return Check(expected.name, f'has {count} messages, {expected.messages} were recorded', 'content')
+    return Check(expected.name, '', 'content')
+
+
+def _stored(store: Listing, bag: RemoteBag, name: str) -> bytes | None:
+    file = bag.file(name)
+    return store.get(BUCKET, file.key) if file else None
+
+
+def _local(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None
+
+
+def _tags(store: Listing, bag: RemoteBag) -> Mapping[str, str]:
+    held = store.head(BUCKET, bag.slices[0].key) if bag.slices else None
+    return held.metadata if held else {}

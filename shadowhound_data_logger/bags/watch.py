@@ -1,0 +1,177 @@
+"""Bags that ``ros2 bag record`` writes into a folder, shipped once they are finished, each once.
+
+Finished is a bag with its metadata.yaml and all that it names, of which nothing has changed for a while. What was shipped
+stands in ``.shadowhound-bags.json`` beside the bags, so that a restart sends nothing twice. A bag is removed only when asked for,
+and after the store itself said that it holds every file of it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.bags.description import METADATA
+from shadowhound_data_logger.bags.fetch import on_disk
+from shadowhound_data_logger.bags.parcel import Outgoing, Parcel, finished
+from shadowhound_data_logger.bags.upload import deliver, is_confirmed, opened_spool, parcel, spool_parcel
+from shadowhound_data_logger.clock import Clock, iso
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.errors import BagError, DataLoggerError
+from shadowhound_data_logger.stores import open_store
+
+MARKS: Final = '.shadowhound-bags.json'
+SPOOLED: Final = 'spooled'
+STORED: Final = 'stored'
+REMOVED: Final = 'removed'
+DELIVER_S: Final = 5.0
+"""For one bag in one round; the spool has it safe, and a later round goes on."""
+RETRY_S: Final = 60.0
+"""Before that: to open the spool costs it a row, and the node that runs here delivers by itself."""
+Look = list[list[Any]]
+"""Name, size and time of change of every file: what does not change while nobody writes."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Something that happened to a bag: SPOOLED, STORED, REMOVED or, with a reason, ``refused``."""
+
+    bag: str
+    what: str
+    reason: str = ''
+
+
+class Watch:
+    """New; ``round`` any number of times, by one thread. Errors of one bag cost that bag alone."""
+
+    def __init__(self, folder: Path, settings: Settings, clock: Clock, *, settle_s: float, is_removing: bool = False,
+                 monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
+        self._folder = folder
+        self._settings = settings
+        self._clock = clock
+        self._settle_s = settle_s
+        self._is_removing = is_removing
+        self._monotonic = monotonic
+        self._looks: dict[str, tuple[Look, float]] = {}
+        self._told: dict[str, str] = {}
+        self._again_s: dict[str, float] = {}
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """For its whole life. Raises BagError when another process watches this folder."""
+        with on_disk(self._folder), (self._folder / f'{MARKS}.lock').open('wb') as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise BagError(f'another process watches {self._folder} already', path=str(self._folder)) from error
+            yield
+
+    def round(self) -> list[Step]:
+        """Ship what is finished, confirm what was shipped. Raises BagError where the folder itself cannot be used."""
+        with on_disk(self._folder):
+            marks = self._marks()
+            bags = [path for path in sorted(self._folder.iterdir()) if path.is_dir() and (path / METADATA).exists()]
+            return [step for path in bags for step in self._step(path, marks)]
+
+    def is_owing(self) -> bool:
+        """Whether the store does not have a bag of this folder yet, for whatever reason."""
+        return bool(self._looks) or any(mark['state'] == SPOOLED for mark in self._marks().values())
+
+    def _step(self, path: Path, marks: dict[str, Any]) -> Iterator[Step]:
+        mark = marks.get(path.name)
+        try:
+            if mark is None:
+                if not self._is_settled(path):
+                    return
+                finished(path)
+                mark = marks[path.name] = self._ship(path)
+                self._write(marks)
+                yield Step(path.name, SPOOLED)
+            if mark['state'] == SPOOLED and self._monotonic() >= self._again_s.get(path.name, 0.0) and self._confirm(path, mark):
+                self._write(marks)
+                yield Step(path.name, STORED)
+            if self._is_removing and mark['state'] == STORED and self._remove(path, mark):
+                self._write(marks)
+                yield Step(path.name, REMOVED)
+        except DataLoggerError as error:
+            if self._told.get(path.name) != str(error):
+                self._told[path.name] = str(error)
+                yield Step(path.name, 'refused', str(error))
+
+    def _is_settled(self, path: Path) -> bool:
+        look = _look(path)
+        before, since_s = self._looks.get(path.name, (None, 0.0))
+        if look != before:
+            self._looks[path.name] = (look, self._monotonic())
+            return self._settle_s <= 0
+        return self._monotonic() - since_s >= self._settle_s
+
+    def _ship(self, path: Path) -> dict[str, Any]:
+        settings = self._settings
+        look = _look(path)
+        with parcel(path, settings.robot, path.name, settings.home, is_archive=False) as sent:
+            with opened_spool(settings, self._clock) as spool:
+                spool_parcel(sent, spool)
+            files = [[file.name, file.key, file.size, file.sha256] for file in sent.files]
+        self._looks.pop(path.name, None)
+        return {'state': SPOOLED, 'spooled': iso(self._clock.wall_ns()), 'look': look, 'files': files}
+
+    def _confirm(self, path: Path, mark: dict[str, Any]) -> bool:
+        """Ask the store; where it does not have everything yet, deliver for a moment, unless the node does."""
+        self._again_s[path.name] = self._monotonic() + RETRY_S
+        if not self._is_stored(mark):
+            settings = self._settings
+            with opened_spool(settings, self._clock) as spool:
+                files = (Outgoing(name, key, path, size, sha256) for name, key, size, sha256 in mark['files'])
+                deliver(settings, spool, Parcel(settings.robot, path.name, path, tuple(files)), deadline_s=DELIVER_S)
+            if not self._is_stored(mark):
+                return False
+        mark['state'], mark['stored'] = STORED, iso(self._clock.wall_ns())
+        return True
+
+    def _is_stored(self, mark: Mapping[str, Any]) -> bool:
+        store = open_store(self._settings.store, self._settings.upload)
+        with closing(store):
+            return is_confirmed(store, [(key, size, sha256) for _, key, size, sha256 in mark['files']])
+
+    def _remove(self, path: Path, mark: dict[str, Any]) -> bool:
+        """Only what the store holds this very moment, and what is still what was sent."""
+        if _look(path) != [list(each) for each in mark['look']] or not self._is_stored(mark):
+            return False
+        shutil.rmtree(path)
+        mark['state'], mark['removed'] = REMOVED, iso(self._clock.wall_ns())
+        return True
+
+    def _marks(self) -> dict[str, Any]:
+        try:
+            found = json.loads((self._folder / MARKS).read_bytes())
+        except FileNotFoundError:
+            return {}
+        except ValueError as error:
+            remedy = 'remove it: nothing is sent twice all the same, but everything is read once more'
+            raise BagError(f'{self._folder / MARKS} cannot be read: {error}', remedy=remedy) from error
+        return dict(found['bags'])
+
+    def _write(self, marks: Mapping[str, Any]) -> None:
+        path = self._folder / MARKS
+        part = path.with_name(f'{MARKS}.part')
+        with part.open('w', encoding='utf-8') as file:
+            json.dump({'version': 1, 'bags': marks}, file, indent=1)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+
+
+def _look(folder: Path) -> Look:
+    found = ((path, path.stat()) for path in sorted(folder.rglob('*')) if path.is_file())
+    return [[str(path.relative_to(folder)), stat.st_size, stat.st_mtime_ns] for path, stat in found]

@@ -1,0 +1,227 @@
+"""One bag, by hand: records some topics for some time beside whatever else runs, and delivers it. A process of its own.
+
+    python -m shadowhound_data_logger.capture.bag_process NAME --duration 60 [--topic /imu ...] [--regex ...]
+
+Its last line on standard output is JSON: what became of the bag. ``bags.record`` starts it, for the command line and for agents.
+Recorded is as the node does it, slice by slice into the spool, with subscriptions of its own; SIGINT ends it early, and whole.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import json
+import logging
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any, Final
+
+import rclpy
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from shadowhound_data_logger.bags.local import RECORDS, local_files
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, key_of, slice_file
+from shadowhound_data_logger.bags.queue import BagQueue
+from shadowhound_data_logger.bags.recorder import Place, Recorder
+from shadowhound_data_logger.bags.recording import Outlet
+from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.capture.bag_tap import BagTap
+from shadowhound_data_logger.capture.intake import Intake
+from shadowhound_data_logger.capture.sensor_logger_node import StopSignals
+from shadowhound_data_logger.capture.stream import Shared
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.errors import BagError, DataLoggerError
+from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.ship.uploader import Uploader
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.worker import Worker
+
+NODE: Final = 'shadowhound_bag_record'
+DISCOVERY_S: Final = 3.0
+"""Longest wait for the first publisher of anything wanted."""
+MORE_S: Final = 0.5
+"""For the others, once one is known."""
+STEP_S: Final = 0.1
+CLOSE_S: Final = 5.0
+
+
+@dataclass(slots=True)
+class Stages:
+    """What is open while it records."""
+
+    writer: SpoolWriter
+    uploader: Uploader
+    manifest: Manifest | None = None
+    """Of the bag, once it has ended."""
+
+    @property
+    def workers(self) -> Sequence[Worker]:
+        return *self.uploader.workers, self.writer.worker
+
+    def put(self, item: DataObject) -> None:
+        """Into the spool, soon."""
+        if item.key.endswith(f'/{MANIFEST}') and isinstance(item.body, bytes):
+            self.manifest = Manifest.from_json(item.body)
+        self.writer.put(item, wait=False)
+
+
+def main() -> int:
+    """The program; 0 when the store has the bag, 1 when the spool has it or nothing was recorded, 2 for bad settings."""
+    given = _arguments(sys.argv[1:])
+    logging.basicConfig(level=logging.WARNING, format='%(message)s')
+    stop = StopSignals()
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = Node(NODE)
+    try:
+        said = _record(node, given, stop)
+    except DataLoggerError as error:
+        said = {'error': str(error)}
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    print(json.dumps(said), flush=True)  # noqa: T201
+    return 0 if said.get('delivered') else 1
+
+
+def _arguments(given: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    parser.add_argument('name')
+    parser.add_argument('--robot', default='thor')
+    parser.add_argument('--duration', type=float, required=True)
+    parser.add_argument('--deadline', type=float, default=60.0)
+    parser.add_argument('--topic', action='append', default=[])
+    parser.add_argument('--regex', default='')
+    return parser.parse_args(given)
+
+
+def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[str, Any]:
+    name = check_name(given.name, 'the mission')
+    topics = given.topic or ([] if given.regex else _topics_there(node, given.robot, stop))
+    parameters = {'robot': given.robot, 'bag.topics': topics or [''], 'bag.regex': given.regex}
+    settings = Settings.load(parameters, os.environ)
+    with ExitStack() as opened:
+        opened.enter_context(_alone(settings))
+        store = open_store(settings.store, settings.upload)
+        opened.callback(store.close)
+        spool = Spool(settings.spool_path, settings.spool, SystemClock.of_this_machine(), settings.robot)
+        spool.open()
+        opened.callback(spool.close)
+        writer = SpoolWriter(spool, settings.spool.commit_s, spooled=lambda new: uploader.wake(new),  # noqa: PLW0108
+                             settled=lambda ids: uploader.settled(ids))  # fmt: skip  # noqa: PLW0108 - made below
+        uploader = Uploader(spool, store, settings.upload, writer.settle)
+        stages = Stages(writer, uploader)
+        recorder = _open_recorder(opened, node, settings, spool, stages)
+        uploader.open()
+        opened.callback(uploader.close, CLOSE_S)
+        dropped = _until_over(recorder, stages, name, given.duration, stop)
+        if stages.manifest is None:
+            raise BagError('nothing was published on the topics that were to be recorded', topics=topics,
+                           remedy=f'`ros2 topic list`; asked for was {" ".join(topics) or given.regex}')  # fmt: skip
+        return _delivered(settings, stages.manifest, stages, given.deadline) | {'dropped': dropped}
+
+
+def _open_recorder(opened: ExitStack, node: Node, settings: Settings, spool: Spool, stages: Stages) -> Recorder:
+    """Writer, intake and recorder, opened; they are closed in the opposite order."""
+    clock, writer = SystemClock.of_this_machine(), stages.writer
+    types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
+    queue = BagQueue(settings.bag.queue_bytes)
+    shared = Shared(spool.accounts, types, lambda _: None, clock, None, BagTap(node, spool.accounts, queue))
+    intake = Intake(node, {}, settings.intake, shared, settings.bag)
+    place = Place(settings.home / RECORDS / settings.robot, settings.robot, clock,
+                  lambda bag: spool.has(BUCKET, key_of(settings.robot, bag, slice_file(bag, 0))))  # fmt: skip
+    outlet = Outlet(spool.accounts, stages.put, writer.flush,
+                    lambda: spool.free_bytes() >= settings.spool.min_free_bytes // 2)  # fmt: skip
+    salvage = Salvage(place.root, settings.robot, settings.bag.priority, outlet, spool.knows)
+    recorder = Recorder(settings.bag, place, queue, outlet, salvage,
+                        lambda on, deadline_s: intake.record(deadline_s, on=on))  # fmt: skip
+    writer.open()
+    opened.callback(writer.close, CLOSE_S)
+    intake.open()
+    opened.callback(intake.close, CLOSE_S)
+    recorder.open()
+    opened.callback(recorder.close, CLOSE_S)
+    return recorder
+
+
+def _topics_there(node: Node, robot: str, stop: StopSignals) -> list[str]:
+    """Of each sensor the first topic that somebody publishes, else its first: what the node takes."""
+    sensors = [sensor.topics for sensor in Settings.load({'robot': robot}, {}).sensors if sensor.enabled]
+    end_s = time.monotonic() + DISCOVERY_S
+    while time.monotonic() < end_s and not stop.received:
+        if any(node.count_publishers(topic) for topics in sensors for topic in topics):
+            time.sleep(MORE_S)
+            break
+        time.sleep(STEP_S)
+    return [next((topic for topic in topics if node.count_publishers(topic)), topics[0]) for topics in sensors]
+
+
+def _until_over(recorder: Recorder, stages: Stages, name: str, duration_s: float, stop: StopSignals) -> int:
+    """Record; how many messages were dropped meanwhile."""
+    recorder.on_mission({'type': name, 'mission_id': None})
+    done, text = recorder.start()
+    if not done:
+        raise BagError(f'no bag was recorded: {text}')
+    end_s = time.monotonic() + duration_s
+    while time.monotonic() < end_s and not stop.received:
+        time.sleep(min(STEP_S, max(0.0, end_s - time.monotonic())))
+        _supervise((*recorder.workers, *stages.workers))
+    dropped, bag = recorder.status().dropped, text
+    done, text = recorder.stop()
+    if not done:
+        raise BagError(f'{bag} could not be ended: {text}', remedy='the next `shadowhound-data bag record` makes it whole')
+    return dropped
+
+
+def _delivered(settings: Settings, manifest: Manifest, stages: Stages, deadline_s: float) -> dict[str, Any]:
+    """Wait until nothing of the bag is in the spool any more."""
+    end_s = time.monotonic() + deadline_s
+    stages.writer.prompt = True
+    stages.writer.flush(CLOSE_S)
+    while (
+        waiting := _waits(settings, manifest.bag)
+    ) and time.monotonic() < end_s:  # a second signal ends the process: the bag is safe
+        time.sleep(STEP_S)
+        _supervise(stages.workers)
+    return {
+        'robot': manifest.robot, 'bag': manifest.bag, 'messages': sum(each.messages for each in manifest.slices),
+        'slices': len(manifest.slices), 'bytes': sum(each.bytes for each in manifest.slices),
+        'topics': {each.topic: each.messages for each in manifest.topics}, 'delivered': not waiting,
+        'last_error': stages.uploader.status().last_error if waiting else '',
+    }  # fmt: skip
+
+
+def _waits(settings: Settings, bag: str) -> bool:
+    return any(file.bag == bag for file in local_files(settings.home, settings.robot).values())
+
+
+def _supervise(workers: Iterable[Worker]) -> None:
+    for worker in workers:
+        worker.look()
+
+
+@contextmanager
+def _alone(settings: Settings) -> Iterator[None]:
+    """One at a time: another one's open slice would look like that of a dead process."""
+    folder = settings.home / RECORDS
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / f'{settings.robot}.lock').open('wb') as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BagError(f'another `bag record` records {settings.robot} already', remedy='wait for its end') from error
+        yield
+
+
+if __name__ == '__main__':
+    sys.exit(main())

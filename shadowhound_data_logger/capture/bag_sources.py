@@ -1,0 +1,58 @@
+"""The subscriptions that a recording needs besides the sensors', and which topics it wants. Owned by the intake thread."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from contextlib import ExitStack
+
+from rclpy.node import Node
+
+from shadowhound_data_logger.bags.topics import Choice
+from shadowhound_data_logger.capture.bag_tap import BagStream
+from shadowhound_data_logger.capture.reader import PolledGroup
+from shadowhound_data_logger.capture.source import Source
+from shadowhound_data_logger.capture.stream import Shared
+from shadowhound_data_logger.config import BagSettings, IntakeSettings, SensorSettings
+
+
+class BagSources:
+    """New; ``refresh`` while a recording goes on, ``end`` after it."""
+
+    def __init__(self, node: Node, bag: BagSettings, settings: IntakeSettings, group: PolledGroup, shared: Shared) -> None:
+        self._node = node
+        self._settings = settings
+        self._group = group
+        self._shared = shared
+        self._choice = Choice(bag, (node.resolve_topic_name(topic) for topic in bag.topics if topic))
+        self._own: dict[str, Source] = {}
+
+    @property
+    def own(self) -> Collection[Source]:
+        """Those of topics that no sensor takes."""
+        return self._own.values()
+
+    def refresh(self, sensors: Mapping[str, bool], now_s: float, *, paused: bool) -> None:
+        """Follow the graph and the topics that sensors take now (True: latched); a topic changes hands without a loss.
+
+        A latched topic is subscribed to anew, so that a bag begins with what was sent before it.
+        """
+        graph = [name for name, _ in self._node.get_topic_names_and_types()] if self._choice.asks_graph else []
+        wanted = self._choice.wanted(sensors, graph)
+        shared = {topic for topic, is_latched in sensors.items() if not is_latched}
+        self._shared.tap.topics = wanted & shared
+        for topic in wanted.difference(shared, self._own):
+            sensor = SensorSettings(name='bag', topics=(topic,))
+            source = self._own[topic] = Source(self._node, sensor, self._settings, self._group, self._shared, BagStream)
+            source.pause(now_s, paused=paused)
+        for source in self._own.values():
+            source.refresh(now_s)
+        for topic in shared.intersection(self._own):
+            self._own.pop(topic).close(now_s)
+
+    def end(self, now_s: float) -> None:
+        """Take what still waits; what comes from now on is recorded by nobody."""
+        own, self._own = self._own, {}
+        with ExitStack() as ending:
+            for source in own.values():
+                ending.callback(source.close, now_s)
+        self._shared.tap.topics = frozenset()

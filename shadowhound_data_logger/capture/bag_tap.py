@@ -1,0 +1,92 @@
+"""What the bags get of what was taken: counted in their own accounts and handed on as it came. Owned by the intake thread.
+
+A topic of a sensor comes from its one subscription (``Stream``), any other from one for the bag alone (``BagStream``).
+While nothing is recorded it costs a look at an empty set for each drain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rclpy.node import Node
+
+from shadowhound_data_logger.bags.metadata import offered_qos
+from shadowhound_data_logger.bags.queue import BagQueue, Lot
+from shadowhound_data_logger.capture.endpoints import Senders
+from shadowhound_data_logger.capture.stream import Repeats, Shared, is_named
+from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.spool.accounts import BAG, PAUSED, Accounts
+
+
+class BagTap:
+    """New; ``topics`` says what is recorded now."""
+
+    def __init__(self, node: Node, accounts: Accounts, queue: BagQueue) -> None:
+        self.topics: frozenset[str] = frozenset()
+        """Full names."""
+        self._node = node
+        self._accounts = accounts
+        self._queue = queue
+        self._qos: dict[tuple[str, str], str] = {}
+
+    def begin(self) -> None:
+        """A recording begins: publishers are asked for their QoS anew."""
+        self._qos.clear()
+
+    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: int | None, *, paused: bool) -> None:
+        """Count messages that are no repeats, their senders named, and hand them on; ``lost`` as in ``Stream.add``."""
+        if not taken:
+            return
+        paused = paused or self._queue.paused
+        with self._accounts.entry(f'{BAG}{topic}') as account:
+            account.type = type_name
+            receive, reported = account.receive, lost is not None
+            fresh = [message for message in taken if receive(message.publisher, message.number, reported=reported)]
+            account.lose(lost)
+            if paused:
+                account.dropped[PAUSED] += len(fresh)
+        if fresh and not paused:
+            dropped = self._queue.put(Lot(topic, type_name, self._qos_of(topic, type_name), fresh))
+            if dropped:
+                self._accounts.drop(f'{BAG}{topic}', 'queue_full', dropped)
+
+    def _qos_of(self, topic: str, type_name: str) -> str:
+        """What the publishers of the topic offer, as it was when the recording first heard of it."""
+        qos = self._qos.get((topic, type_name))
+        if qos is None:
+            found = self._node.get_publishers_info_by_topic(topic)
+            qos = offered_qos(info.qos_profile for info in found if info.topic_type == type_name)
+            self._qos[topic, type_name] = qos
+        return qos
+
+
+class BagStream:
+    """A topic that no sensor takes, with the face of a ``Stream``."""
+
+    kept_ns = 0
+
+    def __init__(self, sensor: SensorSettings, topic: str, type_name: str, last_kept_ns: int, shared: Shared) -> None:  # noqa: ARG002
+        self._topic = topic
+        self._type = type_name
+        self._tap = shared.tap
+        self._repeats = Repeats()
+
+    def update(self, sensor: SensorSettings) -> None:
+        """Nothing of it is sampled."""
+
+    def add(self, taken: Sequence[Taken], senders: Senders, lost: int | None, now_s: float, *, paused: bool,  # noqa: ARG002
+            idle: bool = False) -> None:  # noqa: ARG002  # fmt: skip
+        """Take messages in the order in which they came."""
+        fresh = []
+        for message in taken:
+            publisher = message.publisher or senders.name(message.number, message.source_ns)
+            if is_named(message) or not self._repeats.has(message):
+                fresh.append(message if message.publisher else message._replace(publisher=publisher))
+        self._tap.add(self._topic, self._type, fresh, lost, paused=paused)
+
+    def close_due(self, now_s: float, grace_s: float) -> None:
+        """There are no batches."""
+
+    def close_batch(self) -> None:
+        """There are no batches."""

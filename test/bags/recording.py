@@ -1,0 +1,157 @@
+"""What tests of the recorder share: messages as the intake hands them over, and a spool with its writer."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from clocks import Clocks
+from mcap.reader import make_reader
+
+from shadowhound_data_logger.bags.naming import BUCKET, key_of, slice_file
+from shadowhound_data_logger.bags.queue import BagQueue, Lot
+from shadowhound_data_logger.bags.recorder import Place, Recorder
+from shadowhound_data_logger.bags.recording import Outlet
+from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.config import SpoolSettings
+from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.options import BagSettings
+from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.accounts import BAG
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
+
+NOON_NS = 1_760_788_800 * 10**9
+STRING = 'std_msgs/msg/String'
+ROBOT = 'thor'
+WAIT_S = 20.0
+
+
+def messages(numbers: range, size: int = 0) -> list[Taken]:
+    """Of one publisher, a hundredth of a second apart; each came a millisecond after it was sent."""
+    return [
+        Taken(b'\0\1\0\0%08d' % number + b'x' * size, NOON_NS + number * 10**7, 'p', number, NOON_NS + number * 10**7 + 10**6)
+        for number in numbers
+    ]
+
+
+def lot(numbers: range, topic: str = '/talk', size: int = 0, type_name: str = STRING) -> Lot:
+    return Lot(topic, type_name, '', messages(numbers, size))
+
+
+@dataclass(slots=True)
+class Desk:
+    """A recorder with all behind it. What ``hear`` is given counts as received, as the intake would have it."""
+
+    spool: Spool
+    writer: SpoolWriter
+    queue: BagQueue
+    recorder: Recorder
+    home: Path
+    listening: list[bool] = field(default_factory=list)
+    room: list[bool] = field(default_factory=lambda: [True])
+
+    @property
+    def root(self) -> Path:
+        return self.home / 'bags' / ROBOT
+
+    def hear(self, numbers: range, topic: str = '/talk', size: int = 0) -> None:
+        heard = lot(numbers, topic, size)
+        with self.spool.accounts.entry(f'{BAG}{topic}') as account:
+            for message in heard.messages:
+                assert account.receive(message.publisher, message.number)
+        dropped = self.queue.put(heard)
+        if dropped:
+            self.spool.accounts.drop(f'{BAG}{topic}', 'queue_full', dropped)
+
+    def row(self, topic: str = '/talk') -> dict[str, Any]:
+        """Of the ledger, once all is committed."""
+        assert self.writer.flush(WAIT_S)
+        self.spool.commit()
+        found = ledger.read(self.spool.root, ROBOT)
+        assert ledger.imbalances(found) == []
+        row: dict[str, Any] = found['bags'][topic]
+        return row
+
+    def objects(self) -> dict[str, Path]:
+        """Key below the robot's bags -> file, of all that is in the spool."""
+        assert self.writer.flush(WAIT_S)
+        start = f'{ROBOT}/rosbags/'
+        return {item.key.removeprefix(start): item.path for item in self.spool.pending(1000)}
+
+
+@contextmanager
+def desk(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator[Desk]:
+    """An open one; closed as the node does it, unless it was before."""
+    time = clock or Clocks()
+    if clock is None:
+        time.set()
+    bag = BagSettings(**{'compression': 'none', **settings})
+    spool = Spool(home / 'spool', SpoolSettings(min_free_bytes=0), time, ROBOT)
+    spool.open()
+    spool.carry(BAG)
+    writer = SpoolWriter(spool, 0.01)
+    writer.open()
+    root, queue = home / 'bags' / ROBOT, BagQueue(bag.queue_bytes)
+    made: list[Desk] = []
+    outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush, lambda: made[0].room[0])
+
+    def listen(on: bool, deadline_s: float) -> bool:
+        made[0].listening.append(on)
+        return True
+
+    def is_known(name: str) -> bool:
+        return spool.has(BUCKET, key_of(ROBOT, name, slice_file(name, 0)))
+
+    salvage = Salvage(root, ROBOT, bag.priority, outlet, spool.knows)
+    recorder = Recorder(bag, Place(root, ROBOT, time, is_known), queue, outlet, salvage, listen)
+    made.append(Desk(spool, writer, queue, recorder, home))
+    try:
+        recorder.open()
+        yield made[0]
+    finally:
+        recorder.close(WAIT_S)
+        writer.close(WAIT_S)
+        spool.close()
+
+
+def mission(name: str = 'patrol', number: int = 1, run_id: str | None = None) -> Mapping[str, Any]:
+    """As MissionWatch tells of it."""
+    return {'mission_id': f'{name}_{number}', 'run_id': run_id, 'type': name, 'started': ''}
+
+
+def numbers(path: Path) -> list[int]:
+    """Of the messages of a slice, in the order of the file."""
+    with path.open('rb') as file:
+        return [
+            int(message.data[4:12]) for *_, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False)
+        ]
+
+
+def manifest(found: dict[str, Path], bag: str) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(found[f'{bag}/manifest.json'].read_bytes())
+    return content
+
+
+def start(recorder: Recorder) -> str:
+    done, name = recorder.start()
+    assert done, name
+    return name
+
+
+def write_out(it: Desk) -> None:
+    """As the thread does it twice a second."""
+    done = threading.Event()
+
+    def sync() -> None:
+        assert it.recorder._writing is not None
+        it.recorder._writing.tick()
+        done.set()
+
+    it.queue.mark(sync)
+    assert done.wait(10.0)

@@ -1,0 +1,143 @@
+"""Cutting a piece out of a bag: exactly the messages in it, and of a store little more than their chunks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from bags.real_bags import NAME, STEP_NS, T0, by_rosbags, messages_of, stored, write_ours, write_rosbags
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from stores.spooled import QUICK
+
+from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
+from shadowhound_data_logger.bags.mcap_messages import Message
+from shadowhound_data_logger.bags.remote import BUCKET, find_bag
+from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.directory import DirectoryStore
+from shadowhound_data_logger.stores.memory import MemoryStore
+
+KINDS = [
+    (StoragePlugin.MCAP, CompressionMode.NONE), (StoragePlugin.MCAP, CompressionMode.STORAGE),
+    (StoragePlugin.MCAP, CompressionMode.FILE), (StoragePlugin.SQLITE3, CompressionMode.NONE),
+    (StoragePlugin.SQLITE3, CompressionMode.FILE), (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+]  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def origin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag of three slices of 5 s."""
+    folder = tmp_path_factory.mktemp('robot') / NAME
+    write_ours(folder)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def store(origin: Path) -> MemoryStore:
+    found = MemoryStore()
+    stored(found, origin)
+    return found
+
+
+def source(origin: Path, wanted: Callable[[Message], bool]) -> list[Message]:
+    return [one for one in messages_of([origin / f'{NAME}_{number}.mcap' for number in range(3)]) if wanted(one)]
+
+
+@pytest.mark.parametrize(('choice', 'first', 'last', 'topics'), [
+    (Choice(), 0, 1500, {'/imu', '/camera/blob'}),
+    (Choice('4.5', '6.25'), 450, 625, {'/imu', '/camera/blob'}),
+    (Choice('-1'), 1399, 1500, {'/imu', '/camera/blob'}),
+    (Choice('2025-10-18T12:00:04.990Z', '2025-10-18 12:00:05.01'), 499, 501, {'/imu', '/camera/blob'}),
+    (Choice(f'{T0 // 10**9 + 3}.5', '4', topics=('imu',)), 350, 400, {'/imu'}),
+    (Choice('0', '2', regex='^/cam'), 0, 200, {'/camera/blob'}),
+])  # fmt: skip
+def test_it_has_these_messages_and_no_others(
+    origin: Path, store: MemoryStore, tmp_path: Path, choice: Choice, first: int, last: int, topics: set[str]
+) -> None:
+    """Topic, both stamps, sequence number and bytes of each, in their order; the source is left as it is."""
+    found = cut_remote(store, find_bag(store, 'thor', NAME), tmp_path / 'piece', choice)
+    start_ns, end_ns = T0 + first * STEP_NS, T0 + last * STEP_NS
+    wanted = source(origin, lambda one: start_ns <= one.log_ns < end_ns and one.channel.topic in topics)
+    assert list(messages_of([found.folder / 'piece_0.mcap'])) == wanted
+    assert found.messages == len(wanted) > 0
+    assert sorted(by_rosbags(found.folder)) == sorted((one.channel.topic, one.log_ns, one.cdr) for one in wanted)
+    assert list(messages_of([cut_folder(origin, tmp_path / 'again', choice).folder / 'again_0.mcap'])) == wanted
+
+
+def test_little_more_is_read_than_its_chunks(store: MemoryStore, tmp_path: Path) -> None:
+    """Of a second out of fifteen, not a fifth of the bag; of a topic that lies in every fifth chunk, those chunks."""
+    bag = find_bag(store, 'thor', NAME)
+    found = cut_remote(store, bag, tmp_path / 'second', Choice('7', '8'))
+    assert found.read_bytes < bag.size / 5
+    assert found.read_requests <= 3
+
+
+def test_also_from_a_real_server(seaweed: Tower, origin: Path, tmp_path: Path) -> None:
+    """Ranged reads over S3 give the same piece."""
+    s3 = open_store(seaweed.store_settings(), QUICK)
+    try:
+        stored(s3, origin)
+        found = cut_remote(s3, find_bag(s3, 'thor', NAME), tmp_path / 'piece', Choice('7', '8'))
+    finally:
+        s3.close()
+    start_ns = T0 + 700 * STEP_NS
+    assert list(messages_of([found.folder / 'piece_0.mcap'])) == source(origin, lambda one: 0 <= one.log_ns - start_ns < 10**9)
+    assert found.read_bytes < found.bag_bytes / 5
+
+
+@pytest.mark.parametrize(('plugin', 'mode'), KINDS, ids=lambda value: value.name)
+@pytest.mark.parametrize('is_remote', [False, True], ids=['folder', 'store'])
+def test_bags_of_others(tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode, is_remote: bool) -> None:
+    """Whatever rosbag2 writes becomes a plain MCAP bag of the same messages."""
+    folder = tmp_path / 'store' / BUCKET / 'thor' / 'rosbags' / 'theirs'
+    write_rosbags(folder, plugin, mode)
+    choice = Choice('1', '2', topics=('/imu',))
+    if is_remote:
+        store = DirectoryStore(tmp_path / 'store')
+        found = cut_remote(store, find_bag(store, 'thor', 'theirs'), tmp_path / 'piece', choice)
+    else:
+        found = cut_folder(folder, tmp_path / 'piece', choice)
+    wanted = [one for one in by_rosbags(folder) if T0 + 10**9 <= one[1] < T0 + 2 * 10**9 and one[0] == '/imu']
+    assert len(wanted) == 50
+    assert by_rosbags(found.folder) == wanted
+    channel = next(messages_of([found.folder / 'piece_0.mcap'])).channel
+    assert (channel.type, channel.encoding) == ('sensor_msgs/msg/Imu', 'ros2msg')
+    assert 'float64[9] orientation_covariance' in channel.definition
+
+
+@pytest.mark.parametrize(('choice', 'error', 'text'), [
+    (Choice(topics=('/imv',)), BagError, 'it has /imu'),
+    (Choice(regex='nothing'), BagError, 'no topic of the bag matches'),
+    (Choice('100', '101'), BagError, 'the bag goes from 2025-10-18T12:00:00.000000Z'),
+    (Choice('5', '4'), SettingError, 'a time after --start'),
+    (Choice('noon'), SettingError, '--start'),
+    (Choice(regex='('), SettingError, '--regex'),
+])  # fmt: skip
+def test_a_cut_of_nothing_leaves_nothing(
+    store: MemoryStore, tmp_path: Path, choice: Choice, error: type[Exception], text: str
+) -> None:
+    """It says what there is instead."""
+    with pytest.raises(error, match=text):
+        cut_remote(store, find_bag(store, 'thor', NAME), tmp_path / 'piece', choice)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_folder_is_left_alone(store: MemoryStore, tmp_path: Path) -> None:
+    """Nothing is overwritten."""
+    (tmp_path / 'piece').mkdir()
+    with pytest.raises(BagError, match='is there already'):
+        cut_remote(store, find_bag(store, 'thor', NAME), tmp_path / 'piece', Choice())
+
+
+def test_a_damaged_chunk_is_not_copied(origin: Path, tmp_path: Path) -> None:
+    """Its CRC-32 tells, and nothing is left of the cut."""
+    folder = tmp_path / NAME
+    folder.mkdir()
+    content = bytearray((origin / f'{NAME}_0.mcap').read_bytes())
+    content[20_000] ^= 1
+    (folder / f'{NAME}_0.mcap').write_bytes(content)
+    with pytest.raises(BagDamaged, match='chunk'):
+        cut_folder(folder, tmp_path / 'piece', Choice())
+    assert not (tmp_path / 'piece').exists()

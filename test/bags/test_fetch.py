@@ -1,0 +1,186 @@
+"""Fetching a bag: whole, verified, resumed after a kill, and nothing twice."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from bags.real_bags import NAME, by_rosbags, messages_of, put_item, stored, write_ours, write_rosbags
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from shadowhound_data_logger.bags.fetch import Told, fetch
+from shadowhound_data_logger.bags.remote import BUCKET, find_bag
+from shadowhound_data_logger.errors import BagDamaged, BagError, StoreUnavailable
+from shadowhound_data_logger.stores.directory import DirectoryStore
+from shadowhound_data_logger.stores.memory import MemoryStore
+
+
+class Counting(MemoryStore):
+    """Breaks off after ``limit`` bytes of contents."""
+
+    limit = 1 << 62
+    sent = 0
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
+        for piece in super().content(bucket, key, start):
+            for at in range(0, len(piece), 4096):
+                if self.sent >= self.limit:
+                    raise StoreUnavailable('gone')
+                self.sent += len(piece[at : at + 4096])
+                yield piece[at : at + 4096]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Counting:
+    write_ours(tmp_path / 'robot' / NAME)
+    found = Counting()
+    stored(found, tmp_path / 'robot' / NAME)
+    return found
+
+
+def files(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
+
+
+def test_it_is_the_very_bag(store: Counting, tmp_path: Path) -> None:
+    """Every file is what the robot wrote, and nothing else lies beside it; what was told adds up to all bytes."""
+
+    class Sum(Told):
+        total = 0
+        had = 0
+
+        def begin(self, total: int) -> None:
+            self.total = total
+
+        def have(self, count: int) -> None:
+            self.had += count
+
+    told = Sum()
+    found = fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here', told=told)
+    assert files(found.folder) == files(tmp_path / 'robot' / NAME)
+    assert (found.is_complete, found.unverified) == (True, ())
+    assert told.had == told.total == found.bytes == found.downloaded
+
+
+def test_a_second_run_downloads_nothing(store: Counting, tmp_path: Path) -> None:
+    """Also after a file was damaged: then it downloads that one."""
+    bag = find_bag(store, 'thor', NAME)
+    folder = fetch(store, bag, tmp_path / 'here').folder
+    assert fetch(store, bag, tmp_path / 'here').downloaded == 0
+    damaged = folder / f'{NAME}_1.mcap'
+    content = bytearray(damaged.read_bytes())
+    content[1000] ^= 1
+    damaged.write_bytes(content)
+    assert fetch(store, bag, tmp_path / 'here').downloaded == len(content)
+    assert files(folder) == files(tmp_path / 'robot' / NAME)
+
+
+def test_it_goes_on_where_it_broke_off(store: Counting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over the runs each byte comes once."""
+    monkeypatch.setattr(time, 'sleep', lambda _: None)
+    bag = find_bag(store, 'thor', NAME)
+    store.limit = bag.size // 2
+    with pytest.raises(StoreUnavailable):
+        fetch(store, bag, tmp_path / 'here', threads=1)
+    store.limit = 1 << 62
+    found = fetch(store, bag, tmp_path / 'here')
+    assert store.sent == bag.size
+    assert 0 < found.downloaded < bag.size
+    assert files(found.folder) == files(tmp_path / 'robot' / NAME)
+
+
+def test_a_part_that_lost_its_content_is_downloaded_again(store: Counting, tmp_path: Path) -> None:
+    """After a power cut a part may be of the right length and hold zeros."""
+    part = tmp_path / 'here' / NAME / f'{NAME}_0.mcap.part'
+    part.parent.mkdir(parents=True)
+    part.write_bytes(bytes(5000))
+    folder = fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here').folder
+    assert files(folder) == files(tmp_path / 'robot' / NAME)
+
+
+def test_what_the_store_lost_is_said_and_not_kept(store: Counting, tmp_path: Path) -> None:
+    """A slice that is not what the manifest promises never gets its name."""
+    other = tmp_path / 'other.bin'
+    other.write_bytes(b'x' * 1000)
+    key = f'thor/rosbags/{NAME}/{NAME}_1.mcap'
+    store._objects.pop((BUCKET, key))
+    store.put(put_item(other, key, NAME, 1))
+    with pytest.raises(BagDamaged, match='not in the store what was recorded'):
+        fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here')
+    assert not (tmp_path / 'here' / NAME / f'{NAME}_1.mcap').exists()
+
+
+def test_a_growing_bag_can_be_opened_and_completed(tmp_path: Path) -> None:
+    """Players get a metadata.yaml of what is there; when the bag has ended, its own replaces that."""
+    origin = tmp_path / 'robot' / NAME
+    write_ours(origin)
+    store = MemoryStore()
+    for number in (0, 1):
+        path = origin / f'{NAME}_{number}.mcap'
+        store.put(put_item(path, f'thor/rosbags/{NAME}/{path.name}', NAME, number))
+    found = fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here')
+    assert not found.is_complete
+    wanted = messages_of([origin / f'{NAME}_0.mcap', origin / f'{NAME}_1.mcap'])
+    assert by_rosbags(found.folder) == [(one.channel.topic, one.log_ns, one.cdr) for one in wanted]
+    stored(store, origin, without='_0.mcap')
+    assert fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here').is_complete
+    assert files(found.folder) == files(origin)
+
+
+def test_a_foreign_bag_is_fetched_as_it_is(tmp_path: Path) -> None:
+    """What another program put there without a checksum is told so."""
+    write_rosbags(tmp_path / 'store' / BUCKET / 'thor' / 'rosbags' / 'theirs', StoragePlugin.SQLITE3, CompressionMode.NONE)
+    store = DirectoryStore(tmp_path / 'store')
+    found = fetch(store, find_bag(store, 'thor', 'theirs'), tmp_path / 'here')
+    assert set(found.unverified) == {'metadata.yaml', 'theirs.db3'}
+    assert len(by_rosbags(found.folder)) == 300
+
+
+def test_two_at_a_time_do_not_mix(store: Counting, tmp_path: Path) -> None:
+    """A second process in the same folder is told of the first."""
+    folder = tmp_path / 'here' / NAME
+    folder.mkdir(parents=True)
+    with (folder / f'{NAME}_0.mcap.part').open('ab') as part:
+        fcntl.flock(part, fcntl.LOCK_EX)
+        with pytest.raises(BagError, match='another process fetches'):
+            fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here')
+
+
+def test_a_kill_costs_nothing(tmp_path: Path) -> None:
+    """Kill -9 in mid-fetch: the next run keeps what is there, and the bag is whole."""
+    origin = tmp_path / 'home' / 'store' / BUCKET / 'thor' / 'rosbags' / NAME
+    write_ours(origin, slices=2, each=3000)
+    program = (
+        'import sys, time, pathlib\n'
+        'from shadowhound_data_logger.stores.directory import DirectoryStore\n'
+        'from shadowhound_data_logger.bags.fetch import fetch, Told\n'
+        'from shadowhound_data_logger.bags.remote import find_bag\n'
+        'class Slow(Told):\n'
+        '    def have(self, count):\n'
+        '        if count:\n'
+        '            time.sleep(0.3)\n'
+        'store = DirectoryStore(pathlib.Path(sys.argv[1]))\n'
+        'fetch(store, find_bag(store, "thor", sys.argv[2]), pathlib.Path(sys.argv[3]), threads=1, told=Slow())\n'
+    )
+    here = tmp_path / 'here'
+    child = subprocess.Popen([sys.executable, '-c', program, str(tmp_path / 'home' / 'store'), NAME, str(here)])
+    end = time.monotonic() + 60
+    while not any(path.stat().st_size > 1 << 20 for path in here.rglob(f'{NAME}_*.part')):
+        assert time.monotonic() < end
+        assert child.poll() is None
+        time.sleep(0.01)
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    kept = sum(path.stat().st_size for path in here.rglob('*') if path.is_file())
+    store = DirectoryStore(tmp_path / 'home' / 'store')
+    found = fetch(store, find_bag(store, 'thor', NAME), here)
+    assert found.downloaded == found.bytes - kept
+    assert files(found.folder) == files(origin)

@@ -1,0 +1,89 @@
+"""manifest.json: read back as it was written, and wrong ones refused by the name of the field."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bags.slices import closed
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shadowhound_data_logger.bags.manifest import Manifest, Missing, MissionOf, RecordedTopic, SliceEntry, topics_of
+from shadowhound_data_logger.errors import BagDamaged
+
+ENTRY = SliceEntry('bag_0.mcap', 'thor/rosbags/bag/bag_0.mcap', 1000, 'ab' * 32, 5, 10, 20, {'/imu': 5})
+WHOLE = Manifest(
+    bag='patrol_20261121_120000', robot='thor', mission=MissionOf('patrol', 'm1', None), state='recovered',
+    missing=(Missing('bag_0.mcap', 'the last second', None), Missing('bag_0.mcap', 'a broken chunk', 12)),
+    topics=(RecordedTopic('/imu', 'sensor_msgs/msg/Imu', 5),), slices=(ENTRY,),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize('manifest', [WHOLE, replace(WHOLE, mission=None, state='complete', missing=(), topics=(), slices=())])
+def test_read_as_written(manifest: Manifest) -> None:
+    """Every field survives, null included."""
+    assert Manifest.from_json(manifest.to_json()) == manifest
+
+
+def test_the_fields_that_others_read() -> None:
+    """Names and places are a contract with every reader of the store."""
+    found = json.loads(WHOLE.to_json())
+    assert list(found) == ['version', 'bag', 'robot', 'mission', 'state', 'missing', 'topics', 'slices']
+    assert found['version'] == 1
+    assert list(found['slices'][0]) == ['file', 'key', 'bytes', 'sha256', 'messages', 't_start_ns', 't_end_ns', 'counts']
+    assert found['mission'] == {'type': 'patrol', 'mission_id': 'm1', 'run_id': None}
+    assert found['missing'][0] == {'file': 'bag_0.mcap', 'what': 'the last second', 'messages': None}
+
+
+def test_made_of_slices(tmp_path: Path) -> None:
+    """An entry and the topics are what the writer of the slices told."""
+    one, _ = closed(tmp_path / 'bag_0.mcap', 10)
+    two, _ = closed(tmp_path / 'bag_1.mcap', 4)
+    entry = SliceEntry.of(one, 'key')
+    assert (entry.file, entry.key, entry.bytes, entry.sha256, entry.counts) == (
+        'bag_0.mcap',
+        'key',
+        one.bytes,
+        one.sha256,
+        one.counts,
+    )
+    assert [(each.topic, each.messages) for each in topics_of([one, two])] == [('/talk', 6), ('/echo', 4), ('/blob', 4)]
+
+
+@pytest.mark.parametrize(('place', 'value'), [
+    ('version', 2), ('version', None), ('bag', ''), ('robot', 7), ('state', 'growing'), ('mission', 'patrol'), ('missing', None),
+    ('topics', {}), ('slices', [1]), ('slices[0].bytes', -1), ('slices[0].bytes', True), ('slices[0].messages', 1.5),
+    ('slices[0].sha256', 'AB' * 32), ('slices[0].counts', []), ('slices[0].counts./imu', '5'), ('mission.type', None),
+    ('missing[0].messages', -3),
+])  # fmt: skip
+def test_what_is_wrong_is_named(place: str, value: object) -> None:
+    """One field that is not as it must be refuses the whole, and the error says which."""
+    found = json.loads(WHOLE.to_json())
+    inner: Any = found
+    *way, last = place.replace('[0]', '.0').split('.')
+    for step in way:
+        inner = inner[int(step) if step == '0' else step]
+    inner[last] = value
+    with pytest.raises(BagDamaged) as refused:
+        Manifest.from_json(json.dumps(found).encode(), 'thor/rosbags/bag/manifest.json')
+    assert str(refused.value).startswith('thor/rosbags/bag/manifest.json')
+    assert place in str(refused.value)
+
+
+def test_a_later_version_may_say_more() -> None:
+    """Fields that are not known are ignored."""
+    found = {**json.loads(WHOLE.to_json()), 'colour': 'blue'}
+    assert Manifest.from_json(json.dumps(found).encode()) == WHOLE
+
+
+@given(st.binary(max_size=50) | st.recursive(
+    st.none() | st.integers() | st.text(), lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=5,
+).map(lambda value: json.dumps(value).encode()))  # fmt: skip
+def test_anything_else_is_refused(content: bytes) -> None:
+    """Whatever is no manifest is BagDamaged, never another error."""
+    with pytest.raises(BagDamaged):
+        Manifest.from_json(content)

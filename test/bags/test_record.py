@@ -1,0 +1,94 @@
+"""``record_and_upload_rosbag``: a bag by hand, in a process of its own, from real publishers into the store."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from bags.real_bags import by_rosbags
+
+from shadowhound_data_logger.bags import record_and_upload_rosbag
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.record import record
+from shadowhound_data_logger.errors import BagError
+
+pytestmark = pytest.mark.ros
+long = pytest.mark.skipif(
+    not os.environ.get('SHADOWHOUND_TEST_LONG'), reason='starts more processes: set SHADOWHOUND_TEST_LONG=1'
+)
+PUBLISHER = """
+import time, rclpy
+from nav_msgs.msg import Odometry
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node('publisher')
+odom, text = node.create_publisher(Odometry, '/odom', 10), node.create_publisher(String, '/text', 10)
+while True:
+    odom.publish(Odometry())
+    text.publish(String(data='hello'))
+    time.sleep(0.02)
+"""
+
+
+@pytest.fixture
+def home(domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """With somebody who publishes odometry and text at 50 Hz."""
+    environ = {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+               'SHADOWHOUND_HOME': str(tmp_path / 'home'), 'AWS_ENDPOINT_URL': ''}  # fmt: skip
+    for name, value in environ.items():
+        monkeypatch.setenv(name, value)
+    publisher = subprocess.Popen([sys.executable, '-c', PUBLISHER])
+    yield tmp_path / 'home'
+    publisher.kill()
+    publisher.wait()
+
+
+def rosbags_of(home: Path) -> Path:
+    return home / 'store' / 'sensor-data' / 'thor' / 'rosbags'
+
+
+def test_the_guides_function(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """It returns when the store has the bag, with every topic of the sensors that was published."""
+    found = record_and_upload_rosbag('patrol', 2)
+    assert (found.delivered, found.dropped) == (True, 0)
+    assert f'Uploaded: s3://sensor-data/thor/rosbags/{found.bag}/' in capfd.readouterr().out
+    assert found.bag.startswith('patrol_')
+    messages = by_rosbags(rosbags_of(home) / found.bag)
+    assert {topic for topic, _, _ in messages} == {'/odom'}
+    assert len(messages) == found.messages == found.topics['/odom'] > 20
+    manifest = Manifest.from_json((rosbags_of(home) / found.bag / 'manifest.json').read_bytes())
+    assert (manifest.state, manifest.mission and manifest.mission.type) == ('complete', 'patrol')
+
+
+@long
+def test_other_topics_and_nothing(home: Path) -> None:
+    """A named topic alone; where nothing comes an error says so, and no bag is left."""
+    found = record('words', 1.0, topics=['/text'])
+    assert list(found.topics) == ['/text']
+    with pytest.raises(BagError, match='nothing was published'):
+        record('silence', 0.5, topics=['/nobody'])
+    assert [path.name for path in rosbags_of(home).iterdir()] == [found.bag]
+
+
+@long
+def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
+    """Kill -9 while it records: the next recording makes it whole and says what may be missing."""
+    program = 'shadowhound_data_logger.capture.bag_process'
+    child = subprocess.Popen([sys.executable, '-m', program, '--duration=60', '--topic=/odom', 'cut_off'])
+    end = time.monotonic() + 60
+    while not any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    assert record('next', 1.0, topics=['/text']).delivered
+    (folder,) = rosbags_of(home).glob('cut_off_*')
+    manifest = Manifest.from_json((folder / 'manifest.json').read_bytes())
+    assert manifest.state == 'recovered'
+    assert len(by_rosbags(folder)) == manifest.slices[0].messages > 0

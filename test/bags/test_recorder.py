@@ -1,0 +1,216 @@
+"""Bags begin and end as they are asked to, and whatever was received is in one of them, or the ledger says why not."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from bags.recording import ROBOT, STRING, desk, lot, manifest, mission, numbers, start, write_out
+from clocks import Clocks
+from mcap.reader import make_reader
+
+
+def test_a_bag_from_start_to_stop(tmp_path: Path) -> None:
+    """Its slices, metadata and manifest are in the spool under the bag's name, its folder is gone, the accounts are closed."""
+    with desk(tmp_path) as it:
+        name = start(it.recorder)
+        it.hear(range(1, 11))
+        assert it.recorder.split()[0]
+        it.hear(range(11, 16))
+        assert it.recorder.stop() == (True, f'{name}: 15 messages in 2 slices')
+        found = it.objects()
+        assert sorted(found) == [
+            f'{name}/{file}' for file in ('manifest.json', 'metadata.yaml', f'{name}_0.mcap', f'{name}_1.mcap')
+        ]
+        assert numbers(found[f'{name}/{name}_0.mcap']) + numbers(found[f'{name}/{name}_1.mcap']) == list(range(1, 16))
+        said = manifest(found, name)
+        assert (said['state'], said['missing'], said['mission'], said['robot']) == ('complete', [], None, ROBOT)
+        assert [entry['messages'] for entry in said['slices']] == [10, 5]
+        assert (it.row()['stored'], it.row()['open'], it.row()['stored_in']['pending']) == (15, 0, 15)
+        assert it.listening == [True, False]
+        assert not list(it.root.iterdir())
+
+
+def test_both_stamps_and_the_number_are_kept(tmp_path: Path) -> None:
+    """Log time is when it came, publish time when it was sent, sequence the publisher's number."""
+    with desk(tmp_path) as it:
+        name = start(it.recorder)
+        it.hear(range(7, 8))
+        it.recorder.stop()
+        with it.objects()[f'{name}/{name}_0.mcap'].open('rb') as file:
+            ((schema, channel, message),) = make_reader(file).iter_messages()
+        (sent,) = lot(range(7, 8)).messages
+        assert (message.log_time, message.publish_time, message.sequence) == (sent.received_ns, sent.source_ns, 7)
+        assert (channel.topic, message.data) == ('/talk', sent.cdr)
+        assert schema is not None
+        assert schema.name == STRING
+
+
+def test_what_is_asked_out_of_turn_is_refused(tmp_path: Path) -> None:
+    """One bag at a time; without one there is nothing to stop, split or pause."""
+    with desk(tmp_path) as it:
+        for ask in (it.recorder.stop, it.recorder.split, lambda: it.recorder.pause(paused=True)):
+            assert ask() == (False, 'nothing is recorded')
+        name = start(it.recorder)
+        assert it.recorder.start() == (False, f'{name} is recorded already')
+
+
+def test_bags_of_one_second_have_names_of_their_own(tmp_path: Path) -> None:
+    """Also when the first one has left this disk; and one without messages leaves nothing."""
+    with desk(tmp_path) as it:
+        names = []
+        for number in range(3):
+            names.append(start(it.recorder))
+            it.hear(range(number, number + 1))
+            it.recorder.stop()
+        assert names == [names[0], f'{names[0]}_1', f'{names[0]}_2']
+        before = it.objects()
+        start(it.recorder)
+        it.recorder.stop()
+        assert it.objects() == before
+
+
+def test_slices_end_by_size(tmp_path: Path) -> None:
+    """None is much larger than it may be, and all are in the bag in their order."""
+    with desk(tmp_path, slice_bytes=1 << 20) as it:
+        name = start(it.recorder)
+        for first in range(0, 50, 10):
+            it.hear(range(first, first + 10), size=100_000)
+        it.recorder.stop()
+        found = it.objects()
+        slices = [found[f'{name}/{name}_{number}.mcap'] for number in range(len(found) - 2)]
+        assert len(slices) >= 3
+        assert all(path.stat().st_size < 2_500_000 for path in slices)
+        assert [number for path in slices for number in numbers(path)] == list(range(50))
+
+
+def test_a_full_queue_is_a_loss_with_a_name(tmp_path: Path) -> None:
+    """What the queue has no room for is dropped, the newest first, and counted; the rest is recorded."""
+    with desk(tmp_path, queue_bytes=1 << 20) as it:
+        name = start(it.recorder)
+        it.hear(range(20), size=100_000)
+        it.recorder.stop()
+        assert it.row()['dropped'] == {'queue_full': 10}
+        assert numbers(it.objects()[f'{name}/{name}_0.mcap']) == list(range(10))
+
+
+def test_a_bag_follows_its_mission(tmp_path: Path) -> None:
+    """It begins and ends with it, bears its type, and says its ids, also the run's that became known meanwhile."""
+    with desk(tmp_path, record='mission') as it:
+        it.recorder.on_mission({})
+        assert not it.recorder.status().recording
+        it.recorder.on_mission(mission())
+        bag = it.recorder.status().bag
+        assert bag.startswith('patrol_2025')
+        it.hear(range(3))
+        it.recorder.on_mission(mission(run_id='r1'))
+        it.recorder.on_mission({})
+        said = manifest(it.objects(), bag)
+        assert said['mission'] == {'type': 'patrol', 'mission_id': 'patrol_1', 'run_id': 'r1'}
+        assert not it.recorder.status().recording
+
+
+def test_one_bag_follows_the_other_without_a_gap(tmp_path: Path) -> None:
+    """Recording always, a mission has a bag of its own; the intake listens all the time."""
+    with desk(tmp_path, record='always') as it:
+        names = [it.recorder.status().bag]
+        for number, told in enumerate(({}, mission(), mission(number=2), {})):
+            it.recorder.on_mission(told)
+            names.append(it.recorder.status().bag)
+            it.hear(range(10 * number, 10 * number + 10))
+        it.recorder.stop()
+        found = it.objects()
+        bags = list(dict.fromkeys(names))
+        assert len(bags) == 4
+        assert [numbers(found[f'{bag}/{bag}_0.mcap']) for bag in bags] == [
+            list(range(10 * number, 10 * number + 10)) for number in range(4)
+        ]
+        assert it.listening == [True, False]
+
+
+def test_what_somebody_started_outlives_missions(tmp_path: Path) -> None:
+    """A bag that a service began ends when a service says so."""
+    with desk(tmp_path, record='mission') as it:
+        name = start(it.recorder)
+        it.recorder.on_mission(mission())
+        it.recorder.on_mission({})
+        assert it.recorder.status().bag == name
+
+
+def test_a_stop_of_the_node_ends_the_bag(tmp_path: Path) -> None:
+    """All that was handed over is in the spool then, as a complete bag."""
+    with desk(tmp_path, record='always') as it:
+        name = it.recorder.status().bag
+        it.hear(range(100))
+        assert it.recorder.close(10.0)
+        assert manifest(it.objects(), name)['state'] == 'complete'
+        assert it.row()['stored'] == 100
+
+
+def kill(home: Path) -> Path:
+    """What the next start would find had the node been killed now."""
+    copy = home.with_name(f'{home.name}-after')
+    shutil.copytree(home, copy, copy_function=_copy)
+    return copy
+
+
+def _copy(source: str, target: str) -> None:
+    """What leaves meanwhile is not there any more."""
+    with suppress(FileNotFoundError):
+        shutil.copy2(source, target)
+
+
+@pytest.mark.parametrize('synced', [True, False])
+def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path, synced: bool) -> None:
+    """Closed slices and what was synced of the open one are spooled; the rest is lost by the restart, as the manifest says."""
+    home = tmp_path / 'home'
+    with desk(home, record='always') as it:
+        name = it.recorder.status().bag
+        it.hear(range(10))
+        it.recorder.split()
+        it.hear(range(10, 30))
+        if synced:
+            write_out(it)
+        assert it.row()['open'] == 20
+        left = kill(home)
+    clock = Clocks()
+    clock.set()
+    clock.wait(60.0)
+    with desk(left, clock) as it:
+        it.recorder._salvage.worker.join(20.0)
+        found = it.objects()
+        slices = 2 if synced else 1
+        assert sorted(found) == [f'{name}/{file}' for file in ('manifest.json', 'metadata.yaml')] + [
+            f'{name}/{name}_{number}.mcap' for number in range(slices)
+        ]
+        said = manifest(found, name)
+        assert said['state'] == 'recovered'
+        assert said['missing'][-1]['what'].startswith('what was in memory')
+        row = it.row()
+        assert (row['stored'], row['open'], row['dropped']) == ((30, 0, {}) if synced else (10, 0, {'restart': 20}))
+        assert not list(it.root.iterdir())
+
+
+def test_a_start_that_is_cut_short_is_done_again(tmp_path: Path) -> None:
+    """Whatever of a bag was spooled before a second death, nothing is in the spool twice and the ledger closes."""
+    home = tmp_path / 'home'
+    with desk(home, record='always') as it:
+        name = it.recorder.status().bag
+        it.hear(range(10))
+        write_out(it)
+        assert it.row()['open'] == 10
+        left = kill(home)
+    with desk(left) as it:
+        it.recorder._salvage.worker.join(20.0)
+        shutil.copytree(home / 'bags', tmp_path / 'again')  # the folder as it was, beside a spool that has the bag
+        again = kill(left)
+    shutil.rmtree(again / 'bags', ignore_errors=True)
+    folder = again / 'bags' / ROBOT / name
+    folder.mkdir(parents=True)
+    shutil.copy(next(again.glob('spool/ready/*/*/rosbags/*/*_0.mcap')), folder / f'{name}_0.mcap')
+    with desk(again) as it:
+        it.recorder._salvage.worker.join(20.0)
+        assert sorted(path for path in it.objects() if path.endswith('.mcap')) == [f'{name}/{name}_0.mcap']
+        assert (it.row()['stored'], it.row()['received']) == (10, 10)

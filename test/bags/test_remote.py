@@ -1,0 +1,141 @@
+"""Bags as the store, the spool and the recording folder show them, and times as people write them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from bags.real_bags import NAME, T0, put_item, stored, write_ours, write_rosbags
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from shadowhound_data_logger.bags.info import info_folder, info_of
+from shadowhound_data_logger.bags.overview import BagRow, named_ns, overview
+from shadowhound_data_logger.bags.remote import BUCKET, find_bag, find_bags, natural
+from shadowhound_data_logger.bags.slice_writer import SliceWriter
+from shadowhound_data_logger.bags.span import since, when
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.errors import BagError, SettingError
+from shadowhound_data_logger.stores.directory import DirectoryStore
+from shadowhound_data_logger.stores.memory import MemoryStore
+
+
+def row(store: MemoryStore | DirectoryStore, home: Path, name: str = NAME) -> BagRow:
+    return next(each for each in overview(store, 'thor', home) if each.bag == name)
+
+
+def test_a_complete_bag(tmp_path: Path) -> None:
+    """Its manifest tells everything of it."""
+    store = MemoryStore()
+    write_ours(tmp_path / NAME)
+    stored(store, tmp_path / NAME)
+    found = row(store, tmp_path / 'home')
+    assert (found.state, found.slices, found.messages, found.topics, found.where) == ('complete', 3, 1650, 2, {'store': 5})
+    assert (found.t_start_ns, found.t_end_ns, found.finding) == (T0, T0 + 14_990_000_000, '')
+
+
+def test_a_growing_bag_is_told_by_its_slices(tmp_path: Path) -> None:
+    """In the store one, in the recording folder a closed one and the open one; nothing is opened for it."""
+    store, recording = MemoryStore(), tmp_path / 'home' / 'bags' / 'thor' / NAME
+    write_ours(recording, slices=2, is_ended=False)
+    path = recording / f'{NAME}_0.mcap'
+    store.put(put_item(path, f'thor/rosbags/{NAME}/{path.name}', NAME, 0))
+    writer = SliceWriter(recording / f'{NAME}_2.mcap')
+    found = row(store, tmp_path / 'home')
+    assert (found.state, found.slices, found.where, found.messages) == ('growing', 3, {'store': 1, 'recording': 2}, 550)
+    writer.abort()
+    assert info_of(store, 'thor', NAME, tmp_path / 'home').description.messages == 1100
+
+
+def test_a_manifest_before_its_slices_is_no_complete_bag(tmp_path: Path) -> None:
+    """It is small and overtakes them: the bag grows until all that it promises is there."""
+    store = MemoryStore()
+    write_ours(tmp_path / NAME)
+    stored(store, tmp_path / NAME, without='_1.mcap')
+    found = row(store, tmp_path / 'home')
+    assert (found.state, found.finding) == ('growing', '1 of 3 slices are not here yet')
+    assert info_of(store, 'thor', NAME, tmp_path / 'home').missing == [f'{NAME}_1.mcap']
+
+
+def test_bags_of_others_are_foreign(tmp_path: Path) -> None:
+    """With metadata.yaml as much is known of them; of an archive nothing."""
+    folder = tmp_path / 'store' / BUCKET / 'thor' / 'rosbags'
+    folder.mkdir(parents=True)
+    write_rosbags(folder / 'theirs', StoragePlugin.SQLITE3, CompressionMode.NONE)
+    (folder / 'patrol_20251018_120000.tar.gz').write_bytes(b'x' * 100)
+    store = DirectoryStore(tmp_path / 'store')
+    theirs, archive = row(store, tmp_path, 'theirs'), row(store, tmp_path, 'patrol_20251018_120000.tar.gz')
+    assert (theirs.state, theirs.messages, theirs.topics, theirs.slices) == ('foreign', 300, 2, 1)
+    assert (archive.state, archive.messages, archive.bytes) == ('foreign', None, 100)
+    with pytest.raises(BagError, match='archive'):
+        info_of(store, 'thor', archive.bag, tmp_path)
+
+
+def test_only_those_since(tmp_path: Path) -> None:
+    """By the time at which they began; an older one is not opened for it."""
+    store = MemoryStore()
+    for name in (NAME, 'patrol_20240101_000000'):
+        write_ours(tmp_path / name, slices=1, each=10)
+        stored(store, tmp_path / name)
+    assert [each.bag for each in overview(store, 'thor', tmp_path, since_ns=T0)] == [NAME]
+    assert overview(store, 'thor', tmp_path, since_ns=T0 + SECOND) == []
+    assert overview(store, 'tachi', tmp_path) == []
+
+
+def test_a_name_that_is_none_is_answered_with_near_ones(tmp_path: Path) -> None:
+    """A slip of the hand is the commonest error."""
+    store = MemoryStore()
+    write_ours(tmp_path / NAME, slices=1, each=10)
+    stored(store, tmp_path / NAME)
+    with pytest.raises(BagError, match=NAME):
+        find_bag(store, 'thor', 'patrol_20251018_12000')
+
+
+def test_info_of_a_folder(tmp_path: Path) -> None:
+    """The same as of the store; without metadata.yaml from the slices themselves."""
+    write_ours(tmp_path / NAME)
+    found = info_folder(tmp_path / NAME)
+    (tmp_path / NAME / 'metadata.yaml').unlink()
+    bare = info_folder(tmp_path / NAME)
+    assert bare.description.topics == found.description.topics
+    assert [topic.messages for topic in bare.description.topics] == [1500, 150]
+    assert (bare.description.t_start_ns, bare.description.t_end_ns) == (T0, T0 + 14_990_000_000)
+    assert json.loads((tmp_path / NAME / 'manifest.json').read_text())['state'] == found.state
+
+
+def test_slices_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    """The eleventh after the tenth, not after the first."""
+    assert sorted(['a_10.mcap', 'a_9.mcap', 'a_1.mcap'], key=natural) == ['a_1.mcap', 'a_9.mcap', 'a_10.mcap']
+    store = MemoryStore()
+    write_ours(tmp_path / NAME, slices=11, each=1)
+    stored(store, tmp_path / NAME)
+    assert [file.name for file in find_bags(store, 'thor')[0].slices][-2:] == [f'{NAME}_9.mcap', f'{NAME}_10.mcap']
+
+
+@pytest.mark.parametrize(('text', 'wanted'), [
+    ('0', T0), ('1.5', T0 + 1_500_000_000), ('-2', T0 + 8 * SECOND), ('+3', T0 + 3 * SECOND),
+    ('-0.000000001', T0 + 10 * SECOND - 1), ('2025-10-18T12:00:01.25Z', T0 + 1_250_000_000), ('2025-10-18 12:00', T0),
+    ('2025-10-18T14:00:00.123456789+02:00', T0 + 123_456_789), ('2025-10-18T07:00:00-0500', T0),
+    ('1760788801', T0 + SECOND), ('1760788801.5', T0 + 1_500_000_000), (str(T0 + 7), T0 + 7),
+])  # fmt: skip
+def test_a_time_in_a_bag(text: str, wanted: int) -> None:
+    """In any of the forms, to the nanosecond."""
+    assert when(text, T0, T0 + 10 * SECOND, '--start') == wanted
+
+
+@pytest.mark.parametrize(
+    'text', ['', 'x', '12:00', '2025-13-01', '2025-10-18T25:00', '1e3', 'nan', '--1', '2025-10-18T12:00:00 ']
+)
+def test_what_is_no_time_is_refused(text: str) -> None:
+    """With the option's name."""
+    with pytest.raises(SettingError, match='--start'):
+        when(text, T0, T0, '--start')
+
+
+def test_a_time_ago() -> None:
+    """Days, hours and minutes, or a date."""
+    assert since('2d', T0, '--since') == T0 - 2 * 86400 * SECOND
+    assert since('1.5h', T0, '--since') == T0 - 5400 * SECOND
+    assert since('2025-10-18', T0, '--since') == T0 - 12 * 3600 * SECOND
+    assert named_ns('patrol_20251018_120000') == named_ns('patrol_20251018_120000.tar.gz') == T0
+    assert named_ns('rosbag2_2025_10_18-12_00_00') is None

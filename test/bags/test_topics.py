@@ -1,0 +1,76 @@
+"""Which topics a bag holds, what it is called, and what its notes remember."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shadowhound_data_logger.bags.channel import Channel
+from shadowhound_data_logger.bags.manifest import Missing, MissionOf
+from shadowhound_data_logger.bags.naming import bag_name, key_of, slice_file, slice_number
+from shadowhound_data_logger.bags.notes import FILE, Notes
+from shadowhound_data_logger.bags.slice_info import SliceInfo
+from shadowhound_data_logger.bags.topics import Choice
+from shadowhound_data_logger.options import BagSettings
+
+NOON_NS = 1_760_788_800 * 10**9
+GRAPH = ('/imu', '/odom', '/camera/image_raw', '/_hidden', '/a/_hidden/b', '/rosout')
+SENSORS = ('/imu', '/camera/compressed')
+
+
+@pytest.mark.parametrize(('named', 'regex', 'exclude', 'wanted'), [
+    ((), '', '', SENSORS), (('/x',), '', '', ('/x',)), ((), '.*', '', ('/imu', '/odom', '/camera/image_raw', '/rosout')),
+    ((), '.*', 'raw|rosout', ('/imu', '/odom')), (('/x', '/rosout'), 'im', 'raw|rosout', ('/x', '/rosout', '/imu')),
+    ((), '^/imu$', '', ('/imu',)), ((), 'nothing', '', ()),
+])  # fmt: skip
+def test_which_topics(named: tuple[str, ...], regex: str, exclude: str, wanted: tuple[str, ...]) -> None:
+    """Those that are named, those of which a part matches and that are not excluded or hidden; else what the sensors take."""
+    choice = Choice(BagSettings(regex=regex, exclude=exclude), named)
+    assert choice.asks_graph is bool(regex)
+    assert choice.wanted(SENSORS, GRAPH) == set(wanted)
+
+
+def test_names() -> None:
+    """They say what and when, in UTC, and differ; a slice's number is found again."""
+    assert bag_name('', NOON_NS, lambda _: False) == 'recording_20251018_120000'
+    assert bag_name('../../etc', NOON_NS, lambda _: False) == 'recording_20251018_120000'
+    taken = {'patrol_20251018_120000', 'patrol_20251018_120000_1'}
+    assert bag_name('patrol', NOON_NS, taken.__contains__) == 'patrol_20251018_120000_2'
+    assert key_of('thor', 'b', slice_file('b', 12)) == 'thor/rosbags/b/b_12.mcap'
+    files = ('b_1_0.mcap', 'b_1_10.mcap.open', 'b_0.mcap', 'manifest.json', 'b_1_x.mcap')
+    assert [slice_number('b_1', file) for file in files] == [0, 10, None, None, None]
+
+
+def info(folder: Path, number: int) -> SliceInfo:
+    channel = Channel('/imu', 'x/msg/Y', 'ros2msg', 'float32 x', 'RIHS01_0', '- history: 1')
+    return SliceInfo(folder / slice_file(folder.name, number), 10, 'ab' * 32, 1, 2, 3, {'/imu': 3}, (channel,))
+
+
+def test_notes_are_read_as_they_were_written(tmp_path: Path) -> None:
+    """After a death, a torn last line included; what does not make sense is left out."""
+    notes = Notes.begin(tmp_path / 'thor' / 'b', 'thor', MissionOf('patrol', 'patrol_1', None))
+    notes.add_slice(info(notes.folder, 0))
+    notes.add_missing(Missing('b_0.mcap', 'why', None))
+    notes.set_mission(MissionOf('patrol', 'patrol_1', 'r'))
+    with (notes.folder / FILE).open('ab') as file:
+        file.write(b'{"slice": {"file": "b_1.m')
+    found = Notes.read(notes.folder, 'thor')
+    assert found == notes
+    found.add_slice(info(notes.folder, 1))
+    found.end()
+    again = Notes.read(notes.folder, 'thor')
+    assert (list(again.slices), again.ended, again.mission) == (
+        ['b_0.mcap', 'b_1.mcap'],
+        True,
+        MissionOf('patrol', 'patrol_1', 'r'),
+    )
+    assert again.slices['b_1.mcap'].counts == {'/imu': 3}
+    again.remove()
+    assert not notes.folder.exists()
+
+
+def test_a_folder_without_notes_is_a_bag_of_which_nothing_is_known(tmp_path: Path) -> None:
+    """Its slices tell the rest."""
+    (tmp_path / 'b').mkdir()
+    assert Notes.read(tmp_path / 'b', 'thor') == Notes(tmp_path / 'b', 'b', 'thor', None)

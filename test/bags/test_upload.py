@@ -1,0 +1,246 @@
+"""Uploading finished bags: as they are, verified, through the spool or past it, and watching a folder for them."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import tarfile
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from bags.real_bags import NAME, by_rosbags, write_ours, write_rosbags
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from shadowhound_data_logger.bags.remote import BUCKET, MANIFEST, find_bag, find_bags
+from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, parcel, spool_parcel, upload_now
+from shadowhound_data_logger.bags.verify import verify_remote
+from shadowhound_data_logger.bags.watch import Watch
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.errors import BagDamaged, BagError, NameRefused
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.directory import DirectoryStore
+
+CLOCK = SystemClock.of_this_machine()
+DEADLINE_S = 60.0
+KINDS = [
+    (StoragePlugin.MCAP, CompressionMode.NONE), (StoragePlugin.MCAP, CompressionMode.FILE),
+    (StoragePlugin.SQLITE3, CompressionMode.NONE), (StoragePlugin.SQLITE3, CompressionMode.FILE),
+    (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+]  # fmt: skip
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    return Settings.load({'robot': 'thor', 'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path / 'home')})
+
+
+@pytest.fixture
+def store(settings: Settings) -> DirectoryStore:
+    return DirectoryStore(settings.store.directory)
+
+
+def send(settings: Settings, folder: Path, *, is_archive: bool = False, deadline_s: float = DEADLINE_S) -> Uploaded:
+    """Through the spool."""
+    with (
+        parcel(folder, 'thor', folder.name, settings.home, is_archive=is_archive) as sent,
+        opened_spool(settings, CLOCK) as spool,
+    ):
+        spool_parcel(sent, spool)
+        return deliver(settings, spool, sent, deadline_s=deadline_s)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(('plugin', 'mode'), KINDS, ids=lambda value: value.name)
+def test_any_finished_bag_arrives_as_it_is(
+    settings: Settings, store: DirectoryStore, tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode
+) -> None:
+    """With a manifest that tells its checksums; the folder is left as it was."""
+    write_rosbags(tmp_path / 'theirs', plugin, mode)
+    before = contents(tmp_path / 'theirs')
+    assert send(settings, tmp_path / 'theirs').is_delivered
+    assert contents(tmp_path / 'theirs') == before
+    arrived = contents(settings.store.directory / BUCKET / 'thor' / 'rosbags' / 'theirs')
+    assert {name: body for name, body in arrived.items() if name != MANIFEST} == before
+    found = verify_remote(store, find_bag(store, 'thor', 'theirs'), deep=True)
+    assert (found.state, found.findings) == ('complete', ())
+    assert len(by_rosbags(settings.store.directory / BUCKET / 'thor' / 'rosbags' / 'theirs')) == 300
+    assert list((settings.home / 'sending').iterdir()) == []
+
+
+def test_twice_is_once(settings: Settings, tmp_path: Path) -> None:
+    """The second time nothing is spooled, and the answer is the same."""
+    write_ours(tmp_path / NAME)
+    assert send(settings, tmp_path / NAME) == send(settings, tmp_path / NAME)
+    with closing(open_store(settings.store, settings.upload)) as store:
+        assert [bag.name for bag in find_bags(store, 'thor')] == [NAME]
+        assert len(find_bag(store, 'thor', NAME).files) == 5
+
+
+@pytest.mark.parametrize('is_now', [False, True])
+def test_another_bag_of_that_name_is_refused(settings: Settings, store: DirectoryStore, tmp_path: Path, is_now: bool) -> None:
+    """Nothing is overwritten, nothing is renamed; the remedy is another name."""
+    write_ours(tmp_path / NAME, slices=1)
+    send(settings, tmp_path / NAME)
+    write_ours(tmp_path / 'other' / NAME, slices=1, each=10)
+    if is_now:
+        with (
+            parcel(tmp_path / 'other' / NAME, 'thor', NAME, settings.home, is_archive=False) as sent,
+            pytest.raises(BagError, match='--name'),
+        ):
+            upload_now(store, sent, deadline_s=DEADLINE_S)
+    else:
+        with pytest.raises(BagError, match='--name'):
+            send(settings, tmp_path / 'other' / NAME)
+    assert len(find_bag(store, 'thor', NAME).files) == 3
+
+
+def test_an_archive_is_the_guides(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
+    """thor/rosbags/<name>.tar.gz with the bag's folder in it; made twice it is the same bytes."""
+    write_ours(tmp_path / NAME)
+    assert send(settings, tmp_path / NAME, is_archive=True).is_delivered
+    body = store.get(BUCKET, f'thor/rosbags/{NAME}.tar.gz')
+    with tarfile.open(fileobj=io.BytesIO(body)) as archive:
+        archive.extractall(tmp_path / 'unpacked', filter='data')
+    assert contents(tmp_path / 'unpacked' / NAME) == contents(tmp_path / NAME)
+    assert send(settings, tmp_path / NAME, is_archive=True).is_delivered
+
+
+def test_an_away_tower_is_no_failure(tmp_path: Path, seaweed: Tower) -> None:
+    """The bag waits in the spool, whatever becomes of its folder, and the next process delivers it."""
+    settings = Settings.load({'robot': 'thor', 'spool.min_free_bytes': 0},
+                             {'SHADOWHOUND_HOME': str(tmp_path / 'home'), 'AWS_ENDPOINT_URL': 'http://127.0.0.1:9'})  # fmt: skip
+    write_ours(tmp_path / NAME)
+    found = send(settings, tmp_path / NAME, deadline_s=1.0)
+    assert (found.delivered, found.is_delivered) == (0, False)
+    assert '127.0.0.1:9' in found.last_error
+    back = Settings.load({'robot': 'thor', 'spool.min_free_bytes': 0},
+                         {'SHADOWHOUND_HOME': str(tmp_path / 'home'), **seaweed.environment()})  # fmt: skip
+    with parcel(tmp_path / NAME, 'thor', NAME, back.home, is_archive=False) as sent, opened_spool(back, CLOCK) as spool:
+        shutil.rmtree(tmp_path / NAME)
+        assert deliver(back, spool, sent, deadline_s=DEADLINE_S).is_delivered
+    with closing(open_store(back.store, back.upload)) as store:
+        assert verify_remote(store, find_bag(store, 'thor', NAME), deep=True).state == 'complete'
+
+
+def test_a_spool_without_room_says_so(tmp_path: Path) -> None:
+    """The remedy is to go past it."""
+    settings = Settings.load(
+        {'spool.max_bytes': 1 << 20, 'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path / 'home')}
+    )
+    write_ours(tmp_path / NAME, each=1500)
+    with pytest.raises(BagError, match='--now'):
+        send(settings, tmp_path / NAME)
+
+
+@pytest.mark.parametrize('what', ['no metadata', 'wal', 'slice gone', 'slice cut'])
+def test_an_unfinished_bag_is_refused(settings: Settings, tmp_path: Path, what: str) -> None:
+    """With the reason, before anything is spooled."""
+    folder = tmp_path / NAME
+    write_ours(folder)
+    path = folder / f'{NAME}_2.mcap'
+    if what == 'no metadata':
+        (folder / 'metadata.yaml').unlink()
+    elif what == 'wal':
+        (folder / 'theirs.db3-wal').write_bytes(b'x')
+    elif what == 'slice gone':
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises((BagError, BagDamaged), match=r'finished|not whole|end of an MCAP'):
+        send(settings, folder)
+    assert not settings.home.exists()
+
+
+def test_a_name_that_is_no_key_is_refused(settings: Settings, tmp_path: Path) -> None:
+    """Before anything is spooled."""
+    write_ours(tmp_path / NAME, slices=1, each=5)
+    shutil.move(tmp_path / NAME, tmp_path / 'my bag')
+    with pytest.raises(NameRefused, match='my bag'):
+        send(settings, tmp_path / 'my bag')
+
+
+class Hand:
+    """A clock that is turned by hand."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def watch(settings: Settings, folder: Path, hand: Hand, *, is_removing: bool = False) -> Watch:
+    return Watch(folder, settings, CLOCK, settle_s=10.0, is_removing=is_removing, monotonic=hand)
+
+
+def steps(watching: Watch) -> list[tuple[str, str]]:
+    return [(step.bag, step.what) for step in watching.round()]
+
+
+def test_a_watched_bag_is_shipped_once_it_is_finished(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
+    """Not while its files change, not without metadata.yaml, and never twice, also after a restart."""
+    hand, folder = Hand(), tmp_path / 'recordings'
+    write_ours(folder / NAME)
+    (folder / NAME / 'metadata.yaml').rename(folder / 'aside')
+    watching = watch(settings, folder, hand)
+    hand.now = 20.0
+    assert steps(watching) == []
+    (folder / 'aside').rename(folder / NAME / 'metadata.yaml')
+    assert steps(watching) == []
+    hand.now = 29.0
+    (folder / NAME / 'notes.txt').write_text('still at it')
+    assert steps(watching) == []
+    hand.now = 38.0
+    assert steps(watching) == []
+    hand.now = 39.0
+    assert steps(watching) == [(NAME, 'spooled'), (NAME, 'stored')]
+    assert steps(watching) == []
+    again = watch(settings, folder, hand)
+    assert steps(again) == []
+    hand.now = 60.0
+    assert steps(again) == []
+    assert (folder / NAME / 'notes.txt').exists()
+    assert len(find_bag(store, 'thor', NAME).files) == 6
+
+
+def test_a_bag_is_removed_only_when_the_store_has_it(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
+    """Not when a file of it is gone from there, nor when somebody changed the bag since."""
+    hand, folder = Hand(), tmp_path / 'recordings'
+    for name in ('gone', 'kept', 'changed'):
+        write_ours(folder / name, slices=1, each=10)
+    keeping = watch(settings, folder, hand)
+    keeping.round()
+    hand.now = 10.0
+    assert len(keeping.round()) == 6
+    (settings.store.directory / BUCKET / 'thor' / 'rosbags' / 'kept' / 'kept_0.mcap').unlink()
+    (folder / 'changed' / 'changed_0.mcap').touch()
+    removing = watch(settings, folder, hand, is_removing=True)
+    assert steps(removing) == [('gone', 'removed')]
+    assert sorted(path.name for path in folder.iterdir() if path.is_dir()) == ['changed', 'kept']
+
+
+def test_one_bad_bag_costs_itself_alone(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
+    """It is told once, and the others are shipped."""
+    hand, folder = Hand(), tmp_path / 'recordings'
+    write_ours(folder / 'bad', slices=2, each=10)
+    write_ours(folder / 'good', slices=1, each=10)
+    (folder / 'bad' / 'bad_1.mcap').unlink()
+    watching = watch(settings, folder, hand)
+    watching.round()
+    hand.now = 10.0
+    assert steps(watching) == [('bad', 'refused'), ('good', 'spooled'), ('good', 'stored')]
+    assert steps(watching) == []
+    assert watching.is_owing()
+
+
+def test_two_do_not_watch_one_folder(settings: Settings, tmp_path: Path) -> None:
+    """The second is told of the first."""
+    watching = watch(settings, tmp_path, Hand())
+    with watching.alone(), pytest.raises(BagError, match='another process watches'), watch(settings, tmp_path, Hand()).alone():
+        pass

@@ -1,0 +1,135 @@
+"""What the bags get of a topic: everything that came, once, in accounts of their own, whatever the sensor keeps of it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from capture.test_stream import NOON_NS, TOPIC, TYPE
+
+from shadowhound_data_logger.bags.queue import BagQueue, Lot
+from shadowhound_data_logger.capture.bag_tap import BagStream, BagTap
+from shadowhound_data_logger.capture.endpoints import Senders
+from shadowhound_data_logger.capture.stream import Shared, Stream
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.model import Batch, Taken
+from shadowhound_data_logger.spool.accounts import BAG, Accounts, TopicAccount
+
+
+class Graph:
+    """A node that knows of one publisher without QoS of note; counts how often it is asked."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def get_publishers_info_by_topic(self, topic: str) -> list[Any]:
+        assert topic == TOPIC
+        self.asked += 1
+        forever = SimpleNamespace(nanoseconds=0)
+        qos = SimpleNamespace(history=1, depth=5, reliability=1, durability=2, deadline=forever, lifespan=forever, liveliness=1,
+                              liveliness_lease_duration=forever, avoid_ros_namespace_conventions=False)  # fmt: skip
+        return [SimpleNamespace(topic_type=TYPE, qos_profile=qos), SimpleNamespace(topic_type='other', qos_profile=qos)]
+
+
+class Ear:
+    """A stream with a tap: of a sensor that keeps one message a second, or of the bag alone."""
+
+    def __init__(self, *, own: bool, max_bytes: int = 1 << 20) -> None:
+        self.accounts, self.queue, self.graph = Accounts(), BagQueue(max_bytes), Graph()
+        self.tap = BagTap(self.graph, self.accounts, self.queue)
+        self.tap.topics = frozenset({TOPIC})
+        self.batches: list[Batch] = []
+        shared = Shared(self.accounts, MessageTypes(), self.batches.append, SystemClock.of_this_machine(), tap=self.tap)
+        sensor = SensorSettings(name='talk', rate_hz=1.0)
+        self.stream = BagStream(sensor, TOPIC, TYPE, 0, shared) if own else Stream(sensor, TOPIC, TYPE, 0, shared)
+
+    def add(self, taken: list[Taken], *, paused: bool = False, idle: bool = False) -> None:
+        self.stream.add(taken, Senders(), None, 0.0, paused=paused, idle=idle)
+
+    def heard(self) -> list[int]:
+        """The numbers of what the bag got."""
+        numbers = []
+        while (item := self.queue.next()) is not None:
+            assert isinstance(item, Lot)
+            assert (item.topic, item.type) == (TOPIC, TYPE)
+            assert item.qos.count('history') == 1
+            numbers += [message.number for message in item.messages]
+        return [number for number in numbers if number is not None]
+
+    @property
+    def account(self) -> TopicAccount:
+        with self.accounts.entry(f'{BAG}{TOPIC}') as account:
+            return account
+
+
+def messages(*numbers: int, publisher: str | None = 'p') -> list[Taken]:
+    return [Taken(b'%08d' % number, NOON_NS + number * 10**7, publisher, number, NOON_NS) for number in numbers]
+
+
+@pytest.fixture(params=[True, False], ids=['own', 'shared'])
+def ear(request: pytest.FixtureRequest) -> Ear:
+    return Ear(own=request.param)
+
+
+def test_everything_is_handed_on_once(ear: Ear) -> None:
+    """In the order of arrival, also what came twice by two subscriptions; a gap is missed, as for the sensors."""
+    ear.add(messages(1, 2, 3))
+    ear.add(messages(3, 4, 7))
+    assert ear.heard() == [1, 2, 3, 4, 7]
+    assert (ear.account.received, ear.account.missed, ear.account.open, ear.account.type) == (5, 2, 5, TYPE)
+    assert ear.graph.asked == 1
+
+
+def test_repeats_without_a_sender_are_dropped(ear: Ear) -> None:
+    """By time of sending and number."""
+    ear.add(messages(1, 2, publisher=None))
+    ear.add(messages(2, 3, publisher=None))
+    assert ear.heard() == [1, 2, 3]
+
+
+def test_a_pause_counts_and_drops(ear: Ear) -> None:
+    """That of the node and that of the bag alike."""
+    ear.add(messages(1, 2), paused=True)
+    ear.queue.paused = True
+    ear.add(messages(3))
+    ear.queue.paused = False
+    ear.add(messages(4))
+    assert ear.heard() == [4]
+    assert (ear.account.received, ear.account.dropped) == (4, {'paused': 3})
+
+
+def test_what_the_sensor_keeps_does_not_change() -> None:
+    """Sampling, and outside of a mission nothing, while the bag gets all of it."""
+    ear = Ear(own=False)
+    ear.add(messages(*range(1, 151)))
+    ear.add(messages(200), idle=True)
+    ear.stream.close_batch()
+    assert sum(len(batch.samples) for batch in ear.batches) == 2
+    assert ear.heard() == [*range(1, 151), 200]
+    with ear.accounts.entry(TOPIC) as account:
+        assert (account.received, account.skipped) == (151, 149)
+
+
+def test_a_topic_that_is_not_recorded_costs_nothing() -> None:
+    """It has no account, and nothing waits."""
+    ear = Ear(own=False)
+    ear.tap.topics = frozenset()
+    ear.add(messages(1, 2))
+    assert ear.heard() == []
+    assert ear.accounts.totals(BAG) == {}
+
+
+def test_a_full_queue_drops_the_newest() -> None:
+    """And counts them; what is taken out makes room again."""
+    ear = Ear(own=True, max_bytes=24)
+    ear.add(messages(1, 2, 3, 4, 5))
+    assert ear.account.dropped == {'queue_full': 2}
+    assert ear.heard() == [1, 2, 3]
+    ear.add(messages(6))
+    assert ear.heard() == [6]

@@ -1,0 +1,181 @@
+"""``shadowhound-data bag`` as a user runs it: what it says, its exit codes, and its JSON."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from bags.real_bags import NAME, stored, write_ours
+from click.testing import CliRunner, Result
+from stores.spooled import QUICK
+
+from shadowhound_data_logger.bags.remote import BUCKET
+from shadowhound_data_logger.cli.bag import bag
+from shadowhound_data_logger.errors import BagError, SettingError
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores import open_store
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """With a bag in the folder that is the store."""
+    write_ours(tmp_path / 'home' / 'store' / BUCKET / 'thor' / 'rosbags' / NAME)
+    return tmp_path / 'home'
+
+
+def run(home: Path, *arguments: str | Path, **environ: str) -> Result:
+    env = {'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': '', 'SHADOWHOUND_ROBOT': '', 'COLUMNS': '150', **environ}
+    return CliRunner().invoke(bag, [str(each) for each in arguments], env=env, standalone_mode=False)
+
+
+def said(result: Result) -> object:
+    return json.loads(result.stdout)
+
+
+def test_list(home: Path) -> None:
+    """A line a bag; nothing there is no error, and says where it looked."""
+    found = run(home, 'list')
+    assert found.return_value == 0
+    for text in (NAME, 'complete', '2025-10-18 12:00:00', '15 s', '1,650', 'store'):
+        assert text in found.output
+    (row,) = json.loads(run(home, 'list', '--json').output)
+    assert (row['bag'], row['state'], row['slices'], row['topics']) == (NAME, 'complete', 3, 2)
+    assert row['t_start'] == '2025-10-18T12:00:00.000000000Z'
+    empty = run(home, 'list', '--robot', 'tachi')
+    assert (empty.return_value, 'There is no bag of tachi in the folder' in empty.output) == (0, True)
+    assert said(run(home, 'list', '--since', '2026-01-01', '--json')) == []
+
+
+def test_info(home: Path) -> None:
+    """Topics with types and rates, and the slices; of a folder the same."""
+    found = run(home, 'info', NAME)
+    assert found.return_value == 0
+    for text in ('/imu', 'std_msgs/msg/String', '100.0 Hz', '/camera/blob', '9.9 Hz', f'{NAME}_2.mcap', 'ROS humble'):
+        assert text in found.output
+    told = json.loads(run(home, 'info', NAME, '--json').output)
+    assert {topic['name']: topic['messages'] for topic in told['topics']} == {'/imu': 1500, '/camera/blob': 150}
+    folder = home / 'store' / BUCKET / 'thor' / 'rosbags' / NAME
+    assert json.loads(run(home, 'info', folder, '--json').output)['messages'] == told['messages'] == 1650
+
+
+def test_verify_by_its_exit_code(home: Path) -> None:
+    """0 for a whole bag, 1 for one that is damaged, or growing."""
+    assert run(home, 'verify', NAME).return_value == 0
+    folder = home / 'store' / BUCKET / 'thor' / 'rosbags' / NAME
+    assert run(home, 'verify', '--deep', folder).return_value == 0
+    path = folder / f'{NAME}_1.mcap'
+    content = bytearray(path.read_bytes())
+    content[5000] ^= 1
+    path.write_bytes(content)
+    found = run(home, 'verify', '--deep', NAME)
+    assert (found.return_value, f'{NAME}_1.mcap' in found.output, '2 of 3 files are sound' in found.output) == (1, True, True)
+    path.unlink()
+    found = run(home, 'verify', NAME)
+    assert (found.return_value, 'still growing' in found.output) == (1, True)
+    assert said(run(home, 'verify', NAME, '--json'))['is_complete'] is False  # type: ignore[index]
+
+
+def test_fetch_and_cut(home: Path, tmp_path: Path) -> None:
+    """A second fetch says that nothing was downloaded; a cut says how little was read."""
+    assert 'downloaded 3' in run(home, 'fetch', NAME, '--to', tmp_path / 'here').output
+    assert 'downloaded 0 B' in run(home, 'fetch', NAME, '--to', tmp_path / 'here').output
+    found = run(home, 'cut', NAME, '--start', '-2', '--topics', 'imu,/camera/blob', '-o', tmp_path / 'piece', '--json')
+    told = json.loads(found.output)
+    assert (found.return_value, told['topics'], told['messages']) == (0, 2, 221)
+    assert told['read_bytes'] < told['bag_bytes'] / 3
+    found = run(home, 'cut', tmp_path / 'here' / NAME, '--end', '1', '--regex', 'imu', '-o', tmp_path / 'other')
+    assert '100 messages on 1 topics' in found.output
+    assert run(home, 'verify', tmp_path / 'other').return_value == 0
+
+
+def test_upload_and_watch(home: Path, tmp_path: Path) -> None:
+    """Confirmed by the store, and found there."""
+    write_ours(tmp_path / 'recordings' / 'by_hand', slices=1, each=20)
+    found = run(home, 'upload', tmp_path / 'recordings' / 'by_hand', '--name', 'named')
+    assert (found.return_value, 'confirmed by the store' in found.output) == (0, True)
+    assert run(home, 'upload', '--now', '--tar-gz', tmp_path / 'recordings' / 'by_hand').return_value == 0
+    found = run(home, 'watch', tmp_path / 'recordings', '--once', '--settle', '0.1', '--json')
+    assert [json.loads(line)['what'] for line in found.output.splitlines()] == ['spooled', 'stored']
+    assert found.return_value == 0
+    names = [row['bag'] for row in json.loads(run(home, 'list', '--json').output)]
+    assert sorted(names) == ['by_hand', 'by_hand.tar.gz', 'named', NAME]
+
+
+def test_an_away_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> None:
+    """Exit code 1 and why; a list says that the store is away, and what is here all the same."""
+    write_ours(tmp_path / 'by_hand', slices=1, each=20)
+    away = {'AWS_ENDPOINT_URL': 'http://127.0.0.1:9', 'AWS_ACCESS_KEY_ID': 'k', 'AWS_SECRET_ACCESS_KEY': 's'}
+    found = run(home, 'upload', tmp_path / 'by_hand', '--deadline', '0.5', **away)
+    assert (found.return_value, '3 of 3 files wait in the spool' in found.output) == (1, True)
+    found = run(home, 'list', '--json', **away)
+    assert (found.return_value, '127.0.0.1:9' in found.stderr) == (1, True)
+    assert [row['bag'] for row in json.loads(found.stdout)] == ['by_hand']
+    (row,) = [row for row in json.loads(run(home, 'list', '--json').output) if row['bag'] == 'by_hand']
+    assert (row['state'], row['where']) == ('complete', {'spool': 3})
+
+
+@pytest.mark.parametrize(('arguments', 'error', 'text'), [
+    (('info', 'patrol_2025'), BagError, f'there is {NAME}'),
+    (('cut', NAME, '--topic', '/imv', '-o', 'new'), BagError, 'it has /imu'),
+    (('cut', NAME, '--start', 'noon', '-o', 'new'), SettingError, 'seconds since the start'),
+    (('list', '--since', 'yesterday'), SettingError, '12h'),
+    (('upload', '/nowhere'), BagError, 'is no folder'),
+    (('verify', './nowhere'), Exception, 'there is no folder'),
+    (('info', 'a b'), Exception, 'cannot be part of an object key'),
+])  # fmt: skip
+def test_errors_say_what_to_do(home: Path, arguments: tuple[str, ...], error: type[Exception], text: str) -> None:
+    """By name, value and remedy."""
+    found = run(home, *arguments)
+    assert isinstance(found.exception, error)
+    assert text in getattr(found.exception, 'message', str(found.exception))
+
+
+def test_from_a_real_server(seaweed: Tower, tmp_path: Path) -> None:
+    """The whole round over S3: send, list, look, check, download, cut."""
+    write_ours(tmp_path / 'far')
+    environ = seaweed.environment()
+    home = tmp_path / 'home'
+    assert run(home, 'upload', '--robot', 'spot', tmp_path / 'far', **environ).return_value == 0
+    assert json.loads(run(home, 'list', '--robot', 'spot', '--json', **environ).output)[0]['state'] == 'complete'
+    assert json.loads(run(home, 'info', '--robot', 'spot', 'far', '--json', **environ).output)['messages'] == 1650
+    assert run(home, 'verify', '--robot', 'spot', '--deep', 'far', **environ).return_value == 0
+    assert run(home, 'fetch', '--robot', 'spot', 'far', '--to', tmp_path / 'here', **environ).return_value == 0
+    span = ('--start', '3', '--end', '4')
+    found = run(home, 'cut', '--robot', 'spot', 'far', *span, '-o', tmp_path / 'piece', '--json', **environ)
+    assert json.loads(found.output)['messages'] == 110
+    store = open_store(seaweed.store_settings(), QUICK)
+    try:
+        shutil.rmtree(tmp_path / 'far')
+        write_ours(tmp_path / 'grows', is_ended=False)
+        stored(store, tmp_path / 'grows', robot='spot')
+    finally:
+        store.close()
+    assert json.loads(run(home, 'info', '--robot', 'spot', 'grows', '--json', **environ).output)['state'] == 'growing'
+
+
+def test_reading_needs_neither_ros_nor_a_spool(home: Path) -> None:
+    """On the machine where the data are used none of it is there; and looking leaves nothing behind."""
+    program = (
+        'import sys\n'
+        'from shadowhound_data_logger.cli.main import cli\n'
+        f'for verb in (["list"], ["info", {NAME!r}], ["verify", {NAME!r}]):\n'
+        '    cli(["bag", *verb], standalone_mode=False)\n'
+        'print([name for name in ("rclpy", "botocore", "mlflow") if name in sys.modules])\n'
+    )
+    ran = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60,
+                         env={'SHADOWHOUND_HOME': str(home), 'PATH': ''})  # fmt: skip
+    assert ran.stdout.splitlines()[-1] == '[]'
+    assert [path.name for path in home.iterdir()] == ['store']
+
+
+@pytest.mark.parametrize('verb', ['list', 'info', 'verify', 'fetch', 'cut', 'upload', 'watch', 'record'])
+def test_help_is_enough(verb: str) -> None:
+    """Every option has a text, and the verb says what it does."""
+    command = bag.commands[verb]
+    assert command.help
+    assert all(option.help for option in command.params if isinstance(option, click.Option))
