@@ -1,0 +1,95 @@
+"""``shadowhound-data fetch``: objects into a folder, by prefix or by question; killed, it goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+from shadowhound_data_logger.cli.question import asking, question, settings
+from shadowhound_data_logger.cli.tables import duration, number, plain, volume
+
+SHOWN: Final = 20
+"""Of what could not be fetched; --json has all."""
+
+
+@click.command()
+@click.argument('prefix', required=False)
+@question
+@click.option('--limit', type=click.IntRange(1), metavar='N', help='At most so many objects of a question, the earliest.')
+@click.option('--to', type=click.Path(file_okay=False, path_type=Path), required=True, metavar='DIR', help='Where: DIR/KEY.')
+@click.option('--bucket', default='sensor-data', show_default=True, help='Of a prefix.')
+@click.option('--verify', is_flag=True, help='Read again what is there already.')
+@click.option('--threads', type=click.IntRange(1, 256), default=16, show_default=True, help='Objects at a time.')
+@click.option('--json', 'as_json', is_flag=True, help='Print what became of it as JSON.')
+def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to: Path, bucket: str, verify: bool, threads: int,  # noqa: PLR0913 - one an option
+          as_json: bool) -> int:  # fmt: skip
+    """Download objects, each verified; a second time only what is new. Exit code 1 when something could not be fetched.
+
+    Either everything under a PREFIX (thor/camera/20261121/), or what the flags ask for.
+    """
+    if (prefix is None) == (not flags):
+        raise click.UsageError('name either a prefix or what to ask the catalogue for')
+    with asking():
+        from shadowhound_data_logger.lake import fetch as lake  # noqa: PLC0415
+        from shadowhound_data_logger.lake.source import open_source  # noqa: PLC0415
+
+        store = settings()
+        begun_s = time.monotonic()
+        wishes = lake.under(open_source(store, bucket), prefix) if prefix is not None else _asked(flags, limit)
+    with _progress() as bar:
+        task = bar.add_task('', total=sum(wish.size for wish in wishes), objects=0, of=len(wishes))
+        found = lake.fetch(wishes, to, lambda name: open_source(store, name), verify=verify, threads=threads,
+                           tell=lambda size, objects: _advance(bar, task, size, objects))  # fmt: skip
+    took_s = time.monotonic() - begun_s
+    if as_json:
+        told = {'to': str(to), 'asked': len(wishes), 'moved': found.moved, 'present': found.present, 'bytes': found.bytes,
+                'unverified': found.unverified, 'failed': found.failed, 'took_s': round(took_s, 3)}  # fmt: skip
+        click.echo(json.dumps(told, indent=2))
+    else:
+        _show(found, len(wishes), took_s, to)
+    return 1 if found.failed else 0
+
+
+def _asked(flags: Mapping[str, Any], limit: int | None) -> list[Any]:
+    from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
+    from shadowhound_data_logger.lake.fetch import Wish  # noqa: PLC0415
+
+    with lake.answering():
+        rows = lake.objects(lake.default_source(settings()), **flags).sort('t_start_ns')
+        found = (rows.limit(limit) if limit else rows).select('bucket', 'key', 'bytes', 'sha256').to_pylist()
+    return [Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in found]
+
+
+def _progress() -> Progress:
+    """On standard error, where that is a terminal; nothing else is ever written there."""
+    console = Console(stderr=True)
+    columns = (BarColumn(), DownloadColumn(), TextColumn('{task.fields[objects]:,} of {task.fields[of]:,} objects'),
+               TransferSpeedColumn(), TimeRemainingColumn())  # fmt: skip
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+def _advance(bar: Progress, task: TaskID, size: int, objects: int) -> None:
+    bar.update(task, advance=size, objects=bar.tasks[0].fields['objects'] + objects)
+
+
+def _show(found: Any, asked: int, took_s: float, to: Path) -> None:
+    console = Console(highlight=False, soft_wrap=True)
+    if not asked:
+        console.print('There is nothing to fetch.')
+        return
+    rate = f', {volume(found.bytes / took_s)}/s' if found.moved and took_s else ''
+    console.print(plain(f'{number(found.moved)} objects ({volume(found.bytes)}) moved to {to} in {duration(took_s)}{rate}; '
+                        f'{number(found.present)} were there already.'))  # fmt: skip
+    if found.unverified:
+        console.print(plain(f'{number(found.unverified)} have no checksum in the store: their sizes are right.', 'yellow'))
+    for key, why in list(found.failed.items())[:SHOWN]:
+        console.print(plain(f'  {key}: {why}', 'red'))
+    if found.failed:
+        console.print(plain(f'{number(len(found.failed))} could not be fetched; run it again to try only those.', 'red'))

@@ -1,0 +1,138 @@
+"""``shadowhound-data query``: what is stored, by flags or by SQL, as a table, CSV, JSON, keys or pictures."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from rich.console import Console, RenderableType
+
+from shadowhound_data_logger.cli.question import asking, question, settings, words
+from shadowhound_data_logger.cli.tables import number, plain, plain_table, show_whole, volume
+
+SHOWN: Final = 30
+"""Rows of a table unless --limit says more."""
+COLUMNS: Final = ('t_start', 'sensor', 'key', 'bytes', 'x', 'y', 'battery_pct', 'mission_type')
+"""Of a table of objects; the other formats have all."""
+MOST_POSES: Final = 20_000
+_OBJECTS: Final = {'bucket', 'key'}
+
+
+@click.command()
+@click.argument('sql', required=False)
+@question
+@click.option('--order', metavar='COLUMN', help="What to sort by, such as 't_start desc'  [default: t_start]")
+@click.option('--limit', type=click.IntRange(1), metavar='N', help='At most so many rows.')
+@click.option('--format', 'kind', type=click.Choice(['table', 'csv', 'json', 'keys']), default='table', show_default=True)
+@click.option('--json', 'as_json', is_flag=True, help='Print it as JSON.')
+@click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')
+@click.option('--map', 'ground', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw where the objects lie.')
+def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str, as_json: bool,  # noqa: PLR0913 - one an option
+          sheet: Path | None, ground: Path | None) -> int:  # fmt: skip
+    """Ask what is stored. All flags that are given must hold; times are UTC.
+
+    SQL knows the views objects, missions and topics, restricted by the flags:
+
+        shadowhound-data query "SELECT sensor, count(*) AS n FROM objects GROUP BY sensor" --since yesterday
+    """
+    with asking():
+        from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
+
+        source = lake.default_source(settings())
+        frame = lake.sql(sql, source, **flags) if sql else lake.objects(source, **flags)
+        with lake.answering():
+            frame = _ordered(frame, order or ('t_start_ns' if not sql else None))
+            found = (frame.limit(limit) if limit else frame).to_arrow()
+    if (sheet or ground or kind == 'keys') and not _OBJECTS.issubset(found.column_names):
+        raise click.UsageError('keys and pictures need the columns bucket and key among what the SQL selects')
+    with asking():
+        if sheet or ground:
+            _pictures(source, found.to_pylist(), flags, sheet, ground)
+    _print(found, 'json' if as_json else kind, is_objects=not sql, is_limited=limit is not None)
+    return 0
+
+
+def _ordered(frame: Any, order: str | None) -> Any:
+    if order is None:
+        return frame
+    columns = [part.split() for part in order.split(',')]
+    if not all(len(words_) in (1, 2) and words_[-1].lower() in {words_[0].lower(), 'asc', 'desc'} for words_ in columns):
+        raise click.UsageError(f"--order {order!r} is none: a column, and 'desc' if so")
+    return frame.sort([words_[0] for words_ in columns], desc=[words_[-1].lower() == 'desc' for words_ in columns])
+
+
+def _print(found: Any, kind: str, *, is_objects: bool, is_limited: bool) -> None:
+    if kind == 'keys':
+        for bucket, key in zip(found['bucket'].to_pylist(), found['key'].to_pylist(), strict=True):
+            click.echo(f'{bucket}/{key}')
+    elif kind == 'json':
+        click.echo(json.dumps([_told(row) for row in found.to_pylist()], indent=2, default=str))
+    elif kind == 'csv':
+        writer = csv.writer(sys.stdout, lineterminator='\n')
+        writer.writerow(found.column_names)
+        writer.writerows(_told(row).values() for row in found.to_pylist())
+    else:
+        show_whole(list(_table(found, is_objects=is_objects, is_limited=is_limited)), Console(highlight=False))
+
+
+def _table(found: Any, *, is_objects: bool, is_limited: bool) -> Iterator[RenderableType]:
+    columns = [name for name in COLUMNS if name in found.column_names] if is_objects else found.column_names
+    rows = found.select(columns).slice(0, len(found) if is_limited else SHOWN).to_pylist()
+    left = {name for name in columns if any(isinstance(row[name], (str, datetime)) for row in rows)}
+    table = plain_table('', columns, left)
+    table.title = None
+    for row in rows:
+        table.add_row(*(plain(_cell(name, row[name])) for name in columns))
+    if rows:
+        yield table
+        yield ''
+    yield plain(_verdict(found, len(rows), is_objects=is_objects))
+
+
+def _verdict(found: Any, shown: int, *, is_objects: bool) -> str:
+    what = 'objects' if is_objects else 'rows'
+    if not len(found):
+        return f'No {what}.'
+    text = f'{number(len(found))} {what}'
+    if is_objects:
+        text += f', {volume(sum(found["bytes"].to_pylist()))}'
+    return f'{text}; the first {shown} are shown (--limit, or another --format)' if shown < len(found) else text
+
+
+def _cell(name: str, value: Any) -> str:
+    if value is None:
+        return '-'
+    if isinstance(value, datetime):
+        return f'{value:%Y-%m-%d %H:%M:%S}'
+    if isinstance(value, float):
+        return f'{value:.2f}' if name in {'x', 'y', 'yaw'} else f'{value:g}'
+    return number(value) if isinstance(value, int) and not isinstance(value, bool) else str(value)
+
+
+def _told(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: f'{value:%Y-%m-%dT%H:%M:%S.%fZ}' if isinstance(value, datetime) else value for name, value in row.items()}
+
+
+def _pictures(source: Any, rows: Sequence[Mapping[str, Any]], flags: Mapping[str, Any], sheet: Path | None,
+              ground: Path | None) -> None:  # fmt: skip
+    from shadowhound_data_logger.lake import pictures  # noqa: PLC0415
+    from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415
+    from shadowhound_data_logger.lake.select import wanted  # noqa: PLC0415
+    from shadowhound_data_logger.lake.source import open_source  # noqa: PLC0415
+
+    if sheet:
+        pictures.sheet(rows, lambda bucket: open_source(source.settings, bucket), words(flags), sheet)
+        click.echo(f'Wrote {sheet}', err=True)
+    if ground:
+        around = {name: flags[name] for name in ('robot', 'since', 'until') if name in flags}
+        poses = lake.objects(source, **around, where='x IS NOT NULL').select('x', 'y').to_pydict()
+        path = list(zip(poses['x'], poses['y'], strict=True))
+        near = wanted(0, near=flags.get('near')).near
+        pictures.ground(rows, path[:: len(path) // MOST_POSES + 1], near, words(flags), ground)
+        click.echo(f'Wrote {ground}', err=True)

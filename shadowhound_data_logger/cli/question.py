@@ -1,0 +1,71 @@
+"""The flags with which ``query`` and ``fetch`` ask the catalogue, and the library behind them, which a robot does not have."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final, TypeVar
+
+import click
+
+from shadowhound_data_logger.config import home, store_settings
+from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.options import StoreSettings
+
+EXTRA: Final = {'daft', 'pyarrow', 'obstore'}
+_FLAGS: Final = (
+    click.option('--robot', metavar='NAME', help='Of this robot.'),
+    click.option('--sensor', metavar='NAME', help='Of this sensor: camera, lidar, odom, ...'),
+    click.option('--topic', metavar='NAME', help='Of this topic.'),
+    click.option('--since', metavar='TIME', help='Begun then or later: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).'),
+    click.option('--until', metavar='TIME', help='Begun before that.'),
+    click.option('--near', metavar='X,Y,R', help='At most R metres from X,Y in the odometry frame.'),
+    click.option('--mission', metavar='ID', help='Of this mission: its id or that of its run, or how one begins.'),
+    click.option('--mission-type', metavar='TYPE', help='Of missions of this type.'),
+    click.option('--failed', 'success', flag_value=False, type=bool, default=None, help='Of missions that failed.'),
+    click.option('--succeeded', 'success', flag_value=True, type=bool, default=None, help='Of missions that succeeded.'),
+    click.option('--where', metavar='SQL', help="A condition, such as 'battery_pct < 30'."),
+)
+NAMES: Final = ('robot', 'sensor', 'topic', 'since', 'until', 'near', 'mission', 'mission_type', 'success', 'where')
+_Command = TypeVar('_Command', bound=Callable[..., Any])
+
+
+def question(command: _Command) -> _Command:
+    """Adds the flags; their values come as one mapping ``flags`` of those that were given."""
+
+    @functools.wraps(command)
+    def asked(**given: Any) -> Any:
+        flags = {name: given.pop(name) for name in NAMES}
+        return command(flags={name: value for name, value in flags.items() if value is not None}, **given)
+
+    for flag in reversed(_FLAGS):
+        asked = flag(asked)
+    return asked  # type: ignore[return-value]
+
+
+def words(flags: Mapping[str, Any]) -> str:
+    """The question, to stand over a picture."""
+    told = {**flags, 'success': {True: 'succeeded', False: 'failed'}.get(flags.get('success'), '')}  # type: ignore[arg-type]
+    return ', '.join(
+        str(told[name]) if name in {'sensor', 'success'} else f'{name} {told[name]}' for name in NAMES if told.get(name)
+    )
+
+
+@contextmanager
+def asking() -> Iterator[None]:
+    """A question that is none is bad usage, and so is a machine without the library."""
+    try:
+        yield
+    except (LakeError, SettingError) as error:
+        raise click.UsageError(str(error)) from error
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRA:
+            raise
+        raise click.UsageError(f"{error.name} is not installed: pip install 'shadowhound_data_logger[lake]'") from error
+
+
+def settings() -> StoreSettings:
+    """The store that the environment names."""
+    return store_settings(os.environ, home(os.environ))

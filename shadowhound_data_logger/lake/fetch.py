@@ -1,0 +1,270 @@
+"""Objects into a folder: parallel, each verified by its SHA-256, each file whole or not there, and never the same bytes twice.
+
+It may be killed at any moment and goes on where it was. A file's place is its key: ``DIR/thor/camera/20261121/120000_front.jpg``.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Final
+
+from shadowhound_data_logger.errors import AccessDenied, BucketMissing, LakeError, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.lake.fetched import FOLDER, Fetched, Verified
+from shadowhound_data_logger.lake.source import CHUNK_BYTES, Source
+
+THREADS: Final = 16
+AHEAD: Final = 8
+"""Objects that wait for each thread: enough that none is idle, few enough that an interrupt is prompt."""
+NOTE_S: Final = 1.0
+"""What a kill can make it hash again."""
+TRIES: Final = 3
+_NO_DISK: Final = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
+_DAMAGED: Final = 'damaged'
+AWAY: Final = 8
+"""Objects after one another that the store does not answer for: it is away, and the others need not try."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """An object that is to be in the folder."""
+
+    bucket: str
+    key: str
+    size: int
+    sha256: str | None = None
+    """By the catalogue; None: what the object itself says."""
+    etag: str = ''
+    """By a listing."""
+
+
+@dataclass(slots=True)
+class Result:
+    """What became of the wishes, as it goes on: each is in one of the first three."""
+
+    moved: int = 0
+    present: int = 0
+    """Were there already."""
+    failed: dict[str, str] = field(default_factory=dict)
+    """``bucket/key`` -> why."""
+    bytes: int = 0
+    """That were moved, in whole objects."""
+    unverified: int = 0
+    """Moved objects of which nobody knows the SHA-256: they have the right size."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Done:
+    file: Verified
+    moved: bool
+    proved: bool
+
+
+def under(source: Source, prefix: str) -> list[Wish]:
+    """All whose keys begin so. Raises StoreError."""
+    return sorted(
+        (Wish(source.bucket, entry.key, entry.size, etag=entry.etag) for entry in source.list(prefix)), key=lambda wish: wish.key
+    )
+
+
+def fetch(
+    wishes: Sequence[Wish], folder: Path, open_bucket: Callable[[str], Source], *, verify: bool = False, threads: int = THREADS,
+    tell: Callable[[int, int], None] = lambda _bytes, _objects: None,
+) -> Result:  # fmt: skip
+    """Put them there; ``verify`` reads what is there already once more. ``tell`` hears of bytes and objects, from any thread.
+
+    Raises StoreError where the store as a whole refuses or is away, LakeError where the folder cannot be written.
+    """
+    with Fetched(folder) as fetched, ThreadPoolExecutor(threads, 'fetch') as pool:
+        return _Fetch(fetched, open_bucket, tell, verify=verify).run(wishes, pool, threads * AHEAD)
+
+
+class _Fetch:
+    """One run. The calling thread decides and notes; the pool moves."""
+
+    def __init__(self, fetched: Fetched, open_bucket: Callable[[str], Source], tell: Callable[[int, int], None], *,
+                 verify: bool) -> None:  # fmt: skip
+        self._fetched = fetched
+        self._open_bucket = open_bucket
+        self._tell = tell
+        self._verify = verify
+        self._numbers = count()
+        self._folders: set[Path] = set()
+        self._over = threading.Event()
+        self._fresh: list[Verified] = []
+        self._noted_s = time.monotonic()
+        self._silent = 0
+        self.result = Result()
+
+    def run(self, wishes: Sequence[Wish], pool: ThreadPoolExecutor, ahead: int) -> Result:
+        done: SimpleQueue[tuple[Wish, Future[_Done]]] = SimpleQueue()
+        under_way = 0
+        try:
+            for wish in self._wanting(wishes):
+                pool.submit(self._bring, wish).add_done_callback(lambda future, wish=wish: done.put((wish, future)))  # type: ignore[misc]
+                under_way += 1
+                while under_way >= ahead:
+                    self._settle(*done.get())
+                    under_way -= 1
+            for _ in range(under_way):
+                self._settle(*done.get())
+        finally:
+            self._over.set()
+            pool.shutdown(cancel_futures=True)
+            self._note()
+        return self.result
+
+    def _wanting(self, wishes: Sequence[Wish]) -> Iterator[Wish]:
+        """Those that are not known to be there."""
+        seen: set[str] = set()
+        for wish in wishes:
+            if (refusal := _refusal(wish.key)) or wish.key in seen:
+                self._fail(wish, refusal or 'another bucket has the same key: fetch it elsewhere')
+                continue
+            seen.add(wish.key)
+            known = None if self._verify else self._fetched.verified(wish.key)
+            if known is not None and _is(known, wish):
+                self.result.present += 1
+                self._tell(wish.size, 1)
+            else:
+                yield wish
+
+    def _settle(self, wish: Wish, future: Future[_Done]) -> None:
+        """Account for one. Raises what concerns all of them."""
+        try:
+            self._count(future.result())
+        except (ObjectRefused, AccessDenied, BucketMissing) as error:
+            self._fail(wish, str(error))
+        except StoreUnavailable as error:
+            self._silent += 1
+            if self._silent >= AWAY:
+                raise
+            self._fail(wish, str(error))
+        except OSError as error:
+            if error.errno in _NO_DISK:
+                raise LakeError(f'{self._fetched.folder} cannot be written: {error.strerror}') from error
+            self._fail(wish, error.strerror or type(error).__name__)
+        if time.monotonic() - self._noted_s > NOTE_S:
+            self._note()
+
+    def _fail(self, wish: Wish, why: str) -> None:
+        self.result.failed[f'{wish.bucket}/{wish.key}'] = why
+
+    def _count(self, done: _Done) -> None:
+        self._silent = 0
+        if done.proved:
+            self._fresh.append(done.file)
+        else:
+            self.result.unverified += 1
+        if done.moved:
+            self.result.moved += 1
+            self.result.bytes += done.file.size
+        else:
+            self.result.present += 1
+
+    def _note(self) -> None:
+        self._fetched.note(self._fresh)
+        self._fresh = []
+        self._noted_s = time.monotonic()
+
+    # -- on the threads of the pool --------------------------------------------------------------------------------
+
+    def _bring(self, wish: Wish) -> _Done:
+        source, path = self._open_bucket(wish.bucket), self._fetched.path(wish.key)
+        held = self._held(wish, source, path)
+        if held is not None:
+            self._tell(wish.size, 1)
+            return held
+        for left in reversed(range(TRIES)):
+            try:
+                return self._move(wish, source, path)
+            except (StoreUnavailable, ObjectRefused) as error:
+                passing = isinstance(error, StoreUnavailable) or error.data.get('reason') == _DAMAGED
+                if not (passing and left) or self._over.is_set():
+                    raise
+        raise AssertionError('unreachable')
+
+    def _held(self, wish: Wish, source: Source, path: Path) -> _Done | None:
+        """What is there already, if it is what was stored: left by a run that was killed, or by another program."""
+        if not path.is_file() or path.stat().st_size != wish.size:
+            return None
+        info = None if wish.sha256 else source.head(wish.key)
+        expected = wish.sha256 or (info and info.sha256)
+        seen = path.stat()
+        if expected is None or _sha256(path) != expected:
+            return None
+        return _Done(Verified(wish.key, wish.bucket, wish.size, seen.st_mtime_ns, expected, wish.etag), moved=False, proved=True)
+
+    def _move(self, wish: Wish, source: Source, path: Path) -> _Done:
+        part = self._fetched.parts / str(next(self._numbers))
+        moved, digest = 0, hashlib.sha256()
+        try:
+            content = source.get(wish.key)
+            with part.open('wb') as file:
+                for piece in content.pieces:
+                    self._go_on()
+                    digest.update(piece)
+                    file.write(piece)
+                    moved += len(piece)
+                    self._tell(len(piece), 0)
+            sha256, expected = digest.hexdigest(), wish.sha256 or content.metadata.get('sha256')
+            _check(wish, moved, sha256, expected)
+            self._make_folder(path.parent)
+            part.replace(path)
+        except BaseException:
+            self._tell(-moved, 0)
+            part.unlink(missing_ok=True)
+            raise
+        self._tell(0, 1)
+        file_ = Verified(wish.key, wish.bucket, moved, path.stat().st_mtime_ns, sha256, wish.etag)
+        return _Done(file_, moved=True, proved=expected is not None)
+
+    def _go_on(self) -> None:
+        """Raises StoreUnavailable where the run is over: nobody waits for this object any more."""
+        if self._over.is_set():
+            raise StoreUnavailable('the fetch was broken off')
+
+    def _make_folder(self, folder: Path) -> None:
+        if folder not in self._folders:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._folders.add(folder)
+
+
+def _refusal(key: str) -> str:
+    """Why a key can be no file below the folder; empty when it can. Anybody may have written to the bucket."""
+    if any(part in {'', '.', '..'} for part in key.split('/')) or '\0' in key:
+        return 'its key is no path'
+    return 'its key is ours' if key.split('/', maxsplit=1)[0] == FOLDER else ''
+
+
+def _is(known: Verified, wish: Wish) -> bool:
+    """Whether a file that is as it was noted is what is wanted."""
+    same = (known.bucket, known.size) == (wish.bucket, wish.size)
+    if wish.sha256 is not None:
+        return same and known.sha256 == wish.sha256
+    return same and (not wish.etag or not known.etag or known.etag == wish.etag)
+
+
+def _check(wish: Wish, size: int, sha256: str, expected: str | None) -> None:
+    """Raises ObjectRefused for content that is not what was stored."""
+    where = {'bucket': wish.bucket, 'key': wish.key, 'reason': _DAMAGED}
+    if size != wish.size:
+        raise ObjectRefused(f'it has {size} bytes instead of {wish.size}', **where)
+    if expected is not None and sha256 != expected:
+        raise ObjectRefused(f'its SHA-256 is {sha256[:12]}... instead of {expected[:12]}...', **where)
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open('rb') as file:
+        while piece := file.read(CHUNK_BYTES):
+            digest.update(piece)
+    return digest.hexdigest()

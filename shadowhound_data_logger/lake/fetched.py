@@ -1,0 +1,129 @@
+"""What lies in a folder of fetched objects: which files were verified, so that a second run moves and reads nothing.
+
+``DIR/.fetch/`` holds a SQLite file, the lock of the one fetch at a time, and what is not whole yet.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Final
+
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.errors import LakeError
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+FOLDER: Final = '.fetch'
+_SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS files (
+    key TEXT PRIMARY KEY, bucket TEXT NOT NULL, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sha256 TEXT NOT NULL,
+    etag TEXT NOT NULL, boot TEXT NOT NULL
+) WITHOUT ROWID
+"""
+_KNOWN: Final = "SELECT key, bucket, size, mtime_ns, sha256, etag FROM files WHERE boot IN ('', ?)"
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """A file as it was when its content was compared with what was stored."""
+
+    key: str
+    bucket: str
+    size: int
+    mtime_ns: int
+    sha256: str
+    etag: str
+
+
+class Fetched:
+    """Enter once, leave once, on one thread. A file counts as it stands: of other size or time than noted, it is unknown.
+
+    Files are not synced one by one, which would take longer than to move them. What was noted and not synced, because the process
+    was killed, is believed in the same boot and read again after the next: a power cut may have taken it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.parts = folder / FOLDER / 'parts'
+        self._boot = SystemClock.of_this_machine().boot_id
+        self._lock: IO[bytes] | None = None
+        self._known: dict[str, Verified] = {}
+        self._db: sqlite3.Connection | None = None
+
+    def __enter__(self) -> Self:
+        """Raises LakeError where another fetch is at work or the folder cannot be written."""
+        home = self.folder / FOLDER
+        try:
+            home.mkdir(parents=True, exist_ok=True)
+            self._lock = (home / 'lock').open('ab')
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(self.parts, ignore_errors=True)
+            self.parts.mkdir()
+            self._db = self._opened(home / 'files.db')
+        except BlockingIOError as error:
+            self._release()
+            raise LakeError(f'another fetch is writing to {self.folder}', remedy='wait for it, or name another folder') from error
+        except (OSError, sqlite3.Error) as error:
+            self._release()
+            raise LakeError(f'{self.folder} cannot be written: {error}', folder=str(self.folder)) from error
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._db is not None:
+            os.sync()
+            with self._db:
+                self._db.execute("UPDATE files SET boot = '' WHERE boot != ''")
+            self._db.close()
+        self._release()
+
+    def _release(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+
+    def path(self, key: str) -> Path:
+        return self.folder / key
+
+    def verified(self, key: str) -> Verified | None:
+        """What is known of the file of this key, if it is as it was."""
+        known = self._known.get(key)
+        if known is None:
+            return None
+        try:
+            seen = self.path(key).stat()
+        except OSError:
+            return None
+        return known if (seen.st_size, seen.st_mtime_ns) == (known.size, known.mtime_ns) else None
+
+    def note(self, files: Iterable[Verified]) -> None:
+        assert self._db is not None
+        rows = [(file.key, file.bucket, file.size, file.mtime_ns, file.sha256, file.etag, self._boot) for file in files]
+        with self._db:
+            self._db.executemany('INSERT OR REPLACE INTO files VALUES (?, ?, ?, ?, ?, ?, ?)', rows)
+
+    def _opened(self, path: Path) -> sqlite3.Connection:
+        """A file that is none of SQLite's is only a memory: it begins anew."""
+        for attempt in range(2):
+            db = sqlite3.connect(path)
+            try:
+                db.execute('PRAGMA journal_mode = WAL')
+                db.execute('PRAGMA synchronous = NORMAL')
+                db.execute(_SCHEMA)
+                rows = db.execute(
+                    "SELECT key, bucket, size, mtime_ns, sha256, etag FROM files WHERE boot IN ('', ?)", (self._boot,)
+                )
+                self._known = {row[0]: Verified(*row) for row in rows}
+                return db
+            except sqlite3.DatabaseError:
+                db.close()
+                if attempt:
+                    raise
+                path.unlink(missing_ok=True)
+        raise AssertionError('unreachable')

@@ -1,0 +1,98 @@
+"""Pictures of an answer: a contact sheet of the images that were found, and where the objects lie on the ground.
+
+Importing this loads Pillow; ``ground`` loads matplotlib.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.lake.source import Source
+from shadowhound_data_logger.missions.contact_sheet import MOST, Frame, contact_sheet
+
+IMAGES: Final = ('.jpg', '.jpeg', '.png')
+THREADS: Final = 8
+PALE: Final = '#c7cfd6'
+LETTERS: Final = 56
+"""Of a line of the title."""
+DOTS: Final = 60
+"""Area of an object on the ground, in square points, where there are few."""
+
+
+def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Source], title: str, target: Path) -> None:
+    """A JPEG with up to twenty of the images among the rows, evenly chosen; a frame's number is its row's, from 1.
+
+    Raises LakeError where there is none, StoreError.
+    """
+    images = [(number, row) for number, row in enumerate(rows, 1) if str(row['key']).lower().endswith(IMAGES)]
+    if not images:
+        raise LakeError('no image is among what was found', remedy='ask with --sensor camera')
+    chosen = [
+        images[round(place * (len(images) - 1) / max(1, min(MOST, len(images)) - 1))] for place in range(min(MOST, len(images)))
+    ]
+
+    def save(numbered: tuple[int, Mapping[str, Any]]) -> Frame | None:
+        number, row = numbered
+        path = Path(folder, str(number))
+        try:
+            path.write_bytes(open_bucket(row['bucket']).read(row['key']))
+        except ObjectRefused:  # the catalogue outlives what is deleted
+            return None
+        return Frame(row.get('t_start_ns') or 0, number, path)
+
+    with tempfile.TemporaryDirectory(prefix='shadowhound-sheet-') as folder, ThreadPoolExecutor(THREADS) as pool:
+        frames = [frame for frame in pool.map(save, chosen) if frame is not None]
+        try:
+            contact_sheet(frames, title, min((frame.time_ns for frame in frames), default=0), target)
+        except ValueError as error:
+            raise LakeError(f'{target} cannot be made: {error}') from error
+
+
+def ground(
+    rows: Sequence[Mapping[str, Any]], path: Sequence[tuple[float, float]], near: tuple[float, float, float] | None, title: str,
+    target: Path,
+) -> None:  # fmt: skip
+    """A PNG: the objects by their places, coloured by battery where that is known, over all poses of that time.
+
+    Raises LakeError where none has a place.
+    """
+    from matplotlib import rc_context  # noqa: PLC0415 - a second, for this picture alone
+    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.patches import Circle  # noqa: PLC0415
+
+    from shadowhound_data_logger.missions import plots  # noqa: PLC0415
+
+    placed = [row for row in rows if row.get('x') is not None and row.get('y') is not None]
+    if not placed:
+        raise LakeError('nothing that was found has a place', remedy='was there odometry when it was taken?')
+    with rc_context(plots.STYLE):
+        figure = Figure(dpi=plots.DPI, layout='constrained')
+        axes = figure.add_subplot()
+        if path:
+            east, north = zip(*path, strict=True)
+            axes.scatter(east, north, s=5, c=PALE, lw=0, label='all poses')
+        if near is not None:
+            axes.add_patch(Circle(near[:2], near[2], fill=False, ec=plots.AMBER, lw=1.6, ls='--'))
+            axes.plot([], [], c=plots.AMBER, lw=1.6, ls='--', label='asked for')
+        charge = [float('nan') if row.get('battery_pct') is None else row['battery_pct'] for row in placed]
+        is_known = any(value == value for value in charge)  # noqa: PLR0124 - not all are NaN
+        look = {'c': charge, 'cmap': 'viridis', 'plotnonfinite': True} if is_known else {'c': plots.BLUE}
+        xs, ys = [row['x'] for row in placed], [row['y'] for row in placed]
+        size = max(8.0, min(DOTS, 6000 / len(placed)))
+        dots = axes.scatter(xs, ys, s=size, ec='white', lw=0.5, label='found', zorder=3, **look)
+        axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal')
+        axes.set_title('\n'.join(textwrap.wrap(f'{title}: {len(placed):,}' if title else f'{len(placed):,} objects', LETTERS)))
+        axes.margins(0.08)
+        if is_known:
+            bar = figure.colorbar(dots, cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)), label='battery [%]')
+            bar.outline.set_visible(False)
+        (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+        figure.set_size_inches(plots.WIDTH_IN, min(max(0.8 * plots.WIDTH_IN * (y1 - y0) / (x1 - x0), 2.5), 12.0) + 1.3)
+        figure.legend(loc='outside lower center', ncols=3)
+        figure.savefig(target, format='png')

@@ -1,0 +1,168 @@
+"""The catalogue as Daft DataFrames and as SQL over ``objects``, ``missions`` and ``topics``.
+
+A frame is lazy: it looks which parts there are when it is computed, and of other days than the asked ones not even for the names.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import reduce
+from operator import and_
+from typing import Any, Final
+
+import pyarrow as pa
+
+from shadowhound_data_logger.config import home, store_settings
+from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.lake import schema
+from shadowhound_data_logger.lake.scan import THREADS, Catalogue
+from shadowhound_data_logger.lake.select import Wanted, wanted
+from shadowhound_data_logger.lake.source import Source, open_source
+from shadowhound_data_logger.options import StoreSettings
+
+import daft  # isort: skip - after scan, which turns its telemetry off
+from daft import DataFrame, Expression, col, lit  # isort: skip
+
+_MISSIONS: Final = re.compile(r'\bmissions\b', re.IGNORECASE)
+_SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
+    'command': ('mission_command', pa.string()),
+    'started': ('start', pa.string()),
+    'ended': ('end', pa.string()),
+    'result': ('result', pa.string()),
+    'success': ('success', pa.bool_()),
+    'distance_m': ('distance_m', pa.float64()),
+    'duration_s': ('duration_s', pa.float64()),
+    'battery_consumed_pct': ('battery_consumed_pct', pa.float64()),
+}
+"""Columns of ``missions`` that come from ``summary.json``, null for a mission that has none yet: name there, type."""
+
+
+def objects(source: Source | None = None, **flags: Any) -> DataFrame:
+    """One row an object, with the columns of ``lake/schema.py``.
+
+    ``flags`` are those of ``select.wanted``: ``sensor topic robot since until near mission mission_type success where``.
+    Without a source, of the store that the environment names. Raises SettingError, LakeError for what is no question.
+    """
+    return _objects(source or default_source(), wanted(time.time_ns(), **flags))
+
+
+def missions(source: Source | None = None, **flags: Any) -> DataFrame:
+    """One row a mission that has objects among the wanted ones, and how it ended. Reads catalogue and summaries at once."""
+    return _missions(source or default_source(), wanted(time.time_ns(), **flags))
+
+
+def topics(source: Source | None = None, **flags: Any) -> DataFrame:
+    """One row a robot and topic: how many objects, bytes and messages, from when to when."""
+    return _topics(_objects(source or default_source(), wanted(time.time_ns(), **flags)))
+
+
+def sql(query: str, source: Source | None = None, **flags: Any) -> DataFrame:
+    """SQL over the three views, each restricted by the flags. Raises LakeError for what is no SQL or names no column."""
+    chosen, asked = source or default_source(), wanted(time.time_ns(), **flags)
+    rows = _objects(chosen, asked)
+    views = {'objects': rows, 'topics': _topics(rows)}
+    if _MISSIONS.search(query):  # it has to look first
+        views['missions'] = _missions(chosen, asked)
+    with answering():
+        return daft.sql(query, register_globals=False, **views)
+
+
+def default_source(settings: StoreSettings | None = None) -> Source:
+    """The bucket with the catalogue in the store that the environment names."""
+    return open_source(settings or store_settings(os.environ, home(os.environ)), schema.BUCKET)
+
+
+@contextmanager
+def answering() -> Iterator[None]:
+    """What Daft cannot make sense of is a LakeError; use it around what computes a frame, too."""
+    try:
+        yield
+    except Exception as error:  # Daft's error for SQL has no name that could be imported
+        if type(error).__module__ != 'daft.exceptions':
+            raise
+        raise LakeError(f'the query cannot be answered: {" ".join(str(error).split())}') from error
+
+
+def _objects(source: Source, asked: Wanted) -> DataFrame:
+    rows = Catalogue(source, asked).read()
+    with answering():
+        conditions = list(_conditions(asked))
+        if asked.success is not None:
+            ended = _missions(source, replace(asked, success=None)).where(col('success') == lit(asked.success))
+            ids = ended.select('mission_id').to_pydict()['mission_id']
+            conditions.append(col('mission_id').is_in(ids) if ids else lit(False))
+        return rows.where(reduce(and_, conditions)) if conditions else rows
+
+
+def _conditions(asked: Wanted) -> Iterator[Expression]:
+    for name in ('robot', 'sensor', 'topic', 'mission_type'):
+        if (value := getattr(asked, name)) is not None:
+            yield col(name) == lit(value)
+    if asked.since_ns is not None or asked.until_ns is not None:
+        yield col('t_start').not_null()
+    if asked.since_ns is not None:
+        yield col('t_start_ns') >= lit(asked.since_ns)
+    if asked.until_ns is not None:
+        yield col('t_start_ns') < lit(asked.until_ns)
+    if asked.mission is not None:
+        yield col('mission_id').startswith(asked.mission) | col('run_id').startswith(asked.mission)
+    if asked.near is not None:
+        x, y, radius = asked.near
+        for name, middle in (('x', x), ('y', y)):  # a box first: statistics can rule parts of a file out by it
+            yield (col(name) >= lit(middle - radius)) & (col(name) <= lit(middle + radius))
+        east, north = col('x') - lit(x), col('y') - lit(y)
+        yield east * east + north * north <= lit(radius * radius)
+    if asked.where is not None:
+        yield daft.sql_expr(asked.where)
+
+
+def _topics(rows: DataFrame) -> DataFrame:
+    known = rows.where(col('topic').not_null())
+    return known.groupby('robot', 'topic', 'sensor', 'type').agg(
+        col('key').count().alias('objects'), col('bytes').sum().alias('bytes'), col('count').sum().alias('messages'),
+        col('t_start').min().alias('first'), col('t_end').max().alias('last'),
+    )  # fmt: skip
+
+
+def _missions(source: Source, asked: Wanted) -> DataFrame:
+    """Which there are by the catalogue; how they ended by their summaries, which lie under the id of the run."""
+    rows = _objects(source, asked).where(col('mission_id').not_null())
+    with answering():
+        found = rows.groupby('robot', 'mission_id').agg(
+            col('run_id').max(), col('mission_type').max(), col('key').count().alias('objects'),
+            col('bytes').sum().alias('bytes'), col('t_start').min().alias('first'), col('t_end').max().alias('last'),
+        ).sort('first').to_arrow()  # fmt: skip
+    ids = zip(found['robot'].to_pylist(), found['run_id'].to_pylist(), strict=True)
+    with ThreadPoolExecutor(THREADS) as pool:
+        told = list(pool.map(lambda pair: _summary(source, *pair), ids))
+    types = found['mission_type'].to_pylist()
+    kinds = [kind or one.get('mission_type') for kind, one in zip(types, told, strict=True)]
+    found = found.set_column(found.column_names.index('mission_type'), 'mission_type', pa.array(kinds, pa.string()))
+    for column, (name, kind) in _SUMMARY.items():
+        found = found.append_column(column, pa.array([_value(one.get(name), kind) for one in told], kind))
+    return daft.from_arrow(found)
+
+
+def _summary(source: Source, robot: str, run_id: str | None) -> dict[str, Any]:
+    """What a mission's summary says; empty where there is none yet, or none that can be read."""
+    if run_id is None:
+        return {}
+    try:
+        told = json.loads(source.read(f'{robot}/missions/{run_id}/summary.json'))
+    except (ObjectRefused, ValueError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def _value(value: Any, kind: pa.DataType) -> Any:
+    """Null for what is not of its kind: a summary may be of another version."""
+    if kind == pa.float64():
+        return float(value) if isinstance(value, (int, float)) else None
+    return value if isinstance(value, bool if kind == pa.bool_() else str) else None

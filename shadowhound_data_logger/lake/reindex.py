@@ -1,0 +1,91 @@
+"""``lake reindex``: the rows that the catalogue lacks, made from the store alone: a listing, and what each object says of itself.
+
+It adds parts and changes none. A robot's own part may come later than what is added here: the names of these parts tell readers
+to look for rows that come twice. So it may run at any time and die at any moment; the next run goes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from typing import Final
+
+from shadowhound_data_logger.errors import StoreUnavailable
+from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.lake import parts
+from shadowhound_data_logger.lake.putting import put_part
+from shadowhound_data_logger.lake.scan import KEY, THREADS, folders, read
+from shadowhound_data_logger.lake.schema import BUCKET, Row, is_row, row_of
+from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.lake.source import Entry, Source, open_source
+from shadowhound_data_logger.lake.standing import mended_key
+from shadowhound_data_logger.stores.base import ObjectStore
+
+BUCKETS: Final = (BUCKET, 'trajectories')
+PAGE: Final = 10_000
+"""Objects that are asked for at a time, and then written down."""
+_TRIES: Final = 3
+
+
+@dataclass(slots=True)
+class Reindexed:
+    """What was found, as it goes on."""
+
+    listed: int = 0
+    added: int = 0
+    parts: int = 0
+    gone: int = 0
+    """Rows whose objects are not there any more; they stay."""
+
+
+def reindex(
+    source: Source, store: ObjectStore, robot: str, *, buckets: tuple[str, ...] = BUCKETS,
+    tell: Callable[[Reindexed], None] = lambda _: None,
+) -> Reindexed:  # fmt: skip
+    """Add what is missing of one robot. Raises StoreError, NameRefused; what was added until then stays."""
+    check_name(robot, 'the robot name')
+    found = Reindexed()
+    known = _known(source, robot)
+    for bucket in buckets:
+        place = open_source(source.settings, bucket)
+        entries = (entry for entry in place.list(f'{robot}/') if is_row(bucket, entry.key))
+        while page := list(islice(entries, PAGE)):
+            found.listed += len(page)
+            new = [entry for entry in page if (bucket, entry.key) not in known]
+            known.difference_update((bucket, entry.key) for entry in page)
+            rows = list(_rows(place, new))
+            for _, date, numbered in parts.by_folder(enumerate(rows)):
+                part = [row for _, row in numbered]
+                key = mended_key(robot, date, (f'{row["bucket"]}/{row["key"]}' for row in part))
+                put_part(store, key, robot, parts.encode(part), len(part))
+                found.parts += 1
+            found.added += len(rows)
+            tell(found)
+    found.gone = sum(bucket in buckets for bucket, _ in known)
+    return found
+
+
+def _known(source: Source, robot: str) -> set[tuple[str, str]]:
+    keys = [entry.key for day in folders(source, Wanted(robot=robot)) for entry in day.entries]
+    rows = read(source, keys, KEY)
+    return set(zip(rows['bucket'].to_pylist(), rows['key'].to_pylist(), strict=True))
+
+
+def _rows(place: Source, entries: list[Entry]) -> Iterator[Row]:
+    """An object that is gone meanwhile has none."""
+
+    def row(entry: Entry) -> Row | None:
+        for left in reversed(range(_TRIES)):
+            try:
+                info = place.head(entry.key)
+            except StoreUnavailable:
+                if not left:
+                    raise
+            else:
+                return None if info is None else row_of(place.bucket, entry.key, info.size, info.content_type, info.metadata)
+        return None
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        yield from (found for found in pool.map(row, entries) if found is not None)

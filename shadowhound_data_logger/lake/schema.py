@@ -1,0 +1,160 @@
+"""The catalogue: one row for each object in the store, its columns, and how a row is made of what an object says of itself.
+
+A row holds nothing that is not in the object's S3 metadata and in a listing: a catalogue that is lost is made again from those.
+Every object of a robot is a row but the files of the catalogue itself. Parts lie at
+``<robot>/_catalog/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.parquet``; the date is that of ``t_start``, UTC.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, utc
+from shadowhound_data_logger.lake.parquet import DOUBLE, INT32, INT64, STRING, TIME
+
+if TYPE_CHECKING:
+    import pyarrow
+
+FORMAT_VERSION: Final = 1
+"""Of the rows. Columns are only ever added, at the end."""
+BUCKET: Final = 'sensor-data'
+"""Of the catalogue; its rows name objects of any bucket."""
+COLUMNS: Final[Mapping[str, str]] = {
+    'robot': STRING,
+    'sensor': STRING,
+    'topic': STRING,
+    'type': STRING,
+    'bucket': STRING,
+    'key': STRING,
+    'bytes': INT64,
+    'sha256': STRING,
+    't_start': TIME,
+    't_end': TIME,
+    't_start_ns': INT64,
+    't_end_ns': INT64,
+    'count': INT64,
+    'mission_id': STRING,
+    'run_id': STRING,
+    'mission_type': STRING,
+    'x': DOUBLE,
+    'y': DOUBLE,
+    'yaw': DOUBLE,
+    'pose_frame': STRING,
+    'battery_pct': DOUBLE,
+    'clock': STRING,
+    'clock_offset_ns': INT64,
+    'content_type': STRING,
+    'format_version': INT32,
+}
+"""Name -> kind. ``bucket``, ``key``, ``bytes`` and ``format_version`` are always there; all else is null where it is not known.
+
+Times are in microseconds, because Spark reads no TIMESTAMP(NANOS); the exact ones stand beside them as int64.
+``x y yaw`` are metres and radians (REP-103) in the odometry's frame ``pose_frame``, at the object's time: ``t_start`` of a single
+message, the middle of a batch. ``clock`` is how well the times are known (spool/redating.py). With ``unset`` there is no date:
+``t_start`` and ``t_end`` are null, the ns count from the robot's boot, and the part lies under ``date=1970-01-01``.
+``clock_offset_ns`` is to be added to the times in the content, with ``set_later``.
+"""
+REQUIRED: Final = ('bucket', 'key', 'bytes', 'format_version')
+POSE: Final = 'pose'
+"""Metadata: ``x y yaw frame``, as in ``3.214 -1.502 0.7854 odom``."""
+BATTERY: Final = 'battery_pct'
+UNDATED: Final = '1970-01-01'
+SENSOR: Final = '_catalog'
+"""Of the catalogue's own objects, and their folder."""
+
+Row = dict[str, Any]
+"""Column -> value; a time as an int of microseconds."""
+
+
+def arrow_schema() -> pyarrow.Schema:
+    """The columns as pyarrow has them."""
+    import pyarrow  # noqa: PLC0415 - 40 MB and a second, for those that read or write with it
+
+    kinds = {STRING: pyarrow.string(), INT32: pyarrow.int32(), INT64: pyarrow.int64(), DOUBLE: pyarrow.float64(),
+             TIME: pyarrow.timestamp('us', tz='UTC')}  # fmt: skip
+    return pyarrow.schema([pyarrow.field(name, kinds[kind], nullable=name not in REQUIRED) for name, kind in COLUMNS.items()])
+
+
+def prefix(robot: str) -> str:
+    """What the keys of a robot's catalogue begin with."""
+    return f'{robot}/{SENSOR}/'
+
+
+def part_key(robot: str, date: str, name: str) -> str:
+    """The key of a part with rows of one date (``YYYY-MM-DD``); ``name`` makes it unique."""
+    return f'{prefix(robot)}date={date}/{robot}_{name}.parquet'
+
+
+def is_row(bucket: str, key: str) -> bool:
+    """Whether an object belongs into the catalogue: all do but its own files."""
+    return bucket != BUCKET or key.split('/')[1:2] != [SENSOR]
+
+
+def date_of(row: Row) -> str:
+    """The folder of a row, ``YYYY-MM-DD``."""
+    return f'{utc(row["t_start_ns"]):%Y-%m-%d}' if row['t_start'] is not None else UNDATED
+
+
+def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mapping[str, str]) -> Row:
+    """The row of an object by its S3 metadata; never raises: what is missing or senseless there is null.
+
+    ``robot`` and ``sensor`` of an object that tells nothing are those of its key.
+    """
+    parts = key.split('/')
+    start_ns, end_ns = _int(metadata, 't_start_ns', 'boot_start_ns'), _int(metadata, 't_end_ns', 'boot_end_ns')
+    pose = metadata.get(POSE, '').split(' ')
+    x, y, yaw = (_number(value) for value in (pose[:3] if len(pose) == 4 else ('', '', '')))
+    known = None not in (x, y, yaw)
+    return {
+        'robot': metadata.get('robot') or (parts[0] or None if len(parts) > 1 else None),
+        'sensor': metadata.get('sensor') or (parts[1] if len(parts) > 2 else None),
+        'topic': metadata.get('topic') or None,
+        'type': metadata.get('type') or None,
+        'bucket': bucket,
+        'key': key,
+        'bytes': size,
+        'sha256': metadata.get('sha256') or None,
+        't_start': _micros(start_ns),
+        't_end': _micros(end_ns),
+        't_start_ns': start_ns,
+        't_end_ns': end_ns,
+        'count': _int(metadata, 'count', 'messages'),
+        'mission_id': metadata.get('mission_id') or None,
+        'run_id': metadata.get('run_id') or None,
+        'mission_type': metadata.get('mission_type') or None,
+        'x': x if known else None,
+        'y': y if known else None,
+        'yaw': yaw if known else None,
+        'pose_frame': pose[3] if known else None,
+        'battery_pct': _number(metadata.get(BATTERY, '')),
+        'clock': metadata.get('clock') or None,
+        'clock_offset_ns': _int(metadata, 'clock_offset_ns'),
+        'content_type': content_type or None,
+        'format_version': FORMAT_VERSION,
+    }
+
+
+def _micros(stamp_ns: int | None) -> int | None:
+    return stamp_ns // 1000 if stamp_ns is not None and stamp_ns >= EARLIEST_SANE_NS else None
+
+
+def _int(metadata: Mapping[str, str], *names: str) -> int | None:
+    """The first of these that is there, as a whole number of 64 bits; None where it is none."""
+    for name in names:
+        if name in metadata:
+            try:
+                value = int(metadata[name])
+            except ValueError:
+                return None
+            return value if abs(value) < 1 << 63 else None
+    return None
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None

@@ -1,0 +1,118 @@
+"""What is asked of the catalogue: which objects, of when, of where; and the dates whose parts can hold them.
+
+An object belongs to the moment at which it begins (``t_start``, UTC), as its row belongs to the folder of that date.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from typing import Final
+
+from shadowhound_data_logger.clock import FUTURE_SLACK_NS, SECOND, utc
+from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.lake.schema import UNDATED
+
+DAY: Final = timedelta(days=1)
+MOST_FOLDERS: Final = 400
+"""Dates that are asked for by name; for a longer time the folders that there are are listed first."""
+_AGO: Final = re.compile(r'(\d+(?:\.\d+)?)\s*(s|min|h|d|w)')
+_UNITS: Final = {'s': 1, 'min': 60, 'h': 3600, 'd': 86_400, 'w': 604_800}
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
+TIMES: Final = 'now, today, yesterday, an age such as 30min, 2h or 3d, a date or an ISO time (UTC unless it names a zone)'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wanted:
+    """All that is given must hold; None asks for nothing."""
+
+    robot: str | None = None
+    sensor: str | None = None
+    topic: str | None = None
+    since_ns: int | None = None
+    until_ns: int | None = None
+    """Exclusive."""
+    near: tuple[float, float, float] | None = None
+    """x, y and radius in metres, in the odometry's frame."""
+    mission: str | None = None
+    """How the id of a mission or of its run begins."""
+    mission_type: str | None = None
+    success: bool | None = None
+    """How the mission ended by its ``summary.json``; of one that goes on, neither is true."""
+    where: str | None = None
+    """SQL, such as ``battery_pct < 30``."""
+
+    def has_date(self, date: str) -> bool:
+        """Whether a row under this date can be wanted."""
+        if self.since_ns is None and self.until_ns is None:
+            return True
+        if date == UNDATED:
+            return False
+        first = '' if self.since_ns is None else _date(self.since_ns)
+        return first <= date and (self.until_ns is None or date <= _date(self.until_ns - 1))
+
+    def dates(self, now_ns: int) -> list[str] | None:
+        """Those folders, where they can be named; None where it is shorter to look which there are."""
+        if self.since_ns is None:
+            return None
+        last_ns = now_ns + FUTURE_SLACK_NS if self.until_ns is None else self.until_ns - 1
+        first, last = utc(self.since_ns).date(), utc(max(last_ns, self.since_ns)).date()
+        count = (last - first).days + 1
+        if self.until_ns is not None and self.until_ns <= self.since_ns:
+            return []
+        return None if count > MOST_FOLDERS else [str(first + DAY * number) for number in range(count)]
+
+
+def wanted(  # noqa: PLR0913 - the flags of a question
+    now_ns: int, *, since: str | datetime | None = None, until: str | datetime | None = None,
+    near: tuple[float, float, float] | str | None = None, robot: str | None = None, sensor: str | None = None,
+    topic: str | None = None, mission: str | None = None, mission_type: str | None = None, success: bool | None = None,
+    where: str | None = None,
+) -> Wanted:  # fmt: skip
+    """The question in these words. Raises SettingError for one that is none."""
+    return Wanted(
+        robot=robot, sensor=sensor, topic=topic, mission=mission, mission_type=mission_type, success=success, where=where,
+        since_ns=None if since is None else moment('since', since, now_ns),
+        until_ns=None if until is None else moment('until', until, now_ns),
+        near=None if near is None else _circle(near),
+    )  # fmt: skip
+
+
+def moment(name: str, given: str | datetime, now_ns: int) -> int:
+    """A time in ns: see ``TIMES``. Raises SettingError with ``name``."""
+    if isinstance(given, datetime):
+        return _ns(given)
+    text, now = given.strip().lower(), utc(now_ns)
+    midnight = now.replace(hour=0, minute=0, second=0, microsecond=0)
+    named = {'now': now, 'today': midnight, 'yesterday': midnight - DAY}
+    if text in named:
+        return _ns(named[text])
+    try:
+        if ago := _AGO.fullmatch(text):
+            return now_ns - round(float(ago[1]) * _UNITS[ago[2]] * SECOND)
+        return _ns(datetime.fromisoformat(given.strip().replace('Z', '+00:00').replace('z', '+00:00')))
+    except (ValueError, OverflowError):
+        raise SettingError(name, given, TIMES) from None
+
+
+def _ns(time: datetime) -> int:
+    aware = time if time.tzinfo else time.replace(tzinfo=timezone.utc)
+    since = aware - _EPOCH
+    return ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * 1000
+
+
+def _circle(given: tuple[float, float, float] | str) -> tuple[float, float, float]:
+    allowed = 'x, y and a radius in metres, such as 3.2,1.5,2'
+    try:
+        x, y, radius = (float(part) for part in (given.split(',') if isinstance(given, str) else given))
+    except (ValueError, TypeError):
+        raise SettingError('near', given, allowed) from None
+    if not all(map(math.isfinite, (x, y, radius))) or radius <= 0:
+        raise SettingError('near', given, allowed)
+    return x, y, radius
+
+
+def _date(stamp_ns: int) -> str:
+    return f'{utc(stamp_ns):%Y-%m-%d}'

@@ -1,0 +1,54 @@
+"""How the catalogue lies in the store, robot by robot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from shadowhound_data_logger.clock import utc
+from shadowhound_data_logger.lake.scan import THREADS
+from shadowhound_data_logger.lake.schema import prefix
+from shadowhound_data_logger.lake.source import Source
+from shadowhound_data_logger.lake.standing import Day, days, is_compacted
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Of one robot's catalogue."""
+
+    robot: str
+    days: int
+    first: str
+    """Date, as all dates UTC."""
+    last: str
+    files: int
+    size: int
+    """Bytes of all of them."""
+    compacted: int
+    """Days that are one file."""
+    open_days: int
+    """Days that are over and have several."""
+    covered: int
+    """Files that others stand for: they only take room."""
+
+
+def state(source: Source, robot: str | None = None) -> list[State]:
+    """Of all robots that have a catalogue. Raises StoreError, LakeError."""
+    robots = [robot] if robot else source.folders('')
+    today = f'{utc(time.time_ns()):%Y-%m-%d}'
+    with ThreadPoolExecutor(THREADS) as pool:
+        found = {name: days(source, [name], None, pool) for name in robots if source.folders(prefix(name))}
+    return [_state(name, each, today) for name, each in found.items() if each]
+
+
+def _state(robot: str, found: Iterable[Day], today: str) -> State:
+    each = list(found)
+    entries = [entry for day in each for entry in (*day.entries, *day.covered)]
+    return State(
+        robot=robot, days=len(each), first=each[0].date, last=each[-1].date, files=len(entries),
+        size=sum(entry.size for entry in entries), covered=sum(len(day.covered) for day in each),
+        compacted=sum(len(day.entries) == 1 and is_compacted(day.entries[0].key) for day in each),
+        open_days=sum(len(day.entries) > 1 and day.date < today for day in each),
+    )  # fmt: skip

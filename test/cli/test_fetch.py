@@ -1,0 +1,75 @@
+"""``shadowhound-data fetch``: by prefix or by question, what it says, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+from contextlib import closing
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner, Result
+from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, row
+
+from shadowhound_data_logger.cli.fetch import fetch
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.stores import open_store
+
+TIMES = [NOON_NS + second * SECOND for second in range(5)]
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """Ten objects and their part of the catalogue."""
+    with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
+        for sensor in SENSORS:
+            for stamp_ns in TIMES:
+                add(store, tmp_path / 'tmp', row(sensor, stamp_ns)['key'], content(sensor, stamp_ns))
+        add_part(store, [row(sensor, stamp_ns) for sensor in SENSORS for stamp_ns in TIMES], 'part', tmp_path / 'tmp')
+    return tmp_path
+
+
+def run(home: Path, *arguments: str) -> Result:
+    env = {'SHADOWHOUND_HOME': str(home), 'COLUMNS': '150', 'AWS_ENDPOINT_URL': ''}
+    return CliRunner().invoke(fetch, [*arguments, '--to', str(home / 'data')], env=env, standalone_mode=False)
+
+
+def files(home: Path) -> list[str]:
+    return sorted(str(path.relative_to(home / 'data')) for path in (home / 'data' / 'thor').rglob('*.*'))
+
+
+def test_by_prefix(home: Path) -> None:
+    """Each at DIR/KEY; a second time nothing is moved, and it says so."""
+    found = run(home, 'thor/camera/')
+    assert found.return_value == 0
+    assert '5 objects' in found.output
+    assert files(home) == sorted(row('camera', stamp_ns)['key'] for stamp_ns in TIMES)
+    told = json.loads(run(home, 'thor/camera/', '--json').output)
+    assert (told['moved'], told['present'], told['bytes']) == (0, 5, 0)
+    assert (home / 'data' / files(home)[0]).read_bytes() == content('camera', TIMES[0])
+
+
+def test_by_question(home: Path) -> None:
+    """What the flags ask for, the earliest where there is a limit."""
+    told = json.loads(run(home, '--sensor', 'odom', '--since', '2026-10-28T12:00:01', '--limit', '2', '--json').output)
+    assert (told['asked'], told['moved']) == (2, 2)
+    assert files(home) == sorted(row('odom', stamp_ns)['key'] for stamp_ns in TIMES[1:3])
+    assert 'nothing to fetch' in run(home, '--sensor', 'lidar').output
+
+
+def test_what_cannot_be_fetched_is_a_finding(home: Path) -> None:
+    """Exit code 1, the key and the reason; the rest is there."""
+    gone = row('odom', TIMES[0])['key']
+    (home / 'store' / 'sensor-data' / gone).unlink()
+    found = run(home, '--sensor', 'odom')
+    assert found.return_value == 1
+    assert gone in found.output
+    assert '1 could not be fetched' in found.output
+    assert len(files(home)) == 4
+
+
+def test_bad_usage(home: Path) -> None:
+    """Neither or both of prefix and question; a time that is none."""
+    for arguments in ([], ['thor/', '--sensor', 'odom'], ['--since', 'soon']):
+        assert isinstance(run(home, *arguments).exception, click.UsageError)

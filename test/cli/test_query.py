@@ -1,0 +1,115 @@
+"""``shadowhound-data query`` on a small lake: what it prints in each format, its pictures, and its exit codes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+from lake.making import FAILED, NOON_NS, add, fill, folder_store, row
+from PIL import Image
+
+from shadowhound_data_logger.cli.query import query
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.stores import open_store
+
+
+@pytest.fixture(scope='module')
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One hour of one day, and two of its pictures."""
+    home = tmp_path_factory.mktemp('home')
+    fill(folder_store(home), home / 'tmp', days=(0,), hours=(12,))
+    picture = io.BytesIO()
+    Image.new('RGB', (64, 48), 'teal').save(picture, 'JPEG')
+    with closing(open_store(folder_store(home), UploadSettings())) as store:
+        for second in (0, 15):
+            add(store, home / 'tmp', row('camera', NOON_NS + second * SECOND)['key'], picture.getvalue())
+    return home
+
+
+def run(home: Path, *arguments: str) -> Result:
+    env = {'SHADOWHOUND_HOME': str(home), 'COLUMNS': '150', 'AWS_ENDPOINT_URL': ''}
+    return CliRunner().invoke(query, arguments, env=env, standalone_mode=True)
+
+
+def test_a_table_is_for_reading(home: Path) -> None:
+    """The earliest first, with what matters; how many there are, and that more are not shown."""
+    found = run(home, '--sensor', 'odom')
+    assert '2026-10-28 12:00:00  odom' in found.output
+    assert '48 objects' in found.output
+    assert 'the first 30 are shown' in found.output
+    assert 'No objects.' in run(home, '--sensor', 'lidar').output
+
+
+def test_json_and_csv_are_whole(home: Path) -> None:
+    """Every column of every row, times as ISO in UTC."""
+    told = json.loads(run(home, '--sensor', 'odom', '--json').output)
+    assert len(told) == 48
+    assert told[0]['t_start'] == '2026-10-28T12:00:00.000000Z'
+    assert json.loads(run(home, '--sensor', 'odom', '--format', 'json').output) == told
+    rows = list(csv.DictReader(io.StringIO(run(home, '--sensor', 'odom', '--format', 'csv').output)))
+    assert [one['key'] for one in rows] == [one['key'] for one in told]
+    assert rows[0]['t_start'] == told[0]['t_start']
+
+
+def test_keys_are_for_other_programs(home: Path) -> None:
+    """One a line with its bucket, in the order that was asked for."""
+    found = run(home, '--failed', '--sensor', 'camera', '--format', 'keys', '--order', 't_start desc', '--limit', '2')
+    assert found.output.splitlines() == [
+        'sensor-data/thor/camera/20261028/121545_x.jpg', 'sensor-data/thor/camera/20261028/121530_x.jpg',
+    ]  # fmt: skip
+
+
+def test_sql_with_flags(home: Path) -> None:
+    """The flags restrict what the views show."""
+    found = run(home, 'SELECT mission_id, result, objects FROM missions', '--failed', '--json')
+    assert json.loads(found.output) == [{'mission_id': FAILED, 'result': 'FAILED', 'objects': 16}]
+    assert '2 rows' in run(home, 'SELECT sensor, count(*) AS n FROM objects GROUP BY sensor').output
+
+
+def test_pictures_of_the_answer(home: Path, tmp_path: Path) -> None:
+    """A contact sheet of the images that can be read, and the places on the ground."""
+    sheet, ground = tmp_path / 'sheet.jpg', tmp_path / 'map.png'
+    asked = ('--sensor', 'camera', '--until', '2026-10-28T12:00:30', '--near', '0,0,9')
+    found = run(home, *asked, '--sheet', str(sheet), '--map', str(ground))
+    assert found.exit_code == 0, found.output
+    with Image.open(sheet) as image:
+        assert image.width == 800
+        colours = [image.convert('RGB').getpixel((x, 100)) for x in range(image.width)]
+        assert sum(colour[0] < 20 and 110 < colour[1] < 140 for colour in colours) > 400  # type: ignore[index, operator]
+    with Image.open(ground) as image:
+        assert image.width == 800
+    assert 'no image' in run(home, '--sensor', 'odom', '--sheet', str(sheet)).output
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'says'),
+    [
+        (['SELEC'], 'cannot be answered'), (['--where', 'nope < 3'], 'nope'), (['--since', 'tomorrow'], 'since'),
+        (['--near', '1,2'], 'near'), (['--order', 'a b c'], '--order'), (['--order', 'nope'], 'nope'),
+        (['SELECT sensor FROM objects', '--format', 'keys'], 'bucket and key'), (['--limit', '0'], 'limit'),
+    ],
+)  # fmt: skip
+def test_what_is_no_question_is_bad_usage(home: Path, arguments: list[str], says: str) -> None:
+    """Exit code 2, and what was not understood."""
+    found = run(home, *arguments)
+    assert found.exit_code == 2
+    assert says in found.output
+
+
+def test_a_robot_has_no_library_for_it(home: Path, tmp_path: Path) -> None:
+    """Without Daft it says what to install, as bad usage."""
+    (tmp_path / 'daft.py').write_text("raise ModuleNotFoundError('no', name='daft')\n", encoding='utf-8')
+    command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'query']
+    environ = {**os.environ, 'SHADOWHOUND_HOME': str(home), 'PYTHONPATH': f'{tmp_path}:{os.environ.get("PYTHONPATH", "")}'}
+    ran = subprocess.run(command, env=environ, capture_output=True, text=True, check=False, timeout=60)
+    assert ran.returncode == 2
+    assert 'shadowhound_data_logger[lake]' in ran.stderr

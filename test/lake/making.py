@@ -1,0 +1,157 @@
+"""A small lake for the tests: two days of a robot in a house, with two patrols of which one failed, and who asks for what."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.lake import parts, schema
+from shadowhound_data_logger.lake.source import Entry, Source, open_source
+from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
+
+NOON_NS: Final = 1_793_188_800 * SECOND
+"""2026-10-28T12:00:00Z."""
+DAY_NS: Final = 86_400 * SECOND
+MINUTE_NS: Final = 60 * SECOND
+FAILED, FINISHED = 'mfailed', 'mfinished'
+SENSORS: Final = {
+    'camera': ('/camera/compressed', 'sensor_msgs/msg/CompressedImage', 'jpg', 'image/jpeg'),
+    'odom': ('/odom', 'nav_msgs/msg/Odometry', 'json', 'application/json'),
+}
+
+
+def row(sensor: str, stamp_ns: int, robot: str = 'thor', **more: str) -> schema.Row:
+    """The row of one object as a robot writes it; place and battery follow from the time."""
+    topic, kind, extension, content_type = SENSORS[sensor]
+    turn = stamp_ns % DAY_NS / DAY_NS * 48 * math.pi
+    minute = stamp_ns // MINUTE_NS
+    mission = {10: FAILED, 40: FINISHED}.get(minute % 60 // 10 * 10)
+    metadata = {
+        'robot': robot, 'sensor': sensor, 'topic': topic, 'type': kind, 'count': '1', 't_start_ns': str(stamp_ns),
+        't_end_ns': str(stamp_ns), 'sha256': hashlib.sha256(content(sensor, stamp_ns)).hexdigest(),
+        'pose': f'{6 * math.cos(turn):.3f} {4 * math.sin(turn):.3f} {turn % 6.28:.4f} odom',
+        'battery_pct': f'{100 - stamp_ns % DAY_NS / DAY_NS * 80:.1f}',
+        **({'mission_id': mission, 'run_id': f'run-{mission}', 'mission_type': 'patrol'} if mission else {}), **more,
+    }  # fmt: skip
+    key = f'{robot}/{sensor}/{utc(stamp_ns):%Y%m%d/%H%M%S}_x.{extension}'
+    return schema.row_of(schema.BUCKET, key, len(content(sensor, stamp_ns)), content_type, metadata)
+
+
+def content(sensor: str, stamp_ns: int) -> bytes:
+    """What the object of a row holds."""
+    return f'{sensor} {stamp_ns} '.encode() * 20
+
+
+Minute = tuple[int, list[schema.Row]]
+
+
+def minutes(days: Sequence[int] = (0, 1), hours: Sequence[int] = (11, 12), robot: str = 'thor') -> Iterator[Minute]:
+    """(begin, rows) of every fifth minute of these hours; 0 is the day of ``NOON_NS``."""
+    for day in days:
+        for hour in hours:
+            for minute in range(0, 60, 5):
+                begin_ns = NOON_NS - 12 * 60 * MINUTE_NS + day * DAY_NS + (hour * 60 + minute) * MINUTE_NS
+                rows = [row(sensor, begin_ns + second * SECOND, robot) for second in range(0, 60, 15) for sensor in SENSORS]
+                yield begin_ns, rows
+
+
+def add_part(store: ObjectStore, rows: Sequence[schema.Row], name: str, folder: Path) -> str:
+    """A part of the catalogue, as the robot delivers it."""
+    robot = str(rows[0]['robot'])
+    key = schema.part_key(robot, schema.date_of(rows[0]), name)
+    add(store, folder, key, parts.encode(rows), {'robot': robot})
+    return key
+
+
+def add(store: ObjectStore, folder: Path, key: str, body: bytes, metadata: dict[str, str] | None = None,
+        bucket: str = schema.BUCKET, content_type: str = 'application/octet-stream') -> None:  # fmt: skip
+    """An object in the store."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / 'body'
+    path.write_bytes(body)
+    sha256 = hashlib.sha256(body).hexdigest()
+    store.put(SpooledObject(id=0, bucket=bucket, key=key, path=path, size=len(body), sha256=sha256, content_type=content_type,
+                            metadata=metadata or {}, priority=5, created_ns=0))  # fmt: skip
+
+
+def fill(settings: StoreSettings, folder: Path, **which: Any) -> list[schema.Row]:
+    """The parts of some minutes, and the missions' summaries; the rows that the catalogue has then."""
+    every: list[schema.Row] = []
+    with closing(open_store(settings, UploadSettings())) as store:
+        for begin_ns, rows in minutes(**which):
+            add_part(store, rows, f'{utc(begin_ns):%Y%m%dT%H%M%S}_boot', folder)
+            every += rows
+        for mission, success in ((FAILED, False), (FINISHED, True)):
+            told = {'mission_id': mission, 'success': success, 'result': 'FINISHED' if success else 'FAILED', 'distance_m': 12.5,
+                    'mission_type': 'patrol', 'mission_command': 'go round', 'duration_s': 600}  # fmt: skip
+            add(store, folder, f'thor/missions/run-{mission}/summary.json', json.dumps(told).encode())
+    return every
+
+
+def folder_store(root: Path) -> StoreSettings:
+    return StoreSettings(directory=root / 'store')
+
+
+class Watched:
+    """A source that remembers what it was asked for, and may be told to fail."""
+
+    def __init__(self, inner: Source) -> None:
+        self.inner = inner
+        self.settings, self.bucket = inner.settings, inner.bucket
+        self.asked: list[tuple[str, str]] = []
+        self._lock = threading.Lock()
+
+    def describe(self) -> str:
+        return self.inner.describe()
+
+    def _ask(self, verb: str, key: str) -> None:
+        with self._lock:
+            self.asked.append((verb, key))
+
+    def folders(self, prefix: str) -> list[str]:
+        self._ask('folders', prefix)
+        return self.inner.folders(prefix)
+
+    def list(self, prefix: str) -> Iterator[Entry]:
+        self._ask('list', prefix)
+        return self.inner.list(prefix)
+
+    def read(self, key: str) -> bytes:
+        self._ask('read', key)
+        return self.inner.read(key)
+
+    def tail(self, key: str, count: int) -> bytes:
+        self._ask('tail', key)
+        return self.inner.tail(key, count)
+
+    def get(self, key: str) -> Any:
+        self._ask('get', key)
+        return self.inner.get(key)
+
+    def head(self, key: str) -> Any:
+        self._ask('head', key)
+        return self.inner.head(key)
+
+    def delete(self, keys: Sequence[str]) -> None:
+        for key in keys:
+            self._ask('delete', key)
+        self.inner.delete(keys)
+
+
+def watched(settings: StoreSettings, bucket: str = schema.BUCKET) -> Watched:
+    return Watched(open_source(settings, bucket))
+
+
+def keys(rows: Sequence[schema.Row]) -> list[str]:
+    return sorted(row['key'] for row in rows)

@@ -1,0 +1,303 @@
+"""What is asked for lies in the folder, whole and verified; what lies there already is not moved again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from faults.front import Front
+from faults.kinds import Fault
+from lake.making import Watched, add, folder_store, watched
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import CredentialsRejected, LakeError, StoreUnavailable
+from shadowhound_data_logger.lake.fetch import Result, Wish, fetch, under
+from shadowhound_data_logger.lake.fetched import Fetched
+from shadowhound_data_logger.lake.schema import BUCKET
+from shadowhound_data_logger.lake.source import Content, open_source
+from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.stores import open_store
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.sim.tower import Tower
+
+COUNT = 30
+PREFIX = 'thor/camera/20261028/'
+OBJECTS = {f'{PREFIX}{number:06d}_front.jpg': os.urandom(500 + number) for number in range(COUNT)}
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> StoreSettings:
+    settings = folder_store(tmp_path)
+    fill(settings, tmp_path / 'tmp')
+    return settings
+
+
+def fill(settings: StoreSettings, folder: Path) -> None:
+    with closing(open_store(settings, UploadSettings())) as store:
+        for key, body in OBJECTS.items():
+            add(store, folder, key, body)
+        add(store, folder, 'thor/camera/20261029/000000_front.jpg', b'another day')
+
+
+def run(source: Watched, to: Path, **how: Any) -> Result:
+    """Everything under the prefix; the source remembers what that took."""
+    wishes = how.pop('wishes', None) or under(source, PREFIX)
+    return fetch(wishes, to, lambda _: source, **how)
+
+
+def moved(source: Watched) -> list[str]:
+    return [key for verb, key in source.asked if verb == 'get']
+
+
+def whole(to: Path) -> bool:
+    return {str(path.relative_to(to)): path.read_bytes() for path in (to / 'thor').rglob('*.jpg')} == OBJECTS
+
+
+def test_a_prefix_keeps_its_layout_and_a_second_run_moves_nothing(settings: StoreSettings, tmp_path: Path) -> None:
+    """Exactly the objects under it, each at DIR/KEY; then one listing and not one object more."""
+    source, to = watched(settings), tmp_path / 'data'
+    assert run(source, to) == Result(moved=COUNT, bytes=sum(map(len, OBJECTS.values())))
+    assert whole(to)
+    source.asked.clear()
+    assert run(source, to) == Result(present=COUNT)
+    assert source.asked == [('list', PREFIX)]
+
+
+@pytest.mark.parametrize('prefix', ['thor/camera/2026102', 'thor/camera/20261028', 'thor/cam', 'thor/camera/20261028/00001'])
+def test_a_prefix_need_not_end_at_a_folder(settings: StoreSettings, prefix: str) -> None:
+    """As in S3."""
+    expected = sorted(key for key in [*OBJECTS, 'thor/camera/20261029/000000_front.jpg'] if key.startswith(prefix))
+    assert [wish.key for wish in under(open_source(settings, BUCKET), prefix)] == expected
+
+
+def test_what_was_changed_on_this_side_is_fetched_again(settings: StoreSettings, tmp_path: Path) -> None:
+    """A file that is gone, of another size, or written since; only those."""
+    source, to = watched(settings), tmp_path / 'data'
+    run(source, to)
+    gone, short, touched, *_ = OBJECTS
+    (to / gone).unlink()
+    (to / short).write_bytes(b'short')
+    (to / touched).write_bytes(bytes(len(OBJECTS[touched])))
+    source.asked.clear()
+    assert run(source, to).moved == 3
+    assert sorted(moved(source)) == sorted([gone, short, touched])
+    assert whole(to)
+
+
+def test_verify_finds_what_has_the_right_size_and_time(settings: StoreSettings, tmp_path: Path) -> None:
+    """A bit that rotted on this disk."""
+    source, to = watched(settings), tmp_path / 'data'
+    run(source, to)
+    rotten = to / next(iter(OBJECTS))
+    seen = rotten.stat()
+    rotten.write_bytes(bytes(seen.st_size))
+    os.utime(rotten, ns=(seen.st_atime_ns, seen.st_mtime_ns))
+    assert run(source, to) == Result(present=COUNT)
+    assert not whole(to)
+    assert run(source, to, verify=True).moved == 1
+    assert whole(to)
+
+
+def test_what_another_program_fetched_is_read_and_not_moved(settings: StoreSettings, tmp_path: Path) -> None:
+    """A folder that `aws s3 sync` or a lost memory left: the content is compared, nothing is transferred."""
+    source, to = watched(settings), tmp_path / 'data'
+    for key, body in OBJECTS.items():
+        (to / key).parent.mkdir(parents=True, exist_ok=True)
+        (to / key).write_bytes(body)
+    (to / '.fetch').mkdir()
+    (to / '.fetch' / 'files.db').write_bytes(b'no database at all' * 100)
+    assert run(source, to) == Result(present=COUNT)
+    assert moved(source) == []
+
+
+def test_damage_on_the_way_is_tried_again_and_never_kept(settings: StoreSettings, tmp_path: Path) -> None:
+    """Once is repaired; for ever is a failure that names both checksums, and no file of that name."""
+    once, always, *_ = OBJECTS
+    damaged = {once: 1, always: 99}
+
+    class Damaging(Watched):
+        def get(self, key: str) -> Content:
+            content = super().get(key)
+            if damaged.get(key, 0):
+                damaged[key] -= 1
+                return replace(content, pieces=iter([bytes(content.size)]))
+            return content
+
+    source, to = Damaging(open_source(settings, BUCKET)), tmp_path / 'data'
+    found = run(source, to)
+    assert (found.moved, list(found.failed)) == (COUNT - 1, [f'{BUCKET}/{always}'])
+    assert 'SHA-256' in found.failed[f'{BUCKET}/{always}']
+    assert not (to / always).exists()
+    assert (to / once).read_bytes() == OBJECTS[once]
+    assert list((to / '.fetch' / 'parts').iterdir()) == []
+
+
+def test_the_word_of_the_catalogue_counts(settings: StoreSettings, tmp_path: Path) -> None:
+    """An object that is not what its row says is a failure, whatever it says of itself."""
+    key = next(iter(OBJECTS))
+    found = run(watched(settings), tmp_path / 'data', wishes=[Wish(BUCKET, key, len(OBJECTS[key]), sha256='0' * 64)])
+    assert list(found.failed) == [f'{BUCKET}/{key}']
+
+
+def test_an_object_without_a_checksum_has_its_size_alone(settings: StoreSettings, tmp_path: Path) -> None:
+    """Said so, and looked at again the next time."""
+    key = next(iter(OBJECTS))
+    (settings.directory / '.metadata' / BUCKET / f'{key}.json').unlink()
+    source = watched(settings)
+    assert run(source, tmp_path / 'data').unverified == 1
+    source.asked.clear()
+    assert run(source, tmp_path / 'data').moved == 1
+    assert moved(source) == [key]
+
+
+@pytest.mark.parametrize('key', ['../outside', '/etc/passwd', 'a//b', 'a/./b', 'a/../../b', '.fetch/files.db', ''])
+def test_no_key_leads_out_of_the_folder(settings: StoreSettings, tmp_path: Path, key: str) -> None:
+    """Anybody may have written to a bucket."""
+    source = watched(settings)
+    found = run(source, tmp_path / 'data', wishes=[Wish(BUCKET, key, 3)])
+    assert list(found.failed) == [f'{BUCKET}/{key}']
+    assert source.asked == []
+
+
+def test_one_that_cannot_be_fetched_stops_no_other(settings: StoreSettings, tmp_path: Path) -> None:
+    """Gone meanwhile, a folder where the file should be, the same key in two buckets: each is told with its reason."""
+    keys = list(OBJECTS)
+    to = tmp_path / 'data'
+    (to / keys[0]).mkdir(parents=True)
+    wishes = [*under(open_source(settings, BUCKET), PREFIX), Wish(BUCKET, 'thor/gone', 3), Wish('other', keys[1], 3)]
+    found = run(watched(settings), to, wishes=wishes)
+    assert found.moved == COUNT - 1
+    assert set(found.failed) == {f'{BUCKET}/{keys[0]}', f'{BUCKET}/thor/gone', f'other/{keys[1]}'}
+    assert all(found.failed.values())
+
+
+def test_a_store_that_is_away_ends_it(settings: StoreSettings, tmp_path: Path) -> None:
+    """Not each of a million objects is tried; what concerns all of them is raised."""
+    tried = 0
+
+    class Away(Watched):
+        def get(self, key: str) -> Content:
+            nonlocal tried
+            tried += 1
+            raise error
+
+    source = Away(open_source(settings, BUCKET))
+    wishes = [Wish(BUCKET, f'thor/{number}', 3) for number in range(2000)]
+    error: Exception = StoreUnavailable('away')
+    with pytest.raises(StoreUnavailable):
+        run(source, tmp_path / 'data', wishes=wishes, threads=2)
+    assert tried < 200
+    error = CredentialsRejected('no')
+    with pytest.raises(CredentialsRejected):
+        run(source, tmp_path / 'data', wishes=wishes, threads=2)
+
+
+def test_two_do_not_write_to_one_folder(settings: StoreSettings, tmp_path: Path) -> None:
+    """The second says so."""
+    with Fetched(tmp_path / 'data'), pytest.raises(LakeError, match='another fetch'):
+        run(watched(settings), tmp_path / 'data')
+
+
+def test_what_was_not_synced_is_read_again_after_a_power_cut(settings: StoreSettings, tmp_path: Path) -> None:
+    """Noted by a run that was killed, in another boot: the file is hashed, and moved if it is not whole."""
+    source, to = watched(settings), tmp_path / 'data'
+    run(source, to)
+    with closing(sqlite3.connect(to / '.fetch' / 'files.db')) as db, db:
+        db.execute("UPDATE files SET boot = 'another'")
+    zeros = to / next(iter(OBJECTS))
+    seen = zeros.stat()
+    zeros.write_bytes(bytes(seen.st_size))
+    os.utime(zeros, ns=(seen.st_atime_ns, seen.st_mtime_ns))
+    source.asked.clear()
+    assert run(source, to).moved == 1
+    assert moved(source) == [str(zeros.relative_to(to))]
+    assert whole(to)
+
+
+def test_progress_adds_up(settings: StoreSettings, tmp_path: Path) -> None:
+    """Bytes and objects that are told, also of what was there already, are those that were asked for."""
+    told = [0, 0]
+
+    def tell(size: int, objects: int) -> None:
+        told[0] += size
+        told[1] += objects
+
+    for _ in range(2):
+        told[:] = [0, 0]
+        run(watched(settings), tmp_path / 'data', tell=tell, threads=1)
+        assert told == [sum(map(len, OBJECTS.values())), COUNT]
+
+
+@pytest.fixture(scope='module')
+def real(seaweed: Tower, tmp_path_factory: pytest.TempPathFactory) -> Tower:
+    fill(seaweed.store_settings(), tmp_path_factory.mktemp('real'))
+    return seaweed
+
+
+@pytest.mark.seaweedfs
+def test_from_a_real_server(real: Tower, tmp_path: Path) -> None:
+    """The same over S3, with an empty object and one of several pieces; the second run asks for no object."""
+    with closing(open_store(real.store_settings(), UploadSettings())) as store:
+        add(store, tmp_path / 'tmp', 'thor/rosbags/large/0.mcap', os.urandom(5 << 20))
+        add(store, tmp_path / 'tmp', 'thor/rosbags/large/empty', b'')
+    source, to = watched(real.store_settings()), tmp_path / 'data'
+    assert run(source, to).moved == COUNT
+    assert whole(to)
+    assert run(source, to, wishes=under(source, 'thor/rosbags/large/')) == Result(moved=2, bytes=5 << 20)
+    source.asked.clear()
+    assert run(source, to) == Result(present=COUNT)
+    assert moved(source) == []
+    with pytest.raises(StoreUnavailable):
+        run(watched(replace(real.store_settings(), endpoint_url='http://127.0.0.1:9')), to)
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from shadowhound_data_logger.lake import fetch
+from shadowhound_data_logger.lake.source import open_source
+from shadowhound_data_logger.options import StoreSettings
+settings = StoreSettings(endpoint_url=sys.argv[2], access_key_id=sys.argv[3], secret_access_key=sys.argv[4])
+source = open_source(settings, 'sensor-data')
+fetch.NOTE_S = 0.0
+fetch.fetch(fetch.under(source, sys.argv[5]), Path(sys.argv[1]), lambda _: source, threads=2)
+"""
+
+
+@pytest.mark.seaweedfs
+def test_killed_it_goes_on_where_it_was(real: Tower, tmp_path: Path) -> None:
+    """After a kill -9 in the middle every file that is there is whole, and the next run moves only the others."""
+    to, plain = tmp_path / 'data', real.store_settings()
+    asked = 0
+
+    def hang_after_ten() -> Fault:
+        nonlocal asked
+        asked += 1
+        return Fault.NONE if asked <= 10 else Fault.HUNG
+
+    with Front(real.endpoint_url, hang_after_ten) as front:
+        arguments = [str(to), front.url, str(plain.access_key_id), str(plain.secret_access_key), PREFIX]
+        with subprocess.Popen([sys.executable, '-c', PROGRAM, *arguments]) as process:
+            end = time.monotonic() + 60
+            while len(list(to.rglob('*.jpg'))) < 6:
+                assert time.monotonic() < end, 'it fetches nothing'
+                assert process.poll() is None
+                time.sleep(0.02)
+            process.send_signal(signal.SIGKILL)
+    there = {str(path.relative_to(to)) for path in (to / 'thor').rglob('*.jpg')}
+    assert 6 <= len(there) < COUNT
+    assert all((to / key).read_bytes() == OBJECTS[key] for key in there)
+    source = watched(plain)
+    assert run(source, to).moved == COUNT - len(there)
+    assert not set(moved(source)) & there
+    assert whole(to)

@@ -1,0 +1,220 @@
+"""A question is answered with exactly the rows that it means, and only what can hold them is asked for."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from faults.front import Front
+from lake.making import DAY_NS, FAILED, FINISHED, NOON_NS, Watched, add, fill, folder_store, keys, minutes, watched
+
+from shadowhound_data_logger import lake
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import CredentialsRejected, LakeError
+from shadowhound_data_logger.lake import schema
+from shadowhound_data_logger.lake.query import answering
+from shadowhound_data_logger.lake.source import open_source
+from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.stores import open_store
+
+if TYPE_CHECKING:
+    from faults.upstream import Request
+
+    from shadowhound_data_logger.sim.tower import Tower
+
+DAY = {'since': '2026-10-28', 'until': '2026-10-29'}
+
+
+@pytest.fixture(scope='module')
+def world(tmp_path_factory: pytest.TempPathFactory) -> tuple[StoreSettings, list[schema.Row]]:
+    """Two days of a small robot in a folder."""
+    root = tmp_path_factory.mktemp('lake')
+    return folder_store(root), fill(folder_store(root), root / 'tmp')
+
+
+def found(source: Any, **flags: Any) -> list[str]:
+    return sorted(lake.objects(source, **flags).select('key').to_pydict()['key'])
+
+
+@pytest.mark.parametrize(
+    ('flags', 'holds'),
+    [
+        ({}, lambda _: True),
+        ({'sensor': 'camera'}, lambda row: row['sensor'] == 'camera'),
+        ({'topic': '/odom', 'robot': 'thor'}, lambda row: row['topic'] == '/odom'),
+        ({'robot': 'tachi'}, lambda _: False),
+        (DAY, lambda row: NOON_NS - DAY_NS // 2 <= row['t_start_ns'] < NOON_NS + DAY_NS // 2),
+        ({'since': '2026-10-29T11:30:15'}, lambda row: row['t_start_ns'] >= NOON_NS + DAY_NS - 1785 * 10**9),
+        ({'until': '2026-10-28T11:30:15'}, lambda row: row['t_start_ns'] < NOON_NS - 1785 * 10**9),
+        ({'near': (3.0, 1.5, 2.0)}, lambda row: (row['x'] - 3) ** 2 + (row['y'] - 1.5) ** 2 <= 4),
+        ({'near': '-6,0,0.5', **DAY}, lambda row: (row['x'] + 6) ** 2 + row['y'] ** 2 <= 0.25
+                                                  and row['t_start_ns'] < NOON_NS + DAY_NS // 2),
+        ({'mission_type': 'patrol'}, lambda row: row['mission_type'] == 'patrol'),
+        ({'mission': 'mfail'}, lambda row: row['mission_id'] == FAILED),
+        ({'mission': 'run-mfinished'}, lambda row: row['mission_id'] == FINISHED),
+        ({'success': False}, lambda row: row['mission_id'] == FAILED),
+        ({'success': True, 'sensor': 'odom'}, lambda row: row['mission_id'] == FINISHED and row['sensor'] == 'odom'),
+        ({'where': "battery_pct < 62 AND key LIKE '%.jpg'"}, lambda row: row['battery_pct'] < 62 and row['sensor'] == 'camera'),
+    ],
+    ids=lambda value: str(value)[:40] if isinstance(value, dict) else '',
+)  # fmt: skip
+def test_flags_mean_what_they_say(
+    world: tuple[StoreSettings, list[schema.Row]], flags: dict[str, Any], holds: Callable[[schema.Row], bool]
+) -> None:
+    """The answer is what a loop over all rows finds."""
+    settings, rows = world
+    expected = keys([row for row in rows if holds(row)])
+    assert found(open_source(settings, schema.BUCKET), **flags) == expected
+    assert bool(expected) != (flags == {'robot': 'tachi'}), 'a question that nothing answers proves nothing'
+
+
+def test_every_column_comes_back_as_it_was_written(world: tuple[StoreSettings, list[schema.Row]]) -> None:
+    """Names, order and values; times in UTC."""
+    settings, rows = world
+    answer = lake.objects(open_source(settings, schema.BUCKET), sensor='camera').sort('t_start_ns').limit(1).to_pylist()
+    first = min((row for row in rows if row['sensor'] == 'camera'), key=lambda row: row['t_start_ns'])
+    assert list(answer[0]) == list(schema.COLUMNS)
+    times = {'t_start', 't_end'}
+    assert {name: value for name, value in answer[0].items() if name not in times} == {
+        name: value for name, value in first.items() if name not in times
+    }
+    assert answer[0]['t_start'].timestamp() * 1e6 == first['t_start']
+
+
+def test_only_the_asked_days_are_asked_for(world: tuple[StoreSettings, list[schema.Row]]) -> None:
+    """Of another day not even the names; making a frame asks for nothing at all."""
+    settings, _ = world
+    source = watched(settings)
+    frame = lake.objects(source, **DAY)
+    assert source.asked == []
+    frame.collect()
+    assert {verb for verb, _ in source.asked} == {'folders', 'list', 'read'}
+    assert [key for verb, key in source.asked if verb == 'folders'] == ['']
+    assert {key for verb, key in source.asked if verb == 'list'} == {'thor/_catalog/date=2026-10-28/'}
+    assert all(key.startswith('thor/_catalog/date=2026-10-28/') for verb, key in source.asked if verb == 'read')
+    assert len({key for verb, key in source.asked if verb == 'read'}) == 24
+
+
+def test_a_robot_that_is_named_is_not_looked_for(world: tuple[StoreSettings, list[schema.Row]]) -> None:
+    """One listing of one folder, then its parts."""
+    source = watched(world[0])
+    lake.objects(source, robot='thor', **DAY).collect()
+    assert [verb for verb, _ in source.asked].count('list') == 1
+    assert 'folders' not in {verb for verb, _ in source.asked}
+
+
+def test_sql_over_the_views(world: tuple[StoreSettings, list[schema.Row]]) -> None:
+    """``objects``, ``topics`` and ``missions`` agree with one another, within the flags."""
+    source = open_source(world[0], schema.BUCKET)
+    day = [row for row in world[1] if schema.date_of(row) == '2026-10-28']
+    counted = lake.sql('SELECT sensor, count(*) AS n FROM objects GROUP BY sensor ORDER BY sensor', source, **DAY).to_pydict()
+    assert counted == {'sensor': ['camera', 'odom'], 'n': [len(day) // 2, len(day) // 2]}
+    topics = lake.sql('SELECT topic, objects, messages FROM topics ORDER BY topic', source, **DAY).to_pydict()
+    assert topics == {'topic': ['/camera/compressed', '/odom'], 'objects': counted['n'], 'messages': counted['n']}
+    failed = lake.sql(
+        'SELECT m.result, count(*) AS n FROM objects o JOIN missions m ON o.mission_id = m.mission_id '
+        'WHERE NOT m.success GROUP BY m.result', source, **DAY,
+    ).to_pydict()  # fmt: skip
+    assert failed == {'result': ['FAILED'], 'n': [sum(row['mission_id'] == FAILED for row in day)]}
+
+
+def test_a_mission_without_a_summary_is_told_without_an_end(tmp_path: Path) -> None:
+    """It goes on, or its robot is away: neither failed nor succeeded."""
+    settings = folder_store(tmp_path)
+    fill(settings, tmp_path / 'tmp', days=(0,), hours=(11,))
+    source = open_source(settings, schema.BUCKET)
+    source.delete([f'thor/missions/run-{FAILED}/summary.json'])
+    store = open_store(settings, UploadSettings())
+    add(store, tmp_path / 'tmp', 'thor/missions/run-x/summary.json', b'{broken')
+    told = lake.missions(source).sort('mission_id').to_pydict()
+    assert told['mission_id'] == [FAILED, FINISHED]
+    assert told['success'] == [None, True]
+    assert told['duration_s'] == [None, 600.0]
+    assert found(source, success=False) == []
+
+
+@pytest.mark.parametrize(
+    'ask',
+    [
+        lambda source: lake.objects(source, where='no_such_column < 3').collect(),
+        lambda source: lake.objects(source, where='<<'),
+        lambda source: lake.sql('SELEC 1', source),
+        lambda source: lake.sql('SELECT key FROM nothing', source),
+        lambda source: lake.sql('SELECT nope(key) FROM objects', source),
+    ],
+)
+def test_what_is_no_question_is_one_kind_of_error(
+    world: tuple[StoreSettings, list[schema.Row]], ask: Callable[[Any], object]
+) -> None:
+    """A LakeError that says what Daft could not make sense of."""
+    with pytest.raises(LakeError, match='cannot be answered'), answering():
+        ask(open_source(world[0], schema.BUCKET))
+
+
+def test_a_lake_that_is_not_there_is_empty(tmp_path: Path) -> None:
+    """No store yet, no catalogue yet: no rows, no error."""
+    source = open_source(folder_store(tmp_path), schema.BUCKET)
+    assert found(source) == []
+    assert lake.missions(source).to_pydict()['mission_id'] == []
+    assert lake.topics(source, **DAY).to_pydict()['topic'] == []
+
+
+class Recorder(Front):
+    """A front that notes the target of each request."""
+
+    targets: list[str]
+
+    def forward(self, request: Request, *, slowly: bool = False) -> bytes:
+        self.targets.append(f'{request.method} {request.target}')
+        return super().forward(request, slowly=slowly)
+
+
+def through(front: Front, tower: Tower) -> StoreSettings:
+    plain = tower.store_settings()
+    return StoreSettings(endpoint_url=front.url, access_key_id=plain.access_key_id, secret_access_key=plain.secret_access_key)
+
+
+@pytest.mark.seaweedfs
+def test_a_real_server_is_asked_for_that_day_alone(seaweed: Tower, tmp_path: Path) -> None:
+    """What goes over the wire names no other day; the answer is that of the folder; no secret shows anywhere."""
+    fill(seaweed.store_settings(), tmp_path)
+    rows = [row for _, each in minutes() for row in each]
+    with Recorder(seaweed.endpoint_url) as front:
+        front.targets = []
+        settings = through(front, seaweed)
+        source = Watched(open_source(settings, schema.BUCKET))
+        frame = lake.objects(source, **DAY, near=(3.0, 1.5, 2.0), where='battery_pct < 62')
+        answer = frame.select('key').to_pydict()['key']
+        dated = [target for target in front.targets if 'date' in target]
+        assert len(dated) == 25
+        assert all('date%3D2026-10-28' in target or 'date=2026-10-28' in target for target in dated)
+    expected = [
+        row for row in rows
+        if schema.date_of(row) == '2026-10-28' and row['battery_pct'] < 62 and (row['x'] - 3) ** 2 + (row['y'] - 1.5) ** 2 <= 4
+    ]  # fmt: skip
+    assert sorted(answer) == keys(expected)
+    assert expected
+    shown = f'{source.inner!r} {source.describe()} {frame}'
+    assert settings.secret_access_key not in shown
+    assert settings.access_key_id not in shown
+
+
+@pytest.mark.seaweedfs
+def test_wrong_credentials_are_told_without_showing_them(seaweed: Tower) -> None:
+    """The error is ours and has neither key nor secret."""
+    plain = seaweed.store_settings()
+    wrong = StoreSettings(endpoint_url=plain.endpoint_url, access_key_id=plain.access_key_id, secret_access_key='not the secret')
+    with pytest.raises(CredentialsRejected) as caught:
+        lake.objects(open_source(wrong, schema.BUCKET)).collect()
+    assert plain.access_key_id not in str(caught.value)
+    assert 'not the secret' not in str(caught.value)
+    assert 'AWS_SECRET_ACCESS_KEY' in str(caught.value)
+
+
+def test_a_source_can_be_sent_to_another_process(world: tuple[StoreSettings, list[schema.Row]]) -> None:
+    """As Ray does it."""
+    source = pickle.loads(pickle.dumps(open_source(world[0], schema.BUCKET)))  # noqa: S301 - our own
+    assert len(found(source, **DAY)) == len(world[1]) // 2

@@ -1,0 +1,112 @@
+"""A catalogue that is lost is made again from the objects, and what was never in it comes into it, each row once."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lake.making import DAY_NS, NOON_NS, SENSORS, Watched, add, add_part, content, folder_store, keys, row
+
+from shadowhound_data_logger import lake
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import StoreUnavailable
+from shadowhound_data_logger.lake import reindex as library
+from shadowhound_data_logger.lake import schema
+from shadowhound_data_logger.lake.compact import compact
+from shadowhound_data_logger.lake.source import open_source
+from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.stores import open_store
+
+TIMES = [NOON_NS + second * SECOND for second in range(0, 60, 20)] + [NOON_NS + DAY_NS]
+LATER = datetime.now(timezone.utc) + timedelta(hours=2)
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> StoreSettings:
+    """Objects with what they say of themselves, and no catalogue."""
+    settings = folder_store(tmp_path)
+    with closing(open_store(settings, UploadSettings())) as store:
+        for sensor in SENSORS:
+            for stamp_ns in TIMES:
+                made = row(sensor, stamp_ns)
+                names = ('robot', 'sensor', 'topic', 'type', 'count', 't_start_ns', 't_end_ns')
+                metadata = {name: str(made[name]) for name in names}
+                metadata |= {'pose': f'{made["x"]} {made["y"]} {made["yaw"]} odom', 'battery_pct': str(made['battery_pct'])}
+                add(store, tmp_path / 'tmp', made['key'], content(sensor, stamp_ns), metadata, content_type=made['content_type'])
+        add(store, tmp_path / 'tmp', 'thor/patrol_20261028_120000.csv', b'x,y', bucket='trajectories')
+    return settings
+
+
+ROWS = [row(sensor, stamp_ns) for sensor in SENSORS for stamp_ns in TIMES]
+ALL = sorted([*keys(ROWS), 'thor/patrol_20261028_120000.csv'])
+
+
+def run(settings: StoreSettings, robot: str = 'thor') -> library.Reindexed:
+    with closing(open_store(settings, UploadSettings())) as store:
+        return library.reindex(open_source(settings, schema.BUCKET), store, robot)
+
+
+def answer(settings: StoreSettings, **flags: Any) -> list[str]:
+    return sorted(lake.objects(open_source(settings, schema.BUCKET), **flags).select('key').to_pydict()['key'])
+
+
+def test_a_lost_catalogue_is_made_again(settings: StoreSettings) -> None:
+    """All rows, with what the robot would have written; a second run adds nothing."""
+    found = run(settings)
+    assert (found.listed, found.added, found.gone) == (9, 9, 0)
+    assert answer(settings) == ALL
+    made = {one['key']: one for one in lake.objects(open_source(settings, schema.BUCKET), robot='thor').to_pylist()}
+    for expected in ROWS:
+        kept = {name for name in schema.COLUMNS if name not in {'t_start', 't_end', 'mission_id', 'run_id', 'mission_type'}}
+        assert {name: made[expected['key']][name] for name in kept} == {name: expected[name] for name in kept}
+    assert run(settings).added == 0
+    assert answer(settings) == ALL
+
+
+def test_only_what_is_missing_is_asked(settings: StoreSettings, tmp_path: Path) -> None:
+    """What the robot's parts have is listed and nothing more; what they name that is gone is counted, and stays."""
+    with closing(open_store(settings, UploadSettings())) as store:
+        add_part(store, [row('odom', stamp_ns) for stamp_ns in (*TIMES[:3], NOON_NS + 5 * SECOND)], 'part', tmp_path / 'tmp')
+    found = run(settings)
+    assert (found.listed, found.added, found.gone) == (9, 6, 1)
+    assert answer(settings) == sorted([*ALL, row('odom', NOON_NS + 5 * SECOND)['key']])
+
+
+def test_a_part_that_comes_after_it_adds_no_row_twice(settings: StoreSettings, tmp_path: Path) -> None:
+    """Robots deliver parts after the objects: before and after compaction a row that stands in two files is one row."""
+    run(settings)
+    with closing(open_store(settings, UploadSettings())) as store:
+        add_part(store, [row(sensor, stamp_ns) for sensor in SENSORS for stamp_ns in TIMES[:3]], 'late', tmp_path / 'tmp')
+        assert answer(settings) == ALL
+        assert len(lake.objects(open_source(settings, schema.BUCKET), sensor='camera').collect()) == len(TIMES)
+        source = open_source(settings, schema.BUCKET)
+        for now in (datetime(2026, 10, 30, tzinfo=timezone.utc), LATER):
+            list(compact(source, store, before='2026-10-30', now=lambda now=now: now))  # type: ignore[misc]
+        assert answer(settings) == ALL
+        add_part(store, [row('camera', TIMES[0])], 'later', tmp_path / 'tmp')
+    assert answer(settings) == ALL
+
+
+def test_it_goes_on_where_it_died(settings: StoreSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parts of what was asked so far are there; the next run asks for the rest."""
+    monkeypatch.setattr(library, 'PAGE', 4)
+    asked: list[str] = []
+    plain = library.open_source
+
+    class Flaky(Watched):
+        def head(self, key: str) -> Any:
+            asked.append(key)
+            if len(asked) > 6:
+                raise StoreUnavailable('away')
+            return super().head(key)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(library, 'open_source', lambda *place: Flaky(plain(*place)))
+        with pytest.raises(StoreUnavailable):
+            run(settings)
+    assert run(settings).added == 5
+    assert answer(settings) == ALL

@@ -1,0 +1,88 @@
+"""A question in words becomes times, a circle, and the dates whose parts can hold the answer."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta, timezone
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from lake.making import DAY_NS, NOON_NS
+
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.lake.schema import UNDATED
+from shadowhound_data_logger.lake.select import Wanted, moment, wanted
+
+MIDNIGHT_NS = NOON_NS - DAY_NS // 2
+
+
+@pytest.mark.parametrize(
+    ('text', 'ns'),
+    [
+        ('now', NOON_NS), ('today', MIDNIGHT_NS), ('Yesterday', MIDNIGHT_NS - DAY_NS), ('2h', NOON_NS - 7200 * SECOND),
+        ('30min', NOON_NS - 1800 * SECOND), ('1.5 d', NOON_NS - DAY_NS * 3 // 2), ('2026-10-28', MIDNIGHT_NS),
+        ('2026-10-28T12:00', NOON_NS), ('2026-10-28 12:00:00.000001', NOON_NS + 1000), ('2026-10-28T12:00:00Z', NOON_NS),
+        ('2026-10-28T14:00:00+02:00', NOON_NS), (datetime(2026, 10, 28, 12, tzinfo=timezone.utc), NOON_NS),
+        (datetime(2026, 10, 28, 14, tzinfo=timezone(timedelta(hours=2))), NOON_NS),
+    ],
+)  # fmt: skip
+def test_times_in_words(text: str | datetime, ns: int) -> None:
+    """UTC unless a zone is named; a date is its beginning."""
+    assert moment('since', text, NOON_NS) == ns
+
+
+@pytest.mark.parametrize('text', ['', 'tomorrow', '2 fortnights', '2026-13-01', '-2h', '9e999d', 'h'])
+def test_what_is_no_time_is_refused_by_name(text: str) -> None:
+    """The error names the flag, the value and what is allowed."""
+    with pytest.raises(SettingError, match='until') as caught:
+        moment('until', text, NOON_NS)
+    assert caught.value.data['value'] == text
+    assert 'yesterday' in str(caught.value)
+
+
+@pytest.mark.parametrize('near', ['1,2', '1,2,0', '1,2,-3', 'a,b,c', '1,2,nan', '1,2,3,4'])
+def test_what_is_no_circle_is_refused(near: str) -> None:
+    """A radius is positive and all three are numbers."""
+    with pytest.raises(SettingError, match='near'):
+        wanted(NOON_NS, near=near)
+
+
+@given(st.integers(0, 40 * DAY_NS), st.integers(1, 40 * DAY_NS), st.integers(0, 80 * DAY_NS))
+def test_the_dates_hold_every_wanted_moment_and_no_more_days(since: int, span: int, at: int) -> None:
+    """A moment is wanted only if its date is among them; the first and the last date hold one."""
+    asked = Wanted(since_ns=MIDNIGHT_NS + since, until_ns=MIDNIGHT_NS + since + span)
+    dates = asked.dates(NOON_NS)
+    assert dates is not None
+    moment_ns = MIDNIGHT_NS + at
+    date = f'{utc(moment_ns):%Y-%m-%d}'
+    if since <= at < since + span:
+        assert date in dates
+        assert asked.has_date(date)
+    assert asked.has_date(date) == (date in dates)
+    assert dates[0] == f'{utc(MIDNIGHT_NS + since):%Y-%m-%d}'
+    assert dates[-1] == f'{utc(MIDNIGHT_NS + since + span - 1):%Y-%m-%d}'
+
+
+def test_without_an_end_it_goes_on_to_tomorrow() -> None:
+    """A robot's clock may be a day ahead (clock.FUTURE_SLACK_NS)."""
+    assert Wanted(since_ns=NOON_NS).dates(NOON_NS) == ['2026-10-28', '2026-10-29']
+
+
+def test_nothing_is_between_an_end_and_a_later_beginning() -> None:
+    """No folder is asked for."""
+    assert Wanted(since_ns=NOON_NS, until_ns=NOON_NS).dates(NOON_NS) == []
+
+
+def test_a_long_time_is_looked_up_instead() -> None:
+    """Years of folders are not asked for one by one; neither is all that is before an end."""
+    assert Wanted(since_ns=0, until_ns=NOON_NS).dates(NOON_NS) is None
+    assert Wanted(until_ns=NOON_NS).dates(NOON_NS) is None
+    assert not Wanted(until_ns=MIDNIGHT_NS).has_date('2026-10-28')
+    assert Wanted(until_ns=MIDNIGHT_NS).has_date('2026-10-27')
+
+
+def test_what_has_no_date_is_wanted_only_without_times() -> None:
+    """Objects of a boot whose clock was never set are of no day."""
+    assert Wanted().has_date(UNDATED)
+    assert not Wanted(until_ns=NOON_NS).has_date(UNDATED)
