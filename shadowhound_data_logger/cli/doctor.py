@@ -1,0 +1,184 @@
+"""``shadowhound-data doctor``: what is wrong on this machine, why, and what to do, as text or as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from rich.console import Console, RenderableType
+from rich.padding import Padding
+from rich.progress import Progress, SpinnerColumn, TextColumn
+from rich.text import Text
+
+from shadowhound_data_logger.cli.tables import plain
+from shadowhound_data_logger.doctor.checks import CHECKS
+from shadowhound_data_logger.doctor.context import ParametersUnreadable, make
+from shadowhound_data_logger.doctor.fixes import fix as mend
+from shadowhound_data_logger.doctor.model import Check, Context, Result, Role, Severity
+from shadowhound_data_logger.doctor.run import TIMEOUT_S, Examination
+
+STYLES: Final = {
+    Severity.ERROR: 'red',
+    Severity.WARNING: 'yellow',
+    Severity.INFO: 'dim',
+    Severity.SKIPPED: 'dim',
+    Severity.OK: 'green',
+}
+INDENT: Final = (0, 0, 0, 4)
+WORDS: Final = {Severity.ERROR: 'error', Severity.WARNING: 'warning'}
+
+
+def _rates(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> dict[str, float]:
+    found = {}
+    for text in given:
+        topic, _sign, rate = text.rpartition('=')
+        try:
+            found[topic] = float(rate)
+        except ValueError:
+            topic = ''
+        if not topic:
+            raise click.BadParameter(f'{text!r} is not TOPIC=HZ, such as /imu=50')
+    return found
+
+
+def _selected(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> tuple[Check, ...]:
+    """Those whose name is one that was given, or begins with it."""
+    names = [check.name for check in CHECKS]
+    for name in given:
+        if not any(_is_of(each, name) for each in names):
+            raise click.BadParameter(f'{name!r} is none of {", ".join(names)}')
+    return tuple(check for check in CHECKS if not given or any(_is_of(check.name, name) for name in given))
+
+
+def _is_of(check: str, name: str) -> bool:
+    return check == name or check.startswith(f'{name}.')
+
+
+@click.command()
+@click.option('--role', type=click.Choice([role.value for role in Role]), help='What this machine is  [default: guessed]')
+@click.option('--only', 'checks', multiple=True, metavar='CHECK', callback=_selected, help='Ask this alone; may be repeated.')
+@click.option('--json', 'as_json', is_flag=True, help='Print the results as JSON.')
+@click.option('--fix', is_flag=True, help='Do what is safe (modes of files, missing buckets); the rest is for you to paste.')
+@click.option('--timeout', type=click.FloatRange(0.5, 600.0), default=TIMEOUT_S, show_default=True, help='Seconds for all of it.')
+@click.option('--params-file', type=click.Path(path_type=Path, dir_okay=False, exists=True), envvar='SHADOWHOUND_PARAMETERS',
+              help="The node's parameter file  [default: the defaults]")  # fmt: skip
+@click.option('--namespace', default='/', help='The namespace of the node, as in -r __ns:=/tachi.')
+@click.option('--rate', 'rates', multiple=True, metavar='TOPIC=HZ', callback=_rates, help='Expect another rate; may be repeated.')
+@click.option('-v', '--verbose', is_flag=True, help='Show what is fine as well.')
+def doctor(  # noqa: PLR0913 - one for each option
+    *, role: str | None, checks: tuple[Check, ...], as_json: bool, fix: bool, timeout: float, params_file: Path | None,
+    namespace: str, rates: dict[str, float], verbose: bool,
+) -> int:  # fmt: skip
+    """Why does it not work? Asks this machine, its network, Tower and ROS, and says what to do.
+
+    Leaves probe objects of 64 bytes under ROBOT/_doctor/ in the store and the experiment _doctor in MLflow; changes nothing
+    else without --fix. Exit code 1 on errors and warnings, 0 when there are none.
+    """
+    try:
+        context = make(
+            os.environ, role=Role(role) if role else None, parameter_file=params_file, namespace=namespace, rates_hz=rates
+        )
+    except ParametersUnreadable as error:
+        raise click.BadParameter(str(error), param_hint='--params-file') from error
+    began_s = time.monotonic()
+    results = _examine([check for check in checks if context.role in check.roles], context, timeout)
+    mended = list(mend(results, context)) if fix else []
+    took_s = time.monotonic() - began_s
+    left = [result for result in results if result.is_finding and not _is_mended(result, mended)]
+    if as_json:
+        click.echo(json.dumps(_said(results, mended, context, took_s, ok=not left), indent=2))
+    else:
+        for part in view(results, mended, context, took_s, verbose=verbose):
+            console().print(part)
+    return 1 if left else 0
+
+
+def console() -> Console:
+    """Without a terminal nothing is broken into lines: a command is to be pasted."""
+    made = Console(highlight=False)
+    if not made.is_terminal:
+        made.width = 10_000
+    return made
+
+
+def _examine(checks: Sequence[Check], context: Context, timeout_s: float) -> list[Result]:
+    """With what is still under way shown meanwhile on standard error, where that is a terminal."""
+    stderr = Console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn('{task.description}'))
+    waiting = [check.name for check in checks]
+    with Progress(*columns, console=stderr, transient=True, disable=not stderr.is_terminal) as bar:
+        task = bar.add_task(f'asking {", ".join(waiting)}')
+
+        def tell(check: Check) -> None:
+            waiting.remove(check.name)
+            bar.update(task, description=f'asking {", ".join(waiting)}')
+
+        return Examination(checks, context, timeout_s=timeout_s, tell=tell).run()
+
+
+def _is_mended(result: Result, mended: Sequence[tuple[Result, str]]) -> bool:
+    return bool(result.fix) and any(one.fix == result.fix and not what.startswith('not') for one, what in mended)
+
+
+def _said(results: Sequence[Result], mended: Sequence[tuple[Result, str]], context: Context, took_s: float,
+          *, ok: bool) -> dict[str, Any]:  # fmt: skip
+    return {
+        'role': context.role.value, 'robot': context.settings.robot, 'ok': ok, 'took_s': round(took_s, 3),
+        'findings': sum(result.is_finding for result in results), 'results': [result.as_dict() for result in results],
+        'fixed': [{'check': result.check, 'what': what} for result, what in mended],
+    }  # fmt: skip
+
+
+def view(results: Sequence[Result], mended: Sequence[tuple[Result, str]], context: Context, took_s: float,
+         *, verbose: bool) -> list[RenderableType]:  # fmt: skip
+    """The verdict, each finding with cause and remedy, what was done, what is good to know, and what is fine."""
+    findings = sorted(
+        (result for result in results if result.is_finding), key=lambda result: result.severity is not Severity.ERROR
+    )
+    parts: list[RenderableType] = [_verdict(findings, context, took_s), *(part for each in findings for part in _finding(each))]
+    if mended:
+        parts += [
+            '',
+            *(plain(f'--fix: {what}  ({result.check})', 'red' if what.startswith('not') else 'green') for result, what in mended),
+        ]
+    told = [each for each in results if each.severity in {Severity.INFO, Severity.SKIPPED}]
+    if told:
+        parts.append('')
+        parts += [plain(f'{each.check}: {each.seen}' + (f' ({each.cause})' if each.cause else ''), 'dim') for each in told]
+    fine = [each for each in results if each.severity is Severity.OK]
+    if verbose:
+        parts += ['', *(Text.assemble(('ok ', 'green'), plain(f'{each.check}: {each.seen}')) for each in fine)]
+    elif fine:
+        counts = Counter(each.check.partition('.')[0] for each in fine)
+        parts += ['', Text.assemble(('Fine: ', 'green'), ', '.join(f'{name} {count}' for name, count in counts.items()),
+                                    (' (-v shows them)', 'dim'))]  # fmt: skip
+    return parts
+
+
+def _verdict(findings: Sequence[Result], context: Context, took_s: float) -> Text:
+    """``3 findings: 1 error, 2 warnings``, and of which machine."""
+    where = plain(f'  {context.role.value}, robot {context.settings.robot}, {took_s:.1f} s', 'dim')
+    if not findings:
+        return Text.assemble(('Nothing is wrong', 'bold green'), where)
+    counts = Counter(result.severity for result in findings)
+    parts = [f'{counts[severity]} {word}{"s" * (counts[severity] > 1)}' for severity, word in WORDS.items() if counts[severity]]
+    style = 'bold red' if counts[Severity.ERROR] else 'bold yellow'
+    return Text.assemble((f'{len(findings)} finding{"s" * (len(findings) > 1)}: {", ".join(parts)}', style), where)
+
+
+def _finding(result: Result) -> list[RenderableType]:
+    lines: list[RenderableType] = [
+        '',
+        Text.assemble(plain(result.check, f'bold {STYLES[result.severity]}'), '  ', plain(result.seen)),
+    ]
+    if result.cause:
+        lines.append(Padding(plain(result.cause, 'dim'), INDENT, expand=False))
+    if result.remedy:
+        lines.append(Padding(Text.assemble(('-> ', 'cyan'), plain(result.remedy, 'cyan')), INDENT, expand=False))
+    return lines

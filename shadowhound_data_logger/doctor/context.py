@@ -1,0 +1,146 @@
+"""The context of a run: role, environment and settings, as far as they can be read. A refused setting stops nothing here."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.doctor.machine import listening
+from shadowhound_data_logger.doctor.model import Context, Role
+from shadowhound_data_logger.errors import DataLoggerError, SettingError
+
+S3_PORT: Final = 9000
+MLFLOW_PORT: Final = 5001
+"""Of a Tower as the integration guide sets it up."""
+NODE: Final = 'sensor_logger_node'
+
+
+class ParametersUnreadable(DataLoggerError):
+    """A parameter file is not one."""
+
+
+def make(
+    environ: Mapping[str, str],
+    *,
+    role: Role | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    parameter_file: Path | None = None,
+    namespace: str = '/',
+    rates_hz: Mapping[str, float] | None = None,
+    root: Path = Path('/'),
+) -> Context:
+    """Raises ParametersUnreadable. What Settings refuses is left out, one after the other, and told in ``refused``."""
+    given = dict(parameters if parameters is not None else read_parameters(parameter_file) if parameter_file else {})
+    known, left, refused = dict(environ), dict(given), []
+    while True:
+        try:
+            settings = Settings.load(left, known, namespace)
+            break
+        except SettingError as error:
+            refused.append(error)
+            name = str(error.data['name'])
+            if name in known:
+                del known[name]
+            elif name in left:
+                del left[name]
+            else:  # the robot's name, or a default that it makes too long; else what other parameters say
+                left, namespace = left if name == 'robot' else {}, '/'
+                known.pop('SHADOWHOUND_ROBOT', None)
+    return Context(
+        role=role or guess(environ, settings.spool_path, root),
+        environ=environ,
+        settings=settings,
+        refused=tuple(refused),
+        parameters=given,
+        parameter_file=parameter_file,
+        namespace=namespace,
+        rates_hz=rates_hz or {},
+        root=root,
+    )
+
+
+def guess(environ: Mapping[str, str], spool: Path, root: Path) -> Role:
+    """A spool is Thor's, servers that listen here are Tower's; else who has ROS is Thor, and the rest is Spark."""
+    has_ros = bool(environ.get('ROS_DISTRO')) or find_spec('rclpy') is not None
+    if has_ros and (spool / 'index.db').exists():
+        return Role.THOR
+    if Path('tower/.env').is_file() or _serves(environ, root):
+        return Role.TOWER
+    return Role.THOR if has_ros else Role.SPARK
+
+
+def _serves(environ: Mapping[str, str], root: Path) -> bool:
+    """Whether the S3 server or MLflow listens on this machine."""
+    ports = {S3_PORT, MLFLOW_PORT}
+    for variable in ('AWS_ENDPOINT_URL', 'MLFLOW_TRACKING_URI'):
+        try:
+            url = urlsplit(environ.get(variable, ''))
+            if url.hostname in {'localhost', '127.0.0.1', '::1'} and url.port:
+                ports.add(url.port)
+        except ValueError:
+            continue
+    return any(port in ports for _, port in listening(root))
+
+
+def read_parameters(path: Path) -> dict[str, Any]:
+    """The parameters of a ROS 2 parameter file for our node, flat. Raises ParametersUnreadable.
+
+    https://docs.ros.org/en/humble/How-To-Guides/Node-arguments.html#parameter-files
+    """
+    try:
+        import yaml  # noqa: PLC0415 - rclpy needs it, too; without ROS it may be missing, and then nobody has such a file
+    except ImportError as error:
+        raise ParametersUnreadable(f'{path} cannot be read: {error}', remedy='pip install pyyaml') from error
+    try:
+        given = yaml.safe_load(path.read_text(encoding='utf-8')) or {}
+        flat: dict[str, Any] = {}
+        for node, content in given.items():
+            if node in {'/**', NODE, f'/{NODE}', '/**/' + NODE}:
+                flat |= _flat(content['ros__parameters'])
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError) as error:
+        text = f'{path} is no parameter file: {error}'
+        raise ParametersUnreadable(text, remedy='see launch_configs/go2.yaml') from error
+    return flat
+
+
+def _flat(given: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in given.items():
+        flat |= _flat(value, f'{prefix}{name}.') if isinstance(value, dict) else {f'{prefix}{name}': value}
+    return flat
+
+
+def to_child(context: Context) -> bytes:
+    """For ``from_child``; variables go through the child's own environment, so that no secret is anywhere else."""
+    given = {
+        'role': context.role.value,
+        'parameters': dict(context.parameters),
+        'namespace': context.namespace,
+        'rates_hz': dict(context.rates_hz),
+        'root': str(context.root),
+    }
+    return json.dumps(given).encode()
+
+
+def from_child(sent: bytes) -> Context:
+    """The context that ``to_child`` wrote."""
+    given = json.loads(sent)
+    return make(
+        os.environ,
+        role=Role(given['role']),
+        parameters=given['parameters'],
+        namespace=given['namespace'],
+        rates_hz=given['rates_hz'],
+        root=Path(given['root']),
+    )
+
+
+def home_of(context: Context) -> Path:
+    """Of the user, for files such as ``~/.aws/credentials``."""
+    return Path(context.environ.get('HOME') or '~').expanduser()

@@ -1,0 +1,161 @@
+"""What the shell says: who is asked with which keys, which settings are refused, and whether the node was told the same."""
+
+from __future__ import annotations
+
+import configparser
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.doctor.context import home_of
+from shadowhound_data_logger.doctor.machine import variables
+from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, warning
+from shadowhound_data_logger.spool import status
+
+KEYS: Final = ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY')
+SHARED: Final = ('AWS_ENDPOINT_URL', *KEYS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL', 'ROS_DOMAIN_ID')
+"""Where the node and this shell should agree; AWS's keys among them are compared, never shown."""
+PLACEHOLDERS: Final = ('<', 'TOWER_IP', 'from Tower', '...')
+"""What is in the variables of somebody who pasted the guide as it is."""
+
+
+def check(context: Context) -> Iterator[Result]:
+    """See the module."""
+    for problem in context.refused:
+        yield of_error('environment.settings', problem, 'the node would not start with it')
+    yield from _store(context)
+    yield from _tracking(context)
+    yield from _proxies(context)
+    if context.role is Role.THOR:
+        yield from _node(context)
+
+
+def _store(context: Context) -> Iterator[Result]:
+    environ, endpoint = context.environ, context.settings.store.endpoint_url
+    pasted = [name for name in SHARED if any(mark in environ.get(name, '') for mark in PLACEHOLDERS)]
+    if pasted:
+        yield error(
+            'environment.placeholder',
+            f'{" and ".join(pasted)} still has the words of the manual',
+            'it was pasted, and not filled in',
+            f'export {pasted[0]}=...  # with what Tower gave you',
+        )
+    if not endpoint:
+        if any(problem.data['name'] == 'AWS_ENDPOINT_URL' for problem in context.refused):
+            return
+        yield warning(
+            'environment.endpoint',
+            'AWS_ENDPOINT_URL is not set',
+            f'without it nothing leaves this machine: data go to {context.settings.store.directory}',
+            'export AWS_ENDPOINT_URL=http://TOWER_IP:9000',
+        )
+        return
+    yield ok('environment.endpoint', f'AWS_ENDPOINT_URL is {endpoint}')
+    yield _credentials(context)
+
+
+def _credentials(context: Context) -> Result:
+    """Where the key pair comes from, in botocore's order; which one it is, is not shown."""
+    environ, name = context.environ, 'environment.credentials'
+    missing = [each for each in KEYS if not environ.get(each)]
+    if len(missing) == 1:
+        return error(
+            name, f'{missing[0]} is not set, and the other half of the pair is', 'both or neither', f'export {missing[0]}=...'
+        )
+    if not missing:
+        spaced = [each for each in KEYS if environ[each] != environ[each].strip()]
+        if spaced:
+            return error(
+                name,
+                f'{spaced[0]} has a space or line break at its end',
+                'it was pasted with more than it is',
+                f'export {spaced[0]}=...',
+            )
+        return ok(name, 'the key pair is in the environment (a node that runs has to be started again after a change)')
+    file = Path(environ.get('AWS_SHARED_CREDENTIALS_FILE') or home_of(context) / '.aws/credentials').expanduser()
+    profile = environ.get('AWS_PROFILE') or 'default'
+    if profile in _profiles(file):
+        return ok(name, f'the key pair is in {file}, profile {profile}')
+    return error(
+        name,
+        f'AWS_ACCESS_KEY_ID is not set, and {file} has no profile {profile}',
+        'no request can be signed',
+        'export AWS_ACCESS_KEY_ID=... AWS_SECRET_ACCESS_KEY=...  # or: aws configure',
+    )
+
+
+def _profiles(file: Path) -> list[str]:
+    parser = configparser.RawConfigParser()
+    try:
+        parser.read_string(file.read_text(encoding='utf-8'))
+    except (OSError, ValueError, configparser.Error):
+        return []
+    return [section for section in parser.sections() if parser.has_option(section, 'aws_access_key_id')]
+
+
+def _tracking(context: Context) -> Iterator[Result]:
+    environ = context.environ
+    uri, s3 = environ.get('MLFLOW_TRACKING_URI', ''), environ.get('MLFLOW_S3_ENDPOINT_URL', '')
+    if not uri and context.settings.store.endpoint_url:
+        yield warning(
+            'environment.tracking',
+            'MLFLOW_TRACKING_URI is not set, though there is a Tower',
+            f'missions are logged to {context.settings.home / "mlflow.db"}, where nobody on Tower sees them',
+            'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
+        )
+    elif uri:
+        shown = urlsplit(uri)._replace(netloc=urlsplit(uri).netloc.rpartition('@')[2]).geturl()
+        yield ok('environment.tracking', f'MLFLOW_TRACKING_URI is {shown}')
+    endpoint = context.settings.store.endpoint_url
+    if uri.startswith('http') and endpoint and not s3:
+        yield info(
+            'environment.artifacts',
+            'MLFLOW_S3_ENDPOINT_URL is not set',
+            'our own programs take AWS_ENDPOINT_URL for it; older MLflow clients ask Amazon instead',
+            'export MLFLOW_S3_ENDPOINT_URL=$AWS_ENDPOINT_URL',
+        )
+    elif s3 and endpoint and s3.rstrip('/') != endpoint.rstrip('/'):
+        yield warning(
+            'environment.artifacts',
+            f'MLFLOW_S3_ENDPOINT_URL is {s3}, AWS_ENDPOINT_URL {endpoint}',
+            'artifacts go to another server than the data',
+            'export MLFLOW_S3_ENDPOINT_URL=$AWS_ENDPOINT_URL',
+        )
+
+
+def _proxies(context: Context) -> Iterator[Result]:
+    """A proxy for the internet knows no Tower."""
+    environ = context.environ
+    urls = (context.settings.store.endpoint_url or '', environ.get('MLFLOW_TRACKING_URI', ''))
+    spared = {host.strip().lstrip('.') for name in ('NO_PROXY', 'no_proxy') for host in environ.get(name, '').split(',')}
+    for url in filter(None, urls):
+        names = [name for name in (f'{url.split(":")[0].upper()}_PROXY', f'{url.split(":")[0]}_proxy') if environ.get(name)]
+        host = urlsplit(url).hostname or ''
+        if names and '*' not in spared and not any(host == each or host.endswith(f'.{each}') for each in spared if each):
+            yield warning(
+                'environment.proxy',
+                f'{names[0]} is set, and {host} is not in NO_PROXY',
+                'requests for Tower go to the proxy',
+                f'export NO_PROXY=$NO_PROXY,{host}',
+            )
+            return
+
+
+def _node(context: Context) -> Iterator[Result]:
+    """The node that runs may have been started with other variables, or with keys that were changed since."""
+    found = status.read(context.settings.spool_path, context.settings.robot, SystemClock.of_this_machine())
+    if not found['running']:
+        return
+    theirs = variables(context.root, found['pid'])
+    other = [name for name in SHARED if theirs and theirs.get(name, '') != context.environ.get(name, '')]
+    if other:
+        yield warning(
+            'environment.node',
+            f'the node (process {found["pid"]}) has another {" and ".join(other)} than this shell',
+            'it was started elsewhere, or before a change: what works here need not work there',
+            'start the node again: sudo systemctl restart shadowhound-data-logger',
+        )
+    elif theirs:
+        yield ok('environment.node', 'the node was started with the same addresses and keys')

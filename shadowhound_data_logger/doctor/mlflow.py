@@ -1,0 +1,201 @@
+"""MLflow: whether it answers, takes an experiment, and whether artifacts reach the store that they are meant for.
+
+What it leaves behind: the experiment ``_doctor`` with one tag, and one artifact of 64 bytes under it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from shadowhound_data_logger.clock import iso
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.doctor import s3_put, services
+from shadowhound_data_logger.doctor.mlflow_rest import MlflowRest
+from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, skipped
+from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S
+from shadowhound_data_logger.errors import StoreError, TrackingError, TrackingRefused, TrackingUnavailable
+
+NAME: Final = 'mlflow'
+PROBE: Final = '_doctor'
+MISSIONS: Final = 'thor_missions'
+"""The experiment of MissionDataLogger."""
+LOGS: Final = 'on Tower: docker logs --tail 50 mlflow || docker compose logs --tail 50 mlflow'
+S3_OF_SERVER: Final = (
+    "MLflow's own environment on Tower lacks AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY or MLFLOW_S3_ENDPOINT_URL, "
+    'the bucket is missing, or the S3 server is away'
+)
+
+
+def check(context: Context) -> Iterator[Result]:
+    """See the module."""
+    service = services.mlflow(context)
+    if service is None:
+        uri = context.environ.get('MLFLOW_TRACKING_URI', '')
+        yield info(NAME, f'no MLflow server is set: missions are logged to {uri or context.settings.home / "mlflow.db"}')
+        return
+    if failed := context.failed('network.mlflow'):
+        yield skipped(NAME, failed)
+        return
+    try:
+        rest = MlflowRest(service, context.environ)
+        yield from _health(rest, service.url)
+        experiment = _probe(rest)
+        yield ok('mlflow.experiment', f'the experiment {PROBE} was written to')
+        yield from _missions(rest)
+        yield from _artifacts(rest, str(experiment['artifact_location']), context)
+    except TrackingError as problem:
+        yield _failed(problem, service.variable)
+    except OSError as problem:  # a file of certificates; network.mlflow.tls has more to say
+        yield error('mlflow.tls', f'no certificate of {service.url} can be judged: {problem}', '', 'see network.mlflow.tls')
+
+
+def _health(rest: MlflowRest, url: str) -> Iterator[Result]:
+    said = rest.get('/health')
+    if said != 'OK':
+        raise TrackingUnavailable(f'{url} does not answer like an MLflow server: /health says {said[:40]!r}', code='')
+    version = rest.get('/version')
+    yield ok('mlflow.health', f'MLflow {version} answers', version=version)
+
+
+def _failed(problem: TrackingError, variable: str) -> Result:
+    status, text = problem.data.get('status', 0), problem.data.get('text', '')
+    cause, remedy = 'the server hangs, or waits for a database that is away', f'{LOGS} ; docker compose restart mlflow'
+    if 'Host header' in text:
+        cause, remedy = (
+            'MLflow takes requests for its own names only',
+            'on Tower: mlflow server --allowed-hosts TOWER_IP:5001,...',
+        )
+    elif status in {401, 403} and not text.startswith('<'):
+        cause, remedy = 'it wants a user, or another one', 'export MLFLOW_TRACKING_USERNAME=... MLFLOW_TRACKING_PASSWORD=...'
+    elif 400 <= status < 500 or 'like an MLflow server' in str(problem):
+        cause, remedy = 'something else listens on this port', f'export {variable}=http://TOWER_IP:5001'
+    elif status >= 500:
+        cause, remedy = 'the server fails: its database is away, or of another version', f'{LOGS} ; docker compose ps'
+    return error('mlflow.answer', str(problem), cause, remedy)
+
+
+def _probe(rest: MlflowRest) -> dict[str, Any]:
+    """The probe's experiment, made or brought back where need be, and written to."""
+    found = rest.experiment(PROBE)
+    if found is None:
+        try:
+            rest.create(PROBE)
+        except TrackingRefused as problem:
+            if problem.data['code'] != 'RESOURCE_ALREADY_EXISTS':  # another doctor's
+                raise
+        found = rest.experiment(PROBE)
+    if found is None:
+        raise TrackingUnavailable(f'the experiment {PROBE} was created and is not there', code='')
+    if found.get('lifecycle_stage') == 'deleted':
+        rest.restore(found['experiment_id'])
+    rest.tag(found['experiment_id'], 'shadowhound.doctor', iso(time.time_ns()))
+    return found
+
+
+def _missions(rest: MlflowRest) -> Iterator[Result]:
+    """The experiment of the missions, if there is one: where artifacts go is fixed when it is created."""
+    found = rest.experiment(MISSIONS)
+    if found is None:
+        yield info('mlflow.missions', f'there is no experiment {MISSIONS} yet: no mission has been logged')
+        return
+    where = str(found['artifact_location'])
+    if found.get('lifecycle_stage') == 'deleted':
+        yield error(
+            'mlflow.missions',
+            f'the experiment {MISSIONS} is deleted',
+            'missions wait until it is back',
+            f'on Tower: mlflow experiments restore -x {found["experiment_id"]}',
+        )
+    elif _is_folder(where):
+        yield _local(f'the experiment {MISSIONS}', where)
+    else:
+        yield ok('mlflow.missions', f'the experiment {MISSIONS} keeps its artifacts in {where}')
+
+
+def _is_folder(location: str) -> bool:
+    return urlsplit(location).scheme in {'', 'file'}
+
+
+def _local(who: str, location: str) -> Result:
+    return error(
+        'mlflow.artifacts',
+        f'{who} keeps its artifacts in {location}, a folder',
+        'the server was started with a folder as artifact root and does not serve artifacts: each client writes to its own '
+        'disk, so they reach neither Tower nor its store',
+        'on Tower: mlflow server --artifacts-destination s3://mlflow ...  (and a new experiment: where artifacts go '
+        'is fixed when it is created)',
+    )
+
+
+def _artifacts(rest: MlflowRest, location: str, context: Context) -> Iterator[Result]:
+    """One artifact to where this server's clients send them, and back."""
+    scheme = urlsplit(location).scheme
+    if scheme == 'mlflow-artifacts':
+        yield _proxied(rest, urlsplit(location).path.strip('/'))
+    elif scheme == 's3':
+        yield from _direct(location, context)
+    elif _is_folder(location):
+        yield _local('a new experiment', location)
+    else:
+        yield info('mlflow.artifacts', f'artifacts go to {location}, which is not asked')
+
+
+def _proxied(rest: MlflowRest, folder: str) -> Result:
+    url = rest.artifact_url(f'{folder}/_doctor/probe.txt')
+    try:
+        rest.ask('PUT', url, s3_put.BODY)
+        body = rest.ask('GET', url)
+    except TrackingRefused as problem:
+        return error(
+            'mlflow.artifacts',
+            f'MLflow takes no artifact: {problem}',
+            S3_OF_SERVER,
+            f'{LOGS} ; docker exec mlflow env | grep -E "AWS_|MLFLOW_S3"',
+        )
+    except TrackingUnavailable as problem:
+        return error(
+            'mlflow.artifacts',
+            f'MLflow takes no artifact: {problem}',
+            'it waits for its artifact store, which does not answer',
+            f'{LOGS} ; curl -i $AWS_ENDPOINT_URL',
+        )
+    if body != s3_put.BODY:
+        return error(
+            'mlflow.artifacts', 'an artifact does not come back as it was written', 'its store damages what it holds', LOGS
+        )
+    return ok('mlflow.artifacts', 'an artifact went through MLflow to its store and came back')
+
+
+def _direct(location: str, context: Context) -> Iterator[Result]:
+    """The client itself writes to S3."""
+    from shadowhound_data_logger.stores.s3_requests import S3Requests  # noqa: PLC0415 - botocore costs half a second
+
+    url, endpoint = urlsplit(location), context.environ.get('MLFLOW_S3_ENDPOINT_URL') or context.settings.store.endpoint_url
+    if not endpoint:
+        yield error(
+            'mlflow.artifacts',
+            f'artifacts go to {location}, and MLFLOW_S3_ENDPOINT_URL does not say where that is',
+            'MLflow then asks Amazon',
+            'export MLFLOW_S3_ENDPOINT_URL=http://TOWER_IP:9000',
+        )
+        return
+    settings = replace(context.settings.store, endpoint_url=endpoint)
+    key = f'{url.path.strip("/")}/_doctor/probe.txt'.lstrip('/')
+    upload = UploadSettings(threads=1, connect_timeout_s=CONNECT_S, read_timeout_s=ANSWER_S)
+    try:
+        with closing(S3Requests(settings, upload)) as requests:
+            requests.open()
+            item = s3_put.probe(url.netloc, key)
+            requests.put(item, s3_put.BODY, s3_put.crc32(s3_put.BODY), conditional=False)
+            b''.join(requests.content(url.netloc, key))
+    except StoreError as problem:
+        whose = 'this robot' if context.role is Role.THOR else 'this machine'
+        result = of_error('mlflow.artifacts', problem, f'artifacts of missions go from {whose} to {location} itself')
+        yield replace(result, remedy=result.remedy or f'aws --endpoint-url {endpoint} s3 ls s3://{url.netloc}/')
+        return
+    yield ok('mlflow.artifacts', f'an artifact was written to {location} and read back')

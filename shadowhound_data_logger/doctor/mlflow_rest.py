@@ -1,0 +1,106 @@
+"""The few requests to an MLflow server that the doctor needs, by hand: MLflow's own client takes seconds to import.
+
+https://mlflow.org/docs/latest/api_reference/rest-api.html
+"""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import json
+import ssl
+from collections.abc import Mapping
+from typing import Any, Final
+from urllib.error import HTTPError, URLError
+from urllib.parse import quote, urlencode
+from urllib.request import Request, urlopen
+
+from shadowhound_data_logger.doctor.services import ANSWER_S, Service
+from shadowhound_data_logger.errors import TrackingError, TrackingRefused, TrackingUnavailable
+
+TEXT: Final = 300
+"""Letters of an answer that are shown."""
+
+
+class MlflowRest:
+    """One server. Raises TrackingUnavailable without an answer, TrackingRefused (data: status, code, text) after others."""
+
+    def __init__(self, service: Service, environ: Mapping[str, str]) -> None:
+        self._url = service.url
+        self._headers = {'Content-Type': 'application/json', 'User-Agent': 'shadowhound-doctor', **_authorization(environ)}
+        self._trust: ssl.SSLContext | None = None
+        if service.tls:
+            bundle = environ.get('MLFLOW_TRACKING_SERVER_CERT_PATH') or environ.get('REQUESTS_CA_BUNDLE') or None
+            self._trust = ssl.create_default_context(cafile=bundle)
+            if environ.get('MLFLOW_TRACKING_INSECURE_TLS', '').lower() == 'true':
+                self._trust.check_hostname, self._trust.verify_mode = False, ssl.CERT_NONE
+
+    def experiment(self, name: str) -> dict[str, Any] | None:
+        """By its name, deleted ones as well."""
+        try:
+            answer = self._json('GET', 'experiments/get-by-name?' + urlencode({'experiment_name': name}))
+        except TrackingRefused as error:
+            if error.data['code'] == 'RESOURCE_DOES_NOT_EXIST':
+                return None
+            raise
+        found: dict[str, Any] = answer['experiment']
+        return found
+
+    def create(self, name: str) -> None:
+        self._json('POST', 'experiments/create', {'name': name})
+
+    def restore(self, experiment_id: str) -> None:
+        self._json('POST', 'experiments/restore', {'experiment_id': experiment_id})
+
+    def tag(self, experiment_id: str, name: str, value: str) -> None:
+        self._json('POST', 'experiments/set-experiment-tag', {'experiment_id': experiment_id, 'key': name, 'value': value})
+
+    def artifact_url(self, path: str) -> str:
+        """Of the server's own proxy for artifacts."""
+        return f'{self._url}/api/2.0/mlflow-artifacts/artifacts/{quote(path)}'
+
+    def get(self, path: str) -> str:
+        """A page of the server, such as ``/health``."""
+        return self.ask('GET', f'{self._url}{path}').decode(errors='replace').strip()
+
+    def _json(self, method: str, path: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        data = json.dumps(body).encode() if body is not None else None
+        answer = self.ask(method, f'{self._url}/api/2.0/mlflow/{path}', data)
+        try:
+            found: dict[str, Any] = json.loads(answer)
+        except ValueError as error:
+            raise TrackingUnavailable(f'{self._url} does not answer like an MLflow server', code='') from error
+        return found
+
+    def ask(self, method: str, url: str, data: bytes | None = None) -> bytes:
+        """One request."""
+        try:
+            request = Request(url, data, self._headers, method=method)  # noqa: S310 - http(s), see services
+            with urlopen(request, timeout=ANSWER_S, context=self._trust) as answer:  # noqa: S310
+                content: bytes = answer.read()
+                return content
+        except HTTPError as error:
+            raise _refused(self._url, error) from error
+        except (URLError, OSError, http.client.HTTPException, ValueError) as error:
+            reason = getattr(error, 'reason', error)
+            what = f'gives no answer within {ANSWER_S:g} s' if isinstance(reason, TimeoutError) else f'cannot be asked: {reason}'
+            raise TrackingUnavailable(f'{self._url} {what}', code='') from error
+
+
+def _refused(url: str, error: HTTPError) -> TrackingError:
+    with error:
+        text = error.read().decode(errors='replace')
+    try:
+        said = json.loads(text)
+        code, message = str(said['error_code']), str(said.get('message', ''))
+    except (ValueError, KeyError, TypeError):
+        code, message = '', ' '.join(text.split())
+    return TrackingRefused(f'{url} answers {error.code} {code}: {message[:TEXT]}', status=error.code, code=code, text=message)
+
+
+def _authorization(environ: Mapping[str, str]) -> dict[str, str]:
+    user, password = (environ.get(f'MLFLOW_TRACKING_{name}', '') for name in ('USERNAME', 'PASSWORD'))
+    if user:
+        return {'Authorization': 'Basic ' + base64.b64encode(f'{user}:{password}'.encode()).decode('ascii')}
+    token = environ.get('MLFLOW_TRACKING_TOKEN')
+    return {'Authorization': f'Bearer {token}'} if token else {}

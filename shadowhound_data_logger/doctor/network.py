@@ -1,0 +1,166 @@
+"""The way to Tower: its name, its ports, and whether its certificate can be trusted. Nothing is sent but the TLS greeting."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import time
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from shadowhound_data_logger.doctor import services
+from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok
+from shadowhound_data_logger.doctor.services import CONNECT_S, Service
+
+GLANCE_S: Final = 0.5
+"""For a port that is only a guess."""
+EXPIRED, WRONG_HOST, WRONG_ADDRESS = 10, 62, 64
+"""X509_V_ERR_CERT_HAS_EXPIRED, _HOSTNAME_MISMATCH, _IP_ADDRESS_MISMATCH of OpenSSL's x509_vfy.h; others: not trusted."""
+CA_FILES: Final = {
+    's3': ('AWS_CA_BUNDLE', 'REQUESTS_CA_BUNDLE'),
+    'mlflow': ('MLFLOW_TRACKING_SERVER_CERT_PATH', 'REQUESTS_CA_BUNDLE', 'CURL_CA_BUNDLE'),
+}
+"""Who names the file of trusted authorities, for botocore and for MLflow's client."""
+
+
+def check_s3(context: Context) -> Iterator[Result]:
+    """See the module."""
+    yield from _check(services.s3(context), 'network.s3', context)
+
+
+def check_mlflow(context: Context) -> Iterator[Result]:
+    """See the module."""
+    yield from _check(services.mlflow(context), 'network.mlflow', context)
+
+
+def _check(service: Service | None, check: str, context: Context) -> Iterator[Result]:
+    if service is None:
+        return
+    try:
+        address = _resolve(service)
+    except (OSError, UnicodeError) as problem:
+        yield error(
+            f'{check}.dns',
+            f'the name {service.host} cannot be resolved ({problem})',
+            'no DNS server knows it, or none can be reached: no WiFi, or another one than Tower is in',
+            f'getent hosts {service.host}; or use the IP address of Tower: '
+            f'export {service.variable}=http{"s" * service.tls}://TOWER_IP:{service.port}',
+        )
+        return
+    yield ok(f'{check}.dns', f'{service.host} is {address}')
+    began_s = time.monotonic()
+    try:
+        socket.create_connection((address, service.port), timeout=CONNECT_S).close()
+    except OSError as problem:
+        yield _unreachable(service, address, f'{check}.tcp', problem)
+        return
+    took_ms = 1000 * (time.monotonic() - began_s)
+    yield ok(f'{check}.tcp', f'{service.title} at {service.host}:{service.port} accepts connections ({took_ms:.1f} ms)')
+    if service.tls:
+        yield _greet(service, address, f'{check}.tls', context)
+    elif not service.is_local:
+        yield info(
+            f'{check}.tls',
+            f'{service.url} is not encrypted',
+            'keys are not sent, but whoever is in this network can read the data',
+            'on a network that is not yours: https',
+        )
+
+
+def _resolve(service: Service) -> str:
+    """The first address; a server that listens is reached at any."""
+    found = socket.getaddrinfo(service.host, service.port, type=socket.SOCK_STREAM)
+    return str(found[0][4][0])
+
+
+def _unreachable(service: Service, address: str, check: str, problem: OSError) -> Result:
+    where = f'{service.host}:{service.port}'
+    if isinstance(problem, ConnectionRefusedError):
+        others = [port for port in service.usual_ports if port != service.port and _answers(address, port)]
+        remedy = f'on Tower: sudo ss -ltnp | grep :{service.port} ; docker compose ps'
+        cause = f'the machine is on, but {service.title} does not run there, or listens on another port or to Tower itself only'
+        if others:
+            cause += f'; something answers on port {others[0]}'
+            remedy = f'export {service.variable}={service.at(others[0])}  # if that is {service.title}; else {remedy}'
+        return error(check, f'{where} refuses the connection', cause, remedy)
+    if isinstance(problem, TimeoutError):
+        return error(
+            check,
+            f'{where} does not answer within {CONNECT_S:g} s',
+            'Tower is off, or a firewall drops what is sent to this port, or the WiFi is gone',
+            f'ping -c 3 {service.host} ; on Tower: sudo ufw status | grep {service.port} || sudo ufw allow {service.port}/tcp',
+        )
+    return error(
+        check,
+        f'{where} cannot be reached: {problem.strerror or problem}',
+        'this machine has no way to that network: WiFi off, or another one',
+        f'ip route get {address} ; nmcli device status',
+    )
+
+
+def _answers(address: str, port: int) -> bool:
+    try:
+        socket.create_connection((address, port), timeout=GLANCE_S).close()
+    except OSError:
+        return False
+    return True
+
+
+def bundle(service: Service, context: Context) -> tuple[str, str]:
+    """Variable and path of the authorities that the client of this service trusts; empty for those of the system."""
+    return next(((name, path) for name in CA_FILES[service.name] if (path := context.environ.get(name))), ('', ''))
+
+
+def _greet(service: Service, address: str, check: str, context: Context) -> Result:
+    """A TLS handshake, as the client of this service will do it."""
+    variable, trusted = bundle(service, context)
+    try:
+        trust = ssl.create_default_context(cafile=trusted or None)
+    except OSError as problem:
+        return error(
+            check,
+            f'{variable}={trusted} cannot be read: {problem}',
+            'no certificate can be judged without it',
+            f'ls -l {trusted}',
+        )
+    try:
+        plain = socket.create_connection((address, service.port), timeout=CONNECT_S)
+        with plain, trust.wrap_socket(plain, server_hostname=service.host) as secure:
+            return ok(check, f'{service.url}: {secure.version()}, its certificate is trusted')
+    except ssl.SSLCertVerificationError as problem:
+        return _untrusted(service, check, problem, trusted)
+    except (OSError, ValueError) as problem:
+        return error(
+            check,
+            f'{service.url} does not speak TLS: {problem}',
+            'the server expects plain http on this port',
+            f'export {service.variable}={service.url.replace("https://", "http://")}',
+        )
+
+
+def _untrusted(service: Service, check: str, problem: ssl.SSLCertVerificationError, trusted: str) -> Result:
+    shown = f'openssl s_client -connect {service.host}:{service.port} </dev/null 2>/dev/null | openssl x509 -noout'
+    reasons: dict[int, Callable[[], Result]] = {
+        EXPIRED: lambda: error(
+            f'{check}.expired',
+            f'the certificate of {service.url} has expired',
+            'it was not renewed, or the clock of this machine is ahead',
+            f'{shown} -dates ; date ; renew it on Tower',
+        ),
+        WRONG_HOST: lambda: error(
+            f'{check}.host',
+            f'the certificate of {service.url} is for another name',
+            f'it does not name {service.host}',
+            f'{shown} -ext subjectAltName ; use a name that is in it in {service.variable}',
+        ),
+    }
+    reasons[WRONG_ADDRESS] = reasons[WRONG_HOST]
+    if problem.verify_code in reasons:
+        return reasons[problem.verify_code]()
+    names = CA_FILES[service.name]
+    return error(
+        f'{check}.unknown',
+        f'the certificate of {service.url} is not trusted ({problem.verify_message})',
+        f'the authority that signed it is not in {trusted}' if trusted else 'an authority of its own has signed it',
+        f'copy the certificate of that authority here and: export {names[0]}=/etc/shadowhound/ca.pem',
+    )

@@ -1,0 +1,196 @@
+"""The robot's topics: published, by whom and how, at the rate that is expected, and decodable here. Runs in a child process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final
+
+from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.doctor.expected import STREAMS, UNKNOWN, Stream
+from shadowhound_data_logger.doctor.machine import domains, processes
+from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
+from shadowhound_data_logger.doctor.ros_environment import DRIVERS, domain_of
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.doctor.ros_watch import Heard
+
+NAME: Final = 'ros'
+WINDOW_S: Final = 2.5
+PEEK_S: Final = 1.2
+MOST_PEEKS: Final = 3
+TOO_SLOW, TOO_LOSSY = 0.5, 0.1
+"""Below half of the expected rate; above a tenth that did not arrive."""
+ENOUGH: Final = 4
+"""Messages that have to be expected within the window for a rate to mean something."""
+TYPES_REMEDY: Final = '. ~/ros2_ws/install/setup.bash  # or: colcon build --packages-select {package} && . install/setup.bash'
+
+
+def check(context: Context) -> Iterator[Result]:
+    """See the module."""
+    if find_spec('rclpy') is None:
+        yield error(
+            'ros.sourced',
+            'rclpy cannot be imported',
+            'ROS is not sourced in this shell',
+            '. /opt/ros/humble/setup.bash && . ~/ros2_ws/install/setup.bash',
+        )
+        return
+    from shadowhound_data_logger.doctor import ros_watch  # noqa: PLC0415 - rclpy: a second, and not installed everywhere
+
+    sensors = [sensor for sensor in context.settings.sensors if sensor.enabled]
+    yield from _types(sensors)
+    with ros_watch.node(namespace=context.namespace) as node:
+        names = {node.resolve_topic_name(topic): topic for sensor in sensors for topic in sensor.topics}
+        found = ros_watch.discover(node, list(names))
+        heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S)} if any(found.values()) else {}
+        resolved = {topic: name for name, topic in names.items()}
+    if not heard:
+        yield from _nobody(context, list(names))
+        return
+    for sensor in sensors:
+        yield from _sensor(sensor, [heard[resolved[topic]] for topic in sensor.topics], context.rates_hz)
+
+
+def _types(sensors: Sequence[SensorSettings]) -> Iterator[Result]:
+    """Of the types that the settings expect."""
+    from shadowhound_data_logger.capture.reader import unavailable  # noqa: PLC0415 - rclpy
+
+    missing: dict[str, list[str]] = {}
+    for name in sorted({name for sensor in sensors for name in sensor.types}):
+        if unavailable(name):
+            missing.setdefault(name.partition('/')[0], []).append(name)
+    for package, names in missing.items():
+        yield error(
+            'ros.types',
+            f'{package} cannot be imported, so {", ".join(names)} cannot be received',
+            'the workspace with this package is not sourced in this shell, or was not built for this Python',
+            TYPES_REMEDY.format(package=package),
+        )
+    if not missing:
+        yield ok('ros.types', 'all message types can be received')
+
+
+def _nobody(context: Context, topics: Sequence[str]) -> Iterator[Result]:
+    """None of the topics is there: another domain, or no driver."""
+    ours = domain_of(context.environ)
+    theirs = [domain_of(driver.environ) for driver in processes(context.root, *DRIVERS) if driver.environ]
+    others = [int(domain) for domain in dict.fromkeys([*theirs, *map(str, domains(context.root))]) if domain != ours]
+    for domain in others[:MOST_PEEKS]:
+        if there := _peek(domain, topics):
+            yield error(
+                'ros.domain',
+                f'nobody publishes in domain {ours}, but {len(there)} of the topics are in domain {domain} ({there[0]}, ...)',
+                "this shell has another ROS_DOMAIN_ID than the robot's driver",
+                f'export ROS_DOMAIN_ID={domain}  # here and for the node',
+            )
+            return
+    yield error(
+        'ros.topics',
+        f'nobody publishes any of {", ".join(topics[:4])}, ... in domain {ours}',
+        "the robot's driver does not run, has lost the robot, or is in another domain or network",
+        'ps aux | grep go2_driver ; ros2 launch go2_robot_sdk robot.launch.py ; echo $ROS_DOMAIN_ID  # the same everywhere?',
+    )
+
+
+def _peek(domain: int, topics: Sequence[str]) -> list[str]:
+    """Which of the topics are published in another domain."""
+    from shadowhound_data_logger.doctor import ros_watch  # noqa: PLC0415 - rclpy
+
+    with ros_watch.node(domain) as node:
+        return [topic for topic, publishers in ros_watch.discover(node, topics, PEEK_S).items() if publishers]
+
+
+def _sensor(sensor: SensorSettings, heard: Sequence[Heard], rates_hz: Mapping[str, float]) -> Iterator[Result]:
+    """A sensor is there when one of its topics is; each that is there is judged."""
+    present = [(topic, one) for topic, one in zip(sensor.topics, heard, strict=True) if one.publishers]
+    if not present:
+        names = ' nor '.join(one.topic for one in heard)
+        stream = STREAMS.get(sensor.topics[0], UNKNOWN)
+        if stream.optional:
+            yield info('ros.topic', f'nobody publishes {names}', 'many robots have none')
+        else:
+            yield warning(
+                'ros.topic',
+                f'nobody publishes {names}',
+                f'nothing of {sensor.name} is logged',
+                f'ros2 topic list | grep {heard[0].topic} ; is this part of the driver started? else {sensor.name}.enabled: '
+                'false in the parameter file',
+            )
+        return
+    for topic, one in present:
+        stream = STREAMS.get(topic, UNKNOWN)
+        expected = rates_hz.get(one.topic, rates_hz.get(topic, stream.rate_hz or sensor.rate_hz))
+        yield from _judge(one, sensor, stream, expected)
+
+
+def _judge(one: Heard, sensor: SensorSettings, stream: Stream, expected_hz: float) -> Iterator[Result]:
+    types = sorted({publisher.type for publisher in one.publishers})
+    if len(types) > 1:
+        yield error(
+            'ros.type',
+            f'{one.topic} is published as {" and as ".join(types)}',
+            'only one of them can be logged',
+            f'ros2 topic info -v {one.topic}  # and stop one of the publishers',
+        )
+    if one.unavailable:
+        yield error(
+            'ros.types',
+            f'{one.topic} cannot be received: {one.unavailable}',
+            'its message package is not here',
+            TYPES_REMEDY.format(package=types[0].partition('/')[0]),
+        )
+        return
+    yield from _qos(one, stream)
+    yield _rate(one, sensor, expected_hz)
+
+
+def _qos(one: Heard, stream: Stream) -> Iterator[Result]:
+    if one.deaf:
+        yield warning(
+            'ros.qos',
+            f'{", ".join(one.deaf)} subscribes to {one.topic} and receives nothing',
+            'it asks for RELIABLE or TRANSIENT_LOCAL, and the publisher offers less; ROS tells nobody',
+            'subscribe with rclpy.qos.qos_profile_sensor_data there; the logger itself follows the publisher',
+        )
+    if stream.reliable and not all(publisher.reliable for publisher in one.publishers):
+        yield warning(
+            'ros.qos',
+            f'{one.topic} is published BEST_EFFORT, and RELIABLE is expected',
+            'what the network loses of it is not sent again',
+            f'ros2 topic info -v {one.topic}  # and set its publisher to RELIABLE',
+        )
+
+
+def _rate(one: Heard, sensor: SensorSettings, expected_hz: float) -> Result:
+    figures: dict[str, Any] = {'topic': one.topic, 'rate_hz': round(one.rate_hz, 2), 'received': one.received, 'sent': one.sent}
+    due = expected_hz * one.window_s
+    if sensor.on_change and not one.received:
+        return info('ros.rate', f'{one.topic}: nothing in {one.window_s:.1f} s; it is kept on change only', **figures)
+    if not one.received and due >= ENOUGH:
+        return error(
+            'ros.loss',
+            f'{one.topic} has a publisher, and nothing arrives',
+            'large messages are lost between driver and logger (see sockets), the two run as different users, or a firewall '
+            'takes what is not discovery; or the robot is not connected and the driver has nothing to say',
+            f'ros2 topic hz {one.topic} ; shadowhound-data doctor --only sockets',
+            **figures,
+        )
+    if one.sent and due >= ENOUGH and one.received < (1 - TOO_LOSSY) * one.sent:
+        return warning(
+            'ros.loss',
+            f'{one.topic}: {one.received} of {one.sent} messages arrived',
+            "they do not fit into the shared memory or into the kernel's socket buffers",
+            'shadowhound-data doctor --only sockets  # what to set, for the driver and here',
+            **figures,
+        )
+    if due >= ENOUGH and one.rate_hz < TOO_SLOW * expected_hz:
+        return warning(
+            'ros.rate',
+            f'{one.topic} comes at {one.rate_hz:.1f} Hz, {expected_hz:g} Hz are expected',
+            'the driver is slower than a Go2 with WebRTC or DDS usually is, the connection to the robot is weak, or this '
+            'machine is busy',
+            f'ros2 topic hz {one.topic} ; where that is right: doctor --rate {one.topic}={max(one.rate_hz, 0.1):.0f}',
+            **figures,
+        )
+    return ok('ros.rate', f'{one.topic} comes at {one.rate_hz:.1f} Hz', **figures)

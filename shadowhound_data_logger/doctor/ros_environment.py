@@ -1,0 +1,123 @@
+"""What decides who hears whom in ROS, from the variables of this shell and of the robot's driver; nothing of ROS is loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.doctor.machine import MAX_DOMAIN, Process, processes
+from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
+
+NAME: Final = 'ros.environment'
+DRIVERS: Final = ('go2_driver', 'sim_go2_node')
+"""Programs that publish what a Go2 senses: go2_ros2_sdk's, and the simulated one."""
+RANGES: Final = ('SUBNET', 'LOCALHOST', 'OFF', 'SYSTEM_DEFAULT')
+"""https://docs.ros.org/en/rolling/Tutorials/Advanced/Improved-Dynamic-Discovery.html"""
+AGREE: Final = ('ROS_DOMAIN_ID', 'RMW_IMPLEMENTATION', 'ROS_LOCALHOST_ONLY')
+DEFAULTS: Final = {'ROS_DOMAIN_ID': '0', 'ROS_LOCALHOST_ONLY': '0'}
+
+
+def check(context: Context) -> Iterator[Result]:
+    """See the module."""
+    environ = context.environ
+    yield _domain(environ)
+    yield from _range(environ)
+    yield from _middleware(environ)
+    yield from _driver(context)
+
+
+def domain_of(environ: Mapping[str, str]) -> str:
+    """As it was given; 0 where nothing is."""
+    return environ.get('ROS_DOMAIN_ID') or '0'
+
+
+def _domain(environ: Mapping[str, str]) -> Result:
+    name, given = 'ros.domain_id', domain_of(environ)
+    if not given.isdecimal() or int(given) > MAX_DOMAIN:
+        return error(
+            name, f'ROS_DOMAIN_ID is {given!r}', f'it has to be a number from 0 to {MAX_DOMAIN}', 'export ROS_DOMAIN_ID=0'
+        )
+    return ok(name, f'ROS_DOMAIN_ID is {given}' + (' (not set)' if not environ.get('ROS_DOMAIN_ID') else ''))
+
+
+def _range(environ: Mapping[str, str]) -> Iterator[Result]:
+    name, given = 'ros.discovery', environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '')
+    only = environ.get('ROS_LOCALHOST_ONLY', '')
+    if given and given not in RANGES:
+        yield error(
+            name,
+            f'ROS_AUTOMATIC_DISCOVERY_RANGE is {given!r}',
+            f'it has to be one of {", ".join(RANGES)}',
+            'export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET',
+        )
+    elif given == 'OFF' and not environ.get('ROS_STATIC_PEERS'):
+        yield error(
+            name,
+            'ROS_AUTOMATIC_DISCOVERY_RANGE is OFF',
+            'nobody is found, and ROS_STATIC_PEERS names nobody either',
+            'export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET',
+        )
+    elif given == 'LOCALHOST' or only == '1':
+        variable = 'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST' if given == 'LOCALHOST' else 'ROS_LOCALHOST_ONLY=1'
+        yield info(name, f'{variable}: only nodes on this machine are heard', 'fine where the driver runs here as well')
+    else:
+        yield ok(name, 'nodes on this machine and in its network are heard')
+
+
+def _middleware(environ: Mapping[str, str]) -> Iterator[Result]:
+    given = environ.get('RMW_IMPLEMENTATION', '')
+    folders = [Path(prefix) for prefix in environ.get('AMENT_PREFIX_PATH', '').split(':') if prefix]
+    there = {path.name for folder in folders for path in folder.glob('share/ament_index/resource_index/rmw_typesupport/*')}
+    if given and there and given not in there:
+        distro = environ.get('ROS_DISTRO') or 'humble'
+        yield error(
+            'ros.middleware',
+            f'RMW_IMPLEMENTATION is {given}, which is not installed here',
+            f'there is {" and ".join(sorted(there))}',
+            f'sudo apt install ros-{distro}-{given.replace("_", "-")}; or: unset RMW_IMPLEMENTATION',
+        )
+    elif given or there:
+        yield ok('ros.middleware', f'the middleware is {given or "the default"}')
+
+
+def _driver(context: Context) -> Iterator[Result]:
+    """It may run on another machine; where it runs here, it has to agree with us."""
+    found = processes(context.root, *DRIVERS)
+    if not found:
+        yield info(
+            'ros.driver',
+            "the robot's driver does not run on this machine",
+            'fine where it runs on another one',
+            'ros2 launch go2_robot_sdk robot.launch.py',
+        )
+        return
+    ours = {name: context.environ.get(name) or DEFAULTS.get(name, '') for name in AGREE}
+    differ = [
+        (driver, name, theirs)
+        for driver in found
+        if driver.environ
+        for name in AGREE
+        if (theirs := driver.environ.get(name) or DEFAULTS.get(name, '')) != ours[name]
+    ]
+    if len({driver.pid for driver, _, _ in differ}) == len(found):  # with none of them do we agree
+        for driver, name, theirs in differ:
+            if driver is differ[0][0]:
+                yield _disagree(driver, name, theirs, ours[name])
+    else:
+        names = ', '.join(f'{_program(driver)} (process {driver.pid})' for driver in found)
+        yield ok('ros.driver', f"the robot's driver runs: {names}")
+
+
+def _program(driver: Process) -> str:
+    """The word of its command line that it was found by."""
+    return next((Path(word).name for word in driver.command.split() if any(name in word for name in DRIVERS)), 'it')
+
+
+def _disagree(driver: Process, name: str, theirs: str, ours: str) -> Result:
+    seen = f'{name} is {ours or "not set"} here, and {theirs or "not set"} for the driver (process {driver.pid})'
+    if name == 'RMW_IMPLEMENTATION':
+        remedy = f'export RMW_IMPLEMENTATION={theirs}' if theirs else 'unset RMW_IMPLEMENTATION'
+        return warning('ros.driver', seen, 'two middlewares talk to each other badly or not at all', remedy)
+    remedy = f'export {name}={theirs}  # here and for the node, or the other way round for the driver'
+    return error('ros.driver', seen, 'they do not hear each other', remedy, theirs=theirs)

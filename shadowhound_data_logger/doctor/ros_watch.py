@@ -1,0 +1,145 @@
+"""What is to be seen and heard of the configured topics, by a node of our own. The one module of the doctor that loads rclpy.
+
+It subscribes as the logger does, takes what comes without decoding it, and publishes nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, qos_check_compatible
+
+from shadowhound_data_logger.capture.endpoints import Endpoint, plans
+from shadowhound_data_logger.capture.reader import PolledGroup, Reader, TypeUnavailable, endpoints
+from shadowhound_data_logger.options import IntakeSettings
+
+NODE: Final = 'shadowhound_doctor'
+DISCOVER_S: Final = 3.0
+"""Longest time to find publishers; Fast DDS announces every 3 seconds by default."""
+SETTLE_S: Final = 0.4
+"""After the last one was found, and for a subscription to be matched."""
+POLL_S: Final = 0.02
+
+
+@dataclass(slots=True)
+class Heard:
+    """One topic."""
+
+    topic: str
+    publishers: list[Endpoint]
+    deaf: list[str] = field(default_factory=list)
+    """Subscribers that ask for more than its publishers offer: they receive nothing, and nobody tells them."""
+    unavailable: str = ''
+    """Why nobody can listen to its type here."""
+    received: int = 0
+    sent: int | None = None
+    """By the numbers of the messages; None where they have none."""
+    window_s: float = 0.0
+    _spans: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+    def note(self, publisher: str | None, number: int | None) -> None:
+        self.received += 1
+        if number is not None:
+            first, last = self._spans.get(publisher or '', (number, number))
+            self._spans[publisher or ''] = (min(first, number), max(last, number))
+            self.sent = sum(last - first + 1 for first, last in self._spans.values())
+
+    @property
+    def rate_hz(self) -> float:
+        """As it was sent, as far as that is known."""
+        return max(self.received, self.sent or 0) / self.window_s if self.window_s else 0.0
+
+
+@contextmanager
+def node(domain: int | None = None, namespace: str = '/') -> Iterator[Node]:
+    """In the domain of this process's environment, or another one."""
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=domain)
+    made = Node(NODE, context=context, namespace=namespace, start_parameter_services=False, enable_rosout=False)
+    try:
+        yield made
+    finally:
+        made.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+def discover(of: Node, topics: Sequence[str], patience_s: float = DISCOVER_S) -> dict[str, list[Endpoint]]:
+    """The publishers of each topic; returns once all have one and it has been quiet for a moment."""
+    end = time.monotonic() + patience_s
+    found: dict[str, list[Endpoint]] = {}
+    quiet_since = time.monotonic()
+    while (now := time.monotonic()) < end:
+        seen = {topic: endpoints(of, topic) for topic in topics}
+        if {topic: len(each) for topic, each in seen.items()} != {topic: len(each) for topic, each in found.items()}:
+            found, quiet_since = seen, now
+        if all(found.values()) and now - quiet_since > SETTLE_S:
+            break
+        time.sleep(POLL_S)
+    return found
+
+
+def listen(of: Node, found: dict[str, list[Endpoint]], window_s: float) -> list[Heard]:
+    """Count what comes on each topic that has publishers."""
+    heard = [Heard(topic, publishers) for topic, publishers in found.items()]
+    readers = [(one, reader) for one in heard for reader in _readers(of, one)]
+    try:
+        settled = time.monotonic() + SETTLE_S
+        while time.monotonic() < settled:
+            _drain(readers, count=False)
+            time.sleep(POLL_S)
+        began = time.monotonic()
+        while time.monotonic() < began + window_s:
+            _drain(readers, count=True)
+            time.sleep(POLL_S)
+        _drain(readers, count=True)
+        for one in heard:
+            one.window_s = time.monotonic() - began
+            one.deaf = _deaf(of, one.topic)
+    finally:
+        for _, reader in readers:
+            reader.close()
+    return heard
+
+
+def _readers(of: Node, one: Heard) -> list[Reader]:
+    """As the logger would listen; where two kinds of publishers need two subscriptions, the first is enough to count."""
+    if not one.publishers:
+        return []
+    try:
+        wanted = plans(one.topic, one.publishers, None, IntakeSettings())
+        return [Reader(of, wanted[-1], PolledGroup())]
+    except TypeUnavailable as error:
+        one.unavailable = str(error)
+        return []
+
+
+def _drain(readers: Sequence[tuple[Heard, Reader]], *, count: bool) -> None:
+    for one, reader in readers:
+        for taken in reader.drain():
+            if count:
+                one.note(taken.publisher, taken.number)
+
+
+def _deaf(of: Node, topic: str) -> list[str]:
+    offers = of.get_publishers_info_by_topic(topic)
+    return sorted(
+        {
+            _name(asked)
+            for asked in of.get_subscriptions_info_by_topic(topic)
+            if offers and asked.node_name != NODE and all(_is_deaf(offer, asked) for offer in offers)
+        }
+    )
+
+
+def _is_deaf(offer: Any, asked: Any) -> bool:
+    return bool(qos_check_compatible(offer.qos_profile, asked.qos_profile)[0] == QoSCompatibility.ERROR)
+
+
+def _name(info: Any) -> str:
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'

@@ -1,0 +1,173 @@
+"""Runs checks side by side. Guarantees: it ends in time, and what hangs, crashes or is not reached is in the answer as well."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from shadowhound_data_logger.doctor.context import to_child
+from shadowhound_data_logger.doctor.model import Check, Context, Result, Severity, error
+
+TIMEOUT_S: Final = 12.0
+"""With the start of Python, a run on a dead network ends within 15 s."""
+CHILD: Final = 'shadowhound_data_logger.doctor.child'
+_Message = tuple[str, 'Result | None']
+"""Name of a check and a result of it; None is its end."""
+
+
+@dataclass(slots=True)
+class Running:
+    """A check at work. Its thread adopts the children that it starts, and the runner kills them when it gives the check up."""
+
+    check: Check
+    until_s: float = 0.0
+    given_up: bool = False
+    children: list[subprocess.Popen[bytes]] = field(default_factory=list)
+
+    def adopt(self, child: subprocess.Popen[bytes]) -> None:
+        self.children.append(child)
+        if self.given_up:  # meanwhile; else ``give_up`` will see it
+            child.kill()
+
+    def give_up(self) -> None:
+        self.given_up = True
+        for child in self.children:
+            child.kill()
+
+
+class Examination:
+    """New; ``run`` once, from one thread. A check that misses its deadline is left alone; what it says later is not heard."""
+
+    def __init__(
+        self,
+        checks: Sequence[Check],
+        context: Context,
+        *,
+        timeout_s: float = TIMEOUT_S,
+        tell: Callable[[Check], None] = lambda _: None,
+    ) -> None:
+        """``tell`` hears of each check that has ended. With a longer time for all of it, each check has more as well."""
+        self._waiting = list(checks)
+        self._context = context
+        self._timeout_s = timeout_s
+        self._patience = max(1.0, timeout_s / TIMEOUT_S)
+        self._tell = tell
+        self._order = [check.name for check in checks]
+        self._running: dict[str, Running] = {}
+        self._found: dict[str, list[Result]] = {check.name: [] for check in checks}
+        self._ended: set[str] = set()
+        self._heard: queue.Queue[_Message] = queue.Queue()
+
+    def run(self) -> list[Result]:
+        """All results, in the order of the checks."""
+        end_s = time.monotonic() + self._timeout_s
+        while self._running or self._waiting:
+            self._start_ready(end_s)
+            if self._running:
+                self._listen(min(running.until_s for running in self._running.values()))
+                self._give_up(time.monotonic())
+        return [result for name in self._order for result in self._found[name]]
+
+    def _start_ready(self, end_s: float) -> None:
+        for check in list(self._waiting):
+            if any(name in self._found and name not in self._ended for name in check.after):
+                continue
+            self._waiting.remove(check)
+            if time.monotonic() >= end_s:
+                self._found[check.name].append(Result(check.name, Severity.SKIPPED, 'not asked: no time was left'))
+                self._ended.add(check.name)
+                self._tell(check)
+                continue
+            until_s = min(time.monotonic() + self._patience * check.deadline_s, end_s)
+            running = self._running[check.name] = Running(check, until_s)
+            earlier = {name: tuple(self._found.get(name, ())) for name in check.after}
+            context = replace(self._context, earlier=earlier)
+            threading.Thread(target=_work, args=(running, context, self._heard.put), name=check.name, daemon=True).start()
+
+    def _listen(self, until_s: float) -> None:
+        try:
+            name, result = self._heard.get(timeout=max(0.0, until_s - time.monotonic()))
+        except queue.Empty:
+            return
+        if name not in self._running:
+            return
+        if result is None:
+            self._end(name)
+        else:
+            self._found[name].append(result)
+
+    def _give_up(self, now_s: float) -> None:
+        for name, running in list(self._running.items()):
+            if now_s < running.until_s or not self._heard.empty():
+                continue
+            running.give_up()
+            self._found[name].append(_late(running.check, min(self._patience * running.check.deadline_s, self._timeout_s)))
+            self._end(name)
+
+    def _end(self, name: str) -> None:
+        self._ended.add(name)
+        self._tell(self._running.pop(name).check)
+
+
+def _late(check: Check, limit_s: float) -> Result:
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    cause = (
+        'what it asks hangs'
+        if load < cores
+        else f'what it asks hangs, or this machine is too busy (load {load:.0f} on {cores} cores)'
+    )
+    return error(
+        f'{check.name}.deadline',
+        f'the check did not end within {limit_s:g} s',
+        cause,
+        f'shadowhound-data doctor --only {check.name} --timeout {4 * TIMEOUT_S:g}',
+    )
+
+
+def _work(running: Running, context: Context, say: Callable[[_Message], None]) -> None:
+    """The thread of one check. The one catch-all of the doctor: a check that crashes is a finding and no end of the others."""
+    check, began_s = running.check, time.monotonic()
+    try:
+        for result in in_child(running, context) if check.apart else check.run(context):
+            now_s = time.monotonic()
+            say((check.name, replace(result, took_s=result.took_s or round(now_s - began_s, 3))))
+            began_s = now_s
+    except Exception as problem:  # noqa: BLE001
+        say((check.name, crashed(check, f'{type(problem).__name__}: {problem}')))
+    finally:
+        say((check.name, None))
+
+
+def crashed(check: Check, how: str) -> Result:
+    """The finding that a check itself is."""
+    remedy = f'shadowhound-data doctor --only {check.name} --json, and tell us what it says'
+    return error(f'{check.name}.crash', f'the check failed: {how}', 'a case that the doctor does not know', remedy)
+
+
+def in_child(running: Running, context: Context) -> Iterator[Result]:
+    """The check in a process of its own."""
+    check = running.check
+    with tempfile.TemporaryFile() as log:
+        command = [sys.executable, '-m', CHILD, check.name]
+        child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=dict(context.environ))
+        running.adopt(child)
+        with child:
+            assert child.stdin is not None
+            assert child.stdout is not None
+            child.stdin.write(to_child(context))
+            child.stdin.close()
+            for line in child.stdout:
+                yield Result.from_dict(json.loads(line))
+        if child.returncode:
+            log.seek(0)
+            last = (log.read().decode(errors='replace').strip().splitlines() or ['it said nothing'])[-1]
+            yield crashed(check, f'its process ended with {child.returncode}: {last}')

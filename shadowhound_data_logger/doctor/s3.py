@@ -1,0 +1,255 @@
+"""The S3 server: who it is, whether it takes our signature and our objects, and whether it keeps the two promises of a put.
+
+What it leaves behind: ``<robot>/_doctor/probe`` in each bucket that this machine writes to, 64 bytes that are always the
+same, because the robot's keys may delete nothing. On Tower a second object is written and deleted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import ssl
+import time
+import uuid
+from collections.abc import Iterator
+from contextlib import closing
+from email.utils import parsedate_to_datetime
+from typing import TYPE_CHECKING, Final
+from urllib.error import HTTPError, URLError
+from urllib.request import Request, urlopen
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.doctor import network, s3_put, services
+from shadowhound_data_logger.doctor.model import Context, Result, Role, Severity, error, info, of_error, ok, skipped, warning
+from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S, Service
+from shadowhound_data_logger.errors import (
+    AccessDenied,
+    BucketMissing,
+    CredentialsRejected,
+    ObjectRefused,
+    SettingError,
+    StoreError,
+)
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.stores.s3_requests import S3Requests
+
+NAME: Final = 's3'
+TOWER_BUCKETS: Final = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
+SKEW_S: Final = 5.0
+"""From here on times of two machines cannot be compared."""
+REFUSED_SKEW_S: Final = 900.0
+"""RequestTimeTooSkewed of S3: 15 minutes."""
+SLOW_S: Final = 0.5
+"""A small request that takes longer than this keeps four upload threads below eight objects a second."""
+LATENCY_TRIES: Final = 5
+LISTING_BYTES: Final = 1024
+MINIO: Final = "MinIO's open-source server was archived in April 2026: it goes on working, without fixes and security advisories"
+
+
+def check(context: Context) -> Iterator[Result]:
+    """See the module."""
+    service = services.s3(context)
+    if service is None:
+        yield info(NAME, f'no S3 server is set: data go to {context.settings.store.directory}')
+        return
+    if failed := context.failed('network.s3'):
+        yield skipped(NAME, failed)
+        return
+    for result in _greeting(service, context):
+        yield result
+        if result.check == 's3.answer' and result.is_finding:
+            return
+    from shadowhound_data_logger.stores.s3_requests import S3Requests  # noqa: PLC0415 - botocore costs half a second
+
+    upload = UploadSettings(threads=1, connect_timeout_s=CONNECT_S, read_timeout_s=ANSWER_S)
+    with closing(S3Requests(context.settings.store, upload)) as requests:
+        try:
+            requests.open()
+            requests.probe()
+            yield ok('s3.signature', 'the server takes our signature')
+            yield from _use(requests, context)
+        except SettingError as problem:
+            yield of_error('s3.setting', problem)
+        except CredentialsRejected as problem:
+            yield of_error('s3.signature', problem, 'the key pair is not one of this server: mistyped, or changed on Tower')
+        except StoreError as problem:
+            yield _away(problem)
+
+
+def _away(problem: StoreError) -> Result:
+    """What stops all of it, in the middle of asking."""
+    if problem.data.get('code') in {'RequestTimeTooSkewed', 'RequestExpired'}:
+        return of_error('s3.clock', problem, 'the server refuses signatures that are more than 15 minutes off')
+    if problem.data.get('status', 0) >= 500:
+        return of_error('s3.answer', problem, 'the server itself fails: its disk is full, or its storage is away')
+    if 'like an S3 server' in str(problem):
+        return of_error('s3.answer', problem, 'another program answers on this port, or a proxy or login page on the way')
+    return of_error('s3.answer', problem, 'the connection is bad, or the server is overloaded')
+
+
+def _greeting(service: Service, context: Context) -> Iterator[Result]:
+    """What the server says to somebody without keys: its name, its time, and that it says no more."""
+    trust = ssl.create_default_context(cafile=network.bundle(service, context)[1] or None) if service.tls else None
+    asked = Request(service.url, headers={'User-Agent': 'shadowhound-doctor'})  # noqa: S310 - http(s), see services
+    try:
+        with urlopen(asked, timeout=ANSWER_S, context=trust) as answer:  # noqa: S310
+            headers, body = answer.headers, answer.read(LISTING_BYTES)
+    except HTTPError as problem:  # which is what a server answers to somebody without keys
+        headers, body = problem.headers, b''
+        problem.close()
+    except (URLError, OSError, http.client.HTTPException) as problem:
+        yield _no_answer(service, getattr(problem, 'reason', problem))
+        return
+    yield _named(headers.get('Server', ''), service)
+    yield from _clock(headers.get('Date', ''))
+    if b'ListAllMyBucketsResult' in body:
+        yield warning(
+            's3.open',
+            'the server lists its buckets to somebody without keys',
+            'it was started without credentials: whoever reaches it may do anything',
+            'on Tower: make tower-secrets, and start it with them (docs/tower.md)',
+        )
+
+
+def _no_answer(service: Service, reason: object) -> Result:
+    remedy = 'on Tower: docker compose logs --tail 50 ; docker compose restart ; df -h'
+    if isinstance(reason, TimeoutError):
+        seen = f'{service.url} accepts the connection and gives no answer within {ANSWER_S:g} s'
+        return error('s3.answer', seen, 'the server hangs: a full or dead disk, or its storage is away', remedy)
+    return error('s3.answer', f'{service.url} does not speak HTTP: {reason}', 'something else listens on this port', remedy)
+
+
+def _named(server: str, service: Service) -> Result:
+    if 'minio' in server.lower():
+        return info('s3.server', f'{service.url} is {server}', MINIO, 'plan to move to SeaweedFS: docs/tower.md', server=server)
+    return ok('s3.server', f'{service.url} is {server or "a server that does not say what it is"}', server=server)
+
+
+def _clock(date: str) -> Iterator[Result]:
+    """By the Date header, which has whole seconds."""
+    try:
+        skew_s = time.time() - parsedate_to_datetime(date).timestamp() - 0.5
+    except (TypeError, ValueError):
+        return
+    which = 'ahead of' if skew_s > 0 else 'behind'
+    seen = f'the clock of this machine is {abs(skew_s):.0f} s {which} that of Tower'
+    remedy = 'on both machines: timedatectl ; sudo timedatectl set-ntp true  (docs/thor.md, Wrong clock)'
+    if abs(skew_s) >= REFUSED_SKEW_S - 60.0:
+        yield error('s3.clock', seen, 'from 15 minutes on the server refuses every signature', remedy, skew_s=round(skew_s, 1))
+    elif abs(skew_s) > SKEW_S:
+        yield warning('s3.clock', seen, 'times of robot and Tower cannot be compared', remedy, skew_s=round(skew_s, 1))
+    else:
+        yield ok('s3.clock', 'the clocks of this machine and of Tower agree', skew_s=round(skew_s, 1))
+
+
+def _use(requests: S3Requests, context: Context) -> Iterator[Result]:
+    if context.role is Role.SPARK:
+        yield from _read(requests, context)
+        return
+    missing: set[str] = set()
+    if context.role is Role.TOWER:
+        for result in _buckets(requests):
+            missing |= set(result.fix[1:])
+            yield result
+    written = []
+    for bucket in s3_put.buckets(context.settings):
+        if bucket in missing:
+            continue
+        results = list(s3_put.write(requests, bucket, context.settings.robot))
+        yield from results
+        written += [] if any(result.severity is Severity.ERROR for result in results) else [bucket]
+    if not written:
+        return
+    latency = _latency(requests, written[0], context.settings.robot)
+    yield latency
+    yield from s3_put.promises(requests, written[0], context.settings.robot, latency.data['latency_s'])
+    if context.role is Role.TOWER:
+        yield from _delete(requests, written[0], context.settings.robot)
+
+
+def _buckets(requests: S3Requests) -> Iterator[Result]:
+    """On Tower: those that the guide lists."""
+    try:
+        there = requests.buckets()
+    except AccessDenied as problem:
+        yield of_error('s3.buckets', problem, "these are not Tower's own keys; --role thor asks what a robot's may do")
+        return
+    for name in TOWER_BUCKETS:
+        if name not in there:
+            yield s3_put.missing_bucket(name, requests.endpoint)
+    if all(name in there for name in TOWER_BUCKETS):
+        yield ok('s3.buckets', f'the buckets {", ".join(TOWER_BUCKETS)} are there')
+
+
+def _latency(requests: S3Requests, bucket: str, robot: str) -> Result:
+    took = []
+    for _ in range(LATENCY_TRIES):
+        began_s = time.perf_counter()
+        requests.head(bucket, s3_put.key(robot))
+        took.append(time.perf_counter() - began_s)
+    middle_s = sorted(took)[LATENCY_TRIES // 2]
+    seen = f'a small request takes {1000 * middle_s:.1f} ms'
+    if middle_s > SLOW_S:
+        return warning(
+            's3.latency',
+            seen,
+            'a weak WiFi, or a server that is busy',
+            'ping -c 10 TOWER_IP ; iw dev wlan0 link',
+            latency_s=round(middle_s, 4),
+        )
+    return ok('s3.latency', seen, latency_s=round(middle_s, 4))
+
+
+def _delete(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:
+    """Only Tower's own keys have to be able to."""
+    name = f'{robot}/_doctor/{uuid.uuid4().hex}'
+    requests.put(s3_put.probe(bucket, name), s3_put.BODY, s3_put.crc32(s3_put.BODY), conditional=True)
+    try:
+        requests.delete(bucket, name)
+        gone = requests.head(bucket, name) is None
+    except AccessDenied as problem:
+        yield of_error('s3.delete', problem, "these are not Tower's own keys")
+        return
+    if gone:
+        yield ok('s3.delete', 'an object can be deleted')
+    else:
+        yield warning(
+            's3.delete',
+            f'{bucket}/{name} was deleted and is still there',
+            'versions or a retention rule keep it',
+            f'aws --endpoint-url {requests.endpoint} s3api get-bucket-versioning --bucket {bucket}',
+        )
+
+
+def _read(requests: S3Requests, context: Context) -> Iterator[Result]:
+    """On Spark: list, and read the first object there is."""
+    bucket, prefix = s3_put.buckets(context.settings)[0], f'{context.settings.robot}/'
+    try:
+        first = next(requests.list(bucket, prefix), None)
+        if first is None:
+            yield from _nothing(requests, bucket, prefix)
+            return
+        began_s = time.perf_counter()
+        body = b''.join(requests.content(bucket, first.key))
+    except AccessDenied as problem:
+        yield of_error('s3.read', problem, 'a researcher needs to list and to get')
+        return
+    mbps = 8e-6 * len(body) / max(time.perf_counter() - began_s, 1e-6)
+    yield ok(
+        's3.read', f'{bucket}/{first.key} can be read', download_mbps=round(mbps, 2), sha256=hashlib.sha256(body).hexdigest()
+    )
+
+
+def _nothing(requests: S3Requests, bucket: str, prefix: str) -> Iterator[Result]:
+    try:
+        b''.join(requests.content(bucket, s3_put.key(prefix.rstrip('/'))))
+    except BucketMissing:
+        yield s3_put.missing_bucket(bucket, requests.endpoint)
+    except ObjectRefused:
+        yield warning(
+            's3.read',
+            f'there is nothing under {bucket}/{prefix}',
+            'no robot of this name has delivered anything yet, or not to this server',
+            'SHADOWHOUND_ROBOT names the robot; on it: shadowhound-data doctor',
+        )

@@ -1,0 +1,165 @@
+"""Probe objects: that a put is taken, comes back the same, never overwrites, is refused when damaged, and how fast it is."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.doctor.model import Result, error, of_error, ok, warning
+from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.model import SpooledObject
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.stores.s3_requests import S3Requests
+
+TRAJECTORIES: Final = 'trajectories'
+"""Where missions put the copy of their way (missions/objects.py)."""
+BODY: Final = b'written by shadowhound-data doctor; may be deleted at any time\n\n'
+SMALL_BYTES: Final = 64 << 10
+LARGE_BYTES: Final = 2 << 20
+LARGE_WITHIN_S: Final = 4.0
+"""The large one is tried where the small one says that it takes no longer."""
+SLOW_MBPS: Final = 4.0
+"""The default settings need 3.3 Mbit/s on average (docs/thor.md)."""
+
+
+def buckets(settings: Settings) -> tuple[str, ...]:
+    """Those that a robot writes to."""
+    return tuple(dict.fromkeys([*(sensor.bucket for sensor in settings.sensors if sensor.enabled), TRAJECTORIES]))
+
+
+def missing_bucket(name: str, endpoint: str) -> Result:
+    """The finding, which ``--fix`` can mend where the keys allow it."""
+    return error(
+        's3.bucket',
+        f'there is no bucket {name}',
+        'nobody has created it on this server',
+        f'aws --endpoint-url {endpoint} s3 mb s3://{name}  # or: shadowhound-data doctor --fix',
+        fix=('bucket', name),
+    )
+
+
+def key(robot: str) -> str:
+    """Of the probe, the same in each bucket."""
+    return f'{robot}/_doctor/probe'
+
+
+def write(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:
+    """Put the probe twice, and read it back. Raises StoreError for what is wrong with the server as a whole."""
+    from shadowhound_data_logger.stores.s3_requests import Sent  # noqa: PLC0415 - botocore costs half a second
+
+    item = probe(bucket, key(robot))
+    try:
+        sent = requests.put(item, BODY, crc32(BODY), conditional=True)
+        if sent is Sent.NOT_IMPLEMENTED:
+            requests.put(item, BODY, crc32(BODY), conditional=False)
+        elif sent is Sent.CREATED:  # the first time; now it is there, and a condition that is honoured is refused
+            sent = requests.put(item, BODY, crc32(BODY), conditional=True)
+        body = b''.join(requests.content(bucket, item.key))
+    except BucketMissing:
+        yield missing_bucket(bucket, requests.endpoint)
+        return
+    except (AccessDenied, ObjectRefused) as problem:
+        yield of_error(
+            's3.write',
+            problem,
+            f'no right to put and get under {bucket}/{robot}/, or no such bucket: a server does not say which',
+        )
+        return
+    if body != BODY:
+        yield error(
+            's3.read',
+            f'{bucket}/{item.key} does not come back as it was written',
+            'somebody else writes there, or the server damages what it holds',
+            'on Tower: look at its disks and its log',
+        )
+        return
+    yield ok('s3.write', f'{bucket}: an object was written and read back')
+    if sent is Sent.TAKEN:
+        yield ok('s3.condition', f'{bucket}: If-None-Match is honoured, nothing is ever overwritten')
+        return
+    how = 'does not know' if sent is Sent.NOT_IMPLEMENTED else 'ignores'
+    yield warning(
+        's3.condition',
+        f'{bucket}: the server {how} If-None-Match',
+        'it would overwrite; each put has to look first, which is slower, and two writers in one instant go unseen',
+        'update the S3 server on Tower: SeaweedFS, or MinIO of 2024 or later',
+    )
+
+
+def promises(requests: S3Requests, bucket: str, robot: str, latency_s: float) -> Iterator[Result]:
+    """Bodies that do not match their checksum: a server that verifies keeps nothing of them, so they also measure the speed.
+
+    ``latency_s`` is what a request takes that sends next to nothing.
+    """
+    name = f'{robot}/_doctor/damaged'
+    took_s, refused = _damaged(requests, bucket, name, SMALL_BYTES)
+    size = SMALL_BYTES
+    if (took_s - latency_s) * LARGE_BYTES / SMALL_BYTES < LARGE_WITHIN_S:
+        size = LARGE_BYTES
+        took_s, refused = _damaged(requests, bucket, name, size)
+    if refused:
+        yield ok('s3.checksum', 'the server verifies checksums: what is damaged on its way is refused')
+    else:
+        yield error(
+            's3.checksum',
+            'the server took an object whose CRC32 is wrong',
+            'it does not verify x-amz-checksum-crc32: what is damaged on its way would be confirmed',
+            'update the S3 server on Tower',
+        )
+    mbps = 8e-6 * size / max(took_s - latency_s, took_s / 2)
+    seen = f'{mbps:,.1f} Mbit/s to Tower ({size >> 10} KiB in {took_s:.2f} s)'
+    if mbps < SLOW_MBPS:
+        yield warning(
+            's3.throughput',
+            seen,
+            'below what the default settings make: the backlog grows',
+            'iw dev wlan0 link ; log less: camera.rate_hz, lidar.rate_hz, camera.quality in the parameter file',
+            upload_mbps=round(mbps, 2),
+        )
+    else:
+        yield ok('s3.throughput', seen, upload_mbps=round(mbps, 2))
+
+
+def _damaged(requests: S3Requests, bucket: str, name: str, size: int) -> tuple[float, bool]:
+    """Seconds that it took, and whether the server refused it."""
+    body = os.urandom(size)
+    item = probe(bucket, name, body)
+    began_s = time.perf_counter()
+    try:
+        requests.put(item, body, crc32(b'another'), conditional=False)
+        refused = False
+    except (StoreUnavailable, ObjectRefused) as problem:
+        if not problem.data.get('status'):  # no answer: a break that says nothing of checksums
+            raise
+        refused = True
+    return time.perf_counter() - began_s, refused
+
+
+def probe(bucket: str, name: str, body: bytes = BODY) -> SpooledObject:
+    """An object as a put wants it; there is no file of it."""
+    sha256 = hashlib.sha256(body).hexdigest()
+    return SpooledObject(
+        id=0,
+        bucket=bucket,
+        key=name,
+        path=Path(),
+        size=len(body),
+        sha256=sha256,
+        content_type='text/plain',
+        metadata={},
+        priority=0,
+        created_ns=0,
+    )
+
+
+def crc32(body: bytes) -> str:
+    """As S3 writes it: base64 of four big-endian bytes."""
+    return base64.b64encode(zlib.crc32(body).to_bytes(4, 'big')).decode('ascii')

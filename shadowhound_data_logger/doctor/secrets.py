@@ -1,0 +1,102 @@
+"""Who can read the secrets: modes of files that hold keys, keys in URLs and parameter files, and keys that everybody knows."""
+
+from __future__ import annotations
+
+import re
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from shadowhound_data_logger.doctor.context import home_of
+from shadowhound_data_logger.doctor.model import Context, Result, info, ok, warning
+
+NAME: Final = 'secrets'
+OTHERS: Final = stat.S_IRGRP | stat.S_IROTH | stat.S_IWGRP | stat.S_IWOTH
+WELL_KNOWN: Final = frozenset({'minioadmin', 'minio', 'minio123', 'password', 'admin', 'any', 'some_secret_key'})
+"""Defaults of servers and of their manuals."""
+URLS: Final = ('AWS_ENDPOINT_URL', 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL')
+MOST_BYTES: Final = 1 << 20
+_SECRET: Final = re.compile(
+    r'(?im)^[^#\n]*(aws_secret_access_key|mlflow_tracking_password|secret_?key|postgres_password)\b\s*[:=]\s*\S'
+)
+
+
+def check(context: Context) -> Iterator[Result]:
+    """See the module."""
+    before = [*_urls(context), *_known(context), *_files(context)]
+    yield from before
+    if not any(result.is_finding for result in before):
+        yield ok(NAME, 'no other user can read the keys')
+
+
+def _urls(context: Context) -> Iterator[Result]:
+    for name in URLS:
+        if '@' in urlsplit(context.environ.get(name, '')).netloc:
+            yield warning(
+                'secrets.url',
+                f'{name} holds a user and a password',
+                'URLs are logged, and shown by ps and /proc',
+                f'export {name}=http://...  # without them; AWS_ACCESS_KEY_ID, MLFLOW_TRACKING_USERNAME and _PASSWORD '
+                'take their place',
+            )
+
+
+def _known(context: Context) -> Iterator[Result]:
+    secret = context.environ.get('AWS_SECRET_ACCESS_KEY', '')
+    if secret.lower() in WELL_KNOWN:
+        yield warning(
+            'secrets.default',
+            'AWS_SECRET_ACCESS_KEY is one that everybody knows',
+            'it is the default of a server',
+            'on Tower: make tower-secrets, and hand the new ones to Thor and Spark',
+        )
+
+
+def _files(context: Context) -> Iterator[Result]:
+    for path in _candidates(context):
+        try:
+            status = path.stat()
+            mode = stat.S_IMODE(status.st_mode)
+            if not mode & OTHERS or not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
+                continue
+            if not _SECRET.search(path.read_text(encoding='utf-8', errors='replace')):
+                continue
+        except OSError:  # none, or not ours to read
+            continue
+        if mode & stat.S_IROTH or mode & stat.S_IWOTH:
+            yield warning(
+                'secrets.mode',
+                f'{path} holds a key, and everybody on this machine can read it (mode {mode:04o})',
+                'it was made without a thought of its mode',
+                f'chmod 600 {path}',
+                fix=('mode', str(path), '600'),
+            )
+        else:
+            yield info(
+                'secrets.mode', f'{path} holds a key, and its group can read it (mode {mode:04o})', '', f'chmod 600 {path}'
+            )
+    if context.parameter_file and any('secret' in name.lower() for name in context.parameters):
+        yield warning(
+            'secrets.parameters',
+            f'{context.parameter_file} names a secret',
+            'ROS parameters can be read by everybody in the network',
+            'take it out; AWS_SECRET_ACCESS_KEY belongs into the environment',
+        )
+
+
+def _candidates(context: Context) -> list[Path]:
+    """Where keys usually are."""
+    home, environ = home_of(context), context.environ
+    paths = [
+        Path(environ.get('AWS_SHARED_CREDENTIALS_FILE') or home / '.aws/credentials').expanduser(),
+        Path(environ.get('AWS_CONFIG_FILE') or home / '.aws/config').expanduser(),
+        context.root / 'etc/shadowhound/logger.env',
+        *(Path(name) for name in ('tower/.env', '.env', 'thor.env', 'spark.env')),
+        *sorted(Path('tower/secrets').glob('*.env')),
+        home / '.mlflow/credentials',
+        *(home / name for name in ('.bashrc', '.profile', '.bash_profile', '.zshrc', '.bash_history', '.shadowhound.env')),
+        *([context.parameter_file] if context.parameter_file else []),
+    ]
+    return list(dict.fromkeys(paths))

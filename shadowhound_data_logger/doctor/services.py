@@ -1,0 +1,62 @@
+"""Where the two services of Tower are, as the environment names them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import urlsplit
+
+from shadowhound_data_logger.doctor.model import Context
+
+CONNECT_S: Final = 3.0
+ANSWER_S: Final = 4.0
+"""A Tower that needs longer for an answer is no Tower to work with; the sum of all waits has to fit into the run."""
+LOCAL: Final = frozenset({'localhost', '127.0.0.1', '::1'})
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """A server by its URL."""
+
+    name: str
+    """As in the names of checks: ``s3`` or ``mlflow``."""
+    title: str
+    variable: str
+    url: str
+    """Without user and password."""
+    host: str
+    port: int
+    tls: bool
+    usual_ports: tuple[int, ...]
+    """Where such a server is often found."""
+
+    @property
+    def is_local(self) -> bool:
+        return self.host in LOCAL
+
+    def at(self, port: int) -> str:
+        """The URL with another port."""
+        host = f'[{self.host}]' if ':' in self.host else self.host
+        return f'{"https" if self.tls else "http"}://{host}:{port}'
+
+
+def s3(context: Context) -> Service | None:
+    """The S3 server; None where data go to a folder."""
+    return _service('s3', 'the S3 server', 'AWS_ENDPOINT_URL', context.settings.store.endpoint_url or '', (9000, 8333))
+
+
+def mlflow(context: Context) -> Service | None:
+    """The MLflow server; None where there is none."""
+    return _service('mlflow', 'MLflow', 'MLFLOW_TRACKING_URI', context.environ.get('MLFLOW_TRACKING_URI', ''), (5001, 5000))
+
+
+def _service(name: str, title: str, variable: str, given: str, usual: tuple[int, ...]) -> Service | None:
+    try:
+        url = urlsplit(given)
+        if url.scheme not in {'http', 'https'} or not url.hostname:
+            return None
+        port = url.port or (443 if url.scheme == 'https' else 80)
+    except ValueError:
+        return None
+    shown = url._replace(netloc=url.netloc.rpartition('@')[2]).geturl().rstrip('/')
+    return Service(name, title, variable, shown, url.hostname, port, url.scheme == 'https', usual)

@@ -1,0 +1,158 @@
+"""How large messages cross from the driver to the logger: shared memory that holds them, or socket buffers that do."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.doctor.machine import Process, number, processes
+from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
+from shadowhound_data_logger.doctor.ros_environment import DRIVERS
+from shadowhound_data_logger.options import IMAGE, POINT_CLOUD
+
+NAME: Final = 'sockets'
+PROFILES: Final = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
+"""Fast DDS 3, which reads the second as well, and Fast DDS 2."""
+PROFILE_FILE: Final = '$(ros2 pkg prefix shadowhound_data_logger)/share/shadowhound_data_logger/launch_configs/fastdds_shm.xml'
+ENOUGH_BUFFER: Final = 8 << 20
+"""net.core.rmem_max: a second of clouds of 320 KB at 10 Hz twice over, or eight raw images (docs/thor.md, Middleware)."""
+ENOUGH_SEGMENT: Final = 4 << 20
+"""Four raw images of 921 KB; the default of Fast DDS holds none (512 KB)."""
+ENOUGH_SHM: Final = 128 << 20
+"""Three participants with the segment of our profile."""
+LARGE: Final = frozenset({IMAGE, POINT_CLOUD})
+_SEGMENT: Final = re.compile(r'<segment_size>\s*(\d+)\s*</segment_size>')
+SYSCTL: Final = (
+    "echo 'net.core.rmem_max = 16777216' | sudo tee /etc/sysctl.d/60-dds.conf && sudo sysctl --system # docs/thor.md, Middleware"
+)
+
+
+def check(context: Context) -> Iterator[Result]:
+    """See the module."""
+    large = [sensor.name for sensor in context.settings.sensors if sensor.enabled and LARGE.intersection(sensor.types)]
+    if not large:
+        yield ok('sockets.need', 'no sensor with large messages is logged')
+        return
+    driver = processes(context.root, *DRIVERS)
+    if 'cyclone' in context.environ.get('RMW_IMPLEMENTATION', ''):
+        yield _buffer(context, 'Cyclone DDS sends everything over UDP')
+        yield from _cyclone(context)
+        return
+    yield _profile(context)
+    yield from _memory(context, driver)
+    if driver:
+        yield from _user(driver)
+        yield from _driver_profile(context, driver)
+        found = _buffer(context, '')
+        yield ok(found.check, f'{found.seen}; not needed, as the driver runs here') if found.is_finding else found
+    else:
+        yield _buffer(context, 'where the driver is on another machine, everything comes over UDP', needed=False)
+
+
+def _buffer(context: Context, why: str, *, needed: bool = True) -> Result:
+    size = number(context.root / 'proc/sys/net/core/rmem_max')
+    if size is None:
+        return info('sockets.buffer', 'net.core.rmem_max cannot be read here')
+    seen = f'net.core.rmem_max is {size:,} bytes'
+    if size >= ENOUGH_BUFFER:
+        return ok('sockets.buffer', seen, rmem_max=size)
+    cause = f'{why}: clouds and raw images are cut into fragments, and one that finds no room costs all of it'
+    if not needed:
+        return info('sockets.buffer', seen, cause, SYSCTL, rmem_max=size)
+    return warning('sockets.buffer', seen, cause, SYSCTL, rmem_max=size)
+
+
+def _cyclone(context: Context) -> Iterator[Result]:
+    """The kernel's limit is no use to a socket that asks for the default."""
+    uri = context.environ.get('CYCLONEDDS_URI', '')
+    try:
+        text = Path(uri.removeprefix('file://')).read_text(encoding='utf-8') if uri and '<' not in uri else uri
+    except OSError as problem:
+        yield error(
+            'sockets.cyclone',
+            f'CYCLONEDDS_URI={uri} cannot be read: {problem.strerror}',
+            'Cyclone DDS does not start then',
+            f'ls -l {uri.removeprefix("file://")}',
+        )
+        return
+    if 'SocketReceiveBufferSize' in text:
+        yield ok('sockets.cyclone', 'CYCLONEDDS_URI asks for a receive buffer')
+    else:
+        yield warning(
+            'sockets.cyclone',
+            'CYCLONEDDS_URI asks for no receive buffer',
+            'Cyclone DDS takes 1 MB unless it is told',
+            'export CYCLONEDDS_URI=file:///etc/shadowhound/cyclonedds.xml  # with SocketReceiveBufferSize min="10MB": '
+            'docs/thor.md',
+        )
+
+
+def _profile(context: Context) -> Result:
+    """Fast DDS of this shell."""
+    name, file = next(((name, path) for name in PROFILES if (path := context.environ.get(name))), ('', ''))
+    variable = PROFILES[1] if context.environ.get('ROS_DISTRO') in {'humble', 'jazzy'} else PROFILES[0]
+    remedy = f'export {variable}={PROFILE_FILE}  # for the driver, and here'
+    if not file:
+        return warning(
+            'sockets.profile',
+            'Fast DDS has its small shared memory (512 KB)',
+            'a raw image or a cloud does not fit, goes over UDP in fragments, and is mostly lost',
+            remedy,
+        )
+    try:
+        sizes = [int(size) for size in _SEGMENT.findall(Path(file).read_text(encoding='utf-8'))]
+    except OSError as problem:
+        return error(
+            'sockets.profile', f'{name}={file} cannot be read: {problem.strerror}', 'Fast DDS takes its defaults then', remedy
+        )
+    if max(sizes, default=0) < ENOUGH_SEGMENT:
+        return warning(
+            'sockets.profile',
+            f'{file} has no shared-memory segment of {ENOUGH_SEGMENT >> 20} MB or more',
+            'raw images do not fit',
+            remedy,
+        )
+    return ok('sockets.profile', f'shared memory of {max(sizes) >> 20} MB by {file}')
+
+
+def _memory(context: Context, driver: list[Process]) -> Iterator[Result]:
+    try:
+        disk = os.statvfs(context.root / 'dev/shm')
+    except OSError:
+        return
+    free = disk.f_bavail * disk.f_frsize
+    if free < ENOUGH_SHM:
+        yield warning(
+            'sockets.memory',
+            f'/dev/shm has {free >> 20} MB free',  # noqa: S108 - it is only named
+            'Fast DDS shares memory there; docker gives 64 MB unless told',
+            'fastdds shm clean ; in a container: --ipc=host or --shm-size=1g',
+            free_bytes=free,
+            driver=bool(driver),
+        )
+
+
+def _user(driver: list[Process]) -> Iterator[Result]:
+    others = [each for each in driver if each.uid != os.getuid()]
+    if others:
+        yield warning(
+            'sockets.user',
+            f'the driver (process {others[0].pid}) runs as user {others[0].uid}, this shell as {os.getuid()}',
+            'Fast DDS shares memory within one user only: it finds the other process and hands nothing over',
+            'run the node as the same user: User= in shadowhound-data-logger.service',
+        )
+
+
+def _driver_profile(context: Context, driver: list[Process]) -> Iterator[Result]:
+    """The segment belongs to the publisher."""
+    without = [each for each in driver if each.environ and not any(each.environ.get(name) for name in PROFILES)]
+    if without and any(context.environ.get(name) for name in PROFILES):
+        yield warning(
+            'sockets.driver',
+            f'the driver (process {without[0].pid}) was started without the shared-memory profile',
+            "the memory is the publisher's: here alone it changes nothing",
+            f'start the driver again with: export {PROFILES[1]}={PROFILE_FILE}',
+        )

@@ -1,0 +1,200 @@
+"""The node and its spool: whether it runs, what waits and for how long, whether the accounts close, who holds what."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.doctor.machine import command, lock_holder
+from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
+from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.spool import ledger, status
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.piles import Piles, look
+from shadowhound_data_logger.spool.schema import SCHEMA_VERSION
+
+NAME: Final = 'spool'
+OLD_S: Final = 600.0
+"""A backlog this old is more than a walk behind a wall."""
+LONG_S: Final = 3600.0
+"""A backlog that takes longer than this to deliver is one."""
+TWICE_S: Final = 0.3
+"""A mission agent without a node takes the right to deliver for moments; what holds it longer is looked at."""
+START: Final = 'ros2 run shadowhound_data_logger sensor_logger_node  # or: sudo systemctl start shadowhound-data-logger'
+REBUILD: Final = 'start the node: it rebuilds the index from the files, which are all there'
+STORE: Final = 'shadowhound-data doctor --only s3 --only network'
+
+
+def check(context: Context) -> Iterator[Result]:
+    """See the module."""
+    folder, robot = context.settings.spool_path, context.settings.robot
+    found = status.read(folder, robot, SystemClock.of_this_machine())
+    yield from _node(found, folder)
+    path = folder / 'index.db'
+    if not path.is_file():
+        yield info(
+            'spool.index', f'there is no spool in {folder} yet', 'the node has not run here, or SHADOWHOUND_HOME is another one'
+        )
+        return
+    try:
+        piles, quarantined = _index(path)
+        accounts = ledger.read(folder, robot)
+    except (OSError, sqlite3.Error, SpoolError) as problem:
+        yield error(
+            'spool.index',
+            f'the index {path} is damaged or cannot be read: {problem}',
+            'a failing disk, a power cut with a write cache that lies, or another user',
+            REBUILD,
+        )
+        return
+    yield ok('spool.index', 'the index is whole')
+    yield _ledger(accounts)
+    yield _backlog(piles, context, runs=found['running'])
+    yield from _quarantine(quarantined, folder)
+    yield from _lock(folder, found, context.root)
+
+
+def _index(path: Path) -> tuple[Piles, dict[str, int]]:
+    """What lies there, and objects in quarantine by reason; raises sqlite3.Error for a damaged file."""
+    index = Index(path, read_only=True)
+    try:
+        index.open()
+        if index.db.execute('PRAGMA user_version').fetchone()[0] == SCHEMA_VERSION:
+            index.check()  # an older one is brought up to date by the next start, and has other tables
+        query = "SELECT reason, count(*) FROM objects WHERE state = 'quarantined' GROUP BY reason"
+        reasons = {str(reason): count for reason, count in index.db.execute(query)}
+        return look(index, path.parent, time.time_ns()), reasons
+    finally:
+        index.close()
+
+
+def _node(found: Mapping[str, Any], folder: Path) -> Iterator[Result]:
+    if found['state'] == status.NOT_RUNNING:
+        yield warning(
+            'node.running', f'the node of {found["robot"]} does not run here', f'by {status.file(folder, found["robot"])}', START
+        )
+        return
+    if found['state'] == status.NOT_ANSWERING:
+        yield error(
+            'node.running',
+            f'the node (process {found["pid"]}) has been silent for {found["age_s"]:.0f} s',
+            'it hangs: in a disk that does not answer, say',
+            f'kill -INT {found["pid"]} ; {START}',
+        )
+        return
+    yield ok('node.running', f'the node of {found["robot"]} runs (process {found["pid"]})')
+    store = found['store']
+    if store['state'] not in status.FINE_STORE:
+        yield warning(
+            'node.delivery',
+            f'delivery: {str(store["state"]).replace("_", " ")}',
+            store['last_error'] or 'the node does not say why',
+            STORE,
+        )
+    missed = {
+        topic: row['missed'] + row['dropped'] + row['rejected']
+        for topic, row in found['topics'].items()
+        if row['missed'] is not None
+    }
+    for text in found['findings']:
+        if not text.startswith('delivery:'):
+            yield warning('node.status', text, 'said by the node itself', _status_remedy(text), lost=sum(missed.values()))
+
+
+def _status_remedy(text: str) -> str:
+    remedies = {
+        'missed': 'shadowhound-data doctor --only sockets --only ros  # lost before the logger',
+        'dropped': 'top -H -p $(pgrep -f sensor_logger_node)  # the encoders do not follow: log less, or set encode.threads',
+        'the node is paused': 'ros2 service call /sensor_logger_node/resume std_srvs/srv/Trigger',
+        'bucket': 'shadowhound-data doctor --only s3',
+        'the clock': 'timedatectl  # docs/thor.md, Wrong clock',
+        'quarantined': 'ls -R ~/.shadowhound/spool/quarantine | head',
+    }
+    return next((remedy for start, remedy in remedies.items() if text.startswith(start)), 'shadowhound-data status')
+
+
+def _ledger(accounts: Mapping[str, Any]) -> Result:
+    wrong = ledger.imbalances(accounts)
+    if not wrong:
+        return ok(
+            'spool.ledger',
+            f'the ledger closes over {len(accounts["topics"])} topics and {accounts["objects"]["spooled"]:,} objects',
+        )
+    return error(
+        'spool.ledger',
+        f'the ledger does not close: {wrong[0]}' + (f'; and {len(wrong) - 1} more' if wrong[1:] else ''),
+        'the index was written by something else, or this is a fault of ours',
+        'cp -r ~/.shadowhound/spool /tmp/spool && shadowhound-data ledger --json > /tmp/ledger.json  # and send us both',
+        imbalances=wrong,
+    )
+
+
+def _backlog(piles: Piles, context: Context, *, runs: bool) -> Result:
+    """How much waits, and how long it takes at the rate that the check of the store has measured."""
+    count, size, oldest_s = piles.pending, piles.bytes, piles.oldest_age_s
+    if not count:
+        return ok('spool.backlog', 'nothing waits for delivery', pending=0)
+    figures: dict[str, Any] = {'pending': count, 'bytes': size, 'oldest_age_s': oldest_s}
+    drain_s = _drain_s(count, size, context)
+    seen = f'{count:,} objects ({size / 1e6:,.1f} MB) wait' + (f', the oldest for {oldest_s / 60:,.0f} min' if oldest_s else '')
+    if drain_s is not None:
+        seen += f'; at the measured rate they are gone in {drain_s / 60:,.1f} min'
+        figures['drain_s'] = round(drain_s, 1)
+    if (oldest_s or 0.0) < OLD_S and (drain_s or 0.0) < LONG_S:
+        return ok('spool.backlog', seen, **figures)
+    if not runs:
+        return warning('spool.backlog', seen, 'nobody delivers while the node does not run', START, **figures)
+    if drain_s is None:
+        return warning('spool.backlog', seen, 'Tower is out of reach, or takes nothing', STORE, **figures)
+    return warning(
+        'spool.backlog',
+        seen,
+        'Tower was away for long, or more is logged than the network carries',
+        'bring the robot to a better network; log less: camera.rate_hz, lidar.rate_hz; upload.max_mbps 0',
+        **figures,
+    )
+
+
+def _drain_s(count: int, size: int, context: Context) -> float | None:
+    """None where the store was not asked, or did not answer."""
+    figures: dict[str, float] = {}
+    for result in context.earlier.get('s3', ()):
+        figures |= result.data
+    mbps, upload = figures.get('upload_mbps'), context.settings.upload
+    if not mbps:
+        return None
+    mbps = min(mbps, upload.max_mbps) if upload.max_mbps else mbps
+    return max(8e-6 * size / mbps, count * 2 * figures.get('latency_s', 0.0) / upload.threads)
+
+
+def _quarantine(reasons: Mapping[str, int], folder: Path) -> Iterator[Result]:
+    if reasons:
+        text = ', '.join(f'{count:,} ({reason})' for reason, count in sorted(reasons.items()))
+        yield warning(
+            'spool.quarantine',
+            f'objects in quarantine: {text}',
+            'the store will never take them as they are; nothing is lost',
+            f'ls -R {folder / "quarantine"} | head -40 ; docs/reliability.md',
+        )
+
+
+def _lock(folder: Path, found: Mapping[str, Any], root: Path) -> Iterator[Result]:
+    """Who has the right to deliver."""
+    path = folder / 'drain.lock'
+    holder = lock_holder(root, path)
+    if holder is None or holder == found.get('pid'):
+        return
+    time.sleep(TWICE_S)
+    if lock_holder(root, path) != holder:
+        return
+    who = command(root, holder) or 'a process that this user may not see'
+    yield warning(
+        'spool.lock',
+        f'process {holder} has the right to deliver: {who[:120]}',
+        'another node, a program that rescues the spool, or one that hangs; until it ends, no node delivers',
+        f'ps -fp {holder} ; kill {holder}  # if it is not wanted',
+    )

@@ -1,0 +1,84 @@
+"""What is installed: old enough Pythons and libraries, and whether the node that runs is of this version."""
+
+from __future__ import annotations
+
+import platform
+import re
+import sys
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, requires, version
+from typing import Final
+
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, ok, warning
+from shadowhound_data_logger.spool import status
+
+NAME: Final = 'versions'
+PACKAGE: Final = 'shadowhound_data_logger'
+OLDEST_PYTHON: Final = (3, 10)
+DISTROS: Final = frozenset({'humble', 'jazzy', 'kilted'})
+_NEED: Final = re.compile(r'([A-Za-z0-9_.-]+)\s*>=\s*([0-9.]+)\s*$')
+
+
+def check(context: Context) -> Iterator[Result]:
+    """See the module."""
+    python = platform.python_version()
+    if sys.version_info[:2] < OLDEST_PYTHON:
+        yield error(
+            'versions.python', f'Python {python}', 'the package needs 3.10 or later', 'use the python3 of Ubuntu 22.04 or later'
+        )
+    distro = context.environ.get('ROS_DISTRO', '')
+    if distro and distro not in DISTROS:
+        yield info('versions.ros', f'ROS 2 {distro}', f'tested are {", ".join(sorted(DISTROS))}')
+    yield from _packages(python, distro)
+    if context.role is Role.THOR:
+        yield from _node(context)
+
+
+def _packages(python: str, distro: str) -> Iterator[Result]:
+    """Lower bounds that pip or colcon did not enforce: Debian's boto3 comes before a later one where PYTHONPATH says so."""
+    try:
+        ours, needs = version(PACKAGE), requires(PACKAGE) or []
+    except PackageNotFoundError:
+        yield info('versions.package', 'it runs from a folder and is not installed')
+        return
+    old = []
+    for need in needs:
+        if not (found := _NEED.match(need)):  # an extra, or another kind of bound
+            continue
+        name, least = found.groups()
+        try:
+            have = version(name)
+        except PackageNotFoundError:
+            have = ''
+        if _numbers(have) < _numbers(least):
+            old.append(f'{name}>={least}')
+            yield error(
+                'versions.library',
+                f'{name} is {have or "not installed"}',
+                f'version {least} or later is needed',
+                f'python3 -m pip install --user "{name}>={least}"',
+            )
+    if not old:
+        yield ok(
+            'versions.library', f'{PACKAGE} {ours}, Python {python}, ROS 2 {distro or "without a ROS_DISTRO"}: all that is needed'
+        )
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r'\d+', text)[:3])
+
+
+def _node(context: Context) -> Iterator[Result]:
+    found = status.read(context.settings.spool_path, context.settings.robot, SystemClock.of_this_machine())
+    try:
+        ours = version(PACKAGE)
+    except PackageNotFoundError:
+        return
+    if found['running'] and found['version'] and found['version'] != ours:
+        yield warning(
+            'versions.node',
+            f'the node that runs is version {found["version"]}, installed is {ours}',
+            'it was not started again after an update',
+            'sudo systemctl restart shadowhound-data-logger',
+        )

@@ -1,0 +1,64 @@
+"""Program of a test: several robots in one domain, each in its namespace, each but the first with one thing wrong."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from go2_interfaces.msg import IMU
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2
+
+RATE_HZ = 20.0
+SLOW_EVERY = 20
+"""One in so many."""
+RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+BEST_EFFORT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def main() -> None:
+    """For ever."""
+    rclpy.init()
+    node = Node('robots', start_parameter_services=False, enable_rosout=False)
+    steady = []
+    for name in ('well', 'mute', 'soft', 'deaf', 'two', 'slow', 'unheard'):
+        odometry = node.create_publisher(Odometry, f'/{name}/odom', BEST_EFFORT if name == 'soft' else RELIABLE)
+        steady += [(odometry, Odometry())] if name not in {'mute', 'slow'} else []
+        if name == 'slow':
+            slow = odometry
+        if name != 'unheard':
+            steady.append((node.create_publisher(IMU, f'/{name}/imu', RELIABLE), IMU()))
+        steady.append((node.create_publisher(PointCloud2, f'/{name}/point_cloud2', BEST_EFFORT), PointCloud2()))
+    context = rclpy.Context()  # one participant has one type for a topic
+    rclpy.init(context=context)
+    another = Node('another', context=context, start_parameter_services=False, enable_rosout=False)
+    another.create_publisher(PoseStamped, '/two/odom', RELIABLE)
+    node.create_subscription(PointCloud2, '/deaf/point_cloud2', print, RELIABLE)
+    sys.stdout.write('ready\n')
+    sys.stdout.flush()
+    due, count = time.monotonic(), 0
+    while True:
+        for publisher, message in steady:
+            publisher.publish(message)
+        if count % SLOW_EVERY == 0:
+            slow.publish(Odometry())
+        count += 1
+        due += 1 / RATE_HZ
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+def end() -> None:
+    """With whoever started it."""
+    sys.stdin.read()
+    os._exit(0)
+
+
+if __name__ == '__main__':
+    threading.Thread(target=end, daemon=True).start()
+    main()

@@ -1,0 +1,107 @@
+"""The context: which machine this is taken for, and settings as far as they can be read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from doctor.scene import Scene
+
+from shadowhound_data_logger.doctor import context, machine
+from shadowhound_data_logger.doctor.context import ParametersUnreadable, make, read_parameters
+from shadowhound_data_logger.doctor.model import Role
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a folder without a tower/."""
+    monkeypatch.chdir(tmp_path)
+
+
+def guessed(scene: Scene) -> Role:
+    return make(scene.environ, root=scene.root).role
+
+
+def test_ros_and_a_spool_are_thor(scene: Scene) -> None:
+    """Also where somebody tries a Tower of his own on the robot."""
+    scene.environ['ROS_DISTRO'] = 'humble'
+    scene.spool.mkdir(parents=True)
+    (scene.spool / 'index.db').touch()
+    scene.listen('00000000:2328')
+    assert guessed(scene) is Role.THOR
+
+
+def test_servers_are_tower(scene: Scene, tmp_path: Path) -> None:
+    """One that listens on a port of the guide or of the variables, or what the compose file is started with."""
+    scene.listen('00000000:2328')
+    assert guessed(scene) is Role.TOWER
+    scene.listen('00000000:2329')
+    assert guessed(scene) is not Role.TOWER
+    scene.environ['AWS_ENDPOINT_URL'] = 'http://localhost:9001'
+    assert guessed(scene) is Role.TOWER
+    scene.listen()
+    (tmp_path / 'tower').mkdir()
+    (tmp_path / 'tower/.env').touch()
+    assert guessed(scene) is Role.TOWER
+
+
+def test_the_rest_is_by_ros(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot on its first day, and somebody's desk."""
+    scene.environ['ROS_DISTRO'] = 'humble'
+    assert guessed(scene) is Role.THOR
+    del scene.environ['ROS_DISTRO']
+    monkeypatch.setattr(context, 'find_spec', lambda _: None)
+    assert guessed(scene) is Role.SPARK
+
+
+def test_what_is_refused_is_told_and_left_out(scene: Scene) -> None:
+    """One after the other, until the rest is taken."""
+    scene.environ |= {'AWS_ENDPOINT_URL': 'tower:9000', 'SHADOWHOUND_ROBOT': '../thor'}
+    scene.parameters = {'camera.rate': 1.0, 'imu.batch_s': -1.0, 'odom.rate_hz': 2.0}
+    made = scene.context()
+    assert {error.data['name'] for error in made.refused} == {'AWS_ENDPOINT_URL', 'robot', 'camera.rate', 'imu.batch_s'}
+    assert made.settings.robot == 'thor'
+    assert next(sensor.rate_hz for sensor in made.settings.sensors if sensor.name == 'odom') == 2.0
+
+
+def test_sensors_that_exclude_each_other(scene: Scene) -> None:
+    """Where it is no single parameter that is wrong, the defaults are taken: it ends."""
+    scene.parameters = {'sensors': ['imu', 'imu'], 'imu.topics': ['a']}
+    scene.environ['SHADOWHOUND_ROBOT'] = 'tachi'
+    assert scene.context().refused[0].data['name'] == 'sensors'
+    scene.parameters = {'camera.types': ['a', 'b', 'c'], 'robot': 5}
+    assert {error.data['name'] for error in scene.context().refused} == {'camera.types', 'robot'}
+
+
+def test_a_parameter_file(tmp_path: Path) -> None:
+    """Those of our node and of all nodes, flat; other nodes' are not ours."""
+    path = tmp_path / 'a.yaml'
+    path.write_text('/**:\n  ros__parameters: {robot: tachi}\nsensor_logger_node:\n  ros__parameters:\n    imu: {batch_s: 2.0}\n'
+                    'other:\n  ros__parameters: {x: 1}\n')  # fmt: skip
+    assert read_parameters(path) == {'robot': 'tachi', 'imu.batch_s': 2.0}
+    path.write_text('sensor_logger_node: {}')
+    with pytest.raises(ParametersUnreadable, match='is no parameter file'):
+        read_parameters(path)
+
+
+def test_who_can_reach_what_listens(scene: Scene) -> None:
+    """IPv4 and IPv6, as the kernel writes them; what is connected does not listen."""
+    scene.listen('0100007F:1389', '00000000:2328', '0A01A8C0:0050')
+    six = (
+        '00000000000000000000000001000000:1F90',
+        '0000000000000000FFFF00000100007F:1F91',
+        '00000000000000000000000000000000:1F92',
+    )
+    lines = ['head', *(f'0: {each} 0:0 0A' for each in six), '0: 00000000000000000000000000000000:0016 0:0 01']
+    (scene.root / 'proc/net/tcp6').write_text('\n'.join(lines))
+    assert machine.listening(scene.root) == {
+        (True, 5001), (False, 9000), (False, 80), (True, 8080), (True, 8081), (False, 8082),
+    }  # fmt: skip
+
+
+def test_domains_that_are_in_use(scene: Scene) -> None:
+    """By the port on which everybody of a domain listens."""
+    (scene.root / 'proc/net/udp').write_text(
+        'head\n 1: 00000000:1CE8 0:0 07\n 2: 00000000:21CA 0:0 07\n 3: 00000000:1CF2 0:0 07\n'
+    )
+    assert machine.domains(scene.root) == [0, 5]

@@ -1,0 +1,247 @@
+"""Faults of the robot's own machine, one at a time: its shell, its secrets, its kernel, its disk and its spool."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from doctor.scene import Scene, expect
+from spool.making import make, put, settle
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.doctor.model import Result, Role
+from shadowhound_data_logger.model import State
+
+SECRET = 'AWS_SECRET_ACCESS_KEY = kept-from-others\n'
+MEBI = 1 << 20
+Inject = Callable[[Scene], None]
+ASKED = ('versions', 'environment', 'secrets', 'network.s3', 'ros.environment', 'sockets', 'disk', 'spool', 'missions', 'tower')
+
+
+@pytest.fixture
+def robot(scene: Scene) -> Scene:
+    """Everything is well: a node runs over a spool with one delivered object, and Tower's address is set."""
+    scene.environ |= {'AWS_ENDPOINT_URL': 'http://127.0.0.1:1', 'AWS_ACCESS_KEY_ID': 'a', 'AWS_SECRET_ACCESS_KEY': 'b',
+                      'MLFLOW_TRACKING_URI': 'http://127.0.0.1:1'}  # fmt: skip
+    spool = scene.open_spool()
+    settle(spool, put(spool, make())[0], State.DELIVERED)
+    scene.run_node()
+    return scene
+
+
+def wrong(name: str, value: str) -> Inject:
+    """One variable of the shell."""
+    return lambda scene: scene.environ.update({name: value})
+
+
+def without(*names: str) -> Inject:
+    return lambda scene: [scene.environ.pop(name) for name in names] and None
+
+
+def readable_by_all(scene: Scene) -> None:
+    path = scene.root / 'etc/shadowhound/logger.env'
+    path.write_text(SECRET)
+    path.chmod(0o644)
+
+
+def small_buffers(scene: Scene) -> None:
+    scene.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
+    scene.environ['CYCLONEDDS_URI'] = '<CycloneDDS><SocketReceiveBufferSize min="10MB"/></CycloneDDS>'
+    scene.environ['AMENT_PREFIX_PATH'] = ''
+    (scene.root / 'proc/sys/net/core/rmem_max').write_text('212992\n')
+
+
+def driver_elsewhere(scene: Scene) -> None:
+    scene.process(77, 'python3', '/opt/go2_driver_node', ROS_DOMAIN_ID='5', FASTRTPS_DEFAULT_PROFILES_FILE='x')
+
+
+def driver_with_small_memory(scene: Scene) -> None:
+    scene.process(77, 'python3', '/opt/go2_driver_node', HOME='/root')
+
+
+def backlog(scene: Scene) -> None:
+    """An object of an hour ago, which nobody took."""
+    put(scene.open_spool(), make('thor/late.jpg'))
+    with sqlite3.connect(scene.spool / 'index.db') as index:
+        index.execute('UPDATE objects SET created_ns = ?', (time.time_ns() - 3600 * SECOND,))
+    index.close()
+
+
+def quarantined(scene: Scene) -> None:
+    spool = scene.open_spool()
+    settle(spool, put(spool, make('thor/odd.jpg'))[0], State.QUARANTINED, 'name')
+
+
+def unbalanced(scene: Scene) -> None:
+    with sqlite3.connect(scene.spool / 'index.db') as index:
+        index.execute("UPDATE tally SET objects = objects + 1 WHERE state = 'spooled'")
+    index.close()
+
+
+def damaged(scene: Scene) -> None:
+    """Pages of the index that a bad disk gave back."""
+    scene.stack.close()  # the spool is closed, so that all is in the file
+    path = scene.spool / 'index.db'
+    body = bytearray(path.read_bytes())
+    body[4096:-4096] = os.urandom(len(body) - 8192)
+    path.write_bytes(body)
+
+
+def locked(scene: Scene) -> None:
+    """By a process that is no node."""
+    path = scene.spool / 'drain.lock'
+    path.touch()
+    program = 'import fcntl, sys; f = open(sys.argv[1]); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); sys.stdin.read()'
+    child = subprocess.Popen([sys.executable, '-c', program, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    scene.stack.callback(child.wait)
+    scene.stack.callback(child.terminate)
+    for stream in (child.stdin, child.stdout):
+        assert stream
+        scene.stack.callback(stream.close)
+    assert child.stdout
+    child.stdout.readline()
+    with pytest.raises(BlockingIOError), path.open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    scene.root = Path('/')
+
+
+def not_running(scene: Scene) -> None:
+    scene.run_node(ended=True)
+
+
+def no_delivery(scene: Scene) -> None:
+    scene.run_node(store={'target': 'a server', 'state': 'store_down', 'last_error': 'Tower refused the connection'})
+
+
+def other_shell(scene: Scene) -> None:
+    """The node has other keys than this shell."""
+    scene.process(os.getpid(), 'sensor_logger_node', **{**scene.environ, 'AWS_SECRET_ACCESS_KEY': 'older'})
+
+
+def deaf_tower(scene: Scene) -> None:
+    scene.role = Role.TOWER
+    scene.environ['AWS_ENDPOINT_URL'] = scene.environ['MLFLOW_TRACKING_URI'] = 'http://127.0.0.1:9000'
+    scene.listen('0100007F:2328')
+
+
+def patched(target: str, value: object) -> Inject:
+    """Something of the doctor's own modules is another for the time of the test."""
+
+    def inject(scene: Scene) -> None:
+        scene.stack.enter_context(pytest.MonkeyPatch.context()).setattr(f'shadowhound_data_logger.doctor.{target}', value)
+
+    return inject
+
+
+def stuck_mission(_: Path) -> list[dict[str, object]]:
+    error, remedy = 'http://tower:5001 cannot be asked', 'is MLFLOW_TRACKING_URI right?'
+    return [{'complete': False, 'last_error': error, 'remedy': remedy, 'refused_by_server': [], 'mission_id': 'm'}]
+
+
+FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
+    'no endpoint': (without('AWS_ENDPOINT_URL'), 'environment', 'environment.endpoint', ('export AWS_ENDPOINT_URL=http://',)),
+    'no keys': (without('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY'), 'environment', 'environment.credentials',
+                ('export AWS_ACCESS_KEY_ID=', 'aws configure')),
+    'half a pair': (without('AWS_SECRET_ACCESS_KEY'), 'environment', 'environment.credentials', ('AWS_SECRET_ACCESS_KEY=',)),
+    'no MLflow': (without('MLFLOW_TRACKING_URI'), 'environment', 'environment.tracking', ('export MLFLOW_TRACKING_URI=http://',)),
+    'pasted as it was': (wrong('MLFLOW_TRACKING_URI', 'http://TOWER_IP:5001'), 'environment', 'environment.placeholder',
+                         ('export MLFLOW_TRACKING_URI=',)),
+    'another store for artifacts': (wrong('MLFLOW_S3_ENDPOINT_URL', 'http://old:9000'), 'environment', 'environment.artifacts',
+                                    ('export MLFLOW_S3_ENDPOINT_URL=$AWS_ENDPOINT_URL',)),
+    'a proxy': (wrong('HTTP_PROXY', 'http://proxy:3128'), 'environment', 'environment.proxy', ('NO_PROXY',)),
+    'a setting that is none': (lambda scene: scene.parameters.update({'camera.rate': 3.0}), 'environment', 'environment.settings',
+                               ()),
+    'other keys than the node': (other_shell, 'environment', 'environment.node', ('restart shadowhound-data-logger',)),
+    'secret for all to read': (readable_by_all, 'secrets', 'secrets.mode', ('chmod 600', 'logger.env')),
+    'password in a URL': (wrong('MLFLOW_TRACKING_URI', 'http://me:word@tower:5001'), 'secrets', 'secrets.url',
+                          ('MLFLOW_TRACKING_USERNAME',)),
+    'default secret': (wrong('AWS_SECRET_ACCESS_KEY', 'minioadmin'), 'secrets', 'secrets.default', ('make tower-secrets',)),
+    'wrong domain': (wrong('ROS_DOMAIN_ID', '300'), 'ros.environment', 'ros.domain_id', ('export ROS_DOMAIN_ID=',)),
+    'discovery off': (wrong('ROS_AUTOMATIC_DISCOVERY_RANGE', 'OFF'), 'ros.environment', 'ros.discovery', ('=SUBNET',)),
+    'middleware not installed': (wrong('RMW_IMPLEMENTATION', 'rmw_zenoh_cpp'), 'ros.environment', 'ros.middleware',
+                                 ('apt install', 'rmw-zenoh-cpp')),
+    'driver in another domain': (driver_elsewhere, 'ros.environment', 'ros.driver', ('export ROS_DOMAIN_ID=5',)),
+    'small socket buffers': (small_buffers, 'sockets', 'sockets.buffer', ('net.core.rmem_max', 'sysctl')),
+    'small shared memory': (without('FASTDDS_DEFAULT_PROFILES_FILE'), 'sockets', 'sockets.profile', ('fastdds_shm.xml',)),
+    'small shared memory of the driver': (driver_with_small_memory, 'sockets', 'sockets.driver', ('start the driver again',)),
+    'node not running': (not_running, 'spool', 'node.running', ('sensor_logger_node',)),
+    'node that does not deliver': (no_delivery, 'spool', 'node.delivery', ('doctor --only s3',)),
+    'node of another version': (lambda scene: scene.run_node(version='0.0.1'), 'versions', 'versions.node', ('restart',)),
+    'clock that was never set': (patched('clock.EARLIEST_SANE_NS', 1 << 62), 'clock', 'clock.set', ('timedatectl',)),
+    'mission that is not sent': (patched('missions.overviews', stuck_mission), 'missions', 'missions.sent',
+                                 ('MLFLOW_TRACKING_URI',)),
+    'backlog': (backlog, 'spool', 'spool.backlog', ('doctor --only s3',)),
+    'quarantine': (quarantined, 'spool', 'spool.quarantine', ('quarantine',)),
+    'unbalanced ledger': (unbalanced, 'spool', 'spool.ledger', ('shadowhound-data ledger --json',)),
+    'damaged index': (damaged, 'spool', 'spool.index', ('start the node',)),
+    "another process's lock": (locked, 'spool', 'spool.lock', ('kill ',)),
+    'servers for Tower itself only': (deaf_tower, 'tower', 'tower.listen', ('0.0.0.0', 'ufw allow')),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(('inject', 'asked', 'name', 'words'), FAULTS.values(), ids=FAULTS)
+def test_a_fault_is_found_and_named(robot: Scene, inject: Inject, asked: str, name: str, words: tuple[str, ...]) -> None:
+    """By one finding alone, whose remedy is the right one."""
+    inject(robot)
+    found = robot.findings(asked)
+    if name == 'tower.listen':
+        found = found[:1]  # both addresses are of one port here
+    expect(found, name, *words)
+
+
+def test_a_healthy_robot_gives_no_finding(robot: Scene) -> None:
+    """Of all that is asked without a network."""
+    asked = [name for name in ASKED if not name.startswith('network')]
+    results = robot.ask(*asked)
+    assert but_speed(results) == []
+    assert len(results) > 15
+
+
+def but_speed(results: list[Result]) -> list[Result]:
+    """The findings; how fast the disk under the tests is now is not theirs to judge."""
+    return [result for result in results if result.is_finding and result.check not in {'disk.speed', 'disk.sync'}]
+
+
+def test_an_index_of_an_older_version_is_not_damaged(robot: Scene) -> None:
+    """The next start of the node brings it up to date."""
+    with sqlite3.connect(robot.spool / 'index.db') as index:
+        index.execute('DROP INDEX held')
+        index.execute('PRAGMA user_version = 1')
+    index.close()
+    assert robot.findings('spool') == []
+
+
+@pytest.fixture
+def small_disk(scene: Scene) -> Path:
+    """A file system of its own under the home."""
+    scene.home.mkdir()
+    command = ['mount', '-t', 'tmpfs', '-o', f'size={16 * MEBI}', 'none', str(scene.home)]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip('this user may not mount a file system')
+    scene.stack.callback(subprocess.run, ['umount', '--lazy', str(scene.home)], check=True)
+    return scene.home
+
+
+def test_a_full_disk(scene: Scene, small_disk: Path) -> None:
+    """It is said before the node has to evict, and when nothing at all is free."""
+    scene.parameters['spool.min_free_bytes'] = 4 * MEBI
+    assert but_speed(scene.ask('disk')) == []
+    with (small_disk / 'filler').open('wb', buffering=0) as file:
+        while os.statvfs(small_disk).f_bavail:
+            file.write(bytes(4096))
+    expect(scene.findings('disk'), 'disk.space', f'df -h {small_disk}')
+    scene.parameters['spool.min_free_bytes'] = 0
+    expect(scene.findings('disk'), 'disk.space', f'df -h {small_disk}')
+
+
+def test_a_read_only_spool(scene: Scene, small_disk: Path) -> None:
+    """With the command that makes it writable again."""
+    subprocess.run(['mount', '-o', 'remount,ro', str(small_disk)], check=True)
+    expect(scene.findings('disk'), 'disk.readonly', f'remount,rw {small_disk}')

@@ -1,0 +1,119 @@
+"""Faults of a robot's topics, one at a time, over real DDS: several robots publish, and each is examined as the logger's."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from doctor.scene import Scene, expect
+from domains import free_domain
+
+from shadowhound_data_logger.doctor.model import Result, Severity
+
+pytest.importorskip('rclpy')
+pytestmark = pytest.mark.ros
+
+SENSORS = {'sensors': ['odom', 'imu', 'lidar']}
+ROBOTS = ('well', 'mute', 'soft', 'deaf', 'two', 'slow', 'unheard')
+RATES = {'odom': 20.0, 'imu': 20.0, 'point_cloud2': 20.0}
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What was found of each robot, in the domain where they are, and by somebody in another one."""
+
+    domain: int
+    robots: dict[str, list[Result]]
+    elsewhere: list[Result]
+    nowhere: list[Result]
+
+
+def examine(scene: Scene, namespace: str = '/') -> list[Result]:
+    """In this process, whose ROS is loaded once; the check itself is what a child of the doctor runs."""
+    from shadowhound_data_logger.doctor import ros
+    from shadowhound_data_logger.doctor.context import make
+
+    context = make(scene.environ, role=scene.role, parameters=SENSORS, namespace=namespace, rates_hz=RATES, root=scene.root)
+    return list(ros.check(context))
+
+
+@pytest.fixture(scope='module')
+def examined(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Examined]:
+    with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
+        domain, other = stack.enter_context(free_domain()), stack.enter_context(free_domain())
+        scene = Scene.healthy(tmp_path_factory.mktemp('robots'), stack)
+        publishers = Path(__file__).with_name('publishers.py')
+        robots = subprocess.Popen([sys.executable, str(publishers)], env={**os.environ, 'ROS_DOMAIN_ID': str(domain)},
+                                  stdin=subprocess.PIPE, stdout=subprocess.PIPE)  # fmt: skip
+        stack.enter_context(robots)
+        stack.callback(robots.kill)
+        assert robots.stdout
+        assert robots.stdout.readline() == b'ready\n'
+        patch.setenv('ROS_DOMAIN_ID', str(domain))
+        scene.environ['ROS_DOMAIN_ID'] = str(domain)
+        with ThreadPoolExecutor(len(ROBOTS)) as pool:
+            found = dict(zip(ROBOTS, pool.map(lambda name: examine(scene, f'/{name}'), ROBOTS), strict=True))
+        patch.setenv('ROS_DOMAIN_ID', str(other))
+        scene.environ['ROS_DOMAIN_ID'] = str(other)
+        nowhere = examine(scene, '/well')
+        lines = ['head', f'   1: 00000000:{7400 + 250 * domain:04X} 00000000:0000 07']
+        (scene.root / 'proc/net/udp').write_text('\n'.join(lines) + '\n')
+        yield Examined(domain, found, examine(scene, '/well'), nowhere)
+
+
+def findings(results: list[Result]) -> list[Result]:
+    return [result for result in results if result.is_finding]
+
+
+def test_a_healthy_robot_gives_no_finding(examined: Examined) -> None:
+    """Each topic with the rate at which it was published."""
+    found = examined.robots['well']
+    assert findings(found) == []
+    rates = {result.data['topic']: result.data['rate_hz'] for result in found if result.check == 'ros.rate'}
+    assert rates == {f'/well/{name}': pytest.approx(20.0, rel=0.3) for name in RATES}
+
+
+FAULTS = {
+    'missing topic': ('unheard', 'ros.topic', ('ros2 topic list | grep /unheard/imu', 'imu.enabled: false')),
+    'nothing arrives': ('mute', 'ros.loss', ('ros2 topic hz /mute/odom', '--only sockets')),
+    'wrong rate': ('slow', 'ros.rate', ('ros2 topic hz /slow/odom', '--rate /slow/odom=')),
+    'wrong QoS of a publisher': ('soft', 'ros.qos', ('ros2 topic info -v /soft/odom',)),
+    'wrong QoS of a subscriber': ('deaf', 'ros.qos', ('qos_profile_sensor_data',)),
+    'two types on a topic': ('two', 'ros.type', ('ros2 topic info -v /two/odom',)),
+}
+
+
+@pytest.mark.parametrize(('robot', 'name', 'words'), FAULTS.values(), ids=FAULTS)
+def test_a_fault_is_found_and_named(examined: Examined, robot: str, name: str, words: tuple[str, ...]) -> None:
+    """By one finding alone, whose remedy is the right one."""
+    expect(findings(examined.robots[robot]), name, *words)
+
+
+def test_a_wrong_domain(examined: Examined) -> None:
+    """Where the topics are in another domain, it is that one that is named."""
+    expect(findings(examined.elsewhere), 'ros.domain', f'export ROS_DOMAIN_ID={examined.domain}')
+
+
+def test_no_driver(examined: Examined) -> None:
+    """Where nobody is anywhere, the guide's three questions are asked."""
+    expect(findings(examined.nowhere), 'ros.topics', 'go2_driver', 'robot.launch.py', 'ROS_DOMAIN_ID')
+
+
+def test_no_go2_interfaces(scene: Scene, domain: int, tmp_path: Path) -> None:
+    """In the doctor's own process for ROS, with a workspace that was not sourced."""
+    (tmp_path / 'go2_interfaces').mkdir()
+    (tmp_path / 'go2_interfaces/__init__.py').write_text("raise ImportError('not sourced')")
+    scene.environ |= {'PYTHONPATH': str(tmp_path), 'ROS_DOMAIN_ID': str(domain)}
+    scene.parameters |= SENSORS
+    found = {result.check: result for result in scene.ask('ros')}
+    assert found['ros.types'].severity is Severity.ERROR
+    assert 'go2_interfaces/msg/IMU' in found['ros.types'].seen
+    assert 'colcon build --packages-select go2_interfaces' in found['ros.types'].remedy
+    assert 'ros.topics' in found  # and all else was asked as well

@@ -1,0 +1,138 @@
+"""The runner: what hangs, crashes or is not reached is in the answer, and the answer comes in time."""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+from doctor.scene import Scene
+
+from shadowhound_data_logger.doctor import checks
+from shadowhound_data_logger.doctor.model import Check, Context, Result, Role, Severity, error, ok
+from shadowhound_data_logger.doctor.run import Examination, Running, in_child
+
+LIMIT_S = 0.3
+
+
+def fine(_: Context) -> Iterator[Result]:
+    yield ok('fine.one', 'it is')
+
+
+def crashing(_: Context) -> Iterator[Result]:
+    yield ok('crashing.one', 'so far')
+    raise ZeroDivisionError('no number')
+
+
+def run(scene: Scene, *wanted: Check, timeout_s: float = 60.0) -> list[Result]:
+    return Examination(wanted, scene.context(), timeout_s=timeout_s).run()
+
+
+def test_a_crash_is_a_finding_and_stops_nobody(scene: Scene) -> None:
+    """What the check said before, and what the others say, is there as well."""
+    found = run(scene, Check(name='crashing', run=crashing), Check(name='fine', run=fine))
+    assert [result.check for result in found] == ['crashing.one', 'crashing.crash', 'fine.one']
+    assert 'ZeroDivisionError: no number' in found[1].seen
+    assert found[1].severity is Severity.ERROR
+
+
+def test_a_check_that_hangs_is_a_finding_in_time(scene: Scene) -> None:
+    """Also where that leaves no time for what comes after it, which is said."""
+    over = threading.Event()
+
+    def hangs(_: Context) -> Iterator[Result]:
+        yield ok('hangs.one', 'so far')
+        over.wait(30.0)
+        yield ok('hangs.two', 'too late')
+
+    began = time.monotonic()
+    found = run(scene, Check(name='hangs', run=hangs), Check(name='fine', run=fine, after=('hangs',)), timeout_s=LIMIT_S)
+    took = time.monotonic() - began
+    over.set()
+    assert [result.check for result in found] == ['hangs.one', 'hangs.deadline', 'fine']
+    assert found[2].severity is Severity.SKIPPED
+    assert took < 5.0
+    assert '--only hangs' in found[1].remedy
+
+
+def test_a_deadline_of_its_own(scene: Scene) -> None:
+    """A check that hangs leaves the rest of the time to what comes after it."""
+    over = threading.Event()
+    hangs = Check(name='hangs', run=lambda _: iter([ok('hangs.one', str(over.wait(30.0)))]), deadline_s=LIMIT_S)
+    found = run(scene, hangs, Check(name='fine', run=fine, after=('hangs',)), timeout_s=12.0)
+    over.set()
+    assert [result.check for result in found] == ['hangs.deadline', 'fine.one']
+
+
+def test_what_was_found_before_is_known_after(scene: Scene) -> None:
+    """By the checks that come after, which wait for it."""
+    seen: list[Result | None] = []
+
+    def later(context: Context) -> Iterator[Result]:
+        seen.append(context.failed('first'))
+        yield ok('later', 'asked')
+
+    broken = error('first.part', 'broken', 'so', 'mend it')
+    first = Check(name='first', run=lambda _: iter([ok('first.begin', 'fine'), broken]))
+    assert len(run(scene, Check(name='later', run=later, after=('first', 'not asked')), first)) == 3
+    assert seen
+    assert seen[0]
+    assert seen[0].check == 'first.part'
+
+
+def test_checks_run_side_by_side(scene: Scene) -> None:
+    """Two that wait for each other both end."""
+    meeting = threading.Barrier(2, timeout=30.0)
+    wait = [Check(name=name, run=lambda _: iter([ok('met', str(meeting.wait()))])) for name in ('a', 'b')]
+    assert sorted(result.check for result in run(scene, *wait)) == ['met', 'met']
+
+
+def test_a_process_that_dies_is_a_finding(scene: Scene) -> None:
+    """With the last words it said: here, that there is no such check."""
+    (found,) = in_child(Running(Check(name='nothing', run=fine)), scene.context())
+    assert found.check == 'nothing.crash'
+    assert 'StopIteration' in found.seen
+
+
+def test_a_process_that_hangs_is_killed(scene: Scene) -> None:
+    """Whether it was under way or just about to begin when it was given up."""
+    running = Running(Check(name='hangs', run=fine))
+    children = [subprocess.Popen(['sleep', '60']) for _ in range(2)]
+    running.adopt(children[0])
+    running.give_up()
+    running.adopt(children[1])
+    assert [child.wait(30.0) for child in children] == [-9, -9]
+
+
+@pytest.mark.parametrize('role', Role)
+def test_every_role_has_its_checks(role: Role) -> None:
+    """Names are unique, and what a check comes after is there for all its roles."""
+    mine = {check.name: check for check in checks.CHECKS if role in check.roles}
+    assert len(mine) >= 6
+    assert len({check.name for check in checks.CHECKS}) == len(checks.CHECKS)
+    assert all(name in mine for check in mine.values() for name in check.after)
+
+
+def test_a_dead_network(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing answers, not even the name server: it ends within the bar, each service is named, and the rest is asked."""
+    over = threading.Event()
+
+    def resolve(*_: object, **__: object) -> list[object]:
+        over.wait(60.0)
+        raise OSError('no answer')
+
+    monkeypatch.setattr('socket.getaddrinfo', resolve)
+    scene.environ |= {'AWS_ENDPOINT_URL': 'http://tower:9000', 'MLFLOW_TRACKING_URI': 'http://tower:5001',
+                      'AWS_ACCESS_KEY_ID': 'a', 'AWS_SECRET_ACCESS_KEY': 'b'}  # fmt: skip
+    wanted = [check for check in checks.CHECKS if not check.apart]
+    began = time.monotonic()
+    found = Examination(wanted, scene.context()).run()
+    took = time.monotonic() - began
+    over.set()
+    assert took < 15.0
+    told = {result.check: result.severity for result in found}
+    assert told['network.s3.deadline'] == told['network.mlflow.deadline'] == Severity.ERROR
+    assert told['s3'] == told['mlflow'] == Severity.SKIPPED
+    assert told['node.running'] == Severity.WARNING

@@ -1,0 +1,265 @@
+"""Faults between a robot and its Tower, one at a time, with real servers wherever the fault is one of a server."""
+
+from __future__ import annotations
+
+import json
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from doctor.scene import Scene, expect
+from faults.front import Front
+from faults.kinds import Condition, Fault
+from stores.fake_s3 import FakeS3, hung, refused, served
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.doctor import mlflow, mlflow_rest, network, s3, s3_put
+from shadowhound_data_logger.doctor.model import Result, Role, Severity
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.s3_requests import S3Requests
+
+pytestmark = pytest.mark.seaweedfs
+
+BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
+OWN = tuple(f'{action}:{bucket}/thor/*' for action in ('Read', 'Write') for bucket in ('sensor-data', 'trajectories', 'imu-data'))
+"""Thor's keys may put and get what is its own, and neither list nor delete."""
+READING = tuple(f'{action}:{bucket}' for action in ('Read', 'List') for bucket in BUCKETS)
+Inject = Callable[[Scene], None]
+NETWORK = ('network.s3', 'network.mlflow')
+SERVICES = ('s3', 'mlflow')
+
+
+@pytest.fixture(scope='module')
+def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tower]:
+    """A Tower as it should be: the guide's buckets, a key pair of the least rights for Thor, one that reads for Spark."""
+    users = {'thor': OWN, 'spark': READING, 'stranger': ('Read:other',)}
+    with Tower(tmp_path_factory.mktemp('doctor'), mlflow=True, users=users) as tower:
+        requests = S3Requests(tower.store_settings(), UploadSettings())
+        requests.open()
+        for bucket in BUCKETS:
+            requests.create_bucket(bucket)
+        requests.close()
+        yield tower
+
+
+@pytest.fixture
+def robot(scene: Scene, servers: Tower) -> Scene:
+    """With Thor's keys. Others load the machine: how fast it is now is not what is asked here."""
+    patch = scene.stack.enter_context(pytest.MonkeyPatch.context())
+    patch.setattr(s3_put, 'SLOW_MBPS', 0.0)
+    patch.setattr(s3, 'SLOW_S', 60.0)
+    scene.stack.enter_context(patient(30.0))
+    scene.environ |= servers.environment('thor')
+    return scene
+
+
+@contextmanager
+def patient(seconds: float) -> Iterator[None]:
+    """How long an answer may take."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (s3, mlflow_rest):
+            patch.setattr(module, 'ANSWER_S', seconds)
+        yield
+
+
+def rest(tower: Tower, path: str, **body: Any) -> Any:
+    """One request to MLflow."""
+    url = f'{tower.tracking_uri}/api/2.0/mlflow/{path}'
+    request = urllib.request.Request(url, json.dumps(body).encode(), {'Content-Type': 'application/json'})  # noqa: S310 - ours
+    with urllib.request.urlopen(request, timeout=30.0) as answer:  # noqa: S310
+        return json.loads(answer.read())
+
+
+def test_a_healthy_tower_gives_no_finding(robot: Scene, servers: Tower) -> None:
+    """Not with the robot's few rights, not for Tower's own keys, and not for one who reads."""
+    for role in (Role.THOR, Role.THOR, Role.TOWER, Role.SPARK):
+        robot.role = role
+        user = {Role.TOWER: 'tower', Role.SPARK: 'spark'}.get(role, 'thor')
+        robot.environ |= servers.environment(user)
+        results = robot.ask(*NETWORK, *SERVICES, 'environment', 'secrets')
+        assert [result for result in results if result.is_finding] == []
+        asked = {result.check for result in results if result.severity is Severity.OK}
+        assert ('s3.delete' in asked) is (role is Role.TOWER)
+        assert ('s3.condition' in asked) is (role is not Role.SPARK)
+        assert {'s3.signature', 's3.clock', 'mlflow.health', 'mlflow.experiment', 'mlflow.artifacts'} <= asked
+
+
+def test_probe_objects_do_not_pile_up(robot: Scene, servers: Tower) -> None:
+    """However often the robot asks, there is one in each bucket; Tower's own is deleted again."""
+    for role, user in ((Role.THOR, 'thor'), (Role.THOR, 'thor'), (Role.TOWER, 'tower')):
+        robot.role = role
+        robot.environ |= servers.environment(user)
+        assert robot.findings('s3') == []
+    requests = S3Requests(servers.store_settings(), UploadSettings())
+    requests.open()
+    assert [item.key for bucket in BUCKETS for item in requests.list(bucket, '')] == ['thor/_doctor/probe'] * 2
+    requests.close()
+
+
+def keys(**changes: str) -> Inject:
+    return lambda scene: scene.environ.update(changes)
+
+
+def nobody_there(variable: str) -> Inject:
+    return lambda scene: scene.environ.update({variable: scene.stack.enter_context(refused())})
+
+
+def hanging(variable: str) -> Inject:
+    def inject(scene: Scene) -> None:
+        scene.stack.enter_context(patient(0.5))
+        scene.environ[variable] = scene.stack.enter_context(hung())
+
+    return inject
+
+
+def fronted(fault: Fault = Fault.NONE, condition: Condition = Condition.HONOURED) -> Inject:
+    """The real server behind a front that does this to every request."""
+
+    def inject(scene: Scene) -> None:
+        front = Front(scene.environ['AWS_ENDPOINT_URL'], lambda: fault, secret=scene.environ['AWS_SECRET_ACCESS_KEY'],
+                      condition=condition)  # fmt: skip
+        scene.environ['AWS_ENDPOINT_URL'] = scene.stack.enter_context(front).url
+
+    return inject
+
+
+def imitated(**faults: Any) -> Inject:
+    """A server that is none: it verifies no checksum, signature or whatever."""
+
+    def inject(scene: Scene) -> None:
+        scene.environ['AWS_ENDPOINT_URL'] = scene.stack.enter_context(served(FakeS3(**faults))).url
+
+    return inject
+
+
+def swapped(scene: Scene) -> None:
+    scene.environ['AWS_ENDPOINT_URL'], scene.environ['MLFLOW_TRACKING_URI'] = (
+        scene.environ['MLFLOW_TRACKING_URI'], scene.environ['AWS_ENDPOINT_URL'])  # fmt: skip
+
+
+def bucket_of_another_name(scene: Scene) -> None:
+    scene.parameters |= {'sensors': ['imu'], 'imu.bucket': 'imu-data'}
+
+
+FAULTS: dict[str, tuple[Inject, str, tuple[str, ...]]] = {
+    'wrong secret': (keys(AWS_SECRET_ACCESS_KEY='mistyped'), 's3.signature', ('AWS_SECRET_ACCESS_KEY',)),
+    'wrong access key': (keys(AWS_ACCESS_KEY_ID='NOBODY'), 's3.signature', ('AWS_ACCESS_KEY_ID',)),
+    'wrong port': (nobody_there('AWS_ENDPOINT_URL'), 'network.s3.tcp', ('ss -ltnp', 'docker compose ps')),
+    'hung server': (hanging('AWS_ENDPOINT_URL'), 's3.answer', ('docker compose logs',)),
+    'no S3 server on this port': (imitated(answer=(200, b'<html>Welcome</html>')), 's3.answer', ('curl -i',)),
+    'name that is none': (keys(AWS_ENDPOINT_URL='http://tower.invalid:9000'), 'network.s3.dns', ('getent hosts', 'TOWER_IP')),
+    'missing bucket': (bucket_of_another_name, 's3.bucket', ('s3 mb s3://imu-data', '--fix')),
+    'skewed clock': (fronted(Fault.SKEWED), 's3.clock', ('timedatectl',)),
+    'server that ignores If-None-Match': (fronted(condition=Condition.OVERWRITES), 's3.condition', ('update the S3 server',)),
+    'server without If-None-Match': (fronted(condition=Condition.NOT_IMPLEMENTED), 's3.condition', ('update the S3 server',)),
+    'server error': (fronted(Fault.ERROR_500), 's3.answer', ('log',)),
+    'login page of a network': (fronted(Fault.PORTAL), 's3.answer', ('login page',)),
+    'MLflow down': (nobody_there('MLFLOW_TRACKING_URI'), 'network.mlflow.tcp', ('ss -ltnp', 'docker compose ps')),
+    'MLflow hangs': (hanging('MLFLOW_TRACKING_URI'), 'mlflow.answer', ('docker logs',)),
+    'MLflow without a name': (keys(MLFLOW_TRACKING_URI='http://tower.invalid:5001'), 'network.mlflow.dns', ('getent hosts',)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(('inject', 'name', 'words'), FAULTS.values(), ids=FAULTS)
+def test_a_fault_is_found_and_named(robot: Scene, inject: Inject, name: str, words: tuple[str, ...]) -> None:
+    """Once, with the right remedy, and without a sequel of other findings."""
+    inject(robot)
+    service = 'mlflow' if 'mlflow' in name else 's3'
+    found = robot.findings(f'network.{service}', service)
+    if name == 's3.condition':
+        found = [result for result in {result.check: result for result in found}.values()]  # noqa: C416 - one of each bucket
+    if name == 's3.clock':
+        found = found[-1:]  # by the Date header, and by the refusal
+    expect(found, name, *words)
+
+
+def test_keys_without_rights(robot: Scene, servers: Tower) -> None:
+    """Each bucket is named, with the policy that it takes."""
+    robot.environ |= servers.environment('stranger')
+    found = robot.findings('s3')
+    assert {result.check for result in found} == {'s3.write'}
+    assert all('s3:PutObject' in result.remedy for result in found)
+
+
+def test_ports_that_are_mixed_up(robot: Scene) -> None:
+    """The S3 server's and MLflow's: both are found."""
+    swapped(robot)
+    found = {result.check: result for result in robot.findings(*NETWORK, *SERVICES)}
+    assert set(found) == {'s3.answer', 'mlflow.answer'}
+    assert 'MLFLOW_TRACKING_URI' in found['mlflow.answer'].remedy
+
+
+def test_the_usual_port_is_proposed(robot: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing listens on the port that is set, and something on the usual one."""
+    nobody_there('AWS_ENDPOINT_URL')(robot)
+    monkeypatch.setattr(network, '_answers', lambda _, port: port == 9000)
+    expect(robot.findings('network.s3'), 'network.s3.tcp', 'export AWS_ENDPOINT_URL=http://127.0.0.1:9000')
+
+
+def test_a_server_that_verifies_nothing(robot: Scene) -> None:
+    """Neither checksums nor signatures: both promises that a put relies on are asked for."""
+    imitated()(robot)
+    assert {result.check for result in robot.findings('s3')} == {'s3.checksum', 's3.open'}
+
+
+def test_minio_is_told_and_no_finding(robot: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such Towers go on working; what it means that nobody maintains it is said."""
+    monkeypatch.setattr('stores.fake_s3._Handler.version_string', lambda _: 'MinIO')
+    imitated()(robot)
+    told = {result.check: result for result in robot.ask('s3')}
+    assert told['s3.server'].severity is Severity.INFO
+    assert 'archived' in told['s3.server'].cause
+    assert 'SeaweedFS' in told['s3.server'].remedy
+
+
+def test_what_is_missing_on_tower(robot: Scene, servers: Tower) -> None:
+    """Its own keys see all buckets; those of the guide that are not there are named, and can be made."""
+    robot.role = Role.TOWER
+    robot.environ |= servers.environment('tower')
+    admin = S3Requests(servers.store_settings(), UploadSettings())
+    admin.open()
+    admin._client.delete_bucket(Bucket='lerobot')
+    try:
+        expect(robot.findings('s3'), 's3.bucket', 's3 mb s3://lerobot')
+    finally:
+        admin.create_bucket('lerobot')
+        admin.close()
+
+
+def test_artifacts_that_do_not_reach_their_store(robot: Scene, servers: Tower) -> None:
+    """MLflow answers and takes experiments; only the artifact itself shows it."""
+    artifacts = servers._folder / 'mlflow/artifacts'
+    away = artifacts.with_name('away')
+    if artifacts.exists():
+        artifacts.rename(away)
+    artifacts.write_text('a disk that is not mounted')
+    try:
+        expect(robot.findings('mlflow'), 'mlflow.artifacts', 'docker logs', 'MLFLOW_S3')
+    finally:
+        artifacts.unlink()
+        if away.exists():
+            away.rename(artifacts)
+
+
+def test_artifacts_that_stay_on_the_robot(robot: Scene, servers: Tower, tmp_path: Path) -> None:
+    """The guide's last story: the run succeeds, and its artifacts are in no store."""
+    made = rest(servers, 'experiments/create', name='thor_missions', artifact_location=f'file://{tmp_path}')
+    try:
+        expect(robot.findings('mlflow'), 'mlflow.artifacts', '--artifacts-destination s3://mlflow')
+    finally:
+        rest(servers, 'experiments/delete', experiment_id=made['experiment_id'])
+    expect(robot.findings('mlflow'), 'mlflow.missions', f'mlflow experiments restore -x {made["experiment_id"]}')
+
+
+def test_artifacts_that_go_to_s3_directly(robot: Scene, servers: Tower) -> None:
+    """Then the robot's own keys and MLFLOW_S3_ENDPOINT_URL decide."""
+    expect(_direct(robot, 's3://mlflow/9'), 'mlflow.artifacts', 's3:PutObject', 'mlflow')
+    robot.environ |= servers.environment('tower')
+    assert [result.severity for result in _direct(robot, 's3://mlflow/9')] == [Severity.OK]
+
+
+def _direct(scene: Scene, location: str) -> list[Result]:
+    return list(mlflow._direct(location, scene.context()))
