@@ -26,6 +26,7 @@ setup(
     python_requires='>=3.10',
     # The same as requirements/runtime.in, which says what each is for.
     install_requires=[
+        'backports-zstd>=1.0; python_version < "3.14"',
         'boto3>=1.36',
         'click>=8.1',
         'numpy>=1.21',
@@ -36,6 +37,7 @@ setup(
         'simplejpeg>=1.7',
     ],
     extras_require={
+        'lake': ['daft>=0.7.26,<0.8', 'obstore>=0.11', 'pyarrow>=16'],
         'missions': ['matplotlib>=3.6', 'mlflow-skinny>=2.14'],
         'test': ['pytest'],  # colcon runs pytest where a test extra names it
     },
