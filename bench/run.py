@@ -44,10 +44,12 @@ STEPS: Final = (
     Step('intake', ('--seconds', '20'), ('--seconds', '5')),
     Step('small_messages', ('--seconds', '10'), ('--seconds', '3')),
     Step('full_rate', ('--seconds', '60', '--away', '300'), ('--seconds', '10', '--away', '10')),
+    Step('bag_recording', ('--seconds', '40'), ('--seconds', '10')),
     Step('latency', ('--seconds', '30'), ('--seconds', '8')),
     Step('drain', ('--rounds', '5', '--scale', '0.3'), ('--rounds', '2', '--scale', '0.1')),
     Step('mission_calls', ('--seconds', '20'), ('--seconds', '3')),
     Step('missions', quick=('--points', '10000')),
+    Step('lake', quick=('--days', '2', '--objects', '500')),
     Step('encode_formats'),
     Step('spool_commits', quick=None),
 )

@@ -12,6 +12,7 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.errors import NameRefused, SettingError
 from shadowhound_data_logger.keys import KeyTemplate, check_name
 from shadowhound_data_logger.options import (
@@ -20,8 +21,11 @@ from shadowhound_data_logger.options import (
     DEFAULT_SENSORS,
     FORMATS,
     GROUPS,
+    BagSettings,
+    CatalogueSettings,
     ClockSettings,
     EncodeSettings,
+    EventSettings,
     IntakeSettings,
     MissionSettings,
     QueueSettings,
@@ -33,9 +37,10 @@ from shadowhound_data_logger.options import (
 )
 
 __all__ = [
-    'DEFAULT_SENSORS', 'FOREIGN', 'FORMATS',
-    'ClockSettings', 'EncodeSettings', 'IntakeSettings', 'MissionSettings', 'QueueSettings', 'SensorSettings', 'Settings',
-    'ShutdownSettings', 'SpoolSettings', 'StoreSettings', 'UploadSettings', 'default_parameters', 'home', 'store_settings',
+    'DEFAULT_SENSORS', 'FOREIGN', 'FORMATS', 'BagSettings',
+    'CatalogueSettings', 'ClockSettings', 'EncodeSettings', 'EventSettings', 'IntakeSettings', 'MissionSettings',
+    'QueueSettings', 'SensorSettings', 'Settings', 'ShutdownSettings', 'SpoolSettings', 'StoreSettings', 'UploadSettings',
+    'default_parameters', 'home', 'store_settings',
 ]  # fmt: skip
 
 MIN_RATE_HZ: Final = 1e-4
@@ -66,6 +71,9 @@ class Settings:
     shutdown: ShutdownSettings
     clock: ClockSettings
     mission: MissionSettings
+    bag: BagSettings
+    events: EventSettings
+    catalogue: CatalogueSettings
 
     @property
     def spool_path(self) -> Path:
@@ -79,6 +87,8 @@ class Settings:
         sensors = _sensors(given, robot)
         groups = {name: _fill(kind, name, given) for name, kind in GROUPS.items()}
         _check_fields(groups['mission'])
+        _check_expressions('bag', groups['bag'], ('regex', 'exclude'))
+        _check_events(groups['events'])
         if given:
             name, value = next(iter(given.items()))
             known = sorted({'robot', 'sensors', *GROUPS, *(sensor.name for sensor in sensors)})
@@ -119,12 +129,17 @@ def default_parameters() -> dict[str, Any]:
     """Every parameter with its default, as flat ROS names; sequences as lists."""
     flat: dict[str, Any] = {'robot': '', 'sensors': list(DEFAULT_SENSORS)}
     for name, kind in GROUPS.items():
-        flat |= {f'{name}.{spec.name}': spec.default for spec in fields(kind)}
+        flat |= {f'{name}.{spec.name}': _listed(spec.default) for spec in fields(kind)}
     for sensor in _sensors({}, 'thor'):
         for spec in fields(sensor)[1:]:
             value = getattr(sensor, spec.name)
-            flat[f'{sensor.name}.{spec.name}'] = list(value) if isinstance(value, tuple) else value
+            flat[f'{sensor.name}.{spec.name}'] = _listed(value)
     return flat
+
+
+def _listed(value: Any) -> Any:
+    """As a parameter file has it."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _robot(given: object, environ: Mapping[str, str], namespace: str) -> str:
@@ -197,6 +212,25 @@ def _check_fields(mission: MissionSettings) -> None:
         given = getattr(mission, name)
         if given and not _FIELD.fullmatch(given):
             raise SettingError(f'mission.{name}', given, "empty, or 'topic:field' such as lowstate:bms_state.soc")
+
+
+def _check_expressions(prefix: str, group: BagSettings | EventSettings, names: Sequence[str]) -> None:
+    """Raises SettingError for what is no regular expression."""
+    for name in names:
+        given = getattr(group, name)
+        try:
+            re.compile(given)
+        except re.error as error:
+            raise SettingError(f'{prefix}.{name}', given, f'a regular expression ({error})') from error
+
+
+def _check_events(events: EventSettings) -> None:
+    """Raises SettingError for conditions that are none, or that would trigger nothing."""
+    _check_expressions('events', events, ('regex', 'exclude', 'log_event'))
+    if conditions(events.conditions) and not events.enabled:
+        raise SettingError('events.conditions', list(events.conditions), 'an empty list while events.topics and events.regex name nothing')
+    if events.max_s < events.post_s:
+        raise SettingError('events.max_s', events.max_s, f'at least events.post_s ({events.post_s:g})')
 
 
 def _fill(kind: type, prefix: str, given: dict[str, Any], defaults: Mapping[str, Any] | None = None) -> Any:

@@ -17,6 +17,8 @@ ARCHIVES: Final = ('zip', 'tar')
 BATCHED: Final = ('json', *ARCHIVES)
 """Formats that can hold several messages."""
 CAPTURES: Final = ('always', 'mission')
+RECORDS: Final = ('service', 'mission', 'always')
+COMPRESSIONS: Final = ('zstd', 'none')
 COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
 IMAGE: Final = 'sensor_msgs/msg/Image'
 POINT_CLOUD: Final = 'sensor_msgs/msg/PointCloud2'
@@ -26,8 +28,6 @@ def _setting(default: Any, text: str, *, low: float | None = None, high: float |
              choices: Sequence[str] = (), live: bool = False) -> Any:  # fmt: skip
     """A dataclass field that knows its help text, what values it allows, and whether it can be changed while the node runs."""
     metadata = {'help': text, 'low': low, 'high': high, 'choices': tuple(choices), 'live': live}
-    if isinstance(default, (tuple, list)):
-        return field(default_factory=lambda: tuple(default), metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
@@ -49,6 +49,7 @@ class SensorSettings:
     quality: int = _setting(85, 'JPEG quality where an image has to be encoded.', low=1, high=100, live=True)
     bucket: str = _setting('sensor-data', 'Bucket of its objects.')
     key: str = _setting('{robot}/{sensor}/{date}/{time}_{sensor}.{ext}', 'Key of an object; {date} and {time} are UTC.')
+    dedup: bool = _setting(False, 'Store content that follows itself byte for byte once; the repeats stay listed.')
     priority: int = _setting(5, '0 ships first and is dropped or evicted last, 9 the other way round.', low=0, high=9, live=True)
 
     @property
@@ -147,6 +148,62 @@ class MissionSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class CatalogueSettings:
+    """The catalogue of what the store holds, written after delivery."""
+
+    enabled: bool = _setting(True, 'Write a row of each delivered object to the catalogue.')
+    period_s: float = _setting(60.0, 'Seconds between two parts of it.', low=1.0, high=86_400.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BagSettings:
+    """Recording at full rate, whatever the sensors keep."""
+
+    record: str = _setting(
+        'service', 'When: from ~/bag/start to ~/bag/stop, in every mission besides, or from the start on.', choices=RECORDS
+    )
+    topics: tuple[str, ...] = _setting(('',), 'Topics to record; where none is named and no regex, those that the sensors take.')
+    regex: str = _setting('', 'Record also the topics whose full name has a match of this; ".*" takes all that are not hidden.')
+    exclude: str = _setting('', 'Of the topics that only the regex names, none whose full name has a match of this.')
+    slice_s: float = _setting(60.0, 'Seconds a slice: each is uploaded while the next one records.', low=1.0, high=86_400.0)
+    slice_bytes: int = _setting(256 * MEBI, 'Most bytes a slice.', low=MEBI)
+    compression: str = _setting('zstd', 'Of the chunks in a slice.', choices=COMPRESSIONS)
+    chunk_bytes: int = _setting(MEBI, 'Bytes that are compressed, and read back, at once.', low=4096, high=64 * MEBI)
+    queue_bytes: int = _setting(64 * MEBI, 'Most bytes that wait for the disk; what comes beyond it is dropped.', low=MEBI)
+    priority: int = _setting(8, 'Of slices: 0 ships first and is evicted last, 9 the other way round.', low=0, high=9)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventSettings:
+    """The last seconds of some topics, in memory, of which an event makes a bag; off while no topic is named."""
+
+    topics: tuple[str, ...] = _setting(('',), 'Topics to keep; where none is named and no regex, there are no events.')
+    regex: str = _setting('', 'Keep also the topics whose full name has a match of this; ".*" takes all that are not hidden.')
+    exclude: str = _setting('', 'Of the topics that only the regex names, none whose full name has a match of this.')
+    pre_s: float = _setting(30.0, 'Seconds before a trigger that an event has.', low=0.0, high=3600.0, live=True)
+    post_s: float = _setting(
+        10.0, 'Seconds after it; a trigger meanwhile makes the event last longer.', low=0.0, high=3600.0, live=True
+    )
+    max_s: float = _setting(
+        120.0, 'Most seconds from the first trigger to the end of an event; then another one follows.', low=1.0, high=1e5, live=True
+    )
+    max_bytes: int = _setting(
+        64 * MEBI, 'Most bytes of memory that are kept; beyond it the oldest go, whatever pre_s is.', low=MEBI, live=True
+    )
+    log_event: str = _setting(
+        '.*', "What an agent's log_event triggers: an event where its name has a match of this; empty for none.", live=True
+    )
+    conditions: tuple[str, ...] = _setting(
+        ('',), 'What triggers by itself: "low_battery: lowstate:bms_state.soc < 20 for 5": name, topic:field, comparison, seconds.'
+    )
+
+    @property
+    def enabled(self) -> bool:
+        """Whether anything is kept."""
+        return bool(self.regex or any(self.topics))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StoreSettings:
     """Where objects go: an S3 server, or without an endpoint a folder of the same layout (D13)."""
 
@@ -167,6 +224,9 @@ GROUPS: Final[dict[str, type]] = {
     'shutdown': ShutdownSettings,
     'clock': ClockSettings,
     'mission': MissionSettings,
+    'bag': BagSettings,
+    'events': EventSettings,
+    'catalogue': CatalogueSettings,
 }
 DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
     'camera': {

@@ -19,11 +19,14 @@ ROS = {'ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'go2_interfa
        'sensor_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs'}  # fmt: skip
 ALLOWED = {
     **{name: {'capture', 'sim'} for name in ROS},
+    'rclpy': {'capture', 'doctor', 'sim'},
     'boto3': {'stores', 'sim'},
     'botocore': {'stores', 'ship', 'sim'},
     'mlflow': {'missions', 'sim'},
+    **{name: {'lake'} for name in ('daft', 'obstore')},
+    'pyarrow': {'lake', 'sim'},
 }
-HEAVY = ('rclpy', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3')
+HEAVY = ('rclpy', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'obstore', 'pyarrow')
 LATE = ('import_module', '__import__')
 MODULES = sorted(ROOT.rglob('*.py'))
 
@@ -62,6 +65,24 @@ def test_one_file_knows_mlflow() -> None:
     assert [path.name for path in ours if any(name.startswith('mlflow') for name in imports(path))] == ['tracking.py']
 
 
+def test_one_file_of_the_doctor_knows_ros() -> None:
+    """It is loaded in a process of its own, which may crash; the rest of the doctor works on machines without ROS."""
+    ours = [path for path in MODULES if folder(path) == 'doctor']
+    assert [path.name for path in ours if any(name.startswith('rclpy') for name in imports(path))] == ['ros_watch.py']
+
+
+def test_a_robot_writes_the_catalogue_without_reading_it() -> None:
+    """What the node runs of the lake imports none of the packages that only the extra ``lake`` brings."""
+    program = f"""
+import sys
+from {PACKAGE} import lake
+from {PACKAGE}.lake import catalogue, parts, schema
+print([name for name in ('daft', 'obstore', 'pyarrow') if name in sys.modules])
+"""
+    ran = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60)
+    assert ran.stdout.strip() == '[]'
+
+
 @pytest.mark.parametrize('path', [path for path in MODULES if folder(path) in STAGES], ids=lambda path: '/'.join(path.parts[-2:]))
 def test_the_way_of_the_data(path: Path) -> None:
     """A stage never imports one before it: capture, encode, spool, ship, stores."""
@@ -74,7 +95,7 @@ def test_the_way_of_the_data(path: Path) -> None:
 @pytest.mark.parametrize('path', [path for path in MODULES if not folder(path)], ids=lambda path: path.name)
 def test_the_contracts_know_no_stage(path: Path) -> None:
     """What all share depends on none of them."""
-    outside = {'capture', 'sim', 'cli', *STAGES}
+    outside = {'capture', 'sim', 'cli', 'doctor', *STAGES}
     for name in imports(path):
         parts = name.split('.')
         assert parts[0] != PACKAGE or len(parts) < 2 or parts[1] not in outside, f'{path.name} must not import {name}'

@@ -182,7 +182,7 @@ class _Object:
 
     def number(self, name: str) -> float:
         found = self._fields.get(name)
-        if type(found) not in (int, float):
+        if not isinstance(found, (int, float)) or isinstance(found, bool):
             raise self.wrong(name, 'a number')
         return float(found)
 

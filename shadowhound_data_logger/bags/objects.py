@@ -20,6 +20,11 @@ EVENT_PRIORITY: Final = 1
 """Of an event's slices: before whatever the sensors keep, and like the ending never evicted."""
 
 
+def ros_distro() -> str:
+    """What rosbag2 writes of the distribution; empty where ROS is not sourced."""
+    return os.environ.get('ROS_DISTRO', '')
+
+
 def slice_object(notes: Notes, info: SliceInfo, priority: int) -> DataObject:
     """A closed slice; its messages count in the accounts of the bags, or of the events, whose own priority goes first."""
     is_event = notes.event is not None
@@ -46,8 +51,7 @@ def ending_objects(notes: Notes) -> Iterator[DataObject]:
         topics=topics_of(slices), slices=entries, event=notes.event,
     )  # fmt: skip
     span = min((one.t_start_ns for one in slices), default=0), max((one.t_end_ns for one in slices), default=0)
-    distro = os.environ.get('ROS_DISTRO', '')
-    yield _small(notes, METADATA, metadata_yaml(slices, ros_distro=distro), 'application/yaml', span)
+    yield _small(notes, METADATA, metadata_yaml(slices, ros_distro=ros_distro()), 'application/yaml', span)
     yield _small(notes, MANIFEST, manifest.to_json(), 'application/json', span)
 
 

@@ -29,7 +29,8 @@ log = logging.getLogger(__name__)
 
 SYNC_S: Final = 0.5
 """Between two syncs: with a poll of the intake before it a message is less than a second from the disk."""
-IDLE_S: Final = 60.0
+IDLE_S: Final = 10.0
+"""Between two looks of a thread that has nothing to do; well below its patience."""
 PATIENCE_S: Final = 30.0
 """A round that lasts longer hangs in the disk."""
 STOP_S: Final = 5.0
@@ -228,7 +229,7 @@ class Recorder:
             self._outlet.accounts.rebase_all(BAG)
         recording = Recording(notes, self._settings, self._outlet)
         self._current = _Current(recording, by, time.monotonic(), self._queue.dropped)
-        self._queue.paused = False
+        self._queue.paused = self._queue.paused and listening
         if not self._started:
             self._started = True
             self._worker.start()

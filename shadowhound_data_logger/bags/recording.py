@@ -18,7 +18,7 @@ from shadowhound_data_logger.bags.definitions import describe
 from shadowhound_data_logger.bags.manifest import Missing, MissionOf
 from shadowhound_data_logger.bags.naming import slice_file
 from shadowhound_data_logger.bags.notes import Notes
-from shadowhound_data_logger.bags.objects import ending_objects, slice_object
+from shadowhound_data_logger.bags.objects import ending_objects, ros_distro, slice_object
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.recovery import recover
 from shadowhound_data_logger.bags.slice_info import SliceInfo
@@ -175,7 +175,9 @@ class Recording:
         path = self.notes.folder / slice_file(self.notes.bag, self.number + 1)
         try:
             path.with_name(path.name + OPEN).unlink(missing_ok=True)  # what a try that failed has left
-            self._writer = SliceWriter(path, compression=self._settings.compression, chunk_bytes=self._settings.chunk_bytes)
+            self._writer = SliceWriter(
+                path, compression=self._settings.compression, chunk_bytes=self._settings.chunk_bytes, ros_distro=ros_distro()
+            )
         except OSError as error:
             self._refuse(UNWRITABLE, str(error))
             return False
@@ -201,7 +203,7 @@ class Recording:
             path, written = self._broken[0]
             try:
                 final = path.with_name(path.name.removesuffix(OPEN))
-                info = recover(path) if path.exists() else None
+                info = recover(path, ros_distro=ros_distro()) if path.exists() else None
             except OSError as error:
                 self._refuse(UNWRITABLE, str(error))
                 return False

@@ -14,7 +14,7 @@ from typing import Final
 from shadowhound_data_logger.bags.manifest import Missing
 from shadowhound_data_logger.bags.naming import slice_number
 from shadowhound_data_logger.bags.notes import Notes
-from shadowhound_data_logger.bags.objects import ending_objects, slice_object
+from shadowhound_data_logger.bags.objects import ending_objects, ros_distro, slice_object
 from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.recovery import read_info, recover
 from shadowhound_data_logger.bags.slice_writer import OPEN
@@ -109,7 +109,7 @@ class Salvage:
 
     def _recover(self, notes: Notes, path: Path) -> None:
         """A slice that was open; one without any message is nothing."""
-        info = recover(path)
+        info = recover(path, ros_distro=ros_distro())
         if info.damage is not None and (info.damage.tail_bytes or info.damage.chunks):
             damage = f'{info.damage.tail_bytes} bytes at its end and {info.damage.chunks} chunks in it were not whole'
             notes.add_missing(Missing(info.path.name, damage, info.damage.messages))

@@ -1,17 +1,17 @@
-"""Which topics a bag holds, decided from the settings, the sensors and the graph. Plain Python."""
+"""Which topics a bag holds, or the ring of the events, decided from the settings, the sensors and the graph. Plain Python."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
 
-from shadowhound_data_logger.options import BagSettings
+from shadowhound_data_logger.options import BagSettings, EventSettings
 
 
 class Choice:
     """New for each set of settings; ``wanted`` again and again, because sensors and graph change."""
 
-    def __init__(self, settings: BagSettings, named: Iterable[str]) -> None:
+    def __init__(self, settings: BagSettings | EventSettings, named: Iterable[str]) -> None:
         """``named`` are the settings' topics as full names."""
         self._named = frozenset(named)
         self._regex = re.compile(settings.regex) if settings.regex else None

@@ -1,4 +1,4 @@
-"""The subscriptions that a recording needs besides the sensors', and which topics it wants. Owned by the intake thread."""
+"""The subscriptions that a recording, or the ring of the events, needs besides the sensors', and which topics it wants. Owned by the intake thread."""
 
 from __future__ import annotations
 
@@ -8,22 +8,25 @@ from contextlib import ExitStack
 from rclpy.node import Node
 
 from shadowhound_data_logger.bags.topics import Choice
-from shadowhound_data_logger.capture.bag_tap import BagStream
+from shadowhound_data_logger.capture.bag_tap import BagStream, BagTap
+from shadowhound_data_logger.capture.event_tap import EventTap
 from shadowhound_data_logger.capture.reader import PolledGroup
 from shadowhound_data_logger.capture.source import Source
 from shadowhound_data_logger.capture.stream import Shared
-from shadowhound_data_logger.config import BagSettings, IntakeSettings, SensorSettings
+from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 
 
 class BagSources:
     """New; ``refresh`` while a recording goes on, ``end`` after it."""
 
-    def __init__(self, node: Node, bag: BagSettings, settings: IntakeSettings, group: PolledGroup, shared: Shared) -> None:
+    def __init__(self, node: Node, choice: Choice, tap: BagTap | EventTap, settings: IntakeSettings, group: PolledGroup, shared: Shared) -> None:
+        """``tap`` is told its topics; what has a subscription of its own here goes to that of ``shared``."""
         self._node = node
         self._settings = settings
         self._group = group
         self._shared = shared
-        self._choice = Choice(bag, (node.resolve_topic_name(topic) for topic in bag.topics if topic))
+        self._choice = choice
+        self._tap = tap
         self._own: dict[str, Source] = {}
 
     @property
@@ -39,13 +42,13 @@ class BagSources:
         graph = [name for name, _ in self._node.get_topic_names_and_types()] if self._choice.asks_graph else []
         wanted = self._choice.wanted(sensors, graph)
         shared = {topic for topic, is_latched in sensors.items() if not is_latched}
-        self._shared.tap.topics = wanted & shared
         for topic in wanted.difference(shared, self._own):
             sensor = SensorSettings(name='bag', topics=(topic,))
             source = self._own[topic] = Source(self._node, sensor, self._settings, self._group, self._shared, BagStream)
             source.pause(now_s, paused=paused)
         for source in self._own.values():
             source.refresh(now_s)
+        self._tap.topics = wanted.union(self._own) - (sensors.keys() - shared)
         for topic in shared.intersection(self._own):
             self._own.pop(topic).close(now_s)
 
@@ -55,4 +58,4 @@ class BagSources:
         with ExitStack() as ending:
             for source in own.values():
                 ending.callback(source.close, now_s)
-        self._shared.tap.topics = frozenset()
+        self._tap.topics = frozenset()

@@ -55,10 +55,14 @@ class BagTap:
         """What the publishers of the topic offer, as it was when the recording first heard of it."""
         qos = self._qos.get((topic, type_name))
         if qos is None:
-            found = self._node.get_publishers_info_by_topic(topic)
-            qos = offered_qos(info.qos_profile for info in found if info.topic_type == type_name)
-            self._qos[topic, type_name] = qos
+            qos = self._qos[topic, type_name] = qos_offered(self._node, topic, type_name)
         return qos
+
+
+def qos_offered(node: Node, topic: str, type_name: str) -> str:
+    """By the publishers of a topic with this type, as rosbag2 writes it."""
+    found = node.get_publishers_info_by_topic(topic)
+    return offered_qos(info.qos_profile for info in found if info.topic_type == type_name)
 
 
 class BagStream:

@@ -62,6 +62,8 @@ def entries(status: Mapping[str, Any], earlier: Mapping[str, Any]) -> Iterator[E
     for topic, row in status['topics'].items():
         level, text = _topic(row, earlier['topics'].get(topic, row), stalls.get(topic, ''))
         yield topic, level, text, row
+    yield _bag(status['bag'], earlier['bag'])
+    yield _events(status['events'], earlier['events'])
     yield _spool(status['spool'])
     yield _store(status['store'], earlier['store'], stalls.get('delivery', ''))
     yield _clock(status['clock'])
@@ -74,6 +76,32 @@ def _node(status: Mapping[str, Any]) -> Entry:
     if status['paused']:
         return 'node', WARN, 'paused: messages are counted and not stored', figures
     return 'node', OK, 'logging', figures
+
+
+def _bag(bag: Mapping[str, Any], before: Mapping[str, Any]) -> Entry:
+    figures = {name: value for name, value in bag.items() if name != 'topics'}
+    if not bag['recording']:
+        return 'bag', OK, 'nothing is recorded', figures
+    if bag['refused']:
+        return 'bag', ERROR, f'{bag["bag"]} records nothing now: {bag["refused"]}', figures
+    if bag['bag'] == before['bag'] and bag['dropped'] > before['dropped']:
+        return 'bag', WARN, f'{bag["bag"]} dropped {bag["dropped"] - before["dropped"]} messages lately', figures
+    return 'bag', OK, f'{bag["bag"]} is {"paused" if bag["paused"] else "recorded"}', figures
+
+
+def _events(events: Mapping[str, Any], before: Mapping[str, Any]) -> Entry:
+    figures = {name: value for name, value in events.items() if name not in {'topics', 'last'}}
+    figures |= {f'last {name}': value for name, value in events['last'].items()}
+    if not events['enabled']:
+        return 'events', OK, 'nothing is kept', figures
+    if events['refused']:
+        return 'events', ERROR, f'{events["bag"]} is not written: {events["refused"]}', figures
+    dropped = sum(row['dropped'] for row in events['topics'].values()) - sum(row['dropped'] for row in before['topics'].values())
+    if dropped > 0:
+        return 'events', WARN, f'{dropped} messages of an event were dropped lately', figures
+    if events['bag']:
+        return 'events', OK, f'{events["bag"]} is written', figures
+    return 'events', OK, f'the last {events["seconds"]:g} s are kept', figures
 
 
 def _topic(row: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> tuple[Any, str]:

@@ -8,20 +8,21 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
 from rclpy.node import Node
 
+from shadowhound_data_logger.bags.topics import Choice
+from shadowhound_data_logger.capture.bag_sources import BagSources
+from shadowhound_data_logger.capture.event_tap import EventTap, Taps
 from shadowhound_data_logger.capture.reader import PolledGroup
 from shadowhound_data_logger.capture.source import Source, SourceStatus
-from shadowhound_data_logger.capture.stream import Shared
-from shadowhound_data_logger.clock import Clock
-from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.capture.stream import Offer, Shared
+from shadowhound_data_logger.config import BagSettings, IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.queue import BatchQueue
-from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.worker import Worker
@@ -38,16 +39,22 @@ class Intake:
     ``sensors`` are the settings in force, shared with the encoders; while it runs, this thread alone replaces its entries.
     """
 
-    def __init__(self, node: Node, sensors: dict[str, SensorSettings], settings: IntakeSettings, accounts: Accounts,
-                 types: MessageTypes, queue: BatchQueue, clock: Clock) -> None:  # fmt: skip
+    def __init__(self, node: Node, sensors: dict[str, SensorSettings], settings: IntakeSettings, shared: Shared,
+                 bag: BagSettings, events: EventTap | None = None) -> None:  # fmt: skip
         self._sensors = sensors
         self._settings = settings
-        self._accounts = accounts
-        self._queue = queue
-        group, shared = PolledGroup(), Shared(accounts, types, self._offer, clock)
+        group, of_bag = PolledGroup(), shared
+        if events is not None:
+            shared = shared._replace(tap=Taps(of_bag.tap, events))
         self._sources = tuple(
             Source(node, sensor, settings, group, shared) for sensor in sensors.values()
         )  # fmt: skip
+        # The odometry comes first, so that what is taken after it finds its pose.
+        self._by_turn = sorted(self._sources, key=lambda source: not (shared.robot and shared.robot.is_odometry(source.topic)))
+        named = (node.resolve_topic_name(topic) for topic in bag.topics if topic)
+        self._bag = BagSources(node, Choice(bag, named), of_bag.tap, settings, group, of_bag)
+        self._ring = BagSources(node, events.choice, events, settings, group, shared) if events is not None else None
+        self._records = False
         self._requests: deque[Callable[[], None]] = deque()
         self._wake = threading.Event()
         self._next_poll_s = self._next_refresh_s = 0.0
@@ -59,6 +66,11 @@ class Intake:
     def topics(self) -> Sequence[str]:
         """The resolved topics it listens to, or would."""
         return [source.topic for source in self._sources if source.sensor.enabled]
+
+    @property
+    def _unsampled(self) -> Sequence[Source]:
+        """Of topics that only a bag or the ring wants."""
+        return *self._bag.own, *(self._ring.own if self._ring is not None else ())
 
     def status(self) -> list[SourceStatus]:
         return [source.status() for source in self._sources]
@@ -91,6 +103,10 @@ class Intake:
         """From now on count and skip what comes, or store it again; False if that failed or took too long."""
         return self._ask(partial(self._set_idle, idle=idle), deadline_s)
 
+    def record(self, deadline_s: float, *, on: bool) -> bool:
+        """From now on hand all that comes of the bag's topics to the bag, or no more; False if that failed or took too long."""
+        return self._ask(partial(self._record, on=on), deadline_s)
+
     def update(self, sensors: Iterable[SensorSettings]) -> None:
         """Go on by these settings soon; sensors that are not among them stay as they are."""
         self._post(partial(self._update, tuple(sensors)))
@@ -103,10 +119,13 @@ class Intake:
         self._wake.clear()
         now_s = time.monotonic()
         self._next_poll_s = now_s + self._settings.poll_s
-        todo: list[Callable[[], None]] = [partial(source.drain, now_s) for source in self._sources]
+        todo: list[Callable[[], None]] = [partial(source.drain, now_s) for source in self._by_turn]
+        todo += [partial(source.drain, now_s) for source in self._unsampled]
         if now_s >= self._next_refresh_s:
             self._next_refresh_s = now_s + REFRESH_S
-            todo = [*(partial(source.refresh, now_s) for source in self._sources), *todo]
+            todo = [*(partial(source.refresh, now_s) for source in self._by_turn), *todo]
+            if self._records or self._ring is not None:
+                todo.append(partial(self._follow, now_s))
         _each([*todo, self._obey])
 
     def _obey(self) -> None:
@@ -120,7 +139,7 @@ class Intake:
     def _pause(self, *, paused: bool) -> None:
         now_s = time.monotonic()
         self.paused = paused
-        _each([partial(source.pause, now_s, paused=paused) for source in self._sources])
+        _each([partial(source.pause, now_s, paused=paused) for source in (*self._sources, *self._unsampled)])
 
     def _set_idle(self, *, idle: bool) -> None:
         now_s = time.monotonic()
@@ -132,9 +151,29 @@ class Intake:
         _each([partial(source.update, self._sensors[source.sensor.name], now_s) for source in self._sources])
         self._next_refresh_s = now_s
 
+    def _record(self, *, on: bool) -> None:
+        """What came before is drained first: it is not of this recording, or the last of it."""
+        now_s = time.monotonic()
+        _each([partial(source.drain, now_s) for source in (*self._sources, *self._unsampled)])
+        self._records = on
+        if on:
+            self._follow(now_s)
+        else:
+            self._bag.end(now_s)
+
+    def _follow(self, now_s: float) -> None:
+        sensors = {source.topic: source.is_latched for source in self._sources if source.sensor.enabled}
+        if self._ring is not None:
+            self._ring.refresh(dict.fromkeys(sensors, False), now_s, paused=self.paused)
+            sensors |= {source.topic: source.is_latched for source in self._ring.own}
+        if self._records:
+            self._bag.refresh(sensors, now_s, paused=self.paused)
+
     def _finish(self) -> None:
         now_s = time.monotonic()
-        _each([*(partial(source.close, now_s) for source in self._sources), self.worker.stop])
+        ends = [partial(source.close, now_s) for source in self._sources]
+        ends += [partial(each.end, now_s) for each in (self._bag, self._ring) if each is not None]
+        _each([*ends, self.worker.stop])
 
     # -- between the threads ---------------------------------------------------------------------------------------
 
@@ -157,9 +196,15 @@ class Intake:
         self._post(answer)
         return done.wait(max(0.0, deadline_s)) and bool(succeeded)
 
-    def _offer(self, batch: Batch) -> None:
-        for lost in self._queue.put(batch, self._sensors[batch.sensor].priority):
-            self._accounts.drop(lost.topic, 'queue_full', len(lost.samples))
+
+def offer_to(queue: BatchQueue, sensors: Mapping[str, SensorSettings], accounts: Accounts) -> Offer:
+    """The way of a batch to the encoders: what the queue has no room for is dropped and counted."""
+
+    def offer(batch: Batch) -> None:
+        for lost in queue.put(batch, sensors[batch.sensor].priority):
+            accounts.drop(lost.topic, 'queue_full', len(lost.samples))
+
+    return offer
 
 
 def _each(steps: Sequence[Callable[[], None]]) -> None:

@@ -14,10 +14,12 @@ from typing import Any, Final
 
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.mission_tap import MissionTap
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, iso
+from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.queue import BatchQueue
-from shadowhound_data_logger.missions.active import Active, Lookout, ended
+from shadowhound_data_logger.missions.active import THIS_MACHINE, Active, Lookout, ended
+from shadowhound_data_logger.missions.dating import now_ns
+from shadowhound_data_logger.missions.folder import safe_type
 from shadowhound_data_logger.missions.node_log import NodeLog
 from shadowhound_data_logger.model import Batch, DataObject
 from shadowhound_data_logger.worker import Worker
@@ -50,6 +52,7 @@ class MissionWatch:
         self._lookout = Lookout(settings.home, settings.robot)
         self._mission: Active | None = None
         self._marks: Mapping[str, str] = {}
+        self._last: tuple[Active, Mapping[str, str]] | None = None
         self._log: NodeLog | None = None
         self._due_s = 0.0
         self._wake = threading.Event()
@@ -85,10 +88,12 @@ class MissionWatch:
 
     def mark(self, item: DataObject) -> DataObject:
         """The object with the ids of the mission that it began in."""
-        mission = self._mission
-        if mission is None or (item.t_start_ns >= EARLIEST_SANE_NS and not mission.has(item.t_start_ns)):
-            return item
-        return replace(item, metadata={**item.metadata, **self._marks})
+        mission, last = self._mission, self._last
+        if mission is not None and mission.has(item.t_start_ns):
+            return replace(item, metadata={**item.metadata, **self._marks})
+        if last is not None and last[0].has(item.t_start_ns):  # it was on its way to us when the mission ended
+            return replace(item, metadata={**item.metadata, **last[1]})
+        return item
 
     def observe(self, batch: Batch) -> None:
         """Take from a batch what is logged."""
@@ -100,7 +105,6 @@ class MissionWatch:
     # -- the thread ------------------------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        self._wake.wait(LOOK_S)
         found, before = self._lookout.look(), self._mission
         if (found and found.id) != (before and before.id):
             if before is not None:
@@ -112,10 +116,11 @@ class MissionWatch:
         if self._log is not None and time.monotonic() >= self._due_s:
             self._due_s = time.monotonic() + WRITE_S
             self._log.write()
+        self._wake.wait(LOOK_S)
 
     def _join(self, mission: Active) -> None:
         """From now on; what was taken before is closed first, so that no object is of before and of the mission."""
-        self._marks = {'mission_id': mission.id}
+        self._marks = {'mission_id': mission.id, 'mission_type': safe_type(mission.mission_type)}
         self._find_run(mission)
         if self._settings.join:
             node_log = NodeLog(mission, max(1, round(self._settings.period_s * SECOND)), self._settings.max_speed_mps)
@@ -133,6 +138,7 @@ class MissionWatch:
 
     def _leave(self, mission: Active) -> None:
         """Close what is open, so that all of the mission is encoded, and let go of its journal."""
+        noticed_ns = now_ns(THIS_MACHINE)
         self._mission = over = ended(mission)
         end_s = time.monotonic() + FLUSH_S
         if not (self._set_idle(idle=True) and self._queue.finished(end_s - time.monotonic())):
@@ -140,6 +146,7 @@ class MissionWatch:
         node_log, self._log = self._log, None
         if node_log is not None:
             node_log.close(over)
+        self._last = replace(over, end_ns=noticed_ns if over.end_ns is None else over.end_ns), self._marks
         self._mission, self._marks = None, {}
         log.info('mission %s is over', mission.id)
         self._tell({})

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import MissionSettings, SensorSettings
 from shadowhound_data_logger.encode.image import encode_jpeg
 from shadowhound_data_logger.encode.payload import Job
@@ -39,13 +39,13 @@ class MissionTap:
     """
 
     def __init__(self, settings: MissionSettings, sensors: Mapping[str, SensorSettings], robot: str, types: MessageTypes,
-                 clock: Clock, resolve: Callable[[str], str]) -> None:  # fmt: skip
+                 resolve: Callable[[str], str], marks: Callable[[int], Mapping[str, str]] = lambda _: {}) -> None:  # fmt: skip
         """``resolve`` makes a topic's full name, as the node's namespace and remappings want it."""
         self._sensors = sensors
         self._robot = robot
         self._types = types
-        self._clock = clock
         self._period_ns = max(1, round(settings.period_s * SECOND))
+        self._marks = marks
         self._frames = settings.frames
         self._frame_ns = max(1, round(settings.frame_every_s * SECOND))
         self._odometry = resolve(settings.odometry) if settings.odometry else ''
@@ -72,7 +72,7 @@ class MissionTap:
                 for sample in self._some(batch, self._frame_ns):
                     payload = encode_jpeg(Job(batch, self._sensors[batch.sensor], self._robot, self._types), sample)
                     if payload.content_type == JPEG:
-                        yield Frame(self._time(sample), payload.body)
+                        yield Frame(sample.stamp_ns, payload.body, self._marks(sample.stamp_ns))
         except Rejected as error:
             self._tell(batch.topic, str(error))
 
@@ -88,8 +88,7 @@ class MissionTap:
     def _pose(self, sample: Sample) -> Pose:
         message = self._types.deserialize(ODOMETRY, sample.cdr)
         at, turn = message.pose.pose.position, message.pose.pose.orientation
-        yaw = math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y * turn.y + turn.z * turn.z))
-        return Pose(self._time(sample), at.x, at.y, yaw, at.z, message.header.frame_id)
+        return Pose(sample.stamp_ns, at.x, at.y, yaw_of(turn), at.z, message.header.frame_id)
 
     def _cloud(self, sample: Sample) -> Cloud | None:
         """None for a cloud without x, y and z as float32, or with gaps between its rows."""
@@ -105,20 +104,16 @@ class MissionTap:
         layout = np.dtype({'names': ['x', 'y', 'z'], 'formats': [kind] * 3, 'offsets': at, 'itemsize': size})
         points = np.frombuffer(data, layout)
         xyz = np.stack([points[name] for name in 'xyz'], axis=1).astype(np.float32)
-        return Cloud(self._time(sample), message.header.frame_id, xyz)
+        return Cloud(sample.stamp_ns, message.header.frame_id, xyz)
 
     def _readings(self, type_name: str, sample: Sample, fields: Mapping[str, list[str]]) -> Iterator[Reading]:
         message = self._types.deserialize(type_name, sample.cdr)
         for key, path in fields.items():
-            value = _field(message, path)
+            value = number_at(message, path)
             if value is None:
                 self._tell(key, f'{type_name} has no number {".".join(path)}')
             elif math.isfinite(value):
-                yield Reading(self._time(sample), key, value)
-
-    def _time(self, sample: Sample) -> int:
-        """UTC as far as it is known: a mission's own times are those of this machine's clock."""
-        return sample.stamp_ns if sample.stamp_ns >= EARLIEST_SANE_NS else self._clock.wall_ns()
+                yield Reading(sample.stamp_ns, key, value)
 
     def _tell(self, what: str, text: str) -> None:
         if what not in self._told:
@@ -126,7 +121,7 @@ class MissionTap:
             log.warning('%s is not logged to the mission: %s', what, text)
 
 
-def _field(message: Any, path: list[str]) -> float | None:
+def number_at(message: Any, path: list[str]) -> float | None:
     """The number at the end of the path; None where there is none."""
     found = message
     try:
@@ -135,3 +130,8 @@ def _field(message: Any, path: list[str]) -> float | None:
         return float(found)
     except (AttributeError, IndexError, TypeError, ValueError):
         return None
+
+
+def yaw_of(turn: Any) -> float:
+    """The angle about z of a quaternion, radians within [-pi, pi]."""
+    return math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y * turn.y + turn.z * turn.z))

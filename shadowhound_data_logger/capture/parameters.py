@@ -12,6 +12,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.options import GROUPS
@@ -113,6 +114,11 @@ def _check_topics(node: Node, settings: Settings) -> None:
     for name, given in (('odometry', mission.odometry), ('battery', mission.battery), ('temperature', mission.temperature)):
         if given:
             _resolve(node, f'mission.{name}', given.partition(':')[0], given)
+    for topic in settings.events.topics:
+        if topic:
+            _resolve(node, 'events.topics', topic, list(settings.events.topics))
+    for condition in conditions(settings.events.conditions):
+        _resolve(node, 'events.conditions', condition.topic, condition.text)
     for sensor in settings.sensors:
         for topic in sensor.topics:
             name = f'{sensor.name}.topics'

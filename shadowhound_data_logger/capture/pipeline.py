@@ -7,20 +7,30 @@ import logging
 import os
 import sqlite3
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
 
 from rclpy.node import Node
 
+from shadowhound_data_logger.bags.naming import BUCKET, FOLDER, key_of, slice_file
+from shadowhound_data_logger.bags.queue import BagQueue
+from shadowhound_data_logger.bags.recorder import Place, Recorder
+from shadowhound_data_logger.bags.recording import Outlet
+from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.capture.bag_control import BagControl
+from shadowhound_data_logger.capture.bag_tap import BagTap
 from shadowhound_data_logger.capture.control import Control
 from shadowhound_data_logger.capture.diagnostics import Diagnostics
-from shadowhound_data_logger.capture.intake import Intake
+from shadowhound_data_logger.capture.event_buffer import EventBuffer
+from shadowhound_data_logger.capture.intake import Intake, offer_to
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_tap import MissionTap
 from shadowhound_data_logger.capture.mission_topic import MissionTopic
 from shadowhound_data_logger.capture.parameters import live
+from shadowhound_data_logger.capture.pose_track import RobotTrack
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
+from shadowhound_data_logger.capture.stream import Shared
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import Settings
@@ -29,9 +39,11 @@ from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import dated
+from shadowhound_data_logger.lake.catalogue import Catalogue
 from shadowhound_data_logger.model import DataObject, Outcome
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.accounts import SINKS
 from shadowhound_data_logger.spool.clock_record import ClockRecord
 from shadowhound_data_logger.spool.redating import Redating
 from shadowhound_data_logger.spool.spool import Spool
@@ -53,6 +65,7 @@ class Pipeline:
         system_clock, record = SystemClock.of_this_machine(), ClockRecord(settings.spool_path, settings.robot)
         self._clock = ClockWatch(system_clock, settings.clock.hold_s, record.steps)
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
+        self._catalogue = Catalogue(settings.spool_path, settings.catalogue, settings.robot, self._clock)
         self._redating = Redating(self.spool, self._clock, record, settings.robot)
         self._node = node
         self._day = self._today()
@@ -76,6 +89,8 @@ class Pipeline:
         if not opened.enter_context(self.spool.node_lock()):
             raise SpoolError(f'another sensor_logger_node logs {settings.robot} to {self.spool.root} already',
                              remedy='stop it, or give this one a robot name or SHADOWHOUND_HOME of its own')  # fmt: skip
+        for sink in SINKS:
+            self.spool.carry(sink)
         self.uploader = Uploader(self.spool, self._store, settings.upload, self._settle)
         self.writer = SpoolWriter(self.spool, settings.spool.commit_s, spooled=self.uploader.wake,
                                   settled=self.uploader.settled)  # fmt: skip
@@ -84,15 +99,23 @@ class Pipeline:
         sensors = {sensor.name: sensor for sensor in settings.sensors}
         self.pool = EncodePool(queue, sensors, settings.robot, types, self._spool_later, self.spool.accounts.reject,
                                settings.encode.threads)  # fmt: skip
-        self.intake = Intake(self._node, sensors, settings.intake, self.spool.accounts, types, queue, self._clock)
-        tap = MissionTap(settings.mission, sensors, settings.robot, types, self._clock, self._node.resolve_topic_name)
-        topic = MissionTopic(self._node)
-        self.mission = MissionWatch(settings, self.intake, queue, tap, topic.tell)
+        self._track = RobotTrack(settings.mission, types, self._node.resolve_topic_name)
+        shared = Shared(self.spool.accounts, types, offer_to(queue, sensors, self.spool.accounts), self._clock, self._track,
+                        BagTap(self._node, self.spool.accounts, bag_queue := BagQueue(settings.bag.queue_bytes)))  # fmt: skip
+        place, outlet = self._place(), self._outlet()
+        self.event_buffer = EventBuffer(self._node, settings, place, outlet, types)
+        self.intake = Intake(self._node, sensors, settings.intake, shared, settings.bag, self.event_buffer.tap)
+        salvage = Salvage(place.root, settings.robot, settings.bag.priority, outlet, self.spool.knows)
+        self.recorder = Recorder(settings.bag, place, bag_queue, outlet, salvage,
+                                 lambda on, deadline_s: self.intake.record(deadline_s, on=on))  # fmt: skip
+        tap = MissionTap(settings.mission, sensors, settings.robot, types, self._node.resolve_topic_name, self._track.marks)
+        self._mission_topic = topic = MissionTopic(self._node)
+        self.mission = MissionWatch(settings, self.intake, queue, tap, self._tell_mission)
         self.pool.observe = self.mission.observe
-        self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission)
+        self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
+                                       self.recorder, self.event_buffer)  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
         self._diagnostics = Diagnostics(self._node)
-        self.control = Control(self._node, self.intake, queue, self.writer)
         opened.callback(self._tell, ended=True)
         self.writer.open()
         opened.callback(self.writer.close, 1.0)
@@ -106,10 +129,12 @@ class Pipeline:
         self.mission.open()
         opened.callback(self.mission.stop)
         self.intake.open()
-        self._diagnostics.open()
-        opened.callback(self._diagnostics.close)
-        self.control.open()
-        opened.callback(self.control.close)
+        self.recorder.open()
+        self.event_buffer.open()
+        self.control = Control(self._node, self.intake, queue, self.writer)
+        for answering in (self._diagnostics, self.control, BagControl(self._node, self.recorder), self.event_buffer.control):
+            answering.open()
+            opened.callback(answering.close)
         log.info(self.describe())
 
     def describe(self) -> str:
@@ -124,7 +149,9 @@ class Pipeline:
         """Everything that is in memory to the spool, and from there what can be delivered in time."""
         end_s = time.monotonic() + CLOSE_S
         finished = {
+            'bag recorder': self.recorder.close(CLOSE_S),
             'intake': self.intake.close(CLOSE_S),
+            'event writer': self.event_buffer.close(end_s - time.monotonic()),
             'encode pool': self.pool.close(end_s - time.monotonic()),
             'spool writer': self.writer.flush(end_s - time.monotonic()),
         }
@@ -135,8 +162,12 @@ class Pipeline:
         self._ship_ledger()
         self.writer.prompt = True
         self.writer.flush(1.0)
-        drain_s = self._settings.shutdown.drain_s
-        if drain_s and not self.uploader.drain(drain_s):
+        end_s = time.monotonic() + self._settings.shutdown.drain_s
+        self.uploader.drain(end_s - time.monotonic())
+        self.writer.flush(1.0)
+        self._spool_parts(self._catalogue.parts)
+        self.writer.flush(1.0)
+        if self._settings.shutdown.drain_s and not self.uploader.drain(end_s - time.monotonic()):
             log.warning('%d objects stay in the spool %s and are delivered later', self.spool.pending_count(), self.spool.root)
 
     def tick(self) -> None:
@@ -153,6 +184,7 @@ class Pipeline:
             return
         self._due_s = now_s + PERIOD_S
         self._name_held()
+        self._spool_parts(self._catalogue.due)
         self._tell()
         day = self._today()
         if day != self._day:
@@ -174,6 +206,22 @@ class Pipeline:
                 log.info('%s = %s from now on', name, value)
         self.intake.update(settings.sensors)
         self.uploader.set_max_mbps(settings.upload.max_mbps)
+        self.event_buffer.update(settings.events)
+
+    def _place(self) -> Place:
+        settings = self._settings
+        return Place(settings.home / FOLDER / settings.robot, settings.robot, self._clock,
+                     lambda bag: self.spool.has(BUCKET, key_of(settings.robot, bag, slice_file(bag, 0))))  # fmt: skip
+
+    def _outlet(self) -> Outlet:
+        least = self._settings.spool.min_free_bytes // 2
+        return Outlet(self.spool.accounts, lambda item: self.writer.put(item, wait=False), self.writer.flush,
+                      lambda: self.spool.free_bytes() >= least)  # fmt: skip
+
+    def _tell_mission(self, mission: Mapping[str, Any]) -> None:
+        self._mission_topic.tell(mission)
+        self.recorder.on_mission(mission)
+        self.event_buffer.on_mission(mission)
 
     def _tell(self, *, ended: bool = False) -> None:
         status = self._status.look(ended=ended)
@@ -192,7 +240,15 @@ class Pipeline:
             log.warning('the ledger was not shipped: %s', error)
 
     def _spool_later(self, item: DataObject) -> None:
-        self.writer.put(self._redating.date(self.mission.mark(item)))
+        self.writer.put(self._redating.date(self._track.mark(self.mission.mark(item))))
+
+    def _spool_parts(self, made: Callable[[], list[DataObject]]) -> None:
+        """The catalogue's next parts; what keeps them back now keeps them until the next time."""
+        try:
+            for part in made():
+                self.writer.put(part, wait=False)
+        except (DataLoggerError, sqlite3.Error) as error:
+            log.warning('the catalogue is not written yet: %s', error)
 
     def _name_held(self) -> None:
         """What waited for the clock to be set may go now, or as soon as the disk lets it."""

@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.type_support import NoTypeSupportImportedException, check_for_type_support
 
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan
-from shadowhound_data_logger.capture.stream import Taken
+from shadowhound_data_logger.model import Taken
 
 try:
     from rclpy.event_handler import SubscriptionEventCallbacks
@@ -121,7 +121,10 @@ class Reader:
                     self._overrun = self._overrun or count >= self.plan.depth
                     return
                 cdr, info = taken
-                yield Taken(cdr, info['source_timestamp'], self._publisher(info), info.get('publication_sequence_number'))
+                yield Taken(
+                    cdr, info['source_timestamp'], self._publisher(info), info.get('publication_sequence_number'),
+                    info['received_timestamp'],
+                )  # fmt: skip
             self._overrun = True
 
     def lost(self) -> int | None:

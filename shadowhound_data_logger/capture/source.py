@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Final
@@ -12,10 +12,13 @@ from rclpy.node import Node
 
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, plans
 from shadowhound_data_logger.capture.reader import PolledGroup, Reader, endpoints, unavailable
-from shadowhound_data_logger.capture.stream import Shared, Stream
+from shadowhound_data_logger.capture.stream import AnyStream, Shared, Stream
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 
 log = logging.getLogger(__name__)
+
+MakeStream = Callable[[SensorSettings, str, str, int, Shared], AnyStream]
+"""Of a topic and type, and the stamp of the newest message that was kept before."""
 
 FALLBACK_S: Final = 1.0
 """How long the preferred topic must be without a publisher before another one is taken."""
@@ -45,7 +48,7 @@ class Source:
     """A sensor at work. ``refresh`` follows the graph, ``drain`` takes what came, ``flush`` ends the open batch as well."""
 
     def __init__(self, node: Node, sensor: SensorSettings, settings: IntakeSettings, group: PolledGroup,
-                 shared: Shared) -> None:  # fmt: skip
+                 shared: Shared, make_stream: MakeStream = Stream) -> None:  # fmt: skip
         self.sensor = sensor
         self._node = node
         self._settings = settings
@@ -53,18 +56,20 @@ class Source:
         self._types = shared.types
         self._group = group
         self._shared = shared
+        self._make_stream = make_stream
         self._topics: list[str] = [node.resolve_topic_name(topic) for topic in sensor.topics]
         self._types_expected = dict(zip(self._topics, sensor.types, strict=False))
         self._chosen = self._topics[0]
         self._absent_since_s: float | None = None
         self._publishers = self._matched = 0
-        self._latched = False
+        self.is_latched = False
+        """Whether all publishers send what they sent before to whoever comes; as it was while there were any."""
         self._type = ''
         self._readers: list[Reader] = []
         self._retiring: dict[Reader, float] = {}
         self._heard: set[Plan] = set()
         self._senders = Senders()
-        self._stream: Stream | None = None
+        self._stream: AnyStream | None = None
         self._kept_ns: dict[str, int] = {}
         self._paused = False
         self._idle = False
@@ -80,7 +85,7 @@ class Source:
     def status(self) -> SourceStatus:
         """From any thread: each of its figures is replaced as a whole."""
         return SourceStatus(self.sensor.name, self._chosen, self.sensor.enabled, self._publishers, self._last_received_s,
-                            self._matched, self.sensor.on_change or self._latched, self._unavailable)  # fmt: skip
+                            self._matched, self.sensor.on_change or self.is_latched, self._unavailable)  # fmt: skip
 
     def refresh(self, now_s: float) -> None:
         """Look at the graph and subscribe as its publishers ask for it."""
@@ -89,7 +94,8 @@ class Source:
         publishers = self._choose(now_s)
         self._publishers = len(publishers)
         self._matched = max((reader.matched() for reader in self._readers), default=0)
-        self._latched = bool(publishers) and all(publisher.transient_local for publisher in publishers)
+        if publishers:
+            self.is_latched = all(publisher.transient_local for publisher in publishers)
         self._senders.look([publisher.gid for publisher in publishers])
         wanted = plans(self._chosen, publishers, self._types_expected.get(self._chosen), self._settings, self._type)
         self._warn_of_types(publishers, wanted)
@@ -184,7 +190,7 @@ class Source:
         self._leave(now_s)
         topic = self._chosen
         kept_ns = self._kept_ns.get(topic) or self._accounts.last_kept_ns(topic)
-        self._stream = Stream(self.sensor, topic, type_name, kept_ns, self._shared)
+        self._stream = self._make_stream(self.sensor, topic, type_name, kept_ns, self._shared)
         self._type = type_name
 
     def _retire(self, wanted: set[Plan], now_s: float) -> None:

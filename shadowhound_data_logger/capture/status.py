@@ -16,6 +16,8 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
+from shadowhound_data_logger.bags.recorder import Recorder
+from shadowhound_data_logger.capture.event_buffer import EventBuffer
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.source import SourceStatus
@@ -26,7 +28,8 @@ from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.pool import EncodePool
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
-from shadowhound_data_logger.spool.accounts import Totals
+from shadowhound_data_logger.spool.account_rows import Totals
+from shadowhound_data_logger.spool.accounts import BAG, EVENT
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import file
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -51,11 +54,14 @@ class Stages:
     writer: SpoolWriter
     uploader: Uploader
     mission: MissionWatch
+    recorder: Recorder
+    event_buffer: EventBuffer
 
     @property
     def workers(self) -> Sequence[Worker]:
         """All threads of the node but the main one."""
-        return self.intake.worker, *self.pool.workers, self.writer.worker, *self.uploader.workers, self.mission.worker
+        own = self.intake.worker, self.writer.worker, self.mission.worker
+        return *own, *self.pool.workers, *self.uploader.workers, *self.recorder.workers, *self.event_buffer.workers
 
 
 class Status:
@@ -94,7 +100,7 @@ class Status:
             'robot': self._settings.robot, 'version': self._version, 'pid': os.getpid(), 'boot_id': self._clock.boot_id,
             'boot_ns': boot_ns, 'time': iso(self._clock.wall_ns()), 'uptime_s': round((boot_ns - self._began_ns) / SECOND, 1),
             'paused': self._stages.intake.paused, 'ended': ended,
-            'mission': self._stages.mission.status(), 'topics': self._topics(now_s),
+            'mission': self._stages.mission.status(), 'bag': self._bag(), 'events': self._events(), 'topics': self._topics(now_s),
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
             'spool': {'path': str(self._stages.spool.root), **asdict(piles), 'max_bytes': self._settings.spool.max_bytes},
             'store': self._store(upload, now_s), 'clock': asdict(self._clock.state()),
@@ -142,6 +148,16 @@ class Status:
                 row['rate_hz'] = round(_slope(totals.received - before['received'], now_s - then_s), 2)
                 break
         return row | asdict(totals)
+
+    def _bag(self) -> dict[str, Any]:
+        """What is recorded, with the messages of this session by topic."""
+        topics = {topic: asdict(totals) for topic, totals in self._stages.spool.accounts.totals(BAG).items()}
+        return {**asdict(self._stages.recorder.status()), 'topics': topics}
+
+    def _events(self) -> dict[str, Any]:
+        """Ring and events, with the messages that events asked for in this session by topic."""
+        topics = {topic: asdict(totals) for topic, totals in self._stages.spool.accounts.totals(EVENT).items()}
+        return {**asdict(self._stages.event_buffer.events.status()), 'topics': topics}
 
     def _store(self, upload: UploadStatus, now_s: float) -> dict[str, Any]:
         then_s, sent_bytes, _ = self._past[0] if self._past else (now_s, upload.sent_bytes, {})

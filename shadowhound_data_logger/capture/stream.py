@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 from zlib import crc32
 
 from shadowhound_data_logger.capture.batching import Batcher
 from shadowhound_data_logger.capture.endpoints import Senders
 from shadowhound_data_logger.capture.gate import gate_for
+from shadowhound_data_logger.capture.pose_track import RobotTrack
 from shadowhound_data_logger.clock import Clock, stamp_of
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
-from shadowhound_data_logger.model import Batch, Sample
+from shadowhound_data_logger.model import Batch, Sample, Taken
 from shadowhound_data_logger.spool.accounts import EXACT, PAUSED, Accounts
 
 MAX_RECENT: Final = 10_000
@@ -20,13 +21,22 @@ MAX_RECENT: Final = 10_000
 Offer = Callable[[Batch], None]
 
 
-class Taken(NamedTuple):
-    """A serialized message with what the middleware knows of it; None where it does not say."""
+class Tap(Protocol):
+    """What takes all messages of some topics, whatever is kept of them (``BagTap``)."""
 
-    cdr: bytes
-    source_ns: int
-    publisher: str | None
-    number: int | None
+    @property
+    def topics(self) -> frozenset[str]: ...
+
+    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: int | None, *, paused: bool) -> None: ...
+
+
+class NoTap:
+    """Takes nothing."""
+
+    topics: frozenset[str] = frozenset()
+
+    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: int | None, *, paused: bool) -> None:
+        """Never called: there are no topics."""
 
 
 class Shared(NamedTuple):
@@ -36,6 +46,49 @@ class Shared(NamedTuple):
     types: MessageTypes
     offer: Offer
     clock: Clock
+    robot: RobotTrack | None = None
+    """Who keeps what some topics publish, at full rate."""
+    tap: Tap = NoTap()
+
+
+class Repeats:
+    """What came lately without a sender's gid, to know what a second of our subscriptions delivers again."""
+
+    def __init__(self) -> None:
+        self._recent: dict[tuple[int, int], None] = {}
+
+    def has(self, message: Taken) -> bool:
+        """Whether it came already: sent at the same time, same number or content.
+
+        Asked also while the graph knows one sender, whose name the middleware does not give: a second one may appear.
+        """
+        mark = (message.source_ns, crc32(message.cdr) if message.number is None else message.number)
+        if mark in self._recent:
+            return True
+        self._recent[mark] = None
+        if len(self._recent) > MAX_RECENT:
+            del self._recent[next(iter(self._recent))]
+        return False
+
+
+def is_named(message: Taken) -> bool:
+    """Whether the middleware says who sent it and as which."""
+    return message.publisher is not None and message.number is not None
+
+
+class AnyStream(Protocol):
+    """What becomes of the messages of one topic and type (``Stream``, ``BagStream``)."""
+
+    kept_ns: int
+
+    def update(self, sensor: SensorSettings) -> None: ...
+
+    def add(self, taken: Sequence[Taken], senders: Senders, lost: int | None, now_s: float, *, paused: bool,
+            idle: bool = False) -> None: ...  # fmt: skip
+
+    def close_due(self, now_s: float, grace_s: float) -> None: ...
+
+    def close_batch(self) -> None: ...
 
 
 class Stream:
@@ -52,7 +105,10 @@ class Stream:
         self._has_header = shared.types.has_header(type_name)
         self._gate = gate_for(sensor, has_header=self._has_header, last_kept_ns=last_kept_ns)
         self._batcher = Batcher(sensor, topic, type_name)
-        self._recent: dict[tuple[int, int], None] = {}
+        self._repeats = Repeats()
+        self._tap = shared.tap
+        self._type = type_name
+        self._track = shared.robot.of(topic, type_name) if shared.robot is not None else None
         with shared.accounts.entry(topic) as account:
             account.type = type_name
 
@@ -69,9 +125,12 @@ class Stream:
         ``lost`` is what the middleware reports to have lost since the last time, None where it reports nothing.
         While ``paused`` they are counted as dropped, while ``idle`` (nobody asked for them) as skipped.
         """
-        for sample in self._keep(taken, senders, lost, paused=paused, idle=idle):
+        heard: list[Taken] | None = [] if self._topic in self._tap.topics else None
+        for sample in self._keep(taken, senders, lost, heard, paused=paused, idle=idle):
             for batch in self._batcher.add(sample, now_s):
                 self._offer(batch)
+        if heard:
+            self._tap.add(self._topic, self._type, heard, lost, paused=paused)
 
     def close_due(self, now_s: float, grace_s: float) -> None:
         """End the batch whose time is over, though no message of the next one came."""
@@ -83,25 +142,30 @@ class Stream:
         if len(self._batcher):
             self._offer(self._batcher.close())
 
-    def _keep(self, taken: Sequence[Taken], senders: Senders, lost: int | None, *, paused: bool, idle: bool) -> list[Sample]:
-        """Count the messages, drop repeats and choose those to store."""
+    def _keep(self, taken: Sequence[Taken], senders: Senders, lost: int | None, heard: list[Taken] | None, *, paused: bool,
+              idle: bool) -> list[Sample]:  # fmt: skip
+        """Count the messages, drop repeats and choose those to store; ``heard`` gets all that are no repeats."""
         kept: list[Sample] = []
-        keep = self._gate.keep
+        keep, track = self._gate.keep, self._track
         with self._accounts.entry(self._topic) as account:
-            for cdr, source_ns, gid, number in taken:
+            for message in taken:
+                cdr, source_ns, gid, number, _ = message
                 publisher = gid or senders.name(number, source_ns)
-                is_named = gid is not None and number is not None and account.accounting == EXACT
-                if not is_named and self._is_repeat(source_ns, crc32(cdr) if number is None else number):
+                if not (is_named(message) and account.accounting == EXACT) and self._repeats.has(message):
                     continue
                 if not account.receive(publisher, number, reported=lost is not None):
                     continue
+                if heard is not None:
+                    heard.append(message if gid else message._replace(publisher=publisher))
+                if track is not None:
+                    track.add(self._time(cdr, source_ns), cdr)
                 if paused:
                     account.dropped[PAUSED] += 1
                     continue
                 if idle:
                     account.skipped += 1
                     continue
-                stamp_ns = stamp_of(header_stamp_ns(cdr) if self._has_header else 0, source_ns, self._clock)
+                stamp_ns = self._time(cdr, source_ns)
                 if keep(stamp_ns, cdr):
                     self.kept_ns = stamp_ns
                     kept.append(Sample(stamp_ns, cdr))
@@ -110,15 +174,5 @@ class Stream:
             account.lose(lost)
         return kept
 
-    def _is_repeat(self, source_ns: int, which: int) -> bool:
-        """Whether a message came by another of our subscriptions already: sent at the same time, same number or content.
-
-        Asked also while the graph knows one sender, whose name the middleware does not give: a second one may appear.
-        """
-        mark = (source_ns, which)
-        if mark in self._recent:
-            return True
-        self._recent[mark] = None
-        if len(self._recent) > MAX_RECENT:
-            del self._recent[next(iter(self._recent))]
-        return False
+    def _time(self, cdr: bytes, source_ns: int) -> int:
+        return stamp_of(header_stamp_ns(cdr) if self._has_header else 0, source_ns, self._clock)

@@ -56,16 +56,21 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
 
 def show(found: Mapping[str, Any], console: Console) -> None:
     """The ledger as tables, what there is to say about single topics, and a verdict."""
-    show_whole([topics_table(found), '', objects_table(found), *_section(notes(found)), '', verdict(found)], console)
+    bags = [_table(f'Messages recorded into bags of {found["robot"]}', found['bags']), ''] if found.get('bags') else []
+    show_whole([topics_table(found), '', *bags, objects_table(found), *_section(notes(found)), '', verdict(found)], console)
 
 
 def topics_table(found: Mapping[str, Any]) -> RenderableType:
     """One row a topic; a dash is a figure that the middleware does not tell."""
-    rows = {topic: _figures(row) for topic, row in found['topics'].items()}
-    if not rows:
+    if not found['topics']:
         return Text(f'No message of {found["robot"]} has been received yet.')
+    return _table(f'Messages of {found["robot"]}', found['topics'])
+
+
+def _table(title: str, topics: Mapping[str, Any]) -> RenderableType:
+    rows = {topic: _figures(row) for topic, row in topics.items()}
     columns = [name for name in COLUMNS if name in ALWAYS or any(row[name] for row in rows.values())]
-    table = plain_table(f'Messages of {found["robot"]}', ('topic', *columns))
+    table = plain_table(title, ('topic', *columns))
     for topic, row in rows.items():
         table.add_row(plain(topic), *(_lossy(name, row[name]) for name in columns))
     if len(rows) > 1:
@@ -87,7 +92,8 @@ def objects_table(found: Mapping[str, Any]) -> RenderableType:
 def notes(found: Mapping[str, Any]) -> list[str]:
     """Causes of what was lost, where stored messages are that are not delivered, and accounting that is not exact."""
     lines = []
-    for topic, row in found['topics'].items():
+    in_bags = ((f'{topic} in bags', row) for topic, row in found.get('bags', {}).items())
+    for topic, row in (*found['topics'].items(), *in_bags):
         for name, key in CAUSES.items():
             if row[key]:
                 lines.append(f'{topic}: {name} by {_listed(row[key])}')

@@ -6,8 +6,13 @@ import sys
 
 import click
 
+from shadowhound_data_logger.cli.bag import bag
+from shadowhound_data_logger.cli.doctor import doctor
+from shadowhound_data_logger.cli.fetch import fetch
+from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.cli.ledger import ledger
 from shadowhound_data_logger.cli.missions import missions
+from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.cli.status import status
 from shadowhound_data_logger.errors import DataLoggerError
 
@@ -21,8 +26,13 @@ def cli() -> None:
     """
 
 
+cli.add_command(doctor)
+cli.add_command(bag)
+cli.add_command(fetch)
+cli.add_command(lake)
 cli.add_command(ledger)
 cli.add_command(missions)
+cli.add_command(query)
 cli.add_command(status)
 
 

@@ -65,7 +65,7 @@ def list_(*, as_json: bool) -> int:
 @_as_json
 @_mission
 def show(*, folder: MissionFolder, as_json: bool) -> int:
-    """All there is to know of one mission, and what is not sent, and why. Exit code 1 when it is over and not sent."""
+    """All there is to know of one mission. Exit code 1 when it is over and not sent: then what is left, and why."""
     found = overview(folder)
     if found is None:
         raise click.UsageError(f'{folder.path} has no mission in it')
@@ -102,7 +102,7 @@ def resume(*, deadline: float, experiment: str) -> int:
 @click.option('--to', type=click.File('w', encoding='utf-8', lazy=True), default='-', help='The file  [default: standard output]')
 @_mission
 def export_(*, folder: MissionFolder, kind: str, to: IO[str]) -> int:
-    """Parameters, metric points and events of one mission, as they were logged on this machine."""
+    """Write out all points, events and parameters of one mission. As they were logged on this machine: without MLflow."""
     found = export(folder)
     if kind == 'json':
         json.dump(found, to, indent=2)

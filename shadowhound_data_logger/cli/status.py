@@ -6,6 +6,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from shadowhound_data_logger.cli.tables import bar, duration, fit, number, plain, plain_table, show_whole, volume
-from shadowhound_data_logger.clock import Clock, SystemClock
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
 from shadowhound_data_logger.config import home
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_name
@@ -172,6 +173,10 @@ def _way(found: Mapping[str, Any], console: Console, *, live: bool) -> Table:
         grid.add_row('', '', _piles(spool))
     if live:
         _add_store(grid, found)
+        if found.get('mission'):
+            _add_mission(grid, found)
+        if found.get('bag', {}).get('recording'):
+            _add_bag(grid, found['bag'])
         for name, row in found['workers'].items():
             if row['failing']:
                 grid.add_row(plain(name), Text('fails', 'red'), plain(f'{row["failures"]:,} times so far: {row["last_error"]}'))
@@ -205,6 +210,29 @@ def _add_store(grid: Table, found: Mapping[str, Any]) -> None:
     grid.add_row('', '', f'{store["delivered"]:,} delivered, {store["mbps"]:.1f}{cap} Mbit/s')
     if store['last_error'] and (not fine or store['blocked_buckets']):
         grid.add_row('', '', plain(store['last_error'], 'yellow'))
+
+
+def _add_mission(grid: Table, found: Mapping[str, Any]) -> None:
+    """The mission that is active, its type, since when, and its run."""
+    mission = found['mission']
+    began, now = (datetime.fromisoformat(stamp.replace('Z', '+00:00')) for stamp in (mission['started'], found['time']))
+    since = f'since {mission["started"][:10]} {mission["started"][11:19]} UTC, {duration((now - began).total_seconds())}'
+    if began < utc(EARLIEST_SANE_NS):
+        since = 'begun before the clock was set'
+    grid.add_row('mission', Text('active', 'cyan'), plain(f'{mission["type"]}, {since}'))
+    grid.add_row('', '', plain(mission['mission_id']))
+    grid.add_row('', '', plain(f'MLflow run {mission["run_id"]}' if mission['run_id'] else 'no MLflow run yet'))
+
+
+def _add_bag(grid: Table, bag: Mapping[str, Any]) -> None:
+    """The bag that is recorded, how much is in it, and what is wrong with it."""
+    state, style = ('stands still', 'red') if bag['refused'] else ('paused', 'yellow') if bag['paused'] else ('records', 'cyan')
+    grid.add_row('bag', Text(state, style), plain(f'{bag["bag"]} for {duration(bag["duration_s"])}'))
+    grid.add_row('', '', f'{bag["messages"]:,} messages, {volume(bag["bytes"])}, slice {bag["slice"]}')
+    if bag['refused']:
+        grid.add_row('', '', plain(f'the disk takes nothing: {bag["refused"]}', 'red'))
+    if bag['dropped']:
+        grid.add_row('', '', plain(f'{bag["dropped"]:,} messages dropped', 'yellow'))
 
 
 def _share(part: float, whole: float | None) -> float:

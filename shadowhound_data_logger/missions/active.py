@@ -8,14 +8,18 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock, SystemClock
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missions
 
 log = logging.getLogger(__name__)
+
+THIS_MACHINE: Final = SystemClock('')
+"""Whatever its boot is called: what is compared here is of one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,14 +31,22 @@ class Active:
     start_ns: int
     end_ns: int | None = None
     """Known once it is over."""
+    clock: Clock = THIS_MACHINE
 
     @property
     def id(self) -> str:
         return self.folder.mission_id
 
     def has(self, stamp_ns: int) -> bool:
-        """Whether a time is one of the mission."""
-        return self.start_ns <= stamp_ns and (self.end_ns is None or stamp_ns <= self.end_ns)
+        """Whether a time is one of the mission; so is UTC of another machine where this one never knew it."""
+        is_before_end = self.end_ns is None or stamp_ns <= self.end_ns or self.end_ns < EARLIEST_SANE_NS <= stamp_ns
+        return self.start_ns <= stamp_ns and is_before_end
+
+    def since_start_ns(self, stamp_ns: int) -> int:
+        """How long it had been going on, though the clock was set meanwhile."""
+        if self.start_ns < EARLIEST_SANE_NS <= stamp_ns:
+            stamp_ns -= self.clock.wall_ns() - self.clock.boot_ns()
+        return stamp_ns - self.start_ns
 
 
 class Lookout:
@@ -105,4 +117,4 @@ def ended(active: Active) -> Active:
     except OSError:
         end = {}
     end_ns = int(end['t']) if end.get('k') == 'end' else None
-    return Active(active.folder, active.mission_type, active.start_ns, end_ns)
+    return replace(active, end_ns=end_ns)

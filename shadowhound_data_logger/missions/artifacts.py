@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.drawing import NAMES
 from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.story import Story
@@ -68,7 +67,7 @@ def _write_events(folder: MissionFolder) -> Path:
     """All events of the mission, a line each."""
     path = folder.files / 'events'
     with path.open('w', encoding='utf-8') as file:
-        for line in journal.read(folder.journal):
+        for line in folder.lines():
             if line.record and line.record.get('k') == 'event':
                 file.write(json.dumps({name: line.record[name] for name in ('t', 'name', 'data')}) + '\n')
     return path

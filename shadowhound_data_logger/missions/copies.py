@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
+from collections import deque
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Final
 
@@ -12,12 +16,67 @@ from shadowhound_data_logger.errors import Rejected
 MIN_FREE_BYTES: Final = 64 << 20
 """Below it no file is kept: the journal's few bytes are worth more."""
 COPY_BYTES: Final = 1 << 20
+SPARES: Final = 4
+"""Between two syncs 10 Hz needs one."""
+
+
+class Spares:
+    """Frames of a mission, in files that were made before they are needed.
+
+    After each sync the next new name in a folder costs ext4 more than the writing of a frame (its journal copies what it is
+    committing), so that is left to the thread that syncs. Life: New; ``write`` and ``fill`` from any thread; close once.
+    ``_lock`` guards who makes files ahead.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._numbers = count(1)
+        self._ready: deque[tuple[Path, int]] = deque()
+        self._lock = threading.Lock()
+        self._is_open = True
+
+    def write(self, data: memoryview) -> str:
+        """The name of a file with this content. Raises OSError, and then nothing is there."""
+        _check_room(self._folder)
+        try:
+            target, descriptor = self._ready.popleft()
+        except IndexError:
+            target, descriptor = self._new()
+        _write(target, descriptor, data)
+        return target.name
+
+    def fill(self) -> None:
+        """Make some ahead, as far as there is room."""
+        with self._lock, suppress(OSError):
+            while self._is_open and len(self._ready) < SPARES:
+                _check_room(self._folder)
+                self._ready.append(self._new())
+
+    def close(self) -> None:
+        """Remove what was not needed; idempotent."""
+        with self._lock:
+            self._is_open = False
+            while self._ready:
+                target, descriptor = self._ready.popleft()
+                os.close(descriptor)
+                target.unlink(missing_ok=True)
+
+    def _new(self) -> tuple[Path, int]:
+        target = self._folder / f'{next(self._numbers):08d}.jpg'
+        return target, _create(target)
 
 
 def write(target: Path, data: memoryview) -> None:
     """Raises OSError, and then nothing is there."""
     _check_room(target.parent)
-    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    _write(target, _create(target), data)
+
+
+def _create(target: Path) -> int:
+    return os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+
+
+def _write(target: Path, descriptor: int, data: memoryview) -> None:
     try:
         written = os.write(descriptor, data)
     except OSError:
@@ -41,7 +100,7 @@ def copy(source: str | os.PathLike[str], target: Path) -> None:
     with opened:
         _check_room(target.parent)
         try:
-            with os.fdopen(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), 'wb') as file:
+            with os.fdopen(_create(target), 'wb') as file:
                 shutil.copyfileobj(opened, file, COPY_BYTES)
         except OSError:
             target.unlink(missing_ok=True)

@@ -9,42 +9,26 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, Final
 
 from shadowhound_data_logger.errors import TrackingRefused
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of, prepared
+from shadowhound_data_logger.missions.batch import MOST_POINTS, Batches, send
 from shadowhound_data_logger.missions.drawing import Pictures, nothing
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped, write_json
 from shadowhound_data_logger.missions.node_delivery import NodeDelivery
 from shadowhound_data_logger.missions.objects import Item, Shelf, objects_of
 from shadowhound_data_logger.missions.story import KILLED, Point, Story
 from shadowhound_data_logger.missions.summary import summary_of
-from shadowhound_data_logger.missions.tracking import RUN_GONE, Tracking
-from shadowhound_data_logger.missions.values import MAX_KEYS, MAX_TAG
+from shadowhound_data_logger.missions.tracking import Tracking
 
 log = logging.getLogger(__name__)
 
-MOST_POINTS: Final = 1000
-"""MLflow's limit of a batch."""
 ARTIFACTS_A_STEP: Final = 4
 OBJECTS_A_STEP: Final = 64
 BYTES_A_STEP: Final = 8 << 20
-Part = tuple[Sequence[Point], Mapping[str, str], Mapping[str, str]]
-
-
-@dataclass(slots=True)
-class Batch:
-    """What goes to the run in one request."""
-
-    end: int
-    points: list[Point] = field(default_factory=list)
-    params: dict[str, str] = field(default_factory=dict)
-    tags: dict[str, str] = field(default_factory=dict)
-    is_last: bool = False
-    is_all: bool = False
-    """Whether nothing more is in the journal."""
 
 
 class Delivery:
@@ -63,15 +47,14 @@ class Delivery:
         self._tracking = tracking
         self._shelf = shelf
         self._pictures = pictures
-        self._told = 0  # up to here the story knows the journal
-        self._batch: Batch | None = None
+        self._batches = Batches(folder, self.story)
 
     def track(self) -> bool:
         """Send the next batch of metrics; make the run first, end it after the last."""
         self._recall()
         if self.sent.ended:
             return self.node.track(self.run, self._send)
-        batch = self._batch = self._batch or self._next_batch()
+        batch = self._batches.next(self.sent.metrics, self.node.is_over)
         if batch is None:
             return self.node.track(self.run, self._send) or self._end_abandoned()
         run = self._run_of()
@@ -81,7 +64,6 @@ class Delivery:
                 run.run_id, self.folder.mission_id, self.story.end['status'], int(self.story.end['t']) // 1_000_000
             )
         self._move(metrics=batch.end, ended=batch.is_last)
-        self._batch = None
         if batch.is_all:  # the agent's first: what it logs itself is not sent for the node
             self.node.track(run, self._send)
         return True
@@ -155,54 +137,26 @@ class Delivery:
     def _recall(self) -> None:
         """After a restart: tell the story what was sent before."""
         self.node.recall()
-        if self._told < self.sent.metrics:
-            for line in journal.read(self.folder.journal, self._told):
-                self.story.add(line.record)
-                self._told = line.end
-                if self._told >= self.sent.metrics:
-                    break
-
-    def _next_batch(self) -> Batch | None:
-        """The next records that are not sent."""
-        batch = Batch(self._told)
-        for line in journal.read(self.folder.journal, self._told):
-            if (line.record or {}).get('k') == 'end' and not self.node.is_over():
-                break
-            batch.points += self.story.add(line.record)
-            self._told = batch.end = line.end
-            kind = (line.record or {}).get('k')
-            if kind == 'start':
-                batch.params |= self.story.params()
-                break
-            if kind == 'end':
-                batch.params |= self.story.final_params()
-                batch.tags |= _last_words(self.story)
-                batch.is_last = True
-                break
-            if len(batch.points) > MOST_POINTS - MAX_KEYS:
-                break
-        else:
-            batch.is_all = True
-        return batch if self._told > self.sent.metrics else None
+        self._batches.recall(self.sent.metrics)
 
     def _end_abandoned(self) -> bool:
         """Where the agent died in the middle, say so in its place; whether that was so."""
         if not self.story.start or self.story.end or not self.node.is_over():
             return False
         with journal.abandoned(self.folder.journal) as descriptor:
-            if descriptor is None or any(True for _ in journal.read(self.folder.journal, self._told)):
+            if descriptor is None or any(True for _ in self.folder.lines(self._batches.told)):
                 return descriptor is not None
             error = 'the agent ended without ending its mission'
             last_ns = max(self.story.last_ns, self.node.story.last_ns)
             record = {'k': 'end', 't': last_ns, 'status': KILLED, 'success': False, 'by': 'replayer', 'error': error}
-            torn = journal.finish(self.folder.journal, descriptor, self._told, record)
+            torn = journal.finish(self.folder.journal, descriptor, self._batches.told, record)
         cut = f', {torn} bytes of a record that was being written are cut off' if torn else ''
         log.warning('mission %s: %s; it is closed as %s%s', self.folder.mission_id, error, KILLED, cut)
         return True
 
     def _lines(self, offset: int) -> Iterator[journal.Line]:
         """As far as the run has everything, so that the story is known at the end."""
-        for line in journal.read(self.folder.journal, offset):
+        for line in self.folder.lines(offset):
             if line.end > self.sent.metrics:
                 return
             if (line.record or {}).get('k') == 'end' and (self.sent.objects < offset or not self._summarize()):
@@ -212,7 +166,7 @@ class Delivery:
 
     def _lines_before_a_run(self) -> Iterator[journal.Line]:
         """Up to the end, which needs the run for its summary."""
-        for line in journal.read(self.folder.journal, self.sent.objects):
+        for line in self.folder.lines(self.sent.objects):
             if (line.record or {}).get('k') == 'end':
                 return
             yield line
@@ -230,19 +184,7 @@ class Delivery:
         return self.run
 
     def _send(self, run: Run, points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> None:
-        """Send; what the server refuses is found by halving, counted and left out."""
-        if not (points or params or tags):
-            return
-        try:
-            self._tracking.log(run.run_id, points, params, tags)
-        except TrackingRefused as error:
-            if error.data.get('code') == RUN_GONE:
-                raise
-            parts = _parts(points, params, tags)
-            for part in parts:
-                self._send(run, *part)
-            if not parts:
-                self._refuse(error)
+        send(self._tracking, run.run_id, (points, params, tags), self._refuse)
 
     def _refuse(self, error: Exception, count: str = 'refused') -> None:
         log.error('mission %s: %s', self.folder.mission_id, error)
@@ -288,18 +230,3 @@ class Delivery:
         self.sent = replace(self.sent, **changes)
         durable = not changes.keys().isdisjoint({'objects', 'held', 'complete'})  # after these, files go
         self.folder.set_sent(self.sent, durable=durable)
-
-
-def _parts(points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> list[Part]:
-    """What a batch that was refused is sent as; none for a single thing."""
-    if len(points) + len(params) + len(tags) <= 1:
-        return []
-    half = len(points) // 2
-    halves: list[Part] = [(points[:half], {}, {}), (points[half:], {}, {})]
-    singles: list[Part] = [([], {name: value}, {}) for name, value in params.items()]
-    return [*halves, *singles, *(([], {}, {name: value}) for name, value in tags.items())]
-
-
-def _last_words(story: Story) -> dict[str, str]:
-    error = story.end.get('error')
-    return {'shadowhound.error': str(error)[:MAX_TAG]} if error else {}

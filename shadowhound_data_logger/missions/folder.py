@@ -6,6 +6,7 @@
     sent.json      how far the replayer came
     summary.json   what the mission was, once it is over
     pictures.json  what became of its pictures
+    clock.json     what is added to times of before the clock was set (dating.py)
     floor.npy      x and y (m) of lidar points, a row each, where the node saw any: the floor plan under the trajectory's picture
     trajectory.csv what the node made of odometry, once the mission is over and where the agent logged no trajectory
     node/          the same for what the node logged: its journal, files/ and sent.json
@@ -28,6 +29,7 @@ from typing import Any, Final
 from shadowhound_data_logger.clock import utc
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import MAX_NAME_BYTES, check_name
+from shadowhound_data_logger.missions.journal import Line, dated, read
 
 FOLDER: Final = 'missions'
 UNIQUE_BYTES: Final = 4
@@ -104,6 +106,24 @@ class MissionFolder:
     def node(self) -> MissionFolder:
         """What the node logged beside the agent."""
         return MissionFolder(self.path / 'node')
+
+    def lines(self, offset: int = 0) -> Iterator[Line]:
+        """The agent's journal from there on, with the times that ``clock.json`` makes of them. Raises OSError."""
+        return dated(read(self.journal, offset), self.clock_offset_ns() or 0)
+
+    def node_lines(self, offset: int = 0) -> Iterator[Line]:
+        """The same of what the node logged, empty where it logged nothing. Raises OSError."""
+        journal = self.node.journal
+        return dated(read(journal, offset), self.clock_offset_ns() or 0) if journal.exists() else iter(())
+
+    def clock_offset_ns(self) -> int | None:
+        """What is added to times of before the clock was set; None while that is not decided."""
+        found = read_json(self.path / 'clock.json').get('offset_ns')
+        return found if isinstance(found, int) else None
+
+    def set_clock_offset_ns(self, offset_ns: int) -> None:
+        """Once: points that are sent again after a crash must have the times that they had before."""
+        write_json(self.path / 'clock.json', {'offset_ns': offset_ns}, durable=True)
 
     def run(self) -> Run | None:
         """The run, once the replayer made it."""

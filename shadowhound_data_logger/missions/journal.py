@@ -12,10 +12,12 @@ import os
 import threading
 import weakref
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
+
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 
 CHUNK: Final = 1 << 20
 TAIL_BYTES: Final = 64 << 10
@@ -135,6 +137,17 @@ def read(path: Path, offset: int = 0) -> Iterator[Line]:
                     yield Line(offset, parse(line))
             if len(rest) > MAX_LINE_BYTES:
                 return
+
+
+def dated(lines: Iterable[Line], offset_ns: int) -> Iterator[Line]:
+    """The same lines, with ``offset_ns`` added to the times of the boot clock: those before 2024."""
+    for line in lines:
+        record = line.record
+        if offset_ns and record and int(record.get('t', 0)) < EARLIEST_SANE_NS:
+            record = {**record, 't': int(record['t']) + offset_ns}
+        if offset_ns and record and 'p' in record:
+            record = {**record, 'p': [[ns + offset_ns * (ns < EARLIEST_SANE_NS), *pose] for ns, *pose in record['p']]}
+        yield Line(line.end, record)
 
 
 def parse(line: bytes) -> Mapping[str, Any] | None:

@@ -17,14 +17,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.errors import NameRefused, SettingError
 from shadowhound_data_logger.keys import check_name
-from shadowhound_data_logger.missions import values
+from shadowhound_data_logger.missions.beginning import Beginning
 from shadowhound_data_logger.missions.child import Replayer
-from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, new_folder, safe_type, stamped
-from shadowhound_data_logger.missions.journal import Journal
+from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.recorder import Mission
-from shadowhound_data_logger.missions.report import Report, has_arrived, report
+from shadowhound_data_logger.missions.report import Report, has_arrived, report, sizes
 from shadowhound_data_logger.missions.story import FAILED, KILLED
 from shadowhound_data_logger.worker import Worker
 
@@ -60,7 +60,7 @@ class MissionDataLogger:
         self.home = Path(home or environ.get('SHADOWHOUND_HOME') or '~/.shadowhound').expanduser().absolute()
         self._environ = environ | {'SHADOWHOUND_ROBOT': self.robot}
         self._start_timeout_s = start_timeout_s
-        self._frame_artifact_every_s = frame_artifact_every_s
+        self._beginning = Beginning(self.home, self.robot, frame_artifact_every_s, SystemClock.of_this_machine())
         self._lock = threading.RLock()
         self._mission: Mission | None = None
         self._ended: list[Mission] = []
@@ -107,10 +107,7 @@ class MissionDataLogger:
 
     def end_mission(self, success: bool, distance_m: float, duration_s: float) -> None:
         """End the active mission as FINISHED or FAILED. Where 0 is stated and something else was measured, that stands."""
-        with self._lock:
-            mission = self._active('end_mission')
-            self._mission = None
-        if mission is not None:
+        if mission := self._active('end_mission'):
             mission.end(success, distance_m, duration_s)
             self._leave(mission)
 
@@ -144,13 +141,14 @@ class MissionDataLogger:
     # -- sending ---------------------------------------------------------------------------------------------------
 
     def flush(self, deadline_s: float = 10.0) -> Report:
-        """Have all that was logged sent now, at most for ``deadline_s``; says how far it came. Never raises."""
+        """Have all sent that agent and node have logged, in at most ``deadline_s``; says how far it came. Never raises."""
         self._sync()
-        self._poke()
-        folder, is_active = self._newest, self._mission is not None
-        if folder is None:
+        if self._replayer:
+            self._replayer.wake()
+        if (folder := self._newest) is None:
             return Report('', None, 0, 0, complete=True)
-        _until(lambda: has_arrived(folder, is_active=is_active), deadline_s)
+        logged = sizes(folder) if self._mission else None
+        _until(lambda: has_arrived(folder, logged), deadline_s)
         return report(folder)
 
     def close(self, deadline_s: float = 0.0) -> Report:
@@ -158,9 +156,7 @@ class MissionDataLogger:
 
         What is not sent yet is sent by the process that goes on without us, or at the next start.
         """
-        with self._lock:
-            mission, self._mission = self._mission, None
-        if mission is not None:
+        if mission := self._mission:
             log.warning('mission %s is active while its logger is closed: it ends as KILLED', mission.id)
             mission.end(success=False, status=KILLED, error='the logger was closed')
             self._leave(mission)
@@ -183,28 +179,19 @@ class MissionDataLogger:
         return mission
 
     def _begin(self, mission_type: str, mission_command: str) -> Mission:
-        """Make the folder and the journal; when the disk takes neither, the mission goes on unlogged."""
-        now_ns = time.time_ns()
-        given = values.text(mission_type, values.MAX_PARAM)
-        if safe_type(given) != given:
-            log.warning('the mission type %.80r cannot stand in names: %s stands there', given, safe_type(given))
+        """Make it the active one; when the disk takes nothing, the mission goes on unlogged."""
         with self._lock:
             before, self._mission = self._mission, None
             if before is not None:
                 log.warning('mission %s is still active: it ends as KILLED', before.id)
                 before.end(success=False, status=KILLED, error='another mission was started')
                 self._ended.append(before)
-            try:
-                folder = new_folder(self.home, given, now_ns)
-                journal = _begun(folder, {'k': 'start', 't': now_ns, 'type': given, 'command': values.text(mission_command),
-                                          'robot': self.robot, 'pid': os.getpid()})  # fmt: skip
-            except OSError as error:
-                log.error('the mission %.80s is not logged: %s', given, error)  # noqa: TRY400 - no defect
-                return _nothing(self.home, given, now_ns)
-            self._newest = folder
-            self._mission = Mission(folder, journal, self._frame_artifact_every_s)
+            mission = self._beginning.mission(mission_type, mission_command)
+            if mission is None:
+                return self._beginning.nothing(mission_type)
+            self._newest, self._mission = mission.folder, mission
             self._wake.set()
-            return self._mission
+            return mission
 
     def _active(self, call: str) -> Mission | None:
         mission = self._mission
@@ -220,11 +207,6 @@ class MissionDataLogger:
                 self._mission = None
             self._ended.append(mission)
         self._wake.set()
-        self._poke()
-
-    def _poke(self) -> None:
-        if self._replayer:
-            self._replayer.wake()
 
     def _step(self) -> None:
         """The thread's round: sync the journal, look after the replayer."""
@@ -242,6 +224,8 @@ class MissionDataLogger:
             each.close()
         if mission is not None:
             mission.sync()
+        if self._replayer and ended:
+            self._replayer.wake()
 
     def _forget_all(self) -> None:
         """In a forked child: threads, journal and replayer are the parent's."""
@@ -268,26 +252,6 @@ def _robot(name: str) -> str:
         return check_name(name, 'the robot name')
     except NameRefused as error:
         raise SettingError('robot', name, error.remedy) from error
-
-
-def _begun(folder: MissionFolder, start: dict[str, Any]) -> Journal:
-    """A journal with its first record; nothing is left open when the disk does not take it."""
-    journal = Journal(folder.journal)
-    journal.create()
-    try:
-        journal.append(start)
-    except OSError:
-        journal.close()
-        raise
-    return journal
-
-
-def _nothing(home: Path, mission_type: str, start_ns: int) -> Mission:
-    """A mission that is over: all its calls do nothing. For a disk that takes no journal."""
-    folder = MissionFolder(home / FOLDER / f'{stamped(mission_type, start_ns)}_unlogged')
-    mission = Mission(folder, Journal(folder.journal), 0.0)
-    mission.end()
-    return mission
 
 
 def _until(done: Callable[[], bool], seconds: float) -> None:

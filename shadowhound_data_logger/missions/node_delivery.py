@@ -1,7 +1,7 @@
 """What the node logged of a mission, on its way to the run that the agent's journal made: with places of its own.
 
-What the agent logs itself wins: points of a metric that it has logged are not sent for the node, nor frames once it
-has logged one.
+What the agent logs itself wins: points of a metric that it has logged are not sent for the node. Frames of both are kept: those
+of the node have numbers of their own (node_log.FIRST_FRAME).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of
 from shadowhound_data_logger.missions.folder import MissionFolder, Run
 from shadowhound_data_logger.missions.objects import Item, objects_of
-from shadowhound_data_logger.missions.story import Point, Story
+from shadowhound_data_logger.missions.story import FRAMES, Point, Story
 from shadowhound_data_logger.missions.values import MAX_KEYS
 
 NODE_S: Final = 30.0
@@ -60,9 +60,7 @@ class NodeDelivery:
             for line in self._lines(self._told):
                 points = self.story.add(line.record)
                 self._told = line.end
-                is_frame = (line.record or {}).get('k') == 'frame'
-                if not (is_frame and self._agent.counts['frame']):
-                    self._batch += [point for point in points if point.key not in self._agent.first]
+                self._batch += [point for point in points if not self._is_agents(point.key)]
                 if len(self._batch) > self._most_points - MAX_KEYS:
                     break
         if self._told > self.sent.metrics:
@@ -77,7 +75,7 @@ class NodeDelivery:
         """Send the next frames to the run."""
         end, done = self.sent.artifacts, 0
         for line in self._lines(end, self.sent.metrics):
-            for artifact in () if self._agent.counts['frame'] else artifacts_of(line.record or {}, self._folder, self.story):
+            for artifact in artifacts_of(line.record or {}, self._folder, self.story):
                 send(run, artifact)
                 done += 1
             end = line.end
@@ -90,9 +88,8 @@ class NodeDelivery:
         items: list[Item] = []
         end = self.sent.objects
         for line in self._lines(end, self.sent.metrics if run else 0):
-            if not self._agent.counts['frame']:
-                record = line.record or {}
-                items += [_of(item, self._mission) for item in objects_of(record, self._agent.start, self._folder, run)]
+            found = objects_of(line.record or {}, self._agent.start, self._folder, run)
+            items += [_of(item, self._mission) for item in found]
             end = line.end
             if len(items) >= most:
                 break
@@ -127,14 +124,15 @@ class NodeDelivery:
 
     # -- within ----------------------------------------------------------------------------------------------------
 
+    def _is_agents(self, key: str) -> bool:
+        """Whether the agent logs this metric itself."""
+        return key in self._agent.first or (key == FRAMES and bool(self._agent.counts['frame']))
+
     def _lines(self, offset: int, end: int | None = None) -> Iterator[journal.Line]:
-        try:
-            for line in journal.read(self._folder.journal, offset):
-                if end is not None and line.end > end:
-                    return
-                yield line
-        except FileNotFoundError:
-            return
+        for line in self._mission.node_lines(offset):
+            if end is not None and line.end > end:
+                return
+            yield line
 
     def _is_closed(self) -> bool:
         try:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+FIRST_FRAME: Final = 900_000
+"""Agents number their frames from 0: at 10 Hz one comes here after 25 hours."""
 PATIENCE_NS: Final = 2 * SECOND
 """How long a pose waits for earlier ones that another encoder still has."""
 MOST_WAITING: Final = 100_000
@@ -44,6 +46,8 @@ class Frame(NamedTuple):
 
     stamp_ns: int
     body: bytes
+    marks: Mapping[str, str] = {}
+    """What its object says besides: where the robot was, say."""
 
 
 class Cloud(NamedTuple):
@@ -156,16 +160,17 @@ class NodeLog:
         """A frame for the run's artifacts and the mission's folder in the store."""
         if self._frames >= MOST_FRAME_ARTIFACTS:
             return
-        name = f'{self._frames:08d}.jpg'
+        number = FIRST_FRAME + self._frames
+        name = f'{number:08d}.jpg'
         path = self._folder.files / name
         path.unlink(missing_ok=True)  # of a node that was killed before it journalled the frame
         copies.write(path, memoryview(frame.body))
-        self._append('frame', frame.stamp_ns, id=self._frames, file=name, artifact=True)
+        self._append('frame', frame.stamp_ns, id=number, file=name, artifact=True, marks=dict(frame.marks))
         self._frames += 1
 
     def _step(self, stamp_ns: int) -> int:
         """Whole seconds since the start: what MLflow draws the points over."""
-        return (stamp_ns - self.mission.start_ns) // SECOND
+        return self.mission.since_start_ns(stamp_ns) // SECOND
 
     def _append(self, kind: str, time_ns: int, **fields: Any) -> None:
         self._journal.append({'k': kind, 't': time_ns, **fields})

@@ -6,7 +6,6 @@ trajectories/<robot>/<mission type>_YYYYMMDD_HHMMSS.csv
 
 from __future__ import annotations
 
-import hashlib
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,10 +17,12 @@ from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import StoreUnavailable
 from shadowhound_data_logger.keys import unique
-from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped
+from shadowhound_data_logger.lake.catalogue import Catalogue
+from shadowhound_data_logger.missions.folder import MissionFolder, Run, safe_type, stamped
 from shadowhound_data_logger.missions.story import BUCKET, TRAJECTORIES
 from shadowhound_data_logger.model import Binding, DataObject
 from shadowhound_data_logger.ship.uploader import Uploader
+from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -59,11 +60,12 @@ def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: Miss
     """
     kind, robot = record.get('k'), start['robot']
     home = f'{robot}/missions/{run.run_id if run else folder.mission_id}'
-    metadata = {'robot': robot, 'mission_id': folder.mission_id} | ({'run_id': run.run_id} if run else {})
+    metadata = {'robot': robot, 'mission_id': folder.mission_id, 'mission_type': safe_type(start['type'])}
+    metadata |= {'run_id': run.run_id} if run else {}
     time_ns = int(record.get('t', 0))
     if kind == 'frame':
         number, path = int(record['id']), folder.files / record['file']
-        key, more = f'{home}/camera/frame_{number:06d}.jpg', {**metadata, 'frame_id': str(number)}
+        key, more = f'{home}/camera/frame_{number:06d}.jpg', {**record.get('marks', {}), **metadata, 'frame_id': str(number)}
         yield from _item(path, BUCKET, key, time_ns, more, is_done_with=not record.get('artifact'))
     elif kind == 'trajectory':
         yield from _trajectory(folder.files / record['file'], home, start, time_ns, metadata)
@@ -104,6 +106,7 @@ class Shelf:
         self._used_s = 0.0
         self._node_drains = False
         self._is_new = True
+        self._catalogue = Catalogue(settings.spool_path, settings.catalogue, settings.robot, clock)
         self._spool: Spool | None = None
 
     def add(self, objects: Sequence[DataObject]) -> None:
@@ -177,7 +180,12 @@ class Shelf:
         uploader.open()
         try:
             drained = uploader.drain(SLICE_S)
+            writer.flush(SLICE_S)
+            for part in self._catalogue.due():
+                writer.put(part)
             status = uploader.status()
+        except sqlite3.Error as error:
+            raise spool.unwritable(error) from error
         finally:
             uploader.close(1.0)
             writer.close(SLICE_S)
@@ -195,7 +203,7 @@ class Shelf:
 
 def _has(index: Index, item: DataObject) -> bool:
     """Whether the very same content was spooled under this key, or the next free one, before."""
-    sha256, attempt = hashlib.sha256(item.body).hexdigest(), 0
+    sha256, attempt = content_sha256(item.body), 0
     while rows := index.rows('bucket = ? AND key = ?', (item.bucket, unique(item.key, attempt))):
         if rows[0]['sha256'] == sha256:
             return True

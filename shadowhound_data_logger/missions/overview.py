@@ -82,9 +82,9 @@ def told(folder: MissionFolder) -> Story:
 
 def records(folder: MissionFolder) -> Iterator[tuple[str, Mapping[str, Any] | None]]:
     """``node`` or ``agent``, and what it logged; the node's first, because the agent's end sums up both."""
-    for source, path in (('node', folder.node.journal), ('agent', folder.journal)):
-        if path.exists():
-            yield from ((source, line.record) for line in journal.read(path))
+    for source, lines in (('node', folder.node_lines), ('agent', folder.lines)):
+        if source == 'node' or folder.journal.exists():
+            yield from ((source, line.record) for line in lines())
 
 
 def export(folder: MissionFolder) -> dict[str, Any]:
@@ -106,7 +106,7 @@ def export(folder: MissionFolder) -> dict[str, Any]:
 def _counts(story: Story) -> dict[str, int]:
     node = story.node.counts if story.node else story.counts
     return {
-        'metric_points': story.counts['points'] + node['points'], 'camera_frames': story.counts['frame'] or node['frame'],
+        'metric_points': story.counts['points'] + node['points'], 'camera_frames': story.frames,
         'trajectories': story.counts['trajectory'] or int(node['poses'] > 0),
         'artifacts': story.counts['artifact'], 'events': story.counts['event'],
     }  # fmt: skip

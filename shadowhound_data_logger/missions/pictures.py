@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.contact_sheet import Frame, contact_sheet
 from shadowhound_data_logger.missions.drawing import CHARGE, SHEET, TRAJECTORY
 from shadowhound_data_logger.missions.folder import MissionFolder, write_json
@@ -59,13 +58,12 @@ class Material:
 def material_of(folder: MissionFolder) -> Material:
     """From the agent's journal, and from the node's what the agent did not log. Raises OSError."""
     found, node = Material(), Material()
-    for line in journal.read(folder.journal):
+    for line in folder.lines():
         found.add(line.record or {}, folder.files)
-    if folder.node.journal.exists():
-        node.start_ns = found.start_ns
-        for line in journal.read(folder.node.journal):
-            node.add(line.record or {}, folder.node.files)
-    found.frames = sorted(found.frames or node.frames)
+    node.start_ns = found.start_ns
+    for line in folder.node_lines():
+        node.add(line.record or {}, folder.node.files)
+    found.frames = sorted(found.frames + node.frames)
     found.trajectory = found.trajectory or (folder.trajectory if folder.trajectory.exists() else None)
     found.states = {key: points or node.states[key] for key, points in found.states.items()}
     for key, points in found.states.items():

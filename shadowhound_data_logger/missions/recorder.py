@@ -11,11 +11,14 @@ import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.missions import copies, values
+from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.missions.story import BATTERY, FAILED, FINISHED, TEMPERATURE
@@ -32,14 +35,16 @@ class Mission:
     ``_lock`` makes a record one step with what is remembered of it: that it is to be synced, and that the last one was written.
     """
 
-    def __init__(self, folder: MissionFolder, journal: Journal, frame_artifact_every_s: float) -> None:
+    def __init__(self, folder: MissionFolder, journal: Journal, frame_artifact_every_s: float, clock: Clock) -> None:
         self.folder = folder
+        self._clock = clock
         self._journal = journal
+        self._frames = copies.Spares(folder.files)
         self._every_s = frame_artifact_every_s
         self._left = MOST_FRAME_ARTIFACTS
         self._next_s = float('-inf')
         self._lock = threading.Lock()
-        self._number = 0
+        self._numbers = count(1)
         self._lost = 0
         self._unsynced: list[Path] = []
         self._is_dirty = True
@@ -69,9 +74,7 @@ class Mission:
         try:
             number = values.whole(frame_id, 'frame_id')
             data = values.content(frame_data, f'frame {number}')
-            name = self._new_name('.jpg')
-            copies.write(self.folder.files / name, data)
-            self._append('frame', id=number, file=name, artifact=self._is_sampled())
+            self._append('frame', id=number, file=self._frames.write(data), artifact=self._is_sampled())
         except Rejected as error:
             self._refuse(error)
         except OSError as error:
@@ -130,6 +133,7 @@ class Mission:
     def close(self) -> None:
         """Make durable what was logged and let go of the journal, after ``end``; idempotent."""
         self.sync()
+        self._frames.close()
         self._journal.close()
 
     def sync(self) -> None:
@@ -146,6 +150,7 @@ class Mission:
             self._journal.sync()
         except OSError as error:
             self._lose(error)
+        self._frames.fill()
 
     # -- within ----------------------------------------------------------------------------------------------------
 
@@ -168,7 +173,7 @@ class Mission:
                 self._lose(error)
 
     def _log_file(self, kind: str, path: str | os.PathLike[str], more: Mapping[str, str]) -> None:
-        name = self._new_name('')
+        name = f'{next(self._numbers):08d}'
         try:
             copies.copy(path, self.folder.files / name)
             self._append(kind, file=name, **more)
@@ -178,7 +183,7 @@ class Mission:
             self._lose(error)
 
     def _append(self, kind: str, **fields: Any) -> None:
-        record = {'k': kind, 't': time.time_ns(), **fields}
+        record = {'k': kind, 't': now_ns(self._clock), **fields}
         with self._lock:
             ended = self._ended
             if not ended:
@@ -189,11 +194,6 @@ class Mission:
                     self._unsynced.append(self.folder.files / fields['file'])
         if ended:
             self._warn('ended', 'mission %s has ended: what is logged to it now is left out', self.id)
-
-    def _new_name(self, extension: str) -> str:
-        with self._lock:
-            self._number += 1
-            return f'{self._number:08d}{extension}'
 
     def _is_sampled(self) -> bool:
         """Whether this frame becomes an artifact of the run as well."""

@@ -24,13 +24,15 @@ from typing import Final
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import DataLoggerError, TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.missions.dating import Dating
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.drawing import Drawing
-from shadowhound_data_logger.missions.folder import FOLDER, missions, write_json
+from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missions, write_json
 from shadowhound_data_logger.missions.objects import Shelf
 from shadowhound_data_logger.missions.report import STATE
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
 from shadowhound_data_logger.ship.retry import backoff
+from shadowhound_data_logger.spool import clock_record
 from shadowhound_data_logger.spool.files import flock
 
 log = logging.getLogger(__name__)
@@ -78,7 +80,9 @@ class Replay:
     """All missions of one home. Life: New; step any number; close once. Not thread-safe."""
 
     def __init__(self, home: Path, tracking: Tracking, shelf: Shelf, drawing: Drawing, *,
-                 monotonic: Callable[[], float] = time.monotonic, rng: random.Random | None = None) -> None:  # fmt: skip
+                 settle: Callable[[MissionFolder], bool] = lambda _: True, monotonic: Callable[[], float] = time.monotonic,
+                 rng: random.Random | None = None) -> None:  # fmt: skip
+        """``settle`` says whether the times of a mission are final."""
         self._home = home
         self._tracking = tracking
         self._shelf = shelf
@@ -88,6 +92,8 @@ class Replay:
         rng = rng or random.Random()
         self.gates = {name: Gate(monotonic, rng) for name in (TRACKING, ARTIFACTS, OBJECTS, STORE)}
         self._deliveries: dict[str, Delivery] = {}
+        self._settle = settle
+        self._undated: set[str] = set()
         self._settled: set[str] = set()  # complete, or beyond help until the next start
         self._told: dict[str, object] = {}
         self._logged: set[str] = set()
@@ -131,7 +137,7 @@ class Replay:
     @property
     def owes(self) -> bool:
         """Whether something could not be sent yet."""
-        return any(gate.error for gate in self.gates.values()) or self._shelf.owes or self._drawing.busy
+        return any(gate.error for gate in self.gates.values()) or self._shelf.owes or self._drawing.busy or bool(self._undated)
 
     def hurry(self) -> None:
         for gate in self.gates.values():
@@ -150,9 +156,12 @@ class Replay:
                     self._settled.add(folder.mission_id)
                     if folder.age_s() > KEEP_S:
                         shutil.rmtree(folder.path, ignore_errors=True)
-                else:
+                elif self._settle(folder):
+                    self._undated.discard(folder.mission_id)
                     self._deliveries[folder.mission_id] = Delivery(folder, self._tracking, self._shelf, self._drawing.of)
                     self.gates[TRACKING].hurry()  # its agent waits for the run's id
+                else:
+                    self._undated.add(folder.mission_id)
 
     def _try(self, name: str, work: Callable[[], bool]) -> None:
         gate = self.gates[name]
@@ -248,9 +257,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parent.wait(LOOK_EVERY_S)
             if parent.gone or asked:
                 return 0
-        settings = Settings.load({}, {**os.environ, 'SHADOWHOUND_HOME': str(options.home)})
+        settings, clock = Settings.load({}, {**os.environ, 'SHADOWHOUND_HOME': str(options.home)}), SystemClock.of_this_machine()
         tracking = open_tracking(options.home, options.experiment)
-        replay = Replay(options.home, tracking, Shelf(settings, SystemClock.of_this_machine()), Drawing())
+        dating = Dating(clock, settings.clock.hold_s, lambda: clock_record.read(settings.spool_path, settings.robot)['offsets'])
+        replay = Replay(options.home, tracking, Shelf(settings, clock), Drawing(), settle=dating.settle)
         opened.callback(replay.close)
         run(replay, parent, lambda: bool(asked))
     return 0

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.missions import journal
-from shadowhound_data_logger.missions.folder import MissionFolder, read_json
+from shadowhound_data_logger.missions.dating import REMEDY, WAITS, waits
+from shadowhound_data_logger.missions.folder import MissionFolder, Sent, read_json
 
 STATE: Final = 'replay.json'
 """Beside the missions: what the replayer says of itself."""
@@ -20,7 +21,7 @@ class Report:
     mission_id: str
     run_id: str | None
     sent: int
-    """Records of its journal that the run has."""
+    """Records that the run has: the agent's, and the node's where one joined in."""
     unsent: int
     complete: bool
     """Whether everything has arrived: metrics and artifacts in the run, objects in the spool."""
@@ -32,32 +33,45 @@ class Report:
 
 
 def report(folder: MissionFolder) -> Report:
-    """Reads the whole journal; it is there for as long as the mission is not complete."""
+    """Reads the whole journals; they are there for as long as the mission is not complete."""
     sent, run = folder.sent(), folder.run()
-    try:
-        ends = [line.end for line in journal.read(folder.journal)]
-    except FileNotFoundError:
-        ends = []
-    unsent = sum(end > sent.metrics for end in ends)
-    error, remedy = sent.error, ''
+    count, unsent = map(sum, zip(_count(folder.journal, sent), _count(folder.node.journal, folder.node.sent()), strict=True))
+    error, remedy = (WAITS, REMEDY) if folder.journal.exists() and waits(folder) else (sent.error, '')
     if not sent.complete and not error:
         for one in errors(folder.path.parent).values():
             error, remedy = one
             break
     run_id = run.run_id if run else None
-    return Report(folder.mission_id, run_id, len(ends) - unsent, unsent, sent.complete, sent.missing, error, remedy)
+    return Report(folder.mission_id, run_id, count - unsent, unsent, sent.complete, sent.missing, error, remedy)
 
 
-def has_arrived(folder: MissionFolder, *, is_active: bool) -> bool:
-    """Whether everything is sent that can be: of an active mission, what was journalled so far."""
-    sent = folder.sent()
-    if not is_active:
-        return sent.complete
+def _count(path: Path, sent: Sent) -> tuple[int, int]:
+    """Records of a journal, and those that the run has not."""
     try:
-        size = folder.journal.stat().st_size
+        ends = [line.end for line in journal.read(path)]
     except FileNotFoundError:
-        return True
-    return min(sent.metrics, sent.artifacts, sent.objects) >= size
+        ends = []
+    return len(ends), sum(end > sent.metrics for end in ends)
+
+
+def sizes(folder: MissionFolder) -> tuple[int, int]:
+    """How long the journals of agent and node are; 0 for one that is not there."""
+    return _size(folder.journal), _size(folder.node.journal)
+
+
+def has_arrived(folder: MissionFolder, sizes_: tuple[int, int] | None) -> bool:
+    """Whether the journals are sent as far as they had come then; with None, whether a mission that is over has arrived whole."""
+    if sizes_ is None:
+        return folder.sent().complete
+    places = (folder.sent(), folder.node.sent())
+    return all(min(sent.metrics, sent.artifacts, sent.objects) >= size for sent, size in zip(places, sizes_, strict=True))
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0
 
 
 def errors(missions: Path) -> dict[str, tuple[str, str]]:

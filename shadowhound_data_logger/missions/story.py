@@ -112,6 +112,11 @@ class Story:
         return bool(self.counts['trajectory'] or (self.node and self.node.counts['poses']))
 
     @property
+    def frames(self) -> int:
+        """Of agent and node."""
+        return self.counts['frame'] + (self.node.counts['frame'] if self.node else 0)
+
+    @property
     def success(self) -> bool:
         return bool(self.end.get('success'))
 
@@ -139,6 +144,8 @@ class Story:
                        Point(DISTANCE, self.distance_m, time_ms, self._next_step(DISTANCE))]  # fmt: skip
         if self.battery_consumed_pct is not None:
             points.append(Point('battery_consumed_pct', self.battery_consumed_pct, time_ms, 0))
+        if self.node and self.node.counts['frame'] and self.counts['frame']:
+            points.append(Point(FRAMES, float(self.frames), time_ms, max(self.counts['frame'], self.node.counts['frame']) + 1))
         both = set(self.last).intersection(self.node.last if self.node else ()) - {DISTANCE}
         return points + [Point(key, self.last[key], time_ms, self._next_step(key)) for key in sorted(both)]
 

@@ -27,7 +27,7 @@ def summary_of(story: Story, mission_id: str, run: Run, sent: Sent, pictures: Ma
         'by_node': dict(sorted(node.last.items())),
         'last': dict(sorted(story.newest.items())),
         'counts': {
-            'metric_points': story.counts['points'], 'camera_frames': story.counts['frame'] or node.counts['frame'],
+            'metric_points': story.counts['points'], 'camera_frames': story.frames,
             'trajectories': story.counts['trajectory'], 'artifacts': story.counts['artifact'], 'events': story.counts['event'],
         },
         'ledger': _ledger(story, sent),

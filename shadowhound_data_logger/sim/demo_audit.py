@@ -11,9 +11,11 @@ import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.lake.schema import is_row
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.index import Index
@@ -32,7 +34,7 @@ class Pile:
     delivered: int = 0
     bytes: int = 0
     latest: str = ''
-    """Key of the latest."""
+    """Key of the latest; of the catalogue its folder, for its keys are long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,8 @@ class Audit:
     """Messages counted in them."""
     bodies: Mapping[str, bytes]
     """What was read, by key."""
+    rows: int
+    """Of the catalogue, as it lies in the server."""
     problems: tuple[str, ...]
     """One sentence for each thing that is not as it should be."""
 
@@ -90,8 +94,9 @@ def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectSt
     delivered = {row['key']: row['sha256'] for row in rows if row['state'] == State.DELIVERED.value and row['bucket'] == BUCKET}
     samples = _count(rows, bodies)
     problems = [*ledger.imbalances(found), *_unread(delivered, bodies), *_unaccounted(messages), *_undelivered(found)]
-    problems += _uncounted(found, samples)
-    return Audit(found, messages, _piles(rows), len(bodies), sum(samples.values()), bodies, tuple(problems))
+    catalogue = _catalogued(bodies)
+    problems += [*_uncounted(found, samples), *_uncatalogued(catalogue, bodies)]
+    return Audit(found, messages, _piles(rows), len(bodies), sum(samples.values()), bodies, catalogue.total(), tuple(problems))
 
 
 def _messages(published: int, before: int, account: Mapping[str, Any] | None) -> Messages:
@@ -106,7 +111,7 @@ def _piles(rows: list[Any]) -> dict[str, Pile]:
         pile.objects += 1
         pile.delivered += row['state'] == State.DELIVERED.value
         pile.bytes += row['bytes']
-        pile.latest = row['key']
+        pile.latest = row['key'] if is_row(BUCKET, row['key']) else f'{row["key"].rpartition("/")[0]}/'
     return piles
 
 
@@ -127,6 +132,24 @@ def _unread(delivered: Mapping[str, str], bodies: Mapping[str, bytes]) -> list[s
     for key in delivered.keys() & bodies.keys():
         if hashlib.sha256(bodies[key]).hexdigest() != delivered[key]:
             found.append(f'{key} is not what was spooled')
+    return sorted(found)
+
+
+def _catalogued(bodies: Mapping[str, bytes]) -> Counter[str]:
+    """Rows by key, in all parts of the catalogue."""
+    from pyarrow.parquet import read_table  # noqa: PLC0415 - half a second, at the end of the demo only
+
+    rows: Counter[str] = Counter()
+    for key, body in bodies.items():
+        if not is_row(BUCKET, key):
+            rows.update(read_table(BytesIO(body), columns=['key']).column('key').to_pylist())
+    return rows
+
+
+def _uncatalogued(rows: Mapping[str, int], bodies: Mapping[str, bytes]) -> list[str]:
+    keys = {key for key in bodies if is_row(BUCKET, key)}
+    found = [f'{key} has {rows.get(key, 0)} rows in the catalogue' for key in keys if rows.get(key, 0) != 1]
+    found += [f'{key} has a row in the catalogue, but is not in the bucket' for key in rows.keys() - keys]
     return sorted(found)
 
 

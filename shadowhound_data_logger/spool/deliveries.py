@@ -18,6 +18,8 @@ from shadowhound_data_logger.model import ObjectInfo
 
 PAGE: Final = 256
 """Objects asked for between two notes of what was sound: what an interruption costs."""
+_DELIVERED: Final = "FROM spool.objects AS object WHERE state = 'delivered' AND sensor <> '_catalog'"
+"""Without the catalogue's parts (lake/schema.py): others stand for them in time, and they go; they can be made again."""
 BUSY_TIMEOUT_S: Final = 1.0
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS audit (name TEXT NOT NULL);
@@ -70,7 +72,7 @@ class Deliveries:
     def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]:
         """What is delivered and not noted yet, by number and as the store has to describe it."""
         query = (
-            "SELECT id, bucket, key, bytes, sha256 FROM spool.objects AS object WHERE state = 'delivered' AND id > ?"
+            f'SELECT id, bucket, key, bytes, sha256 {_DELIVERED} AND id > ?'
             ' AND NOT EXISTS (SELECT 1 FROM sound WHERE sound.id = object.id) ORDER BY id LIMIT ?'
         )
         last = 0
@@ -91,7 +93,7 @@ class Deliveries:
 
     def known(self) -> int:
         """Delivered objects that the index remembers; those of longer ago are forgotten (``spool.remember_days``)."""
-        return int(self._ask("SELECT count(*) FROM spool.objects WHERE state = 'delivered'")[0][0])
+        return int(self._ask(f'SELECT count(*) {_DELIVERED}')[0][0])
 
     def ever(self) -> int:
         """Delivered objects since the index began, the forgotten ones among them."""
@@ -99,7 +101,7 @@ class Deliveries:
 
     def since_ns(self) -> int | None:
         """When the first of those that the index remembers was delivered; None without any."""
-        (found,) = self._ask("SELECT min(settled_ns) FROM spool.objects WHERE state = 'delivered'")[0]
+        (found,) = self._ask(f'SELECT min(settled_ns) {_DELIVERED}')[0]
         return None if found is None else int(found)
 
     @property

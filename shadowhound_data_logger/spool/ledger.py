@@ -48,7 +48,8 @@ def of_index(index: Index, robot: str) -> dict[str, Any]:
     names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
     accounts = {topic: _topic(topic, topics, publishers, tally) for topic in sorted(names)}
     sensors = {topic: row for topic, row in accounts.items() if not topic.startswith(SINKS)}
-    bags, events = ({topic.removeprefix(sink): row for topic, row in accounts.items() if topic.startswith(sink)} for sink in SINKS)
+    bags, events = ({topic.removeprefix(sink): row for topic, row in accounts.items() if topic.startswith(sink)}
+                    for sink in SINKS)  # fmt: skip
     objects = {what: sum(row[2] for row in tally if row[1] == what) for what in ('spooled', *STATES)}
     volume = {what: sum(row[3] for row in tally if row[1] == what) for what in ('spooled', *STATES)}
     ledger: dict[str, Any] = {

@@ -19,6 +19,7 @@ TOPIC = {
 }  # fmt: skip
 STATUS: dict[str, Any] = {
     'robot': 'thor', 'version': '0.1.0', 'pid': 7, 'uptime_s': 12.3, 'paused': False, 'topics': {'/imu': TOPIC},
+    'bag': {'recording': True, 'paused': False, 'bag': 'patrol_1', 'dropped': 3, 'refused': '', 'topics': {}},
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'max_messages': 10, 'max_bytes': 100},
     'spool': {'path': '/s', 'pending': 3, 'held': 0, 'quarantined': 1, 'bytes': 10, 'max_bytes': 100, 'free_bytes': 5,
               'oldest_age_s': None},
@@ -50,9 +51,9 @@ def told(name: str, **values: Any) -> tuple[Any, str]:
 
 
 def test_all_is_fine() -> None:
-    """There is an entry for each topic, spool, store, clock, workers and the node; old losses are not told for ever."""
+    """There is an entry for each topic, the bag, spool, store, clock, workers and the node; old losses are not told for ever."""
     found = list(entries(STATUS, STATUS))
-    assert [entry[0] for entry in found] == ['node', '/imu', 'spool', 'store', 'clock', 'workers']
+    assert [entry[0] for entry in found] == ['node', '/imu', 'bag', 'spool', 'store', 'clock', 'workers']
     assert {entry[1] for entry in found} == {OK}
     assert told('/imu')[1] == '100 Hz'
 
@@ -83,6 +84,12 @@ def test_a_topic(values: dict[str, Any], level: Any, words: str) -> None:
     ('name', 'values', 'level', 'words'),
     [
         ('node', {'paused': True}, WARN, 'paused'),
+        ('bag', {}, OK, 'patrol_1 is recorded'),
+        ('bag', {'bag__recording': False}, OK, 'nothing is recorded'),
+        ('bag', {'bag__paused': True}, OK, 'patrol_1 is paused'),
+        ('bag', {'bag__dropped': 5}, WARN, 'patrol_1 dropped 2 messages lately'),
+        ('bag', {'bag__dropped': 5, 'bag__bag': 'patrol_2'}, OK, 'patrol_2 is recorded'),
+        ('bag', {'bag__refused': 'no_room'}, ERROR, 'patrol_1 records nothing now: no_room'),
         ('clock', {'clock__is_set': False, 'clock__unset_s': 12.0}, WARN, 'not set for 12 s: objects wait for their date'),
         ('clock', {'clock__is_set': False, 'clock__gave_up': True}, WARN, 'objects go to _unsynced'),
         ('clock', {'clock__last_step_age_s': 59.0}, WARN, 'stepped by 3.5 s 59 s ago'),

@@ -17,7 +17,6 @@ from rosbags.typesys import Stores, get_typestore
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_tap import MissionTap
-from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -89,7 +88,7 @@ def watching(opened: ExitStack, home: Path, **parameters: object) -> tuple[Setti
 def new_tap(**parameters: object) -> MissionTap:
     settings = given(parameters, Path('nowhere'))
     sensors = {sensor.name: sensor for sensor in settings.sensors}
-    return MissionTap(settings.mission, sensors, 'thor', MessageTypes(), SystemClock.of_this_machine(), lambda topic: f'/{topic}')
+    return MissionTap(settings.mission, sensors, 'thor', MessageTypes(), lambda topic: f'/{topic}')
 
 
 def batch(sensor: str, topic: str, kind: str, *messages: Any, start_ns: int = NOON_NS, step_ns: int = SECOND // 10) -> Batch:
@@ -131,14 +130,27 @@ def test_objects_of_the_missions_time_are_marked(tmp_path: Path, opened: ExitSta
     until(setting.watch.status, 'the mission is noticed')
     (folder,) = missions(tmp_path)
     start_ns = int(journal.first(folder.journal)['t'])
-    assert setting.watch.mark(thing(start_ns)).metadata == {'robot': 'thor', 'mission_id': mission_id}
+    marked = {'robot': 'thor', 'mission_id': mission_id, 'mission_type': 'patrol'}
+    assert setting.watch.mark(thing(start_ns)).metadata == marked
     assert setting.watch.mark(thing(start_ns - 1)).metadata == {'robot': 'thor'}
     folder.set_run(Run('run7', '1', ''))
     until(lambda: setting.watch.mark(thing(start_ns)).metadata.get('run_id') == 'run7', 'the run is noticed')
     logger.end_mission(True, 1.0, 1.0)
     until(lambda: not setting.watch.status(), 'the end is noticed')
-    assert setting.watch.mark(thing(start_ns)).metadata == {'robot': 'thor'}
+    end_ns = int(journal.last(folder.journal)['t'])
+    assert setting.watch.mark(thing(end_ns)).metadata == {**marked, 'run_id': 'run7'}, 'it was on its way'
+    assert setting.watch.mark(thing(end_ns + 1)).metadata == {'robot': 'thor'}
     assert [told.get('run_id', 'none') for told in setting.told] == [None, 'run7', 'none']
+
+
+def test_a_mark_is_plain_text(tmp_path: Path, opened: ExitStack) -> None:
+    """Whatever the agent calls its mission: a store takes no other metadata."""
+    setting, logger = watching(opened, tmp_path)
+    logger.start_mission('Küche\n\N{DOG FACE}', '')
+    until(setting.watch.status, 'the mission is noticed')
+    (folder,) = missions(tmp_path)
+    marks = setting.watch.mark(thing(int(journal.first(folder.journal)['t']))).metadata
+    assert all(value.isascii() and value.isprintable() for value in marks.values())
 
 
 @pytest.mark.parametrize(('capture', 'asked'), [('always', ['flush', 'flush']), ('mission', ['begin idle', 'busy', 'idle'])])

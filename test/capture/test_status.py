@@ -14,6 +14,7 @@ from spool.making import FakeClock, make, new_spool, put
 
 pytest.importorskip('rclpy')
 
+from shadowhound_data_logger.bags.recorder import BagStatus
 from shadowhound_data_logger.capture.source import SourceStatus
 from shadowhound_data_logger.capture.status import Stages, Status
 from shadowhound_data_logger.clock_watch import ClockWatch
@@ -53,6 +54,13 @@ class Missions(Threads):
         return {}
 
 
+class Recorders(Threads):
+    """Records nothing."""
+
+    def status(self) -> BagStatus:
+        return BagStatus(recording=False)
+
+
 class Uploader:
     """Delivers as much as it is told."""
 
@@ -79,7 +87,8 @@ class Setting:
         uploader: Any = self.uploader
         mission: Any = Missions('mission')
         self.queue = BatchQueue(QueueSettings())
-        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission)
+        recorder: Any = Recorders('bag-writer')
+        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder)
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
         self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 
@@ -144,7 +153,7 @@ def test_a_failing_worker_is_told(setting: Setting) -> None:
     workers = setting.look()['workers']
     assert workers['intake'] == {'alive': False, 'failing': True, 'failures': 3, 'deaths': 1, 'last_error': 'ValueError: x',
                                  'busy_s': 0.0, 'patience_s': None}  # fmt: skip
-    assert set(workers) == {'intake', 'encode-0', 'spool-writer', 'upload-lock', 'upload-0', 'mission'}
+    assert set(workers) == {'intake', 'encode-0', 'spool-writer', 'upload-lock', 'upload-0', 'mission', 'bag-writer'}
 
 
 def test_a_stall_is_told(setting: Setting) -> None:

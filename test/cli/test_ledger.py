@@ -86,6 +86,15 @@ def test_columns_without_figures_are_left_out() -> None:
     assert 'dropped' in shown(a_ledger(imu=a_topic(dropped={'queue_full': 1}))).split()
 
 
+def test_bags_have_a_table_of_their_own() -> None:
+    """What was recorded into bags, and why not, stands beside what the sensors kept; without bags there is no such table."""
+    found = a_ledger(imu=a_topic())
+    assert 'bags' not in shown(found)
+    text = shown(found | {'bags': {'/imu': a_topic(skipped=0, dropped={'queue_full': 40}, stored=60)}})
+    assert 'Messages recorded into bags of thor' in text
+    assert '/imu in bags: dropped by queue_full 40' in text
+
+
 def test_causes_are_listed_by_topic() -> None:
     """What was missed, rejected or dropped is said with its causes, the largest first."""
     text = shown(a_ledger(imu=a_topic(missed=15, missed_by={'transport': 3, 'restart': 12}), odom=a_topic()))

@@ -49,7 +49,7 @@ def a_status(**changes: Any) -> dict[str, Any]:
         'workers': {'intake': {'failing': False, 'failures': 0, 'last_error': '', 'busy_s': 0.0}}, 'stalls': {},
     }  # fmt: skip
     for name, value in changes.items():
-        found[name] = found[name] | value if isinstance(value, dict) and name != 'topics' else value
+        found[name] = found.get(name, {}) | value if isinstance(value, dict) and name != 'topics' else value
     return found
 
 
@@ -96,6 +96,34 @@ def test_it_fits_into_80_columns() -> None:
     assert '3 objects wait (oldest 12 min 5 s)' in text
     assert '1,234 delivered, 1.2 of 8 Mbit/s' in text
     assert text.rstrip().splitlines()[-1].startswith('Fine')
+
+
+def test_it_says_what_is_recorded() -> None:
+    """The bag, how much is in it, and what is wrong with it; nothing while nothing is recorded."""
+    bag = {'recording': True, 'paused': False, 'bag': 'patrol_1', 'slice': 3, 'messages': 12_345, 'bytes': 10**7, 'dropped': 0,
+           'duration_s': 200.0, 'queue_bytes': 0, 'refused': '', 'topics': {}}  # fmt: skip
+    assert 'bag' not in shown(bag={**bag, 'recording': False})
+    text = shown(bag=bag)
+    assert line(text, 'bag').split() == ['bag', 'records', 'patrol_1', 'for', '3', 'min', '20', 's']
+    assert '12,345 messages, 10.0 MB, slice 3' in text
+    text = shown(bag={**bag, 'refused': 'no_room', 'dropped': 7})
+    assert 'stands still' in line(text, 'bag')
+    assert '7 messages dropped' in text
+
+
+def test_it_says_which_mission_is_active() -> None:
+    """Its type, since when, its id and its run, in 80 columns; nothing where there is none."""
+    assert 'mission' not in shown()
+    mission = {'mission_id': 'patrol_20261121_063605_1f2e3d4c', 'run_id': None, 'type': 'patrol',
+               'started': '2026-11-21T06:36:05.123456Z'}  # fmt: skip
+    text = shown(mission=mission)
+    assert line(text, 'mission') == 'mission  active      patrol, since 2026-11-21 06:36:05 UTC, 3 min'
+    assert mission['mission_id'] in text
+    assert 'no MLflow run yet' in text
+    text = shown(mission={**mission, 'run_id': 'a' * 32, 'started': '1970-01-01T00:02:00.000000Z'})
+    assert f'MLflow run {"a" * 32}' in text
+    assert 'patrol, begun before the clock was set' in text
+    assert max(len(each.rstrip()) for each in text.splitlines()) <= 80
 
 
 @pytest.mark.parametrize('width', [52, 60])

@@ -46,6 +46,16 @@ class Station:
         assert answer.success, answer.message
         return str(answer.message)
 
+    def bag(self, what: str) -> tuple[bool, str]:
+        """What ``~/bag/start``, ``stop`` or ``split`` answers."""
+        answer = self._call(Trigger, f'/bag/{what}', Trigger.Request())
+        return bool(answer.success), str(answer.message)
+
+    def bag_pause(self, *, paused: bool) -> tuple[bool, str]:
+        """What ``~/bag/pause`` answers."""
+        answer = self._call(SetBool, '/bag/pause', SetBool.Request(data=paused))
+        return bool(answer.success), str(answer.message)
+
     def set(self, **values: Any) -> str:
         """Set parameters (``sensor__name``) together; why they were refused, empty where they were not."""
         parameters = [Parameter(name.replace('__', '.'), value=value).to_parameter_msg() for name, value in values.items()]

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from e2e.processes import Node, Processes, until
+import pytest
+from e2e.processes import LONG, Node, Processes, until
 from e2e.reading import Objects
 from e2e.station import NODE, Station
+from missions.server import Server, complete
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
 from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
 from shadowhound_data_logger.missions.overview import told
 from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.s3 import S3Store
 
 ENOUGH = 100
 PARAMETERS = {'mission.capture': 'mission', 'mission.frame_every_s': 1.0, 'lowstate.batch_s': 1.0}
@@ -88,3 +93,42 @@ def test_a_mission_has_its_data_and_nothing_else_is_stored(
     assert {found for time_ns, found in times if start_ns <= time_ns <= end_ns} == {mission_id}
     assert all(start_ns - 10**9 < time_ns < end_ns + 10**9 for time_ns, _ in times)
     assert {key.split('/')[1] for key in objects.infos} >= {'camera', 'imu', 'lidar', 'lowstate', 'odom', 'states'}
+
+
+@pytest.mark.skipif(not LONG, reason='half a minute: set SHADOWHOUND_TEST_LONG=1')
+def test_a_run_has_what_the_node_measured(processes: Processes, tower: Tower, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real MLflow server has the whole mission of an agent that only starts and ends it, and the objects name its run."""
+    environ = tower.environment()
+    for name, value in environ.items():
+        monkeypatch.setenv(name, value)
+    node = processes.node(environ, {**PARAMETERS, 'mission.capture': 'always'})
+    processes.sim('duration_s:=60.0')
+    logger = MissionDataLogger(home=node.home, robot=processes.robot, start_timeout_s=30.0)
+    until(lambda: node.topic('/imu').get('received', 0) > ENOUGH, 'the robot is heard')
+    run_id = logger.start_mission('patrol', command := f'by the node of {processes.robot}')
+    (folder,) = missions(node.home)
+    status = node.home / 'spool' / f'status-{processes.robot}.json'
+    until(lambda: json.loads(status.read_bytes())['mission'].get('run_id') == run_id, 'the node knows the run')
+    node.received('/imu', node.topic('/imu')['received'] + ENOUGH)
+    until(lambda: sees(folder), lambda: f'the node logs the robot: {told(folder).node}')
+    logger.end_mission(True, 0.0, 0.0)
+    until(lambda: complete(node.home), lambda: f'all is sent: {logger.flush(0.0)}')
+    assert logger.close().complete
+    server = Server(tower, None)  # type: ignore[arg-type]  # no wire
+    run = server.run(command)
+    assert (run.info.run_id, run.info.status) == (run_id, 'FINISHED')
+    assert run.data.metrics['distance_m'] == run.data.metrics['distance_traveled_m'] > 0.5
+    assert {'battery_pct', 'temperature_c', 'pose_x', 'pose_y', 'pose_yaw', 'camera_frame_900000', 'battery_consumed_pct',
+            'success'} <= run.data.metrics.keys()  # fmt: skip
+    steps = [point.step for point in server.history(run_id, 'pose_x')]
+    assert steps == sorted(set(steps))
+    assert {'camera/frame_900000.jpg', 'trajectories/trajectory.csv', 'trajectory.png', 'battery.png', 'camera_summary.jpg',
+            'summary.json'} <= server.artifacts(run_id)  # fmt: skip
+    node.delivered()
+    assert node.stop()['balanced']
+    with closing(S3Store(tower.store_settings(), UploadSettings())) as store:
+        store.open()
+        infos = Objects.of(store, 'sensor-data', processes.robot).infos
+    names = {key.partition(f'/missions/{run_id}/')[2] for key in infos}
+    assert {'camera/frame_900000.jpg', 'trajectory.csv', 'summary.json'} <= names
+    assert run_id in {info.metadata.get('run_id') for key, info in infos.items() if '/imu/' in key}

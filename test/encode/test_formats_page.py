@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 import simplejpeg
 
+from shadowhound_data_logger.lake.parts import encode
+from shadowhound_data_logger.lake.schema import row_of
+
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / 'docs' / 'formats.md').read_text(encoding='utf-8')
 START, *EXAMPLES = re.findall(r'^```python\n(.*?)^```', PAGE, re.DOTALL | re.MULTILINE)
@@ -41,6 +44,9 @@ def bucket(ros: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     }
     for name, encoding in made.items():
         (tmp_path / name).write_bytes(encoding.object.body)
+    day = tmp_path / 'thor' / '_catalog' / 'date=2025-10-18'
+    day.mkdir(parents=True)
+    (day / 'part.parquet').write_bytes(encode([row_of('sensor-data', 'thor/camera/a.jpg', 1, '', {'pose': '3 1 0 odom'})]))
     shutil.copy(ROOT / 'interfaces' / 'go2_interfaces' / 'msg' / 'VoxelMapCompressed.msg', tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -11,17 +11,20 @@ from shadowhound_data_logger import MissionDataLogger
 
 FRAME_EVERY = 5
 PERIOD_S = 0.005
+NO_CSV = '-'
 
 
 def jpeg(number: int) -> bytes:
     return b'\xff\xd8' + b'%06d' % number * 500 + b'\xff\xd9'
 
 
-def main(home: str, command: str, csv: str) -> None:
+def main(home: str, command: str, csv: str, period_s: str = str(PERIOD_S)) -> None:
+    """``csv`` is the trajectory that it logs, NO_CSV for none."""
     logger = MissionDataLogger(home=Path(home), start_timeout_s=0.2, frame_artifact_every_s=0.0)
     said = f'{logger.start_mission("patrol", command)}\n'
     number = 0
-    logger.log_trajectory(csv)
+    if csv != NO_CSV:
+        logger.log_trajectory(csv)
     while True:
         os.write(1, said.encode())
         logger.log_robot_state(90.0 - number / 1e4, 40.0, number)
@@ -29,7 +32,7 @@ def main(home: str, command: str, csv: str) -> None:
             logger.log_camera_frame(jpeg(number), number)
         said = f'{number}\n'
         number += 1
-        time.sleep(PERIOD_S)
+        time.sleep(float(period_s))
 
 
 if __name__ == '__main__':

@@ -10,10 +10,12 @@ from pathlib import Path
 
 import pytest
 from missions.fakes import journal, journalling
+from missions.server import until
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.missions.folder import FOLDER
+from shadowhound_data_logger.missions.copies import SPARES
+from shadowhound_data_logger.missions.folder import FOLDER, missions
 
 JPEG = b'\xff\xd8 a picture \xff\xd9'
 
@@ -71,6 +73,21 @@ def test_what_was_logged_reaches_the_disk_within_a_quarter_of_a_second(tmp_path:
         logger.log_camera_frame(JPEG, 1)
         assert done.wait(5.0)
     assert synced[: synced.index('journal') + 1][-3:] == ['00000002.jpg', 'files', 'journal']
+
+
+def test_frames_have_files_that_were_made_ahead(tmp_path: Path) -> None:
+    """What is not needed of them goes at the end, and a frame that comes too soon gets a file all the same."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        (folder,) = missions(tmp_path)
+        until(lambda: len(list(folder.files.iterdir())) == SPARES, 'files are made ahead')
+        for number in range(3 * SPARES):
+            logger.log_camera_frame(JPEG + bytes([number]), number)
+    frames = {
+        record['id']: (folder.files / record['file']).read_bytes() for record in journal(tmp_path) if record['k'] == 'frame'
+    }
+    assert frames == {number: JPEG + bytes([number]) for number in range(3 * SPARES)}
+    assert len(list(folder.files.iterdir())) == len(frames)
 
 
 def test_a_disk_that_is_full_at_the_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,10 +76,10 @@ def test_an_agent_that_only_starts_and_ends_has_a_whole_run(tmp_path: Path) -> N
     }  # fmt: skip
     rows = tracking.artifacts['trajectories/trajectory.csv'].decode().splitlines()
     assert (rows[0], len(rows)) == ('timestamp,x,y,yaw,z', 6)
-    assert tracking.artifacts['camera/frame_000000.jpg'] == JPEG
+    assert tracking.artifacts['camera/frame_900000.jpg'] == JPEG
     run_name = mission.id.rpartition('_')[0]
     assert {f'trajectories/thor/{run_name}.csv', 'sensor-data/thor/missions/run0/trajectory.csv',
-            'sensor-data/thor/missions/run0/camera/frame_000000.jpg'} <= set(shelf.names())  # fmt: skip
+            'sensor-data/thor/missions/run0/camera/frame_900000.jpg'} <= set(shelf.names())  # fmt: skip
     assert {item.metadata['mission_id'] for item in shelf.objects} == {mission.id}
     assert not mission.folder.node.files.exists()
 
@@ -130,7 +130,7 @@ def test_a_node_that_hangs_does_not_hold_the_end(tmp_path: Path) -> None:
 
 
 def test_the_agents_own_values_win(tmp_path: Path) -> None:
-    """Of a metric that both log the agent's is the newest; of frames the agent's alone are sent."""
+    """Of a metric that both log the agent's is the newest; frames of both are kept, under numbers of their own."""
     tracking, shelf = FakeTracking(), FakeShelf()
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
@@ -142,9 +142,11 @@ def test_the_agents_own_values_win(tmp_path: Path) -> None:
         leave(node_log)
     assert deliver(node_log.mission.folder, tracking, shelf)
     assert newest(tracking)['battery_pct'] == 55.0
-    frames = [item.body for item in shelf.objects if item.key.endswith('.jpg')]
-    assert frames == [b'\xff\xd8 of the agent \xff\xd9']
-    assert newest(tracking)['camera_frames'] == 1.0
+    frames = {item.key.rpartition('/')[2]: item.body for item in shelf.objects if item.key.endswith('.jpg')}
+    assert frames == {'frame_000000.jpg': b'\xff\xd8 of the agent \xff\xd9', 'frame_900000.jpg': JPEG}
+    assert tracking.artifacts['camera/frame_900000.jpg'] == JPEG
+    assert json.loads(tracking.artifacts['summary.json'])['counts']['camera_frames'] == 2
+    assert newest(tracking)['camera_frames'] == 2.0
 
 
 def test_a_dead_agents_mission_ends_with_the_nodes_last_word(tmp_path: Path) -> None:

@@ -15,8 +15,12 @@ from pathlib import Path
 import pytest
 from PIL import Image
 from rich.console import Console
-from spool.making import make, new_spool, settle
+from spool.making import FakeClock, make, new_spool, settle
 
+from shadowhound_data_logger.config import CatalogueSettings
+from shadowhound_data_logger.lake.catalogue import Catalogue
+from shadowhound_data_logger.lake.parts import encode
+from shadowhound_data_logger.lake.schema import row_of
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.sim import demo, demo_processes, demo_report
 from shadowhound_data_logger.sim.demo_audit import Audit, audit
@@ -56,6 +60,10 @@ class Scene:
         self.store.put(item)
         settle(self.spool, item, State.DELIVERED)
 
+    def catalogue(self) -> None:
+        for part in self.spool.commit(Catalogue(self.root, CatalogueSettings(), 'thor', FakeClock()).parts()):
+            self.deliver(part)
+
     def audit(self) -> Audit:
         return audit(self.root, 'thor', self.published, self.store)
 
@@ -78,6 +86,7 @@ def good(scene: Scene) -> Scene:
     """Everything is delivered."""
     for item in scene.items:
         scene.deliver(item)
+    scene.catalogue()
     return scene
 
 
@@ -85,7 +94,7 @@ def test_an_audit_of_what_is_well_has_no_problems(good: Scene) -> None:
     """Objects and samples are counted, messages before the match are told apart, an unlogged topic is no problem."""
     found = good.audit()
     assert found.problems == ()
-    assert (found.read_back, found.samples) == (3, 5)
+    assert (found.read_back, found.samples, found.rows) == (4, 5, 3)
     assert found.messages[CAMERA].before_match == 10
     assert found.messages[IMU].before_match == 0
     assert found.messages[RAW].account is None
@@ -94,7 +103,8 @@ def test_an_audit_of_what_is_well_has_no_problems(good: Scene) -> None:
 
 def test_an_object_that_changed_is_found(good: Scene) -> None:
     """Content that is not what was spooled is named by its key."""
-    good.store.get = lambda _, key: b'other' if 'front' in key else json.dumps({'samples': [1, 2, 3]}).encode()  # type: ignore[method-assign]
+    get = good.store.get
+    good.store.get = lambda bucket, key: b'other' if 'front' in key else get(bucket, key)  # type: ignore[method-assign]
     assert [problem for problem in good.audit().problems if 'is not what was spooled' in problem] == [
         'thor/camera/20251018/120000_front.jpg is not what was spooled',
         'thor/camera/20251018/120001_front.jpg is not what was spooled',
@@ -106,10 +116,22 @@ def test_a_delivered_object_that_is_not_there_is_found(scene: Scene) -> None:
     for item in scene.items[1:]:
         scene.deliver(item)
     settle(scene.spool, scene.items[0], State.DELIVERED)
+    scene.catalogue()
     assert scene.audit().problems == (
         'thor/camera/20251018/120000_front.jpg was delivered, but is not in the bucket',
         f'{CAMERA}: 2 messages are delivered, but 1 lie in the bucket',
+        'thor/camera/20251018/120000_front.jpg has a row in the catalogue, but is not in the bucket',
     )
+
+
+def test_an_object_without_a_row_is_found(good: Scene) -> None:
+    """What the catalogue does not have, or has twice, is named by its key."""
+    late, twice = 'thor/imu/20251018/120009_imu.json', 'thor/camera/20251018/120000_front.jpg'
+    good.deliver(good.spool.commit([an_object(late, b'{"samples": []}', IMU, samples=0)])[0])
+    body = encode([row_of('sensor-data', twice, 3, 'image/jpeg', {'robot': 'thor'})])
+    again = make('thor/_catalog/date=2025-10-18/again.parquet', body, sensor='_catalog', topic=None, samples=0)
+    good.deliver(good.spool.commit([again])[0])
+    assert good.audit().problems == (f'{twice} has 2 rows in the catalogue', f'{late} has 0 rows in the catalogue')
 
 
 def test_a_message_after_the_last_one_heard_is_found(good: Scene) -> None:
@@ -144,7 +166,7 @@ def test_the_result_fits_into_80_columns(good: Scene) -> None:
     assert '10 messages went out before the node had found their publishers' in text
     assert f'{RAW} is not logged' in text
     assert 'The S3 server was away for 10 s' in text
-    assert '3 objects with 5 messages read back from the S3 server: all as spooled' in text
+    assert '4 objects with 5 messages read back from the S3 server: all as spooled' in text
     assert IMU_KEY in text
 
 

@@ -91,6 +91,15 @@ def test_what_was_delivered_is_there(store: ObjectStore, spooled: Spool, bucket:
     assert not list(spooled.root.glob('verify*'))
 
 
+def test_the_catalogues_parts_are_not_asked_for(spooled: Spool) -> None:
+    """They go once a larger part stands for them: one that is gone is no finding, and none is counted."""
+    store = MemoryStore()
+    part = replace(make('thor/_catalog/date=2026-11-21/a.parquet'), sensor='_catalog', topic=None, samples=0)
+    settle(spooled, *put(spooled, part), State.DELIVERED)
+    deliver(spooled, store, 'sensor-data', 'a')
+    assert (verify(spooled, store).asked, verify(spooled, store).counts) == (1, {})
+
+
 def test_what_happened_to_an_object_is_found(store: ObjectStore, spooled: Spool, bucket: str) -> None:
     """Deleted, cut, replaced by other content or by another program: each is named for what it is."""
     names = ('deleted', 'cut', 'changed', 'foreign', 'same', 'good')

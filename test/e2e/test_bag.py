@@ -1,0 +1,168 @@
+"""Bags recorded by the node: what was published is in them byte for byte, slices leave while the next one records."""
+
+from __future__ import annotations
+
+import signal
+import sqlite3
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from e2e.bag_reading import BUCKET, Bag, bags, by_topic
+from e2e.processes import LONG, Processes, published, until
+from e2e.reading import STRING, TYPES, decode, texts
+from e2e.station import Station
+from e2e.witness import recorded
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.s3 import S3Store
+
+DURATION_S = 60.0 if LONG else 6.0
+SLICE_S = 2.0
+SOON_NS = 10 * 10**9
+"""From the end of a slice to its delivery."""
+BEST_EFFORT = {'/point_cloud2', '/camera/camera_info'}
+
+pytestmark = pytest.mark.timeout(120 + 2 * DURATION_S)
+
+
+@pytest.fixture(scope='module')
+def store(seaweed: Tower) -> Iterator[ObjectStore]:
+    opened = S3Store(seaweed.store_settings(), UploadSettings())
+    opened.open()
+    yield opened
+    opened.close()
+
+
+class Session:
+    """One run of robot, witness and a node that records from its start on."""
+
+    def __init__(self, bag: Bag, ledger: dict[str, Any], heard: dict[str, list[Any]], said: dict[str, int]) -> None:
+        self.bag, self.ledger, self.heard, self.said = bag, ledger, heard, said
+        self.messages = by_topic(bag.messages())
+
+
+@pytest.fixture(scope='module')
+def session(shared: Processes, seaweed: Tower, store: ObjectStore) -> Session:
+    node = shared.node(seaweed.environment(), {'bag.record': 'always', 'bag.slice_s': SLICE_S})
+    recording = shared.folder / 'witness'
+    witness = shared.witness(TYPES, recording, best_effort=BEST_EFFORT)
+    said = published(shared.sim(f'duration_s:={DURATION_S}'), DURATION_S + 60)
+    ledger = node.stop()
+    witness.signal(signal.SIGTERM)
+    assert witness.wait() == 0
+    (bag,) = bags(store, shared.robot, shared.folder / 'bags')
+    return Session(bag, ledger, by_topic(recorded(recording)), said)
+
+
+def test_the_bag_is_whole_to_every_reader(session: Session) -> None:
+    """mcap, rosbags, metadata.yaml and manifest.json agree on what is in it, and that nothing is missing."""
+    assert session.bag.manifest['state'] == 'complete'
+    assert session.bag.manifest['missing'] == []
+    assert session.bag.check() == {topic: len(found) for topic, found in session.messages.items()}
+
+
+@pytest.mark.parametrize('topic', TYPES)
+def test_every_message_is_there_as_it_was_published(session: Session, topic: str) -> None:
+    """Equal bytes in the same order, with the time of sending and, not before it, the time of arrival."""
+    found, heard = session.messages[topic], session.heard[topic]
+    assert len(found) == session.said[topic]
+    assert [message.publish_ns for message in found] == [message.source_ns for message in heard]
+    assert [message.cdr for message in found] == [message.cdr for message in heard]
+    assert all(0 <= message.log_ns - message.publish_ns < SOON_NS for message in found)
+    assert len({message.sequence for message in found}) == len(found)
+
+
+def test_bags_are_a_sink_of_their_own_in_the_ledger(session: Session) -> None:
+    """All that was published was recorded and delivered, whatever the sensors kept of it."""
+    assert set(session.ledger['bags']) == set(TYPES)
+    for topic, row in session.ledger['bags'].items():
+        assert (topic, row['published'], row['received'], row['missed']) == (topic, session.said[topic], session.said[topic], 0)
+        assert (row['stored'], row['stored_in']['delivered'], row['open']) == (row['received'], row['received'], 0)
+    camera = session.ledger['topics']['/camera/compressed']
+    assert camera['stored'] <= DURATION_S + 2
+    assert camera['skipped'] == camera['received'] - camera['stored']
+
+
+def test_slices_are_delivered_while_the_next_one_records(session: Session, store: ObjectStore, shared: Processes) -> None:
+    """The first is in the store before the last one begins, and carries what a listing has to know."""
+    assert len(session.bag.slices) >= DURATION_S / SLICE_S - 1
+    first, last = session.bag.manifest['slices'][0], session.bag.manifest['slices'][-1]
+    info = store.head(BUCKET, first['key'])
+    assert info is not None
+    assert {'robot', 'bag', 'slice', 'messages', 't_start_ns', 't_end_ns', 'sha256'} <= set(info.metadata)
+    assert info.metadata['sha256'] == first['sha256']
+    row = _row(shared, first['key'])
+    assert row['settled_ns'] < last['t_start_ns'] + SOON_NS // 2
+    assert row['settled_ns'] - first['t_end_ns'] < SOON_NS
+
+
+def _row(processes: Processes, key: str) -> dict[str, Any]:
+    with sqlite3.connect(processes.folder / 'home' / 'spool' / 'index.db') as db:
+        db.row_factory = sqlite3.Row
+        return dict(db.execute('SELECT * FROM objects WHERE key = ?', (key,)).fetchone())
+
+
+@pytest.fixture
+def station(processes: Processes) -> Iterator[Station]:
+    made = Station(processes.environ)
+    yield made
+    made.close()
+
+
+def test_the_services_begin_pause_split_and_end_a_bag(
+    processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
+) -> None:
+    """Of a topic that no sensor takes: what came between start and stop is in the bag but for the pause, in two slices."""
+    node = processes.node(seaweed.environment(), {'bag.regex': '^/b_', 'bag.exclude': 'not', 'sensors': ['odom']})
+    publisher = processes.publisher()
+    for topic in ('/b_one', '/b_not'):
+        publisher.create(topic, STRING)
+    assert station.bag('stop') == (False, 'nothing is recorded')
+    done, name = station.bag('start')
+    assert done
+    assert name.startswith('recording_')
+    assert not station.bag('start')[0]
+    publisher.matched('/b_one')
+    publisher.publish('/b_one', texts(range(20)))
+    until(lambda: node.ledger()['bags'].get('/b_one', {}).get('received') == 20, 'all are received')
+    assert station.bag('split')[0]
+    assert station.bag_pause(paused=True)[0]
+    publisher.publish('/b_one', texts(range(20, 30)))
+    until(lambda: node.ledger()['bags']['/b_one']['received'] == 30, 'all are received')
+    assert station.bag_pause(paused=False)[0]
+    publisher.publish('/b_one', texts(range(30, 40)))
+    until(lambda: node.ledger()['bags']['/b_one']['received'] == 40, 'all are received')
+    assert station.bag('stop')[0]
+    ledger = node.stop()
+    (bag,) = bags(store, processes.robot, processes.folder / 'bags')
+    assert bag.folder.name == name
+    assert bag.check() == {'/b_one': 30}
+    assert [int(decode(STRING, message.cdr).data) for message in bag.messages()] == [*range(20), *range(30, 40)]
+    assert [said['messages'] for said in bag.manifest['slices']] == [20, 10]
+    assert ledger['bags']['/b_one']['dropped'] == {'paused': 10}
+    assert '/b_one' not in ledger['topics']
+    assert not list((processes.folder / 'home' / 'bags' / processes.robot).iterdir())
+
+
+def test_a_bag_begins_with_what_was_latched(processes: Processes, seaweed: Tower, store: ObjectStore, station: Station) -> None:
+    """What a latched publisher sent before the recording is in the bag, once, though a sensor had taken it long ago."""
+    parameters = {'sensors': ['map'], 'map.topics': ['/b_map'], 'map.rate_hz': 0.0}
+    node = processes.node(seaweed.environment(), parameters)
+    publisher = processes.publisher()
+    publisher.create('/b_map', STRING, latched=True, depth=1)
+    publisher.matched('/b_map')
+    publisher.publish('/b_map', texts([1]))
+    node.received('/b_map', 1)
+    assert station.bag('start')[0]
+    until(lambda: node.ledger()['bags'].get('/b_map', {}).get('received') == 1, 'what was latched is received')
+    publisher.publish('/b_map', texts([2]))
+    node.received('/b_map', 2)
+    until(lambda: node.ledger()['bags']['/b_map']['received'] == 2, 'what came later is received')
+    assert station.bag('stop')[0]
+    ledger = node.stop()
+    (bag,) = bags(store, processes.robot, processes.folder / 'bags')
+    assert [int(decode(STRING, message.cdr).data) for message in bag.messages()] == [1, 2]
+    assert ledger['topics']['/b_map']['received'] == ledger['bags']['/b_map']['received'] == 2

@@ -1,0 +1,129 @@
+"""The catalogue of a simulated patrol: read by pyarrow, held against the bucket and against where the simulator says it was."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import signal
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import pyarrow
+import pyarrow.parquet
+import pytest
+from e2e.processes import Processes, until
+
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.lake import schema
+from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.sim.world import World
+from shadowhound_data_logger.stores.s3 import S3Store
+
+SEED = 1
+ODOMETRY_HZ = 50
+START_S = 60
+"""The robot was started less than so long before its first odometry was stored."""
+NEAR_M = 0.1
+TURNED_RAD = 0.1
+TOLD_OTHERWISE = {'t_start', 't_end', 'content_type'}
+"""Times come as datetimes, and SeaweedFS guesses what an application/octet-stream is."""
+WITH_HEADER = {'camera', 'camera_info', 'joints', 'lidar', 'odom'}
+"""The time of the others is that of sending: a simulator that is late sends them with a newer one than its odometry has."""
+FAST = {'catalogue.period_s': 2.0, 'lowstate.batch_s': 2.0}
+
+
+@pytest.fixture
+def store(seaweed: Tower) -> Iterator[S3Store]:
+    opened = S3Store(seaweed.store_settings(), UploadSettings())
+    opened.open()
+    yield opened
+    opened.close()
+
+
+def listed(store: S3Store, robot: str) -> dict[tuple[str, str], ObjectInfo]:
+    """All objects of a robot, with what they say of themselves; but not the catalogue."""
+    found = {}
+    for bucket in ('sensor-data', 'trajectories'):
+        for info in store.list(bucket, f'{robot}/'):
+            if schema.is_row(bucket, info.key) and (told := store.head(bucket, info.key)) is not None:
+                found[bucket, info.key] = told
+    return found
+
+
+def catalogued(store: S3Store, robot: str) -> list[dict[str, Any]]:
+    """All rows of all parts; each has the schema and the date of its folder."""
+    rows = []
+    for info in store.list(schema.BUCKET, schema.prefix(robot)):
+        table = pyarrow.parquet.read_table(io.BytesIO(store.get(schema.BUCKET, info.key)))
+        assert table.schema.equals(schema.arrow_schema())
+        for row in table.to_pylist():
+            assert f'/date={row["t_start"]:%Y-%m-%d}/' in info.key
+            rows.append(row)
+    return rows
+
+
+def started_ns(rows: list[dict[str, Any]], store: S3Store) -> int:
+    """When the simulated robot began: the time from which its odometry is the simulator's own."""
+    odometry = [json.loads(store.get(row['bucket'], row['key'])) for row in rows if row['sensor'] == 'odom']
+    assert len(odometry) > 3
+    world = World.of(SEED)
+
+    def off(start_ns: int) -> float:
+        truths = [world.motion((pose['stamp_ns'] - start_ns) / 1e9) for pose in odometry]
+        places = [pose['position'] for pose in odometry]
+        return max(math.hypot(truth.x - at['x'], truth.y - at['y']) for truth, at in zip(truths, places, strict=True))
+
+    first_ns = min(pose['stamp_ns'] for pose in odometry)
+    best = min((first_ns - round(number / ODOMETRY_HZ * 1e9) for number in range(START_S * ODOMETRY_HZ)), key=off)
+    assert off(best) < 1e-6
+    return best
+
+
+def patrol(processes: Processes, seaweed: Tower, store: S3Store) -> None:
+    """A mission of a robot that walks; its node is killed once a part is there, and started again."""
+    node = processes.node(seaweed.environment(), FAST)
+    robot = processes.sim(f'seed:={SEED}', 'image_raw:=false')
+    logger = MissionDataLogger(home=node.home, robot=processes.robot, replay=False, start_timeout_s=0.0)
+    try:
+        until(lambda: node.topic('/odom').get('stored', 0) >= 2, 'the robot walks')
+        logger.start_mission('patrol', 'go round')
+        until(lambda: any(store.list(schema.BUCKET, schema.prefix(processes.robot))), 'a part is there while the robot walks')
+        node.kill()
+        node = processes.node(seaweed.environment(), FAST)
+        stored = node.topic('/odom')['stored']
+        until(lambda: node.topic('/odom')['stored'] >= stored + 3, 'the robot is heard again')
+        robot.signal(signal.SIGINT)
+        assert robot.wait() == 0
+        logger.end_mission(True, 0.0, 0.0)
+    finally:
+        logger.close()
+    assert node.stop()['objects']['pending'] == 0
+
+
+def test_every_object_has_one_row_and_the_right_pose(processes: Processes, seaweed: Tower, store: S3Store) -> None:
+    """All of the bucket but the catalogue is in it once, as the bucket says it, and poses are the simulator's within 10 cm."""
+    patrol(processes, seaweed, store)
+    objects, rows = listed(store, processes.robot), catalogued(store, processes.robot)
+    assert Counter((row['bucket'], row['key']) for row in rows) == Counter(objects.keys())
+    for row in rows:
+        info = objects[row['bucket'], row['key']]
+        again = schema.row_of(info.bucket, info.key, info.size, info.content_type, info.metadata)
+        assert [row[name] for name in schema.COLUMNS if name not in TOLD_OTHERWISE] == [
+            again[name] for name in schema.COLUMNS if name not in TOLD_OTHERWISE
+        ]
+    assert {row['mission_type'] for row in rows} == {None, 'patrol'}
+    assert {row['sensor'] for row in rows if row['x'] is not None} >= WITH_HEADER
+    assert not {row['sensor'] for row in rows if row['x'] is None} & WITH_HEADER
+    world, start_ns = World.of(SEED), started_ns(rows, store)
+    assert any(row['battery_pct'] is not None for row in rows)
+    for row in (row for row in rows if row['x'] is not None):
+        t = ((row['t_start_ns'] + row['t_end_ns']) / 2 - start_ns) / 1e9
+        truth = world.motion(t)
+        assert math.hypot(row['x'] - truth.x, row['y'] - truth.y) < NEAR_M, row
+        assert abs((row['yaw'] - truth.yaw + math.pi) % math.tau - math.pi) < TURNED_RAD, row
+        assert row['pose_frame'] == 'odom'
+        assert row['battery_pct'] is None or abs(row['battery_pct'] - world.power(t).soc) < 4.0, row

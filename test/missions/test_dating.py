@@ -1,0 +1,168 @@
+"""Missions of a robot that starts in 1970 and learns the time later, or never: all that they log has one date, the right one."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+from clocks import NOON_NS, Clocks
+from missions.fakes import FakeDrawing, FakeShelf, FakeTracking, journalling
+
+from shadowhound_data_logger.clock import SECOND, SystemClock
+from shadowhound_data_logger.missions.active import Active, Lookout, ended
+from shadowhound_data_logger.missions.dating import WAITS, Dating
+from shadowhound_data_logger.missions.folder import MissionFolder, missions
+from shadowhound_data_logger.missions.node_log import NodeLog
+from shadowhound_data_logger.missions.odometer import Pose
+from shadowhound_data_logger.missions.overview import overview
+from shadowhound_data_logger.missions.replay import Replay
+from shadowhound_data_logger.missions.report import report
+
+MS = 1_000_000
+NAME = 'patrol_20251018_115950'
+"""Of a run that began ten seconds before noon."""
+
+
+@pytest.fixture
+def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
+    """Of this machine."""
+    found = Clocks()
+    monkeypatch.setattr(SystemClock, 'of_this_machine', lambda: found)
+    return found
+
+
+def fly(home: Path, clocks: Clocks, *, is_set_meanwhile: bool = False) -> MissionFolder:
+    """Ten seconds with a point in the middle; the clock may be set right after that."""
+    csv = home / 't.csv'
+    csv.write_text('timestamp,x,y,yaw\n')
+    with journalling(home) as logger:
+        logger.start_mission('patrol', '')
+        clocks.wait(5)
+        logger.log_metric('a', 1.0)
+        if is_set_meanwhile:
+            clocks.set(NOON_NS - 5 * SECOND)
+        logger.log_trajectory(csv)
+        clocks.wait(5)
+        logger.end_mission(True, 1.0, 0.0)
+    return next(missions(home))
+
+
+def sender(home: Path, clocks: Clocks, tracking: FakeTracking, shelf: FakeShelf, **offsets: int) -> Replay:
+    dating = Dating(clocks, 600.0, lambda: {name.replace('_', '-'): offset for name, offset in offsets.items()})
+    return Replay(home, tracking, shelf, FakeDrawing(), settle=dating.settle, rng=random.Random(1))  # type: ignore[arg-type]
+
+
+def check(tracking: FakeTracking, shelf: FakeShelf, folder: MissionFolder) -> None:
+    """All of it has the date that it should have."""
+    noon_ms = NOON_NS // MS
+    assert tracking.names[folder.mission_id] == f'{NAME} {noon_ms - 10_000}'
+    assert tracking.params['timestamp'] == '2025-10-18T11:59:50+00:00'
+    assert [point.time_ms for point in tracking.points if point.key == 'a'] == [noon_ms - 5000]
+    assert tracking.finished == [('run0', 'FINISHED', noon_ms)]
+    assert tracking.params['duration_s'] == '10.000'
+    assert f'trajectories/thor/{NAME}.csv' in shelf.names()
+    assert all(NOON_NS - 10 * SECOND <= item.t_start_ns <= NOON_NS for item in shelf.objects)
+
+
+def test_a_mission_waits_for_its_date(tmp_path: Path, clocks: Clocks) -> None:
+    """Nothing of it is sent while the clock is in 1970, which the report says; then run, points and keys have the right time."""
+    folder, tracking, shelf = fly(tmp_path, clocks), FakeTracking(), FakeShelf()
+    replay = sender(tmp_path, clocks, tracking, shelf)
+    assert not replay.step()
+    assert replay.owes
+    assert (tracking.runs, report(folder).last_error) == ({}, WAITS)
+    clocks.set(NOON_NS)
+    while replay.step():
+        pass
+    check(tracking, shelf, folder)
+    assert not replay.owes
+    found = overview(folder)
+    assert found
+    assert (found['started'], found['last_error']) == ('2025-10-18T11:59:50.000000Z', '')
+
+
+def test_the_clock_is_set_in_the_middle(tmp_path: Path, clocks: Clocks) -> None:
+    """What was logged before is dated like what was logged after, and the duration is what it was."""
+    folder, tracking, shelf = fly(tmp_path, clocks, is_set_meanwhile=True), FakeTracking(), FakeShelf()
+    replay = sender(tmp_path, clocks, tracking, shelf)
+    while replay.step():
+        pass
+    check(tracking, shelf, folder)
+
+
+def test_a_date_is_given_once(tmp_path: Path, clocks: Clocks) -> None:
+    """A clock that is corrected later changes no time of a mission that is half sent: no point comes twice."""
+    fly(tmp_path, clocks)
+    clocks.set(NOON_NS)
+    away = FakeTracking(fail=lambda name: name == 'finish')
+    sender(tmp_path, clocks, away, FakeShelf()).step()
+    clocks.set(NOON_NS + SECOND)
+    tracking, shelf = FakeTracking(), FakeShelf()
+    replay = sender(tmp_path, clocks, tracking, shelf)
+    while replay.step():
+        pass
+    assert tracking.finished == [('run0', 'FINISHED', NOON_NS // MS)]
+
+
+def test_a_boot_that_is_over(tmp_path: Path, clocks: Clocks) -> None:
+    """Where the node noted the clock of that boot, that dates it; else nobody will ever know, and it goes as it is."""
+    folder = fly(tmp_path, clocks)
+    later = Clocks(boot_id='later')
+    later.set(NOON_NS + 3600 * SECOND)
+    tracking, shelf = FakeTracking(), FakeShelf()
+    replay = sender(tmp_path, later, tracking, shelf, this_boot=NOON_NS - clocks.up_ns)
+    while replay.step():
+        pass
+    check(tracking, shelf, folder)
+    (tmp_path / 'other').mkdir()
+    fly(tmp_path / 'other', Clocks())
+    unknown = FakeTracking()
+    replay = sender(tmp_path / 'other', later, unknown, FakeShelf())
+    while replay.step():
+        pass
+    assert unknown.params['timestamp'].startswith('1970-01-01T00:01')
+
+
+def test_a_clock_that_is_never_set(tmp_path: Path, clocks: Clocks) -> None:
+    """After ``clock.hold_s`` the mission goes with the times that it has."""
+    fly(tmp_path, clocks)
+    tracking = FakeTracking()
+    replay = sender(tmp_path, clocks, tracking, FakeShelf())
+    assert not replay.step()
+    clocks.wait(601)
+    while replay.step():
+        pass
+    assert tracking.params['timestamp'].startswith('1970-01-01T00:01')
+    assert tracking.finished
+
+
+def test_the_node_s_part_is_dated_as_well(tmp_path: Path, clocks: Clocks) -> None:
+    """Poses of before and after the clock was set are one path, and steps are seconds since the start all the way."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        found = Lookout(tmp_path, 'thor').look()
+        assert found
+        mission = Active(found.folder, found.mission_type, found.start_ns, clock=clocks)
+        node_log = NodeLog(mission, SECOND, 5.0)
+        node_log.open()
+        for second in range(4):
+            if second == 2:
+                clocks.set(NOON_NS - 8 * SECOND)
+            stamp_ns = clocks.wall_ns() if second >= 2 else clocks.boot_ns()
+            assert mission.has(stamp_ns)
+            node_log.add(Pose(stamp_ns, float(second), 0.0, 0.0))
+            clocks.wait(1)
+        node_log.write()
+        logger.end_mission(True, 0.0, 0.0)
+        logger.flush(0.0)
+        node_log.close(ended(mission))
+    tracking, shelf = FakeTracking(), FakeShelf()
+    replay = sender(tmp_path, clocks, tracking, shelf)
+    while replay.step():
+        pass
+    points = [(point.time_ms, point.step, point.value) for point in tracking.points if point.key == 'pose_x']
+    first_ms = NOON_NS // MS - 10_000
+    assert points == [(first_ms + 1000 * second, second, float(second)) for second in range(4)]
+    rows = tracking.artifacts['trajectories/trajectory.csv'].decode().splitlines()[1:]
+    assert [row.split('.')[0] for row in rows] == [str(NOON_NS // SECOND - 10 + second) for second in range(4)]

@@ -1,0 +1,67 @@
+"""A mission that is sent to the tracking server of the environment, with this Python's MLflow, and sent again as after a kill.
+
+``python -m missions.voyage FOLDER`` prints as JSON what the server has of it then.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from missions.fakes import FakeShelf, journalling
+
+from shadowhound_data_logger.missions.delivery import Delivery
+from shadowhound_data_logger.missions.folder import Sent, missions
+from shadowhound_data_logger.missions.replay import open_tracking
+
+POINTS = 1200
+
+
+def fly(home: Path) -> None:
+    """Texts that some databases do not like, and more points than one batch takes."""
+    with journalling(home, frame_artifact_every_s=0.0) as logger:
+        logger.start_mission('patrol', 'Küche\0 \N{DOG FACE} ' + 'x' * 7000)
+        for number in range(POINTS):
+            logger.log_robot_state(90.0 - number / 100, 40.0, number)
+        logger.log_metric('big/one', 1.5e300, (1 << 62))
+        logger.log_camera_frame(b'\xff\xd8 a picture', 0)
+        logger.end_mission(True, 12.5, 60.0)
+
+
+def send(home: Path) -> Delivery:
+    """All of it, twice: the second time as by a sender that was killed before it noted how far it was."""
+    (folder,) = missions(home)
+    tracking, shelf = open_tracking(home, 'thor_missions'), FakeShelf()
+    for _ in range(2):
+        delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
+        while any([delivery.track(), delivery.attach(), delivery.shelve()]):
+            pass
+        folder.set_sent(Sent())
+    return delivery
+
+
+def look(client: Any) -> dict[str, Any]:
+    """Artifacts by their own store: the list of the 3.17 client asks for models as well, which a server of 2.x does not know."""
+    from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
+
+    experiment = client.get_experiment_by_name('thor_missions')
+    (run,) = client.search_runs([experiment.experiment_id], "params.mission_type = 'patrol' and attributes.status != 'RUNNING'")
+    files = get_artifact_repository(run.info.artifact_uri)
+    history = client.get_metric_history(run.info.run_id, 'battery_pct')
+    return {
+        'status': run.info.status, 'metrics': run.data.metrics, 'steps': [point.step for point in history],
+        'params': {name: value for name, value in run.data.params.items() if name != 'timestamp'},
+        'artifacts': sorted(item.path for folder in ('', 'camera') for item in files.list_artifacts(folder)),
+    }  # fmt: skip
+
+
+def main(home: str) -> None:
+    fly(Path(home))
+    delivery = send(Path(home))
+    sys.stdout.write(json.dumps(look(delivery._tracking._client)) + '\n')  # type: ignore[attr-defined]
+
+
+if __name__ == '__main__':
+    main(sys.argv[1])
