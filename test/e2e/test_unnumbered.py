@@ -12,8 +12,9 @@ from e2e.processes import Node, Processes, Publisher, until
 from e2e.reading import STRING, texts
 
 LEAVE_OUT = """
-from shadowhound_data_logger.capture import reader, stream
-reader.Taken = lambda cdr, source_ns, publisher, number: stream.Taken(cdr, source_ns, None, None)
+from shadowhound_data_logger import model
+from shadowhound_data_logger.capture import reader
+reader.Taken = lambda cdr, source_ns, publisher, number, received_ns: model.Taken(cdr, source_ns, None, None, received_ns)
 """
 UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 """What nobody takes from its socket buffers is overrun by what follows."""

@@ -186,7 +186,7 @@ def test_a_real_server_is_asked_for_that_day_alone(seaweed: Tower, tmp_path: Pat
         front.targets = []
         settings = through(front, seaweed)
         source = Watched(open_source(settings, schema.BUCKET))
-        frame = lake.objects(source, **DAY, near=(3.0, 1.5, 2.0), where='battery_pct < 62')
+        frame = lake.objects(source, **DAY, robot='thor', near=(3.0, 1.5, 2.0), where='battery_pct < 62')
         answer = frame.select('key').to_pydict()['key']
         dated = [target for target in front.targets if 'date' in target]
         assert len(dated) == 25
