@@ -1,4 +1,4 @@
-"""Program of a benchmark: begins and ends bags by the node's services. An order is a line ``{"do": "start"}``, or stop."""
+"""Program of a benchmark: asks the node's services for bags. An order is a line ``{"do": "start"}``, stop or trigger."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ def main() -> None:
     """Answers ``{"success": true, "message": "..."}``."""
     rclpy.init()
     node = Node('bag_switch', start_parameter_services=False, enable_rosout=False)
-    clients = {what: node.create_client(Trigger, f'/sensor_logger_node/bag/{what}') for what in ('start', 'stop')}
+    names = {'start': 'bag/start', 'stop': 'bag/stop', 'trigger': 'event/trigger'}
+    clients = {what: node.create_client(Trigger, f'/sensor_logger_node/{name}') for what, name in names.items()}
     for line in sys.stdin:
         client = clients[json.loads(line)['do']]
         answer = Trigger.Response(success=False, message='there is no such service')

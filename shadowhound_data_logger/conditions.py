@@ -1,4 +1,4 @@
-"""Conditions: settings that say when a number in a message is an event's trigger. Values only, as ``options``; here they are read.
+"""Conditions: settings that say when a number of a message triggers an event. Values only; here they are read.
 
 A condition is a text such as ``low_battery: lowstate:bms_state.soc < 20 for 5``: its name, a topic with a field, a comparison,
 and for how many seconds it has to hold.

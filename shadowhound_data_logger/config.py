@@ -228,7 +228,8 @@ def _check_events(events: EventSettings) -> None:
     """Raises SettingError for conditions that are none, or that would trigger nothing."""
     _check_expressions('events', events, ('regex', 'exclude', 'log_event'))
     if conditions(events.conditions) and not events.enabled:
-        raise SettingError('events.conditions', list(events.conditions), 'an empty list while events.topics and events.regex name nothing')
+        allowed = 'an empty list while events.topics and events.regex name nothing'
+        raise SettingError('events.conditions', list(events.conditions), allowed)
     if events.max_s < events.post_s:
         raise SettingError('events.max_s', events.max_s, f'at least events.post_s ({events.post_s:g})')
 

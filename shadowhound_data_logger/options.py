@@ -185,7 +185,7 @@ class EventSettings:
         10.0, 'Seconds after it; a trigger meanwhile makes the event last longer.', low=0.0, high=3600.0, live=True
     )
     max_s: float = _setting(
-        120.0, 'Most seconds from the first trigger to the end of an event; then another one follows.', low=1.0, high=1e5, live=True
+        120.0, 'Most seconds from the first trigger to the end of an event; another one follows.', low=1.0, high=1e5, live=True
     )
     max_bytes: int = _setting(
         64 * MEBI, 'Most bytes of memory that are kept; beyond it the oldest go, whatever pre_s is.', low=MEBI, live=True
@@ -194,7 +194,7 @@ class EventSettings:
         '.*', "What an agent's log_event triggers: an event where its name has a match of this; empty for none.", live=True
     )
     conditions: tuple[str, ...] = _setting(
-        ('',), 'What triggers by itself: "low_battery: lowstate:bms_state.soc < 20 for 5": name, topic:field, comparison, seconds.'
+        ('',), 'What triggers by itself: "low_battery: lowstate:bms_state.soc < 20 for 5": name, topic:field, comparison, time.'
     )
 
     @property

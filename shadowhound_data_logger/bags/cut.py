@@ -21,10 +21,11 @@ from shadowhound_data_logger.bags.description import METADATA, of_metadata
 from shadowhound_data_logger.bags.fetch import fetch, on_disk
 from shadowhound_data_logger.bags.mcap_messages import Message, Wanted
 from shadowhound_data_logger.bags.metadata import metadata_yaml
+from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.packed import Packed
 from shadowhound_data_logger.bags.plain import Plain, is_plain
 from shadowhound_data_logger.bags.ranges import LocalFile, Meter, StoredFile
-from shadowhound_data_logger.bags.remote import BUCKET, Listing, RemoteBag, natural
+from shadowhound_data_logger.bags.remote import Listing, RemoteBag, natural
 from shadowhound_data_logger.bags.slice_writer import SliceWriter
 from shadowhound_data_logger.bags.span import when
 from shadowhound_data_logger.clock import iso

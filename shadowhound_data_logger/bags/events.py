@@ -13,20 +13,20 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
+from shadowhound_data_logger.bags.claims import Claims
 from shadowhound_data_logger.bags.manifest import EventOf, MissionOf, TriggerOf
 from shadowhound_data_logger.bags.naming import bag_name
 from shadowhound_data_logger.bags.notes import Notes, discard
 from shadowhound_data_logger.bags.recorder import SYNC_S, Answer, Place
 from shadowhound_data_logger.bags.recording import UNWRITABLE, Outlet, Recording
-from shadowhound_data_logger.bags.ring import Held, Ring
+from shadowhound_data_logger.bags.ring import Ring
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.missions.folder import safe_type
 from shadowhound_data_logger.options import BagSettings, EventSettings
-from shadowhound_data_logger.spool.accounts import EVENT
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -40,8 +40,6 @@ RETRY_S: Final = 5.0
 """Between two tries to begin a bag on a disk that takes nothing."""
 FLUSH_S: Final = 5.0
 PATIENCE_S: Final = 30.0
-RING_FULL: Final = 'ring_full'
-"""Why messages are dropped that had to go from the ring before an event that asked for them could write them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +76,7 @@ class _Event:
 
 
 class Events:
-    """Life: New; open once; ``trigger``, ``lose`` and ``status`` from any thread; ``close`` after the intake is closed.
+    """Life: New; open once; ``trigger`` and ``status`` from any thread; ``close`` after the intake is closed.
 
     ``_lock`` guards which event goes on and what is asked of it; the writing belongs to the thread ``event-writer``.
     """
@@ -90,6 +88,7 @@ class Events:
         self._bag = bag
         self._place = place
         self._ring = ring
+        self.claims = Claims(outlet.accounts)
         self._outlet = outlet
         self._poll_s = poll_s
         self._monotonic = monotonic
@@ -175,12 +174,6 @@ class Events:
         log.info('event %s (%s): %s', name, by, text)
         return True, text
 
-    def lose(self, held: Iterable[Held], reason: str = RING_FULL) -> None:
-        """What an event asked for and cannot have."""
-        for each in held:
-            fresh = self._receive(each)
-            self._outlet.accounts.drop(f'{EVENT}{each.lot.topic}', reason, len(fresh))
-
     # -- under the lock --------------------------------------------------------------------------------------------
 
     def _begin(self, triggers: Sequence[TriggerOf], at_s: float, since_s: float | None = None) -> _Event:
@@ -190,7 +183,7 @@ class Events:
         held_s = 0.0 if oldest_s is None or since_s is not None else min(max(0.0, at_s - oldest_s), settings.pre_s)
         name = safe_type(triggers[0].name)
         if since_s is None:
-            self._outlet.accounts.rebase_all(EVENT)
+            self.claims.begin()
         root, is_known = self._place.root, self._place.is_known
         bag = bag_name(f'{PREFIX}{name}', triggers[0].at_ns, lambda bag: (root / bag).exists() or is_known(bag))
         of = EventOf(name, settings.pre_s, round(held_s, 3), settings.post_s, tuple(triggers))
@@ -255,10 +248,11 @@ class Events:
         assert recording is not None
         self._tell_triggers(event, recording.notes)
         while held := self._ring.next(event.until_s + self._poll_s):
-            fresh = self._receive(held)
+            fresh = self.claims.receive(held)
             if fresh:
                 recording.write(held.lot._replace(messages=fresh))
             self._sync(recording)
+        recording.leave_out(self.claims.take_lost())
         self._sync(recording)
 
     def _sync(self, recording: Recording) -> None:
@@ -288,15 +282,6 @@ class Events:
     def _give_up(self, event: _Event) -> None:
         """The disk took nothing for as long as it lasted."""
         while held := self._ring.next(event.until_s + self._poll_s):
-            self.lose([held], UNWRITABLE)
+            self.claims.lose([held], UNWRITABLE)
         if self._end(event):
             log.error('%s is lost: the disk took nothing', event.bag)
-
-    def _receive(self, held: Held) -> list[Any]:
-        """Count messages as asked for, repeats left out."""
-        with self._outlet.accounts.entry(f'{EVENT}{held.lot.topic}') as account:
-            account.type = held.lot.type
-            receive, reported = account.receive, held.lost is not None
-            fresh = [each for each in held.lot.messages if receive(each.publisher, each.number, reported=reported)]
-            account.lose(held.lost)
-        return fresh

@@ -20,9 +20,10 @@ from shadowhound_data_logger.bags.description import METADATA, slice_info
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.mcap_index import read_index
 from shadowhound_data_logger.bags.metadata import metadata_yaml
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.ranges import LocalFile, Meter
 from shadowhound_data_logger.bags.recovery import file_digest
-from shadowhound_data_logger.bags.remote import BUCKET, MANIFEST, Listing, RemoteBag, RemoteFile, missing_of
+from shadowhound_data_logger.bags.remote import Listing, RemoteBag, RemoteFile, missing_of
 from shadowhound_data_logger.errors import BagDamaged, BagError, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import ObjectInfo

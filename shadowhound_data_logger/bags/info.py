@@ -13,12 +13,11 @@ from shadowhound_data_logger.bags.local import LocalFile as Waiting
 from shadowhound_data_logger.bags.local import local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.mcap_index import read_index
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile
 from shadowhound_data_logger.bags.remote import (
-    BUCKET,
     FOREIGN,
     GROWING,
-    MANIFEST,
     Listing,
     RemoteBag,
     RemoteFile,

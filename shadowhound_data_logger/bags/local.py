@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.naming import FOLDER
-from shadowhound_data_logger.bags.remote import BUCKET, prefix_of
+from shadowhound_data_logger.bags.naming import BUCKET, FOLDER, prefix_of
 from shadowhound_data_logger.bags.slice_writer import OPEN
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.spool.index import Index

@@ -2,17 +2,19 @@
 
     {"version": 1, "bag": "patrol_20261121_120000", "robot": "thor", "state": "complete",
      "mission": {"type": "patrol", "mission_id": "...", "run_id": null}, "event": null,
-     "missing": [{"file": "patrol_20261121_120000_3.mcap", "what": "...", "messages": null}],
+     "missing": [{"file": "patrol_20261121_120000_3.mcap", "what": "...", "messages": null,
+                 "topic": null, "reason": null}],
      "topics": [{"topic": "/imu", "type": "sensor_msgs/msg/Imu", "messages": 6000}],
      "slices": [{"file": "patrol_20261121_120000_0.mcap", "key": "thor/rosbags/...", "bytes": 1, "sha256": "...",
                  "messages": 1, "t_start_ns": 1, "t_end_ns": 1, "counts": {"/imu": 1}}]}
 
-``mission`` is null for a bag of no mission, ``run_id`` where it was not known yet. ``missing`` is empty unless ``state`` is
-``recovered``; its ``messages`` is null where nobody counted them. Unknown fields are a later version's, and ignored.
+``mission`` is null for a bag of no mission, ``run_id`` where it was not known yet. ``missing`` is empty where ``state`` is
+``complete``; its ``messages`` is null where nobody counted them, ``topic`` and ``reason`` where it is not of one topic. Unknown
+fields are a later version's, and ignored.
 ``event`` is what made the bag of an event, in the order of the triggers:
 
     {"name": "low_battery", "pre_s": 30.0, "held_s": 30.0, "post_s": 10.0,
-     "triggers": [{"name": "low_battery", "by": "condition", "at_ns": 1, "detail": "lowstate:bms_state.soc < 20: 19"}]}
+     "triggers": [{"name": "low_battery", "by": "condition", "at_ns": 1, "detail": "low_battery: ...soc < 20: 19"}]}
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ VERSION: Final = 1
 COMPLETE: Final = 'complete'
 RECOVERED: Final = 'recovered'
 """The recording did not end by itself: what had not reached the disk is missing, at least."""
-STATES: Final = frozenset({COMPLETE, RECOVERED})
+GAPS: Final = 'gaps'
+"""It did end by itself, but not all that came is in the bag."""
+STATES: Final = frozenset({COMPLETE, GAPS, RECOVERED})
 _SHA256: Final = re.compile('[0-9a-f]{64}')
 
 
@@ -72,6 +76,9 @@ class Missing:
     file: str
     what: str
     messages: int | None
+    topic: str | None = None
+    reason: str | None = None
+    """Why the messages were dropped, in the words of the ledger."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +142,7 @@ class Manifest:
         mission, event = top.object_or_none('mission'), top.object_or_none('event')
         return cls(
             top.text('bag'), top.text('robot'), _mission(mission) if mission else None, state,
-            tuple(Missing(one.text('file'), one.text('what'), one.count_or_none('messages')) for one in top.objects('missing')),
+            tuple(map(_missing, top.objects('missing'))),
             tuple(RecordedTopic(one.text('topic'), one.text('type'), one.count('messages')) for one in top.objects('topics')),
             tuple(map(_slice, top.objects('slices'))), _event(event) if event else None,
         )  # fmt: skip
@@ -208,6 +215,11 @@ class _Object:
 
     def _at(self, name: str) -> str:
         return f'{self._place}.{name}' if self._place else name
+
+
+def _missing(one: _Object) -> Missing:
+    return Missing(one.text('file'), one.text('what'), one.count_or_none('messages'), one.text_or_none('topic'),
+                   one.text_or_none('reason'))  # fmt: skip
 
 
 def _mission(one: _Object) -> MissionOf:

@@ -43,6 +43,11 @@ def slice_number(bag: str, file: str) -> int | None:
     return int(head) if found and file.startswith(f'{bag}_') and head.isascii() and head.isdigit() else None
 
 
+def prefix_of(robot: str, bag: str = '') -> str:
+    """Of the keys of a robot's bags, or of one of them."""
+    return f'{robot}/rosbags/{bag}/' if bag else f'{robot}/rosbags/'
+
+
 def key_of(robot: str, bag: str, file: str) -> str:
     """In the bucket of the bags."""
-    return f'{robot}/rosbags/{bag}/{file}'
+    return f'{prefix_of(robot, bag)}{file}'

@@ -2,7 +2,7 @@
 
     {"bag": "patrol_20251018_120000", "robot": "thor", "mission": {"type": "patrol", "mission_id": "...", "run_id": null}}
     {"slice": {"file": "patrol_20251018_120000_0.mcap", "bytes": 1, ...}}      each slice that was closed
-    {"missing": {"file": "...", "what": "...", "messages": 3}}                 what is known to be lost
+    {"missing": {"file": "...", "what": "...", "messages": 3, ...}}            what is known to be lost
     {"mission": {...}}                                                         when more is known of the mission
     {"event": {...}}                                                           what triggered it, and whenever more did
     {"ended": true}                                                            the recording ended by itself
@@ -85,10 +85,10 @@ class Notes:
         del said['damage']
         self._append({'slice': said})
 
-    def add_missing(self, missing: Missing) -> None:
+    def add_missing(self, *missing: Missing) -> None:
         """Something is lost. Raises OSError, as above."""
-        self.missing.append(missing)
-        self._append({'missing': asdict(missing)})
+        self.missing.extend(missing)
+        self._append(*({'missing': asdict(one)} for one in missing))
 
     def set_mission(self, mission: MissionOf) -> None:
         """More is known of the mission. Raises OSError, as above."""
@@ -106,14 +106,19 @@ class Notes:
         self._append({'ended': True})
 
     def remove(self) -> None:
-        """All is in the spool. Raises OSError."""
+        """All is durable in the spool, which may be about to remove the slices it linked. Raises OSError."""
+        for file in self.slices:
+            (self.folder / file).unlink(missing_ok=True)
         (self.folder / FILE).unlink(missing_ok=True)
         self.folder.rmdir()
 
-    def _append(self, line: Mapping[str, Any]) -> None:
+    def _append(self, *lines: Mapping[str, Any]) -> None:
+        if not lines:
+            return
         descriptor = os.open(self.folder / FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
         try:
-            os.write(descriptor, b'\n' + json.dumps(line).encode() + b'\n')  # whatever a line that failed has left
+            content = ''.join(f'{json.dumps(line)}\n' for line in lines)
+            os.write(descriptor, b'\n' + content.encode())  # whatever a line that failed has left
             os.fdatasync(descriptor)
         finally:
             os.close(descriptor)

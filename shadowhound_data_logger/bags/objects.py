@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from typing import Final
 
-from shadowhound_data_logger.bags.manifest import COMPLETE, RECOVERED, Manifest, SliceEntry, topics_of
+from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, RECOVERED, Manifest, SliceEntry, topics_of
 from shadowhound_data_logger.bags.metadata import metadata_yaml
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, slice_number
 from shadowhound_data_logger.bags.notes import Notes
@@ -45,7 +45,7 @@ def ending_objects(notes: Notes) -> Iterator[DataObject]:
     """What makes the bag whole; ``notes`` know all slices. The same notes give the same bytes."""
     slices = [notes.slices[file] for file in sorted(notes.slices, key=lambda file: slice_number(notes.bag, file) or 0)]
     entries = tuple(SliceEntry.of(info, key_of(notes.robot, notes.bag, info.path.name)) for info in slices)
-    state = COMPLETE if notes.ended and not notes.missing else RECOVERED
+    state = RECOVERED if not notes.ended else GAPS if notes.missing else COMPLETE
     manifest = Manifest(
         bag=notes.bag, robot=notes.robot, mission=notes.mission, state=state, missing=tuple(notes.missing),
         topics=topics_of(slices), slices=entries, event=notes.event,

@@ -16,9 +16,10 @@ from typing import IO, Final, cast
 from shadowhound_data_logger.bags.description import METADATA, Description, Part, of_metadata, slice_info
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, RecordedTopic, SliceEntry
 from shadowhound_data_logger.bags.mcap_index import read_index
+from shadowhound_data_logger.bags.naming import MANIFEST, prefix_of
 from shadowhound_data_logger.bags.ranges import LocalFile
 from shadowhound_data_logger.bags.recovery import file_digest
-from shadowhound_data_logger.bags.remote import ARCHIVE, MANIFEST, natural, prefix_of
+from shadowhound_data_logger.bags.remote import ARCHIVE, natural
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.keys import check_key, check_name
 
@@ -71,6 +72,11 @@ def finished(folder: Path) -> Description:
     for name, path in names.items():
         if name.endswith(_UNFINISHED) and path.stat().st_size:
             raise BagError(f'{folder} is not finished: {name} is there', remedy='does somebody record into it?', path=str(folder))
+    inside = folder.resolve()
+    for path in folder.rglob('*'):
+        if path.is_symlink() and not path.resolve().is_relative_to(inside):
+            remedy = 'put the file itself there'
+            raise BagError(f'{path} is a link out of the bag', remedy=remedy, path=str(path))
     described = of_metadata(names[METADATA].read_bytes(), str(names[METADATA]))
     for part in described.parts:
         if part.name not in names:

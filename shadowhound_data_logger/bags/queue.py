@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate, takewhile
 from typing import Final, NamedTuple
 
 from shadowhound_data_logger.model import Taken
 
+QUEUE_FULL: Final = 'queue_full'
+"""Why messages are dropped that do not fit."""
 WAKE_BYTES: Final = 1 << 20
 """So much is worth a wake before the writer's time has come: about a chunk."""
 
@@ -37,6 +39,7 @@ class BagQueue:
         self._items: deque[tuple[Lot | Mark, int]] = deque()
         self._marks = 0
         self._urgent = False
+        self._lost = Counter[tuple[str, str]]()
         self.bytes = 0
         self.paused = False
         """Whether messages are to be counted only, instead of put."""
@@ -52,6 +55,7 @@ class BagQueue:
                 fitting = list(takewhile(lambda total: self.bytes + total <= self._max_bytes, accumulate(sizes)))
                 lost = len(sizes) - len(fitting)
                 self.dropped += lost
+                self._lost[lot.topic, QUEUE_FULL] += lost
                 lot, size = lot._replace(messages=lot.messages[: len(fitting)]), fitting[-1] if fitting else 0
             if lot.messages:
                 self._items.append((lot, size))
@@ -60,6 +64,17 @@ class BagQueue:
                 self._urgent = True
                 self._changed.notify()
         return lost
+
+    def leave_out(self, topic: str, reason: str, count: int) -> None:
+        """Messages that are not put at all."""
+        with self._changed:
+            self._lost[topic, reason] += count
+
+    def take_lost(self) -> Mapping[tuple[str, str], int]:
+        """What did not get in since this was last asked, by topic and reason."""
+        with self._changed:
+            lost, self._lost = self._lost, Counter()
+            return lost
 
     def mark(self, mark: Mark) -> None:
         """Have the writer do something at this place; always taken in."""

@@ -230,6 +230,8 @@ class Recorder:
         recording = Recording(notes, self._settings, self._outlet)
         self._current = _Current(recording, by, time.monotonic(), self._queue.dropped)
         self._queue.paused = self._queue.paused and listening
+        if not listening:
+            self._queue.take_lost()
         if not self._started:
             self._started = True
             self._worker.start()
@@ -259,6 +261,7 @@ class Recorder:
 
         def end() -> None:
             self._writing = None
+            recording.leave_out(self._queue.take_lost())
             if recording.close(deadline_s):
                 done.set()
 
@@ -286,5 +289,6 @@ class Recorder:
 
     def _sync(self) -> None:
         if self._writing is not None and time.monotonic() >= self._due_s:
+            self._writing.leave_out(self._queue.take_lost())
             self._writing.tick()
             self._due_s = time.monotonic() + SYNC_S

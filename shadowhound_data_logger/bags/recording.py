@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -67,6 +67,7 @@ class Recording:
         self._writer: SliceWriter | None = None
         self._channels: dict[tuple[str, str], Channel] = {}
         self._written = Counter[str]()  # into the open slice
+        self._lost = Counter[tuple[str, str]]()  # by topic and reason, not noted yet
         self._broken: list[tuple[Path, Counter[str]]] = []
         self._closed_bytes = 0
         self._began_s = self._again_s = 0.0
@@ -96,6 +97,10 @@ class Recording:
             if writer.size >= self._settings.slice_bytes:
                 self.split()
 
+    def leave_out(self, lost: Mapping[tuple[str, str], int]) -> None:
+        """Messages that were dropped before they came here, by topic and reason; they count in the accounts already."""
+        self._lost.update(lost)
+
     def tick(self) -> None:
         """Make durable what was written; end the slice whose time is over, or when the disk has no room."""
         if self._writer is None:
@@ -124,6 +129,7 @@ class Recording:
         else:
             self._written.clear()
             self._hand_over(info)
+            self._note_lost()
 
     def close(self, deadline_s: float) -> bool:
         """End the bag; False when it is left to the next start to make it whole."""
@@ -131,6 +137,7 @@ class Recording:
         self._again_s = 0.0
         if not self._mend():
             return False
+        self._note_lost()
         notes = self.notes
         try:
             if notes.slices or notes.missing:
@@ -181,6 +188,7 @@ class Recording:
         except OSError as error:
             self._refuse(UNWRITABLE, str(error))
             return False
+        self._note_lost()
         self.number += 1
         self._began_s = now_s
         if self.refused:
@@ -210,8 +218,8 @@ class Recording:
             self._broken.pop(0)
             lost = written - Counter(info.counts if info else {})
             for topic, count in lost.items():
-                self._drop(topic, count, UNWRITABLE)
-            self._note(Missing(final.name, 'the disk did not take it', lost.total()))
+                self._count(topic, UNWRITABLE, count)
+                self._note(Missing(final.name, 'the disk did not take it', count, topic, UNWRITABLE))
             if info is not None and info.messages:
                 self._hand_over(replace(info, damage=None))
             elif info is not None:
@@ -227,15 +235,27 @@ class Recording:
             log.warning('bag %s: %s', self.notes.bag, error)
         self._outlet.put(slice_object(self.notes, info, self._settings.priority))
 
-    def _note(self, missing: Missing) -> None:
+    def _note_lost(self) -> None:
+        """The manifest names what was dropped since the slice before, all of it in or after the newest slice."""
+        lost, self._lost = self._lost, Counter()
+        file = slice_file(self.notes.bag, max(0, self.number))
+        found = sorted(lost.items())
+        self._note(*(Missing(file, f'dropped: {reason}', count, topic, reason) for (topic, reason), count in found))
+
+    def _note(self, *missing: Missing) -> None:
         try:
-            self.notes.add_missing(missing)
+            self.notes.add_missing(*missing)
         except OSError as error:
             log.warning('bag %s: %s', self.notes.bag, error)
 
-    def _drop(self, topic: str, count: int, reason: str = '') -> None:
+    def _drop(self, topic: str, count: int) -> None:
+        reason = self.refused or UNWRITABLE
+        self._lost[topic, reason] += count
+        self._count(topic, reason, count)
+
+    def _count(self, topic: str, reason: str, count: int) -> None:
         self.dropped += count
-        self._outlet.accounts.drop(f'{self.notes.sink}{topic}', reason or self.refused or UNWRITABLE, count)
+        self._outlet.accounts.drop(f'{self.notes.sink}{topic}', reason, count)
 
     def _refuse(self, reason: str, text: str) -> None:
         self._again_s = self._monotonic() + RETRY_S

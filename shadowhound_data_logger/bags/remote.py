@@ -12,13 +12,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from shadowhound_data_logger.bags.description import METADATA
 from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, prefix_of
 from shadowhound_data_logger.errors import BagError
 from shadowhound_data_logger.model import ObjectInfo
 
-BUCKET: Final = 'sensor-data'
-MANIFEST: Final = 'manifest.json'
 ARCHIVE: Final = '.tar.gz'
 GROWING: Final = 'growing'
 FOREIGN: Final = 'foreign'
@@ -80,11 +78,6 @@ class RemoteBag:
 
     def file(self, name: str) -> RemoteFile | None:
         return next((file for file in self.files if file.name == name), None)
-
-
-def prefix_of(robot: str, bag: str = '') -> str:
-    """Of the keys of a robot's bags, or of one of them."""
-    return f'{robot}/rosbags/{bag}/' if bag else f'{robot}/rosbags/'
 
 
 def find_bags(store: Listing, robot: str) -> list[RemoteBag]:

@@ -1,4 +1,4 @@
-"""What triggers events by itself: a number of a message that crosses a threshold, or what a mission's agent logs. Plain Python."""
+"""What triggers events by itself: a number that crosses a threshold, or what a mission's agent logs. Plain Python."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from shadowhound_data_logger.bags.fetch import Told, on_disk
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.parcel import Outgoing, Parcel, archive_of, finished, parcel_of
-from shadowhound_data_logger.bags.remote import BUCKET, MANIFEST
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import BagError, ForeignObject, StoreUnavailable

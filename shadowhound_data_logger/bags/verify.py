@@ -14,20 +14,13 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.description import METADATA, Description, of_metadata
-from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.manifest import Manifest, Missing
 from shadowhound_data_logger.bags.mcap_format import Op
 from shadowhound_data_logger.bags.mcap_index import read_index, records
 from shadowhound_data_logger.bags.mcap_messages import unpack, walk
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile
-from shadowhound_data_logger.bags.remote import (
-    BUCKET,
-    FOREIGN,
-    MANIFEST,
-    Listing,
-    RemoteBag,
-    RemoteFile,
-    state_of,
-)
+from shadowhound_data_logger.bags.remote import FOREIGN, Listing, RemoteBag, RemoteFile, state_of
 from shadowhound_data_logger.errors import BagDamaged, BagError
 
 THREADS: Final = 4
@@ -52,6 +45,8 @@ class Verified:
     state: str
     checks: tuple[Check, ...]
     read_bytes: int
+    missing: tuple[Missing, ...]
+    """What the manifest says that the recording could not get in: no finding, since the bag is as it was recorded."""
 
     @property
     def findings(self) -> tuple[Check, ...]:
@@ -91,7 +86,7 @@ def verify_remote(store: Listing, bag: RemoteBag, *, deep: bool = False, told: T
     with ThreadPoolExecutor(THREADS, 'bag-verify') as pool:
         checks = tuple(pool.map(one, expected))
     tags = {} if manifest or described else _tags(store, bag)
-    return Verified(bag.name, state_of(bag, manifest, tags), (*early, *checks), meter.bytes)
+    return Verified(bag.name, state_of(bag, manifest, tags), (*early, *checks), meter.bytes, _missing(manifest))
 
 
 def verify_folder(folder: Path, *, deep: bool = False, told: Telling = lambda _: None) -> Verified:
@@ -105,7 +100,11 @@ def verify_folder(folder: Path, *, deep: bool = False, told: Telling = lambda _:
         raise BagError(f'{folder} holds no bag: neither {METADATA} nor a slice is in it', path=str(folder))
     checks = [_check_local(folder / each.name, each, deep, told) for each in _expected(manifest, described, files)]
     state = state_of(bag, manifest, {}) if manifest else FOREIGN
-    return Verified(folder.name, state, (*early, *checks), sum(files.values()))
+    return Verified(folder.name, state, (*early, *checks), sum(files.values()), _missing(manifest))
+
+
+def _missing(manifest: Manifest | None) -> tuple[Missing, ...]:
+    return manifest.missing if manifest else ()
 
 
 def _writers_word(get: Callable[[str], bytes | None]) -> tuple[Manifest | None, Description | None, tuple[Check, ...]]:

@@ -1,4 +1,7 @@
-"""The subscriptions that a recording, or the ring of the events, needs besides the sensors', and which topics it wants. Owned by the intake thread."""
+"""The subscriptions that a recording, or the ring of the events, needs besides the sensors', and which topics it wants.
+
+Owned by the intake thread.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +11,18 @@ from contextlib import ExitStack
 from rclpy.node import Node
 
 from shadowhound_data_logger.bags.topics import Choice
-from shadowhound_data_logger.capture.bag_tap import BagStream, BagTap
-from shadowhound_data_logger.capture.event_tap import EventTap
+from shadowhound_data_logger.capture.bag_tap import BagStream
 from shadowhound_data_logger.capture.reader import PolledGroup
 from shadowhound_data_logger.capture.source import Source
-from shadowhound_data_logger.capture.stream import Shared
+from shadowhound_data_logger.capture.stream import Shared, Tap
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 
 
 class BagSources:
     """New; ``refresh`` while a recording goes on, ``end`` after it."""
 
-    def __init__(self, node: Node, choice: Choice, tap: BagTap | EventTap, settings: IntakeSettings, group: PolledGroup, shared: Shared) -> None:
+    def __init__(self, node: Node, choice: Choice, tap: Tap, settings: IntakeSettings, group: PolledGroup,
+                 shared: Shared) -> None:  # fmt: skip
         """``tap`` is told its topics; what has a subscription of its own here goes to that of ``shared``."""
         self._node = node
         self._settings = settings

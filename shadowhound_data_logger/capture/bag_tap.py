@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from rclpy.node import Node
 
 from shadowhound_data_logger.bags.metadata import offered_qos
-from shadowhound_data_logger.bags.queue import BagQueue, Lot
+from shadowhound_data_logger.bags.queue import QUEUE_FULL, BagQueue, Lot
 from shadowhound_data_logger.capture.endpoints import Senders
 from shadowhound_data_logger.capture.stream import Repeats, Shared, is_named
 from shadowhound_data_logger.config import SensorSettings
@@ -46,10 +46,12 @@ class BagTap:
             account.lose(lost)
             if paused:
                 account.dropped[PAUSED] += len(fresh)
-        if fresh and not paused:
+        if fresh and paused:
+            self._queue.leave_out(topic, PAUSED, len(fresh))
+        elif fresh:
             dropped = self._queue.put(Lot(topic, type_name, self._qos_of(topic, type_name), fresh))
             if dropped:
-                self._accounts.drop(f'{BAG}{topic}', 'queue_full', dropped)
+                self._accounts.drop(f'{BAG}{topic}', QUEUE_FULL, dropped)
 
     def _qos_of(self, topic: str, type_name: str) -> str:
         """What the publishers of the topic offer, as it was when the recording first heard of it."""

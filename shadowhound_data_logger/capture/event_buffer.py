@@ -1,4 +1,4 @@
-"""The event buffer of the node, put together: the ring, what triggers events, and who writes them. Without topics it is nothing."""
+"""The event buffer of the node, put together: the ring, what triggers events, and who writes them; nothing without topics."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class EventBuffer:
         ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
         self.events = Events(options, settings.bag, place, ring, outlet, settings.intake.poll_s)
         self.control = EventControl(node, self.events)
-        self.tap = EventTap(node, options, ring, self.events) if options.enabled else None
+        self.tap = EventTap(node, options, ring, self.events.claims) if options.enabled else None
         self._watch = self._make_watch(options, home, place, types)
 
     @property

@@ -12,7 +12,7 @@ from typing import Final
 
 from rclpy.node import Node
 
-from shadowhound_data_logger.bags.events import Events
+from shadowhound_data_logger.bags.claims import Claims
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.ring import Held, Ring
 from shadowhound_data_logger.bags.topics import Choice
@@ -62,7 +62,7 @@ class Inbox:
 class EventTap:
     """New; ``choice`` says which topics it wants, ``topics`` those that it gets."""
 
-    def __init__(self, node: Node, settings: EventSettings, ring: Ring, events: Events) -> None:
+    def __init__(self, node: Node, settings: EventSettings, ring: Ring, claims: Claims) -> None:
         self.topics: frozenset[str] = frozenset()
         watched = [(node.resolve_topic_name(each.topic), each) for each in conditions(settings.conditions)]
         named = [node.resolve_topic_name(topic) for topic in settings.topics if topic]
@@ -72,7 +72,7 @@ class EventTap:
         self._unkept = frozenset(self.inbox.conditions) - kept
         self._node = node
         self._ring = ring
-        self._events = events
+        self._claims = claims
         self._qos: dict[tuple[str, str, str | None], str] = {}
 
     def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: int | None, *, paused: bool) -> None:
@@ -87,9 +87,9 @@ class EventTap:
         lot = Lot(topic, type_name, self._qos_of(topic, type_name, taken[-1].publisher), taken)
         if not paused:
             if gone := self._ring.put(lot, lost, now_s):
-                self._events.lose(gone)
+                self._claims.lose(gone)
         elif self._ring.claimed:
-            self._events.lose([Held(lot, lost, now_s, 0)], PAUSED)
+            self._claims.lose([Held(lot, lost, now_s, 0)], PAUSED)
 
     def _qos_of(self, topic: str, type_name: str, publisher: str | None) -> str:
         """What the publishers of the topic offered when this one was first heard."""
@@ -104,10 +104,11 @@ class Taps:
 
     def __init__(self, *taps: Tap) -> None:
         self._taps = taps
+        self.topics: frozenset[str] = frozenset()
 
-    @property
-    def topics(self) -> frozenset[str]:
-        return frozenset().union(*(tap.topics for tap in self._taps))
+    def look(self) -> None:
+        """One of them may want other topics than before."""
+        self.topics = frozenset().union(*(tap.topics for tap in self._taps))
 
     def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: int | None, *, paused: bool) -> None:
         for tap in self._taps:

@@ -1,6 +1,6 @@
 """Watches for what triggers events by itself: conditions on messages, and what the active mission's agent logs.
 
-Messages are deserialized here, off the intake, some of them only (``event_tap.Inbox``). Of missions it knows what lies on the disk.
+Messages are deserialized here, off the intake, some of them only (``event_tap.Inbox``). Of missions it reads the disk.
 """
 
 from __future__ import annotations

@@ -44,8 +44,9 @@ class Intake:
         self._sensors = sensors
         self._settings = settings
         group, of_bag = PolledGroup(), shared
+        self._taps = Taps(of_bag.tap, *([events] if events is not None else []))
         if events is not None:
-            shared = shared._replace(tap=Taps(of_bag.tap, events))
+            shared = shared._replace(tap=self._taps)
         self._sources = tuple(
             Source(node, sensor, settings, group, shared) for sensor in sensors.values()
         )  # fmt: skip
@@ -168,6 +169,7 @@ class Intake:
             sensors |= {source.topic: source.is_latched for source in self._ring.own}
         if self._records:
             self._bag.refresh(sensors, now_s, paused=self.paused)
+        self._taps.look()
 
     def _finish(self) -> None:
         now_s = time.monotonic()

@@ -33,7 +33,7 @@ from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.capture.stream import Shared
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.clock_watch import ClockWatch
-from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.config import SensorSettings, Settings
 from shadowhound_data_logger.encode.pool import EncodePool
 from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -102,12 +102,7 @@ class Pipeline:
         self._track = RobotTrack(settings.mission, types, self._node.resolve_topic_name)
         shared = Shared(self.spool.accounts, types, offer_to(queue, sensors, self.spool.accounts), self._clock, self._track,
                         BagTap(self._node, self.spool.accounts, bag_queue := BagQueue(settings.bag.queue_bytes)))  # fmt: skip
-        place, outlet = self._place(), self._outlet()
-        self.event_buffer = EventBuffer(self._node, settings, place, outlet, types)
-        self.intake = Intake(self._node, sensors, settings.intake, shared, settings.bag, self.event_buffer.tap)
-        salvage = Salvage(place.root, settings.robot, settings.bag.priority, outlet, self.spool.knows)
-        self.recorder = Recorder(settings.bag, place, bag_queue, outlet, salvage,
-                                 lambda on, deadline_s: self.intake.record(deadline_s, on=on))  # fmt: skip
+        self._make_intake(sensors, shared, bag_queue)
         tap = MissionTap(settings.mission, sensors, settings.robot, types, self._node.resolve_topic_name, self._track.marks)
         self._mission_topic = topic = MissionTopic(self._node)
         self.mission = MissionWatch(settings, self.intake, queue, tap, self._tell_mission)
@@ -208,15 +203,18 @@ class Pipeline:
         self.uploader.set_max_mbps(settings.upload.max_mbps)
         self.event_buffer.update(settings.events)
 
-    def _place(self) -> Place:
-        settings = self._settings
-        return Place(settings.home / FOLDER / settings.robot, settings.robot, self._clock,
-                     lambda bag: self.spool.has(BUCKET, key_of(settings.robot, bag, slice_file(bag, 0))))  # fmt: skip
-
-    def _outlet(self) -> Outlet:
-        least = self._settings.spool.min_free_bytes // 2
-        return Outlet(self.spool.accounts, lambda item: self.writer.put(item, wait=False), self.writer.flush,
-                      lambda: self.spool.free_bytes() >= least)  # fmt: skip
+    def _make_intake(self, sensors: dict[str, SensorSettings], shared: Shared, queue: BagQueue) -> None:
+        """The intake with what takes all messages of it, for bags and for events."""
+        settings, spool, writer = self._settings, self.spool, self.writer
+        place = Place(settings.home / FOLDER / settings.robot, settings.robot, self._clock,
+                      lambda bag: spool.has(BUCKET, key_of(settings.robot, bag, slice_file(bag, 0))))  # fmt: skip
+        outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush,
+                        lambda: spool.free_bytes() >= settings.spool.min_free_bytes // 2)  # fmt: skip
+        self.event_buffer = EventBuffer(self._node, settings, place, outlet, shared.types)
+        self.intake = Intake(self._node, sensors, settings.intake, shared, settings.bag, self.event_buffer.tap)
+        salvage = Salvage(place.root, settings.robot, settings.bag.priority, outlet, spool.knows)
+        self.recorder = Recorder(settings.bag, place, queue, outlet, salvage,
+                                 lambda on, deadline_s: self.intake.record(deadline_s, on=on))  # fmt: skip
 
     def _tell_mission(self, mission: Mapping[str, Any]) -> None:
         self._mission_topic.tell(mission)

@@ -24,8 +24,7 @@ Offer = Callable[[Batch], None]
 class Tap(Protocol):
     """What takes all messages of some topics, whatever is kept of them (``BagTap``)."""
 
-    @property
-    def topics(self) -> frozenset[str]: ...
+    topics: frozenset[str]
 
     def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: int | None, *, paused: bool) -> None: ...
 

@@ -25,7 +25,7 @@ from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 
 THREADS = 8
-STYLES = {'complete': 'green', 'growing': 'cyan', 'recovered': 'yellow', 'foreign': 'dim'}
+STYLES = {'complete': 'green', 'growing': 'cyan', 'recovered': 'yellow', 'gaps': 'yellow', 'foreign': 'dim'}
 
 
 def _robot(_: click.Context, __: click.Parameter, name: str) -> str:

@@ -13,6 +13,7 @@ from rich.console import Console, RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.bags.info import BagInfo, info_folder, info_of
+from shadowhound_data_logger.bags.manifest import Missing
 from shadowhound_data_logger.bags.overview import BagRow, NoStore, overview
 from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
 from shadowhound_data_logger.bags.span import since as since_ns
@@ -47,6 +48,7 @@ def list_(*, since: str, robot: str, as_json: bool) -> int:
     \b
     growing    still recorded, or not all of it has arrived yet
     complete   all slices are known, with their checksums
+    gaps       the same, but messages were dropped while it recorded: bag info says which
     recovered  the same, after a crash or power cut: bag info says what is missing
     foreign    not from this package: nobody says what should be in it
 
@@ -145,10 +147,11 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
     told = found.description
     yield Text.assemble(plain(found.bag, 'bold'), '  ', plain(found.state, STYLES.get(found.state, 'red')))
     manifest = found.manifest
-    mission = manifest.mission if manifest else None
+    mission, event = (manifest.mission, manifest.event) if manifest else (None, None)
     lines = {
         'robot': found.robot or (manifest.robot if manifest else ''),
         'mission': f'{mission.type}, run {mission.run_id or "-"}, id {mission.mission_id or "-"}' if mission else '',
+        'event': ', '.join(f'{each.name} by {each.by}' for each in event.triggers) if event else '',
         'began': f'{moment(told.t_start_ns)} UTC' if told.messages else '-',
         'ended': f'{moment(told.t_end_ns)} UTC' if told.messages else '-',
         'duration': duration(told.duration_s), 'messages': f'{number(told.messages)} on {len(told.topics)} topics',
@@ -168,9 +171,15 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
     yield _files(found)
     if found.missing:
         yield plain(f'Not here yet: {", ".join(found.missing)}', 'yellow')
-    for lost in manifest.missing if manifest else ():
+    yield from _lost(manifest.missing if manifest else ())
+
+
+def _lost(missing: Sequence[Missing]) -> Iterator[RenderableType]:
+    """What the recording itself could not get into the bag."""
+    for lost in missing:
         count = '' if lost.messages is None else f' ({number(lost.messages)} messages)'
-        yield plain(f'Missing since a crash, in or after {lost.file}: {lost.what}{count}', 'yellow')
+        topic = f' of {lost.topic}' if lost.topic else ''
+        yield plain(f'Missing{topic}, in or after {lost.file}: {lost.what}{count}', 'yellow')
 
 
 def _topics(found: BagInfo) -> RenderableType:
@@ -230,6 +239,7 @@ def _verdict(found: Verified) -> Iterator[RenderableType]:
     how = ', '.join(sorted({check.checked for check in sound}))
     text = f'{number(len(sound))} of {number(len(found.checks))} files are sound (by {how})' if sound else 'No file is sound'
     yield Text.assemble(plain(found.bag, 'bold'), ' ', plain(found.state, STYLES.get(found.state, 'red')), f': {text}.')
+    yield from _lost(found.missing)
     if found.state == GROWING:
         yield plain('It is still growing: its manifest, or a slice that it promises, is not there yet.', 'yellow')
     if found.state == FOREIGN:

@@ -38,15 +38,20 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
         raise click.UsageError('name either a prefix or what to ask the catalogue for')
     with asking():
         from shadowhound_data_logger.lake import fetch as lake  # noqa: PLC0415
+        from shadowhound_data_logger.lake import fetched_rows  # noqa: PLC0415
         from shadowhound_data_logger.lake.source import open_source  # noqa: PLC0415
 
         store = settings()
         begun_s = time.monotonic()
-        wishes = lake.under(open_source(store, bucket), prefix) if prefix is not None else _asked(flags, limit)
+        rows = [] if prefix is not None else _asked(flags, limit)
+        wishes = [lake.Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows]
+        if prefix is not None:
+            wishes = lake.under(open_source(store, bucket), prefix)
     with _progress() as bar:
         task = bar.add_task('', total=sum(wish.size for wish in wishes), objects=0, of=len(wishes))
         found = lake.fetch(wishes, to, lambda name: open_source(store, name), verify=verify, threads=threads,
                            tell=lambda size, objects: _advance(bar, task, size, objects))  # fmt: skip
+        fetched_rows.keep(to, [row for row in rows if f'{row["bucket"]}/{row["key"]}' not in found.failed])
     took_s = time.monotonic() - begun_s
     if as_json:
         told = {'to': str(to), 'asked': len(wishes), 'moved': found.moved, 'present': found.present, 'bytes': found.bytes,
@@ -57,14 +62,14 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
     return 1 if found.failed else 0
 
 
-def _asked(flags: Mapping[str, Any], limit: int | None) -> list[Any]:
+def _asked(flags: Mapping[str, Any], limit: int | None) -> list[dict[str, Any]]:
+    """The rows of the catalogue."""
     from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
-    from shadowhound_data_logger.lake.fetch import Wish  # noqa: PLC0415
 
     with lake.answering():
         rows = lake.objects(lake.default_source(settings()), **flags).sort('t_start_ns')
-        found = (rows.limit(limit) if limit else rows).select('bucket', 'key', 'bytes', 'sha256').to_pylist()
-    return [Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in found]
+        found: list[dict[str, Any]] = (rows.limit(limit) if limit else rows).to_pylist()
+    return found
 
 
 def _progress() -> Progress:

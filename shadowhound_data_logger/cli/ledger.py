@@ -56,8 +56,10 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
 
 def show(found: Mapping[str, Any], console: Console) -> None:
     """The ledger as tables, what there is to say about single topics, and a verdict."""
-    bags = [_table(f'Messages recorded into bags of {found["robot"]}', found['bags']), ''] if found.get('bags') else []
-    show_whole([topics_table(found), '', *bags, objects_table(found), *_section(notes(found)), '', verdict(found)], console)
+    titles = {'bags': 'Messages recorded into bags of', 'events': 'Messages that events asked for of'}
+    tables = [_table(f'{title} {found["robot"]}', found[sink]) for sink, title in titles.items() if found.get(sink)]
+    files = [part for table in tables for part in (table, '')]
+    show_whole([topics_table(found), '', *files, objects_table(found), *_section(notes(found)), '', verdict(found)], console)
 
 
 def topics_table(found: Mapping[str, Any]) -> RenderableType:
@@ -92,8 +94,8 @@ def objects_table(found: Mapping[str, Any]) -> RenderableType:
 def notes(found: Mapping[str, Any]) -> list[str]:
     """Causes of what was lost, where stored messages are that are not delivered, and accounting that is not exact."""
     lines = []
-    in_bags = ((f'{topic} in bags', row) for topic, row in found.get('bags', {}).items())
-    for topic, row in (*found['topics'].items(), *in_bags):
+    in_files = ((f'{topic} in {sink}', row) for sink in ('bags', 'events') for topic, row in found.get(sink, {}).items())
+    for topic, row in (*found['topics'].items(), *in_files):
         for name, key in CAUSES.items():
             if row[key]:
                 lines.append(f'{topic}: {name} by {_listed(row[key])}')

@@ -177,6 +177,8 @@ def _way(found: Mapping[str, Any], console: Console, *, live: bool) -> Table:
             _add_mission(grid, found)
         if found.get('bag', {}).get('recording'):
             _add_bag(grid, found['bag'])
+        if found.get('events', {}).get('enabled'):
+            _add_events(grid, found['events'])
         for name, row in found['workers'].items():
             if row['failing']:
                 grid.add_row(plain(name), Text('fails', 'red'), plain(f'{row["failures"]:,} times so far: {row["last_error"]}'))
@@ -233,6 +235,19 @@ def _add_bag(grid: Table, bag: Mapping[str, Any]) -> None:
         grid.add_row('', '', plain(f'the disk takes nothing: {bag["refused"]}', 'red'))
     if bag['dropped']:
         grid.add_row('', '', plain(f'{bag["dropped"]:,} messages dropped', 'yellow'))
+
+
+def _add_events(grid: Table, events: Mapping[str, Any]) -> None:
+    """What the ring has, what is written of it, and what triggered last."""
+    state, style = ('stands still', 'red') if events['refused'] else ('writes', 'cyan') if events['bag'] else ('ready', 'green')
+    what = events['bag'] or f'the last {duration(events["seconds"])} are kept'
+    grid.add_row('events', Text(state, style), plain(what))
+    grid.add_row('', '', f'{volume(events["bytes"])} of {volume(events["max_bytes"])} of memory, {events["written"]:,} written')
+    if events['refused']:
+        grid.add_row('', '', plain(f'the disk takes nothing: {events["refused"]}', 'red'))
+    if events['last']:
+        last = events['last']
+        grid.add_row('', '', plain(f'last: {last["name"]} by {last["by"]}, {last["time"][:10]} {last["time"][11:19]} UTC'))
 
 
 def _share(part: float, whole: float | None) -> float:

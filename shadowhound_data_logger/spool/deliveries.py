@@ -20,6 +20,7 @@ PAGE: Final = 256
 """Objects asked for between two notes of what was sound: what an interruption costs."""
 _DELIVERED: Final = "FROM spool.objects AS object WHERE state = 'delivered' AND sensor <> '_catalog'"
 """Without the catalogue's parts (lake/schema.py): others stand for them in time, and they go; they can be made again."""
+_NOT_NOTED: Final = 'AND NOT EXISTS (SELECT 1 FROM sound WHERE sound.id = object.id)'
 BUSY_TIMEOUT_S: Final = 1.0
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS audit (name TEXT NOT NULL);
@@ -71,10 +72,7 @@ class Deliveries:
 
     def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]:
         """What is delivered and not noted yet, by number and as the store has to describe it."""
-        query = (
-            f'SELECT id, bucket, key, bytes, sha256 {_DELIVERED} AND id > ?'
-            ' AND NOT EXISTS (SELECT 1 FROM sound WHERE sound.id = object.id) ORDER BY id LIMIT ?'
-        )
+        query = f'SELECT id, bucket, key, bytes, sha256 {_DELIVERED} AND id > ? {_NOT_NOTED} ORDER BY id LIMIT ?'
         last = 0
         while page := self._ask(query, last, PAGE):
             yield [(number, ObjectInfo(bucket, key, size, sha256)) for number, bucket, key, size, sha256 in page]

@@ -14,9 +14,9 @@ from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, SliceEntry
 from shadowhound_data_logger.bags.mcap_index import read_index
 from shadowhound_data_logger.bags.mcap_messages import Message, Wanted, read_messages
 from shadowhound_data_logger.bags.metadata import metadata_yaml
+from shadowhound_data_logger.bags.naming import BUCKET, prefix_of
 from shadowhound_data_logger.bags.ranges import LocalFile
 from shadowhound_data_logger.bags.recovery import file_digest
-from shadowhound_data_logger.bags.remote import BUCKET, prefix_of
 from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.bags.slice_writer import SliceWriter
 from shadowhound_data_logger.model import SpooledObject

@@ -17,7 +17,8 @@ from bags.real_bags import NAME, by_rosbags, messages_of, put_item, stored, writ
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from shadowhound_data_logger.bags.fetch import Told, fetch
-from shadowhound_data_logger.bags.remote import BUCKET, find_bag
+from shadowhound_data_logger.bags.naming import BUCKET
+from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.errors import BagDamaged, BagError, StoreUnavailable
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,16 @@ from bags.slices import closed
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowhound_data_logger.bags.manifest import Manifest, Missing, MissionOf, RecordedTopic, SliceEntry, topics_of
+from shadowhound_data_logger.bags.manifest import (
+    EventOf,
+    Manifest,
+    Missing,
+    MissionOf,
+    RecordedTopic,
+    SliceEntry,
+    TriggerOf,
+    topics_of,
+)
 from shadowhound_data_logger.errors import BagDamaged
 
 ENTRY = SliceEntry('bag_0.mcap', 'thor/rosbags/bag/bag_0.mcap', 1000, 'ab' * 32, 5, 10, 20, {'/imu': 5})
@@ -32,11 +41,28 @@ def test_read_as_written(manifest: Manifest) -> None:
 def test_the_fields_that_others_read() -> None:
     """Names and places are a contract with every reader of the store."""
     found = json.loads(WHOLE.to_json())
-    assert list(found) == ['version', 'bag', 'robot', 'mission', 'state', 'missing', 'topics', 'slices']
+    assert list(found) == ['version', 'bag', 'robot', 'mission', 'state', 'missing', 'topics', 'slices', 'event']
     assert found['version'] == 1
     assert list(found['slices'][0]) == ['file', 'key', 'bytes', 'sha256', 'messages', 't_start_ns', 't_end_ns', 'counts']
     assert found['mission'] == {'type': 'patrol', 'mission_id': 'm1', 'run_id': None}
-    assert found['missing'][0] == {'file': 'bag_0.mcap', 'what': 'the last second', 'messages': None}
+    assert found['missing'][0] == {
+        'file': 'bag_0.mcap', 'what': 'the last second', 'messages': None, 'topic': None, 'reason': None,
+    }  # fmt: skip
+
+
+def test_what_made_an_event_comes_back() -> None:
+    """Each trigger with its time; a manifest of before there were events has none, and damage is told with its place."""
+    event = EventOf(
+        'fall', 30.0, 12.5, 10.0, (TriggerOf('fall', 'service', 7, None), TriggerOf('low', 'condition', 8, 'soc < 20: 19'))
+    )
+    assert Manifest.from_json(replace(WHOLE, event=event).to_json()).event == event
+    found = json.loads(WHOLE.to_json())
+    del found['event']
+    assert Manifest.from_json(json.dumps(found).encode()).event is None
+    for name, value in (('held_s', True), ('held_s', None), ('triggers', {}), ('name', '')):
+        found['event'] = {**asdict(event), name: value}
+        with pytest.raises(BagDamaged, match=f'event.{name}'):
+            Manifest.from_json(json.dumps(found).encode())
 
 
 def test_made_of_slices(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -71,5 +72,35 @@ def test_a_disk_that_refuses_costs_what_it_did_not_take(tmp_path: Path, monkeypa
         assert (row['received'], row['stored'], row['open']) == (20, len(kept), 0)
         assert set(row['dropped']) == {'unwritable'}
         assert kept[:5] + kept[-5:] == [*range(5), *range(15, 20)]
-        assert manifest(found, name)['state'] == 'recovered'
+        said = manifest(found, name)
+        assert said['state'] == ('gaps' if said['missing'] else 'complete')
+        assert sum(each['messages'] for each in said['missing']) == 20 - len(kept)
+        assert all((each['topic'], each['reason']) == ('/talk', 'unwritable') for each in said['missing'])
         assert ledger.imbalances(ledger.read(it.spool.root, ROBOT)) == []
+
+
+def test_what_did_not_get_in_is_in_the_manifest(tmp_path: Path) -> None:
+    """A bag that ended by itself without some messages has gaps, by topic and reason, as in the ledger; the next has none."""
+    with desk(tmp_path, queue_bytes=100) as it:
+        name = start(it.recorder)
+        it.hear(range(2))
+        write_out(it)
+        it.hear(range(2, 4), '/large', size=200)
+        it.queue.leave_out('/talk', 'paused', 3)
+        it.room[0] = False
+        write_out(it)
+        it.hear(range(5, 7))
+        write_out(it)
+        it.recorder.stop()
+        said = manifest(it.objects(), name)
+        found = Counter({(each['topic'], each['reason']): each['messages'] for each in said['missing']})
+        assert (said['state'], len(found)) == ('gaps', len(said['missing']))
+        assert found == {('/large', 'queue_full'): 2, ('/talk', 'paused'): 3, ('/talk', 'no_room'): 2}
+        assert it.row()['dropped'] == {'no_room': 2}
+        assert it.row('/large')['dropped'] == {'queue_full': 2}
+        it.room[0] = True
+        name = start(it.recorder)
+        it.hear(range(7, 9))
+        it.recorder.stop()
+        said = manifest(it.objects(), name)
+        assert (said['state'], said['missing']) == ('complete', [])

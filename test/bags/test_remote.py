@@ -10,8 +10,9 @@ from bags.real_bags import NAME, T0, put_item, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from shadowhound_data_logger.bags.info import info_folder, info_of
+from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.overview import BagRow, named_ns, overview
-from shadowhound_data_logger.bags.remote import BUCKET, find_bag, find_bags, natural
+from shadowhound_data_logger.bags.remote import find_bag, find_bags, natural
 from shadowhound_data_logger.bags.slice_writer import SliceWriter
 from shadowhound_data_logger.bags.span import since, when
 from shadowhound_data_logger.clock import SECOND

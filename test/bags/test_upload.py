@@ -12,7 +12,8 @@ import pytest
 from bags.real_bags import NAME, by_rosbags, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from shadowhound_data_logger.bags.remote import BUCKET, MANIFEST, find_bag, find_bags
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
+from shadowhound_data_logger.bags.remote import find_bag, find_bags
 from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, parcel, spool_parcel, upload_now
 from shadowhound_data_logger.bags.verify import verify_remote
 from shadowhound_data_logger.bags.watch import Watch
@@ -155,6 +156,16 @@ def test_an_unfinished_bag_is_refused(settings: Settings, tmp_path: Path, what: 
     with pytest.raises((BagError, BagDamaged), match=r'finished|not whole|end of an MCAP'):
         send(settings, folder)
     assert not settings.home.exists()
+
+
+@pytest.mark.parametrize('is_archive', [False, True])
+def test_a_link_out_of_the_bag_is_refused(settings: Settings, tmp_path: Path, is_archive: bool) -> None:
+    """Neither is what it names sent, nor an archive in which it names something else."""
+    write_ours(tmp_path / NAME, slices=1)
+    (tmp_path / 'secret').write_text('secret')
+    (tmp_path / NAME / 'notes.txt').symlink_to(tmp_path / 'secret')
+    with pytest.raises(BagError, match='is a link out'):
+        send(settings, tmp_path / NAME, is_archive=is_archive)
 
 
 def test_a_name_that_is_no_key_is_refused(settings: Settings, tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ import pytest
 from bags.real_bags import NAME, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from shadowhound_data_logger.bags.remote import BUCKET, find_bag
+from shadowhound_data_logger.bags.naming import BUCKET
+from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.bags.verify import Verified, verify_folder, verify_remote
 from shadowhound_data_logger.errors import BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore

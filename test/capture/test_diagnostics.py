@@ -19,6 +19,8 @@ TOPIC = {
 }  # fmt: skip
 STATUS: dict[str, Any] = {
     'robot': 'thor', 'version': '0.1.0', 'pid': 7, 'uptime_s': 12.3, 'paused': False, 'topics': {'/imu': TOPIC},
+    'events': {'enabled': True, 'seconds': 30.0, 'bytes': 10, 'max_bytes': 100, 'bag': '', 'refused': '', 'triggers': 1,
+               'written': 1, 'last': {'name': 'fall', 'by': 'log_event'}, 'topics': {'/imu': {'dropped': 2}}},
     'bag': {'recording': True, 'paused': False, 'bag': 'patrol_1', 'dropped': 3, 'refused': '', 'topics': {}},
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'max_messages': 10, 'max_bytes': 100},
     'spool': {'path': '/s', 'pending': 3, 'held': 0, 'quarantined': 1, 'bytes': 10, 'max_bytes': 100, 'free_bytes': 5,
@@ -51,9 +53,9 @@ def told(name: str, **values: Any) -> tuple[Any, str]:
 
 
 def test_all_is_fine() -> None:
-    """There is an entry for each topic, the bag, spool, store, clock, workers and the node; old losses are not told for ever."""
+    """There is an entry for each topic, the bag, events, spool, store, clock, workers and the node; old losses are told once."""
     found = list(entries(STATUS, STATUS))
-    assert [entry[0] for entry in found] == ['node', '/imu', 'bag', 'spool', 'store', 'clock', 'workers']
+    assert [entry[0] for entry in found] == ['node', '/imu', 'bag', 'events', 'spool', 'store', 'clock', 'workers']
     assert {entry[1] for entry in found} == {OK}
     assert told('/imu')[1] == '100 Hz'
 
@@ -90,6 +92,11 @@ def test_a_topic(values: dict[str, Any], level: Any, words: str) -> None:
         ('bag', {'bag__dropped': 5}, WARN, 'patrol_1 dropped 2 messages lately'),
         ('bag', {'bag__dropped': 5, 'bag__bag': 'patrol_2'}, OK, 'patrol_2 is recorded'),
         ('bag', {'bag__refused': 'no_room'}, ERROR, 'patrol_1 records nothing now: no_room'),
+        ('events', {}, OK, 'the last 30 s are kept'),
+        ('events', {'events__enabled': False}, OK, 'nothing is kept'),
+        ('events', {'events__bag': 'event_1'}, OK, 'event_1 is written'),
+        ('events', {'events__topics': {'/imu': {'dropped': 5}}}, WARN, '3 messages of an event were dropped lately'),
+        ('events', {'events__bag': 'event_1', 'events__refused': 'unwritable'}, ERROR, 'event_1 is not written: unwritable'),
         ('clock', {'clock__is_set': False, 'clock__unset_s': 12.0}, WARN, 'not set for 12 s: objects wait for their date'),
         ('clock', {'clock__is_set': False, 'clock__gave_up': True}, WARN, 'objects go to _unsynced'),
         ('clock', {'clock__last_step_age_s': 59.0}, WARN, 'stepped by 3.5 s 59 s ago'),

@@ -14,6 +14,7 @@ from spool.making import FakeClock, make, new_spool, put
 
 pytest.importorskip('rclpy')
 
+from shadowhound_data_logger.bags.events import EventStatus
 from shadowhound_data_logger.bags.recorder import BagStatus
 from shadowhound_data_logger.capture.source import SourceStatus
 from shadowhound_data_logger.capture.status import Stages, Status
@@ -61,6 +62,17 @@ class Recorders(Threads):
         return BagStatus(recording=False)
 
 
+class EventBuffers(Threads):
+    """Keeps nothing."""
+
+    @property
+    def events(self) -> EventBuffers:
+        return self
+
+    def status(self) -> EventStatus:
+        return EventStatus(enabled=False)
+
+
 class Uploader:
     """Delivers as much as it is told."""
 
@@ -88,7 +100,8 @@ class Setting:
         mission: Any = Missions('mission')
         self.queue = BatchQueue(QueueSettings())
         recorder: Any = Recorders('bag-writer')
-        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder)
+        event_buffer: Any = EventBuffers('event-writer')
+        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder, event_buffer)
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
         self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 
@@ -153,7 +166,8 @@ def test_a_failing_worker_is_told(setting: Setting) -> None:
     workers = setting.look()['workers']
     assert workers['intake'] == {'alive': False, 'failing': True, 'failures': 3, 'deaths': 1, 'last_error': 'ValueError: x',
                                  'busy_s': 0.0, 'patience_s': None}  # fmt: skip
-    assert set(workers) == {'intake', 'encode-0', 'spool-writer', 'upload-lock', 'upload-0', 'mission', 'bag-writer'}
+    others = {'encode-0', 'spool-writer', 'upload-lock', 'upload-0', 'mission', 'bag-writer', 'event-writer'}
+    assert set(workers) == {'intake', *others}
 
 
 def test_a_stall_is_told(setting: Setting) -> None:

@@ -14,7 +14,7 @@ from bags.real_bags import NAME, stored, write_ours
 from click.testing import CliRunner, Result
 from stores.spooled import QUICK
 
-from shadowhound_data_logger.bags.remote import BUCKET
+from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.cli.bag import bag
 from shadowhound_data_logger.errors import BagError, SettingError
 from shadowhound_data_logger.sim.tower import Tower

@@ -31,7 +31,9 @@ def test_every_parameter_is_on_it() -> None:
 def test_live_parameters_are_marked() -> None:
     """Those that `ros2 param set` can change, and no others."""
     live = {row.split('|')[1].strip() for row in page().splitlines() if '| yes |' in row}
-    assert live == {'*sensor*.`enabled`', '*sensor*.`rate_hz`', '*sensor*.`quality`', '*sensor*.`priority`', '`upload.max_mbps`'}
+    events = {f'`events.{name}`' for name in ('pre_s', 'post_s', 'max_s', 'max_bytes', 'log_event')}
+    sensors = {f'*sensor*.`{name}`' for name in ('enabled', 'rate_hz', 'quality', 'priority')}
+    assert live == {*sensors, '`upload.max_mbps`', *events}
 
 
 def test_every_environment_variable_is_on_it() -> None:

@@ -111,6 +111,20 @@ def test_it_says_what_is_recorded() -> None:
     assert '7 messages dropped' in text
 
 
+def test_it_says_what_the_events_do() -> None:
+    """What the ring has and what triggered last; nothing while it is off."""
+    events = {'enabled': True, 'seconds': 30.2, 'bytes': 10**7, 'max_bytes': 64 << 20, 'bag': '', 'refused': '', 'triggers': 2,
+              'written': 1, 'topics': {},
+              'last': {'name': 'fall', 'by': 'log_event', 'time': '2026-11-21T12:00:00.5Z', 'bag': 'event_fall'}}  # fmt: skip
+    assert 'events' not in shown(events={**events, 'enabled': False})
+    text = shown(events=events)
+    assert line(text, 'events').split() == ['events', 'ready', 'the', 'last', '30', 's', 'are', 'kept']
+    assert '10.0 MB of 67.1 MB of memory, 1 written' in text
+    assert 'last: fall by log_event, 2026-11-21 12:00:00 UTC' in text
+    assert line(shown(events={**events, 'bag': 'event_fall_1'}), 'events').split() == ['events', 'writes', 'event_fall_1']
+    assert 'stands still' in line(shown(events={**events, 'bag': 'event_fall_1', 'refused': 'no_room'}), 'events')
+
+
 def test_it_says_which_mission_is_active() -> None:
     """Its type, since when, its id and its run, in 80 columns; nothing where there is none."""
     assert 'mission' not in shown()

@@ -56,6 +56,11 @@ class Station:
         answer = self._call(SetBool, '/bag/pause', SetBool.Request(data=paused))
         return bool(answer.success), str(answer.message)
 
+    def event(self) -> tuple[bool, str]:
+        """What ``~/event/trigger`` answers."""
+        answer = self._call(Trigger, '/event/trigger', Trigger.Request())
+        return bool(answer.success), str(answer.message)
+
     def set(self, **values: Any) -> str:
         """Set parameters (``sensor__name``) together; why they were refused, empty where they were not."""
         parameters = [Parameter(name.replace('__', '.'), value=value).to_parameter_msg() for name, value in values.items()]

@@ -88,7 +88,7 @@ def test_bags_are_a_sink_of_their_own_in_the_ledger(session: Session) -> None:
 
 def test_slices_are_delivered_while_the_next_one_records(session: Session, store: ObjectStore, shared: Processes) -> None:
     """The first is in the store before the last one begins, and carries what a listing has to know."""
-    assert len(session.bag.slices) >= DURATION_S / SLICE_S - 1
+    assert len(session.bag.slices) >= DURATION_S / SLICE_S * 0.8 - 1  # a slice ends with the first sync after its time
     first, last = session.bag.manifest['slices'][0], session.bag.manifest['slices'][-1]
     info = store.head(BUCKET, first['key'])
     assert info is not None

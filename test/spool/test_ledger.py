@@ -59,6 +59,7 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
             },
         },
         'bags': {},
+        'events': {},
         'objects': {
             'spooled': 4, 'delivered': 1, 'pending': 1, 'held': 1, 'evicted': 0, 'quarantined': 1, 'deduplicated': 0,
         },

@@ -1,0 +1,154 @@
+"""What fleets of 1, 100 and 10,000 robots amount to, from measured rates: the tables of docs/scale.md.
+
+Run it as ``python bench/scale.py`` to print them, with ``--write`` to put them into the page. A test compares the two.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+PAGE: Final = Path(__file__).resolve().parents[1] / 'docs' / 'scale.md'
+FLEETS: Final = (1, 100, 10_000)
+HOURS: Final = 8
+"""That a robot works a day; all else is a day of them."""
+DAY_S: Final = HOURS * 3600
+PART_BYTES, ROW_BYTES = 4000, 81
+"""Of a part of the catalogue, and of each row in it (measured with the rows of bench/lake.py: 23 take 5.9 KB, 360 take 33 KB)."""
+COMPACT_ROW_BYTES: Final = 88
+"""Of a row in a compacted day (measured on 33,326 rows; their sha256 is random text, which hardly shrinks)."""
+PART_S: Final = 60
+"""``catalogue.period_s``."""
+LISTED: Final = 1000
+"""Keys a LIST answers, in S3."""
+PUTS_A_CORE: Final = 190
+"""Objects of 50 KB confirmed a second, for each of two cores that robot and store shared (docs/performance.md: 377)."""
+INDEX_BYTES: Final = 16
+"""Memory of a SeaweedFS volume server for an object (its README, "O(1) disk read")."""
+FILER_BYTES: Final = 1073
+"""Of its filer's LevelDB for an object with our metadata (measured on 12,000, its log included)."""
+PUT_DOLLARS, GET_DOLLARS, MONTH_DOLLARS = 0.005 / 1000, 0.0004 / 1000, 0.023
+"""Of one PUT or LIST, one GET, one GB for a month: S3 Standard in us-east-1 as we know it; yours will differ."""
+DAYS: Final = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """A parameter file, by what a run of it stored (docs/thor.md)."""
+
+    name: str
+    bytes_s: float
+    objects_s: float
+
+
+PROFILES: Final = (
+    Profile('default (go2.yaml)', 36e9 / 86_400, 6),
+    Profile('default, batches of 10 s as tar', 36e9 / 86_400, 0.8),
+    Profile('full rate (go2_full_rate.yaml)', 384e9 / 86_400, 8),
+)
+"""The second one: camera, lidar, imu, states, joints, odom, lowstate each an object in 10 s, and the calibration hardly ever."""
+
+
+def flow(profile: Profile) -> Iterator[tuple[str, ...]]:
+    """Rows: what comes in."""
+    for robots in FLEETS:
+        objects = robots * profile.objects_s
+        yield (
+            f'{robots:,}', f'{robots * profile.bytes_s * 8 / 1e6:,.0f} Mbit/s', f'{objects:,.1f}', f'{objects * DAY_S:,.0f}',
+            size(robots * profile.bytes_s * DAY_S), size(robots * profile.bytes_s * DAY_S * 365), f'{objects / PUTS_A_CORE:,.2f}',
+        )  # fmt: skip
+
+
+def catalogue(profile: Profile) -> Iterator[tuple[str, ...]]:
+    """Rows: the catalogue of a day, and the requests of a question for the whole fleet's day, before and after compaction."""
+    for robots in FLEETS:
+        parts = robots * DAY_S // PART_S
+        rows = robots * profile.objects_s * DAY_S
+        yield (
+            f'{robots:,}', f'{rows:,.0f}', f'{parts:,}', size(parts * PART_BYTES + rows * ROW_BYTES),
+            f'{robots * lists(DAY_S // PART_S) + parts:,}', size(rows * COMPACT_ROW_BYTES), f'{robots * 2:,}',
+        )  # fmt: skip
+
+
+def lists(keys: int) -> int:
+    """Requests that list so many."""
+    return -(-keys // LISTED)
+
+
+def store(profile: Profile) -> Iterator[tuple[str, ...]]:
+    """Rows: what thirty days of objects are to a SeaweedFS, and to the price list of a cloud."""
+    for robots in FLEETS:
+        objects = robots * profile.objects_s * DAY_S * DAYS
+        gigabytes = robots * profile.bytes_s * DAY_S * DAYS / 1e9
+        parts = robots * DAY_S // PART_S * DAYS
+        yield (
+            f'{robots:,}', f'{objects:,.0f}', size(objects * FILER_BYTES), size(objects * INDEX_BYTES),
+            f'${(objects + parts) * PUT_DOLLARS:,.0f}', f'${gigabytes * MONTH_DOLLARS:,.0f}', f'${objects * GET_DOLLARS:,.0f}',
+        )  # fmt: skip
+
+
+HEADS: Final = {
+    'flow': (
+        'robots',
+        'network, while they work',
+        'objects a second',
+        'objects a day',
+        'bytes a day',
+        'bytes a year',
+        'cores that take it',
+    ),
+    'catalogue': ('robots', 'rows a day', 'parts a day', 'in parts', 'requests for a day of all', 'compacted', 'requests then'),
+    'store': (
+        'robots',
+        'objects in 30 days',
+        "filer's metadata",
+        "volume servers' memory",
+        'PUTs',
+        'a month of keeping',
+        'reading all once',
+    ),
+}
+TABLES: Final = {'flow': flow, 'catalogue': catalogue, 'store': store}
+
+
+def size(count: float) -> str:
+    """As people say it, in powers of ten."""
+    for unit in ('B', 'KB', 'MB', 'GB', 'TB', 'PB'):
+        if count < 1000 or unit == 'PB':
+            return f'{count:,.0f} {unit}' if count >= 100 or unit == 'B' else f'{count:.2g} {unit}'
+        count /= 1000
+    raise AssertionError('unreachable')
+
+
+def markdown(name: str) -> str:
+    """One table, all profiles under each other."""
+    lines = ['| ' + ' | '.join(('', *HEADS[name])) + ' |', '|' + '---|' * (len(HEADS[name]) + 1)]
+    for profile in PROFILES:
+        for number, row in enumerate(TABLES[name](profile)):
+            lines.append('| ' + ' | '.join(('' if number else profile.name, *row)) + ' |')
+    return '\n'.join(lines)
+
+
+def filled(page: str) -> str:
+    """The page with its tables made anew."""
+    for name in TABLES:
+        before, rest = page.split(f'<!-- scale {name} -->\n')
+        page = f'{before}<!-- scale {name} -->\n{markdown(name)}\n<!-- end {name} -->{rest.partition(f"<!-- end {name} -->")[2]}'
+    return page
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
+    parser.add_argument('--write', action='store_true', help='into docs/scale.md')
+    if parser.parse_args(arguments).write:
+        PAGE.write_text(filled(PAGE.read_text(encoding='utf-8')), encoding='utf-8')
+        return
+    print('\n\n'.join(markdown(name) for name in TABLES))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,117 @@
+"""What tests of events share: a ring and its writer over a spool, at a time that the test owns."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bags.recording import ROBOT, STRING, WAIT_S, messages
+from clocks import Clocks
+
+from shadowhound_data_logger.bags.events import NOTICE_S, Events
+from shadowhound_data_logger.bags.naming import BUCKET, key_of, slice_file
+from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.recorder import Place
+from shadowhound_data_logger.bags.recording import Outlet
+from shadowhound_data_logger.bags.ring import Ring
+from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.config import SpoolSettings
+from shadowhound_data_logger.options import BagSettings, EventSettings
+from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.accounts import EVENT
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
+
+POLL_S = 0.2
+
+
+def until(condition: Callable[[], Any], what: str) -> None:
+    end_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < end_s, what
+        time.sleep(0.002)
+
+
+@dataclass(slots=True)
+class Buffer:
+    """Events with all behind them. ``hear`` is what the intake does at the present second."""
+
+    spool: Spool
+    writer: SpoolWriter
+    ring: Ring
+    events: Events
+    home: Path
+    now_s: list[float]
+    room: list[bool] = field(default_factory=lambda: [True])
+
+    @property
+    def root(self) -> Path:
+        return self.home / 'bags' / ROBOT
+
+    def hear(self, numbers: range, topic: str = '/talk', size: int = 0, lost: int | None = None) -> None:
+        gone = self.ring.put(Lot(topic, STRING, '', messages(numbers, size)), lost, self.now_s[0])
+        self.events.claims.lose(gone)
+
+    def pass_s(self, seconds: float) -> None:
+        self.now_s[0] += seconds
+
+    def taken(self) -> None:
+        """Wait until the writer has all that the ring had."""
+        until(lambda: self.ring.bytes == 0, 'the writer takes what there is')
+
+    def written(self, count: int = 1) -> None:
+        until(lambda: self.events.status().written >= count, f'{count} events are written: {self.events.status()}')
+
+    def rows(self) -> dict[str, Any]:
+        """Of the ledger, once all is committed."""
+        assert self.writer.flush(WAIT_S)
+        self.spool.commit()
+        found = ledger.read(self.spool.root, ROBOT)
+        assert ledger.imbalances(found) == []
+        rows: dict[str, Any] = found['events']
+        return rows
+
+    def objects(self) -> dict[str, Path]:
+        """Key below the robot's bags -> file, of all that is in the spool."""
+        assert self.writer.flush(WAIT_S)
+        start = f'{ROBOT}/rosbags/'
+        return {item.key.removeprefix(start): item.path for item in self.spool.pending(1000)}
+
+    def bags(self) -> list[str]:
+        return sorted({key.partition('/')[0] for key in self.objects()})
+
+
+@contextmanager
+def buffer(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator[Buffer]:
+    """An open one, with five seconds before a trigger and two after it; closed as the node does it."""
+    clocks = clock or Clocks()
+    if clock is None:
+        clocks.set()
+    options = EventSettings(**{'topics': ('/talk',), 'pre_s': 5.0, 'post_s': 2.0, 'max_s': 10.0, **settings})
+    bag = BagSettings(compression='none')
+    spool = Spool(home / 'spool', SpoolSettings(min_free_bytes=0), clocks, ROBOT)
+    spool.open()
+    spool.carry(EVENT)
+    writer = SpoolWriter(spool, 0.01)
+    writer.open()
+    now_s, made = [1000.0], list[Buffer]()
+    outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush, lambda: made[0].room[0])
+    place = Place(home / 'bags' / ROBOT, ROBOT, clocks, lambda name: spool.has(BUCKET, key_of(ROBOT, name, slice_file(name, 0))))
+    ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
+    events = Events(options, bag, place, ring, outlet, POLL_S, lambda: now_s[0])
+    salvage = Salvage(place.root, ROBOT, 8, outlet, spool.knows)
+    made.append(Buffer(spool, writer, ring, events, home, now_s))
+    try:
+        salvage.open()
+        until(lambda: not salvage.is_busy, 'what was cut off is whole')
+        events.open()
+        yield made[0]
+    finally:
+        events.close(WAIT_S)
+        salvage.close(WAIT_S)
+        writer.close(WAIT_S)
+        spool.close()

@@ -1,0 +1,369 @@
+"""An event's bag has the seconds before its trigger and after it, each message once, and the ledger says what it lacks."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+from bags.eventing import Buffer, buffer, until
+from bags.recording import ROBOT, WAIT_S, manifest, mission, numbers
+from bags.test_recorder import kill
+from clocks import Clocks
+
+from shadowhound_data_logger.bags.events import EventStatus
+from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.recording import Recording
+from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.options import EventSettings
+
+
+def only_bag(it: Buffer) -> str:
+    (bag,) = it.bags()
+    return bag
+
+
+def in_bag(it: Buffer, bag: str) -> list[int]:
+    """The numbers of its messages, slice by slice."""
+    found = it.objects()
+    return [number for file in manifest(found, bag)['slices'] for number in numbers(found[f'{bag}/{file["file"]}'])]
+
+
+def hear_each_second(it: Buffer, seconds: range) -> None:
+    for second in seconds:
+        it.hear(range(second, second + 1))
+        it.pass_s(1.0)
+
+
+def test_the_seconds_before_a_trigger_and_after_it(tmp_path: Path) -> None:
+    """No more and no less; the manifest says why, whole and under the event's name."""
+    with buffer(tmp_path) as it:
+        hear_each_second(it, range(20))
+        done, text = it.events.trigger('fall', 'log_event', 'leg 2')
+        hear_each_second(it, range(20, 25))
+        it.written()
+        bag = only_bag(it)
+        assert (done, text) == (True, f'{bag} begins')
+        assert bag.startswith('event_fall_2025')
+        assert in_bag(it, bag) == list(range(15, 23))
+        said = manifest(it.objects(), bag)
+        assert (said['state'], said['missing'], said['mission'], said['robot']) == ('complete', [], None, ROBOT)
+        assert {name: said['event'][name] for name in ('name', 'pre_s', 'held_s', 'post_s')} == {
+            'name': 'fall', 'pre_s': 5.0, 'held_s': 5.0, 'post_s': 2.0,
+        }  # fmt: skip
+        assert [(one['name'], one['by'], one['detail']) for one in said['event']['triggers']] == [('fall', 'log_event', 'leg 2')]
+        row = it.rows()['/talk']
+        assert (row['received'], row['stored'], row['open'], row['missed'], row['dropped']) == (8, 8, 0, 0, {})
+        assert not list(it.root.iterdir())
+
+
+def test_what_was_on_its_way_for_a_while_counts_from_when_it_happened(tmp_path: Path) -> None:
+    """An agent's log_event is noticed late: the event's seconds are counted from when it was said."""
+    with buffer(tmp_path) as it:
+        hear_each_second(it, range(20))
+        it.events.trigger('fall', 'log_event', None, 1.0)
+        hear_each_second(it, range(20, 25))
+        it.written()
+        assert in_bag(it, only_bag(it)) == list(range(14, 22))
+
+
+def test_triggers_that_overlap_are_one_event(tmp_path: Path) -> None:
+    """A trigger in the seconds after another one makes the bag longer, and all of them are told."""
+    with buffer(tmp_path) as it:
+        hear_each_second(it, range(10))
+        it.events.trigger('fall', 'service')
+        hear_each_second(it, range(10, 11))
+        done, text = it.events.trigger('low_battery', 'condition', 'soc < 20: 19')
+        hear_each_second(it, range(11, 15))
+        it.written()
+        bag = only_bag(it)
+        assert (done, text) == (True, f'{bag} lasts longer')
+        assert in_bag(it, bag) == list(range(5, 14))
+        event = manifest(it.objects(), bag)['event']
+        assert event['name'] == 'fall'
+        assert [one['name'] for one in event['triggers']] == ['fall', 'low_battery']
+        assert event['triggers'][1]['detail'] == 'soc < 20: 19'
+
+
+def test_an_event_is_no_longer_than_it_may_be(tmp_path: Path) -> None:
+    """What would make it longer is another event, which begins where it ended: nothing between them, nothing in both."""
+    with buffer(tmp_path, max_s=3.0) as it:
+        hear_each_second(it, range(10))
+        it.events.trigger('fall', 'service')
+        hear_each_second(it, range(10, 12))
+        done, text = it.events.trigger('again', 'service')
+        first = it.events.status().bag
+        assert (done, text) == (True, f'another event follows {first}, which is as long as it may be')
+        for second in range(12, 20):
+            hear_each_second(it, range(second, second + 1))
+            it.written(1)
+        it.written(2)
+        second_bag = next(bag for bag in it.bags() if bag != first)
+        assert second_bag.startswith('event_again_')
+        both = in_bag(it, first) + in_bag(it, second_bag)
+        assert both == list(range(5, 5 + len(both)))
+        assert len(both) > len(in_bag(it, first)) > 5
+        assert manifest(it.objects(), second_bag)['event']['held_s'] == 0.0
+        assert it.rows()['/talk']['missed'] == 0
+
+
+def test_an_event_after_another_begins_where_that_ended(tmp_path: Path) -> None:
+    """What the first one has is not in the second one, though it is not long ago; what nobody asked for is nobody's loss."""
+    with buffer(tmp_path) as it:
+        hear_each_second(it, range(10))
+        it.events.trigger('one', 'service')
+        hear_each_second(it, range(10, 14))
+        it.written()
+        it.events.trigger('two', 'service')
+        hear_each_second(it, range(14, 18))
+        it.written(2)
+        it.pass_s(60.0)
+        hear_each_second(it, range(100, 110))
+        it.events.trigger('three', 'service')
+        hear_each_second(it, range(110, 114))
+        it.written(3)
+        found = {bag.split('_')[1]: in_bag(it, bag) for bag in it.bags()}
+        assert found == {'one': list(range(5, 13)), 'two': list(range(13, 17)), 'three': list(range(105, 113))}
+        row = it.rows()['/talk']
+        assert (row['published'], row['received'], row['missed']) == (20, 20, 0)
+
+
+def test_a_gap_within_an_event_is_missed(tmp_path: Path) -> None:
+    """As it is anywhere else: numbers that never came are told as missed."""
+    with buffer(tmp_path) as it:
+        it.hear(range(5))
+        it.hear(range(7, 10))
+        it.hear(range(3), '/echo')
+        it.events.trigger('gap', 'service')
+        it.pass_s(5.0)
+        it.written()
+        row = it.rows()['/talk']
+        assert (row['published'], row['received'], row['missed_by']) == (10, 8, {'transport': 2})
+        assert it.rows()['/echo']['missed'] == 0
+
+
+def test_repeats_are_in_it_once(tmp_path: Path) -> None:
+    """What two subscriptions brought is one message."""
+    with buffer(tmp_path) as it:
+        it.hear(range(5))
+        it.hear(range(3, 8))
+        it.events.trigger('again', 'service')
+        it.pass_s(5.0)
+        it.written()
+        assert in_bag(it, only_bag(it)) == list(range(8))
+
+
+def test_it_ships_first_and_is_never_evicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its slices go before what the sensors keep, and stay when the disk is full."""
+    with buffer(tmp_path) as it:
+        given: list[DataObject] = []
+        put = it.writer.put
+
+        def noting(item: DataObject, *, wait: bool = True) -> None:
+            given.append(item)
+            put(item, wait=wait)
+
+        monkeypatch.setattr(it.writer, 'put', noting)
+        it.hear(range(5))
+        it.events.trigger('fall', 'service')
+        it.pass_s(5.0)
+        it.written()
+        assert [(item.priority, item.protected) for item in given] == [(1, True)] * 3
+        assert {item.metadata['event'] for item in given} == {'fall'}
+
+
+def test_it_says_in_which_mission_it_was(tmp_path: Path) -> None:
+    """With the run's id, though that became known later."""
+    with buffer(tmp_path) as it:
+        it.events.on_mission(mission())
+        it.hear(range(5))
+        it.events.trigger('fall', 'service')
+        it.taken()
+        it.events.on_mission(mission(run_id='r1'))
+        it.pass_s(5.0)
+        it.written()
+        assert manifest(it.objects(), only_bag(it))['mission'] == {'type': 'patrol', 'mission_id': 'patrol_1', 'run_id': 'r1'}
+
+
+@pytest.mark.parametrize('name', ['../../etc', 'über den Berg', '', 'x' * 300])
+def test_a_name_that_cannot_be_in_a_key_is_made_one_that_can(tmp_path: Path, name: str) -> None:
+    """Whatever an agent calls its event; the manifest has what it said."""
+    with buffer(tmp_path) as it:
+        it.hear(range(2))
+        it.events.trigger(name or '?', 'log_event')
+        it.pass_s(5.0)
+        it.written()
+        bag = only_bag(it)
+        assert bag.isascii()
+        assert '/' not in bag
+        assert manifest(it.objects(), bag)['event']['triggers'][0]['name'] == (name or '?')
+
+
+def test_a_ring_without_anything_makes_no_bag(tmp_path: Path) -> None:
+    """A trigger before the first message leaves nothing behind when nothing comes."""
+    with buffer(tmp_path) as it:
+        it.events.trigger('early', 'service')
+        it.pass_s(5.0)
+        it.written()
+        assert it.objects() == {}
+        assert not list(it.root.iterdir())
+
+
+class Disk:
+    """Takes nothing while it hangs."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.works = threading.Event()
+        self.works.set()
+        write = Recording.write
+
+        def waiting(recording: Recording, lot: Lot) -> None:
+            assert self.works.wait(WAIT_S)
+            write(recording, lot)
+
+        monkeypatch.setattr(Recording, 'write', waiting)
+
+
+def test_what_had_to_go_before_it_was_written_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk that hangs costs the oldest of what was asked for, which is counted; the ring grows no larger than it may be."""
+    disk = Disk(monkeypatch)
+    with buffer(tmp_path, max_bytes=1 << 20) as it:
+        disk.works.clear()
+        it.hear(range(5), size=50_000)
+        it.events.trigger('slow', 'service')
+        it.taken()
+        for number in range(5, 35):
+            it.hear(range(number, number + 1), size=50_000)
+        assert it.ring.bytes <= 1 << 20
+        disk.works.set()
+        it.pass_s(5.0)
+        it.written()
+        row = it.rows()['/talk']
+        assert (row['received'], row['stored'], row['dropped'], row['missed']) == (35, 25, {'ring_full': 10}, 0)
+        assert in_bag(it, only_bag(it)) == [*range(5), *range(15, 35)]
+        said = manifest(it.objects(), only_bag(it))
+        assert sum(lost['messages'] for lost in said['missing']) == 10
+
+
+def test_it_takes_from_the_ring_what_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no second copy of the ring: what is on its way to the disk is one piece, and the rest still in the ring."""
+    disk = Disk(monkeypatch)
+    with buffer(tmp_path, max_bytes=16 << 20) as it:
+        for number in range(15):
+            it.hear(range(number, number + 1), size=1 << 20)
+        before = it.ring.bytes
+        disk.works.clear()
+        it.events.trigger('large', 'service')
+        until(lambda: it.ring.bytes < before, 'it begins')
+        assert before - it.ring.bytes < 1.1 * (1 << 20)
+        disk.works.set()
+        it.pass_s(5.0)
+        it.written()
+        assert len(in_bag(it, only_bag(it))) == 15
+
+
+def test_a_disk_without_room_costs_the_event_and_nothing_else(tmp_path: Path) -> None:
+    """What it takes nothing of is dropped and counted, and the next event is whole."""
+    with buffer(tmp_path) as it:
+        it.room[0] = False
+        it.hear(range(5))
+        it.events.trigger('lost', 'service')
+        it.pass_s(5.0)
+        it.written()
+        assert it.rows()['/talk']['dropped'] == {'no_room': 5}
+        it.room[0] = True
+        it.hear(range(5, 10))
+        it.events.trigger('kept', 'service')
+        it.pass_s(5.0)
+        it.written(2)
+        kept, lost = it.bags()
+        assert in_bag(it, kept) == list(range(5, 10))
+        assert [one['messages'] for one in manifest(it.objects(), lost)['missing']] == [5]
+
+
+def test_a_folder_that_cannot_be_made_costs_the_event(tmp_path: Path) -> None:
+    """It is tried again until the event is over, then its messages are dropped; nothing stays claimed."""
+    with buffer(tmp_path) as it:
+        it.root.parent.mkdir(parents=True)
+        it.root.write_text('in the way')
+        it.hear(range(5))
+        it.events.trigger('lost', 'service')
+        until(lambda: it.events.status().refused, 'it is refused')
+        it.pass_s(5.0)
+        until(lambda: not it.events.status().bag, 'the event is over')
+        assert it.rows()['/talk']['dropped'] == {'unwritable': 5}
+        assert not it.ring.claimed
+        it.root.unlink()
+
+
+def test_a_close_ends_the_event(tmp_path: Path) -> None:
+    """With what the ring has; nothing is triggered any more."""
+    with buffer(tmp_path) as it:
+        it.hear(range(5))
+        it.events.trigger('fall', 'service')
+        it.hear(range(5, 8))
+        assert it.events.close(WAIT_S)
+        assert in_bag(it, only_bag(it)) == list(range(8))
+        assert it.events.trigger('late', 'service') == (False, 'no events any more: the node is closing')
+
+
+def test_without_topics_there_is_nothing(tmp_path: Path) -> None:
+    """No thread, no ring, and a trigger is told why."""
+    with buffer(tmp_path, topics=('',)) as it:
+        assert list(it.events.workers) == []
+        assert it.events.status() == EventStatus(enabled=False)
+        assert it.events.trigger('x', 'service') == (
+            False, 'no events: neither events.topics nor events.regex names a topic to keep'
+        )  # fmt: skip
+
+
+def test_other_settings_are_in_force_at_once(tmp_path: Path) -> None:
+    """Those that are live: how far back, how long, and how many bytes."""
+    with buffer(tmp_path) as it:
+        it.events.update(EventSettings(topics=('/talk',), pre_s=2.0, post_s=1.0, max_s=10.0, max_bytes=2 << 20))
+        hear_each_second(it, range(10))
+        it.events.trigger('fall', 'service')
+        hear_each_second(it, range(10, 15))
+        it.written()
+        assert in_bag(it, only_bag(it)) == list(range(8, 12))
+        assert it.events.status().max_bytes == 2 << 20
+
+
+def killed(home: Path, it: Buffer) -> Path:
+    """What the next start would find had the node been killed now, with the accounts that were committed last."""
+    it.rows()
+    return kill(home)
+
+
+def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path) -> None:
+    """What reached the disk is in the event's bag, which says that the rest is missing; the ledger closes."""
+    home = tmp_path / 'home'
+    with buffer(home) as it:
+        it.hear(range(10), size=2000)
+        it.events.trigger('fall', 'service', 'leg 2')
+        it.taken()
+        it.pass_s(1.0)
+        it.events.trigger('low_battery', 'condition')
+        until(lambda: any(path.stat().st_size > 20_000 for path in it.root.glob('*/*.open')), 'it is synced')
+        it.hear(range(10, 15), size=2000)
+        it.taken()
+        assert it.rows()['/talk']['open'] == 15
+        left = killed(home, it)
+    clock = Clocks()
+    clock.set()
+    clock.wait(60.0)
+    with buffer(left, clock) as it:
+        bag = only_bag(it)
+        assert in_bag(it, bag) == list(range(10))
+        said = manifest(it.objects(), bag)
+        assert said['state'] == 'recovered'
+        assert said['missing'][-1]['what'].startswith('what was in memory')
+        assert [one['name'] for one in said['event']['triggers']] == ['fall', 'low_battery']
+        row = it.rows()['/talk']
+        assert (row['received'], row['stored'], row['open'], row['dropped']) == (15, 10, 0, {'restart': 5})
+        assert not list(it.root.iterdir())
+        it.hear(range(20, 25))
+        it.events.trigger('after', 'service')
+        it.pass_s(5.0)
+        it.written()
+        assert it.rows()['/talk']['missed'] == 0

@@ -1,0 +1,175 @@
+"""Events of the node: the seconds before a trigger and after it are in a bag of their own, whoever triggered."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from e2e.bag_reading import Bag, bags
+from e2e.processes import Node, Processes, Publisher, until
+from e2e.reading import STRING, TYPES, decode, texts
+from e2e.station import Station
+
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.spool.status import file
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.s3 import S3Store
+
+TOPIC, OTHER = '/e_one', '/e_two'
+SETTINGS = {'events.regex': '^/e_', 'events.pre_s': 60.0, 'events.post_s': 1.0, 'sensors': ['odom']}
+
+
+@pytest.fixture
+def station(processes: Processes) -> Iterator[Station]:
+    made = Station(processes.environ)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def store(seaweed: Tower) -> Iterator[ObjectStore]:
+    opened = S3Store(seaweed.store_settings(), UploadSettings())
+    opened.open()
+    yield opened
+    opened.close()
+
+
+def publisher_of(processes: Processes, topic: str = TOPIC) -> Publisher:
+    publisher = processes.publisher()
+    publisher.create(topic, STRING)
+    publisher.matched(topic)
+    return publisher
+
+
+def status(node: Node) -> dict[str, Any]:
+    """What the node tells of its events."""
+    path = file(node.home / 'spool', node.robot)
+    until(path.exists, 'the node tells its status')
+    found: dict[str, Any] = json.loads(path.read_text())['events']
+    return found
+
+
+def numbers(bag: Bag) -> list[int]:
+    return [int(decode(STRING, message.cdr).data) for message in bag.messages()]
+
+
+def marks(bag: Bag) -> list[tuple[str, int, int]]:
+    """What tells each of its messages from the others."""
+    return [(each.topic, each.publish_ns, each.sequence) for each in bag.messages()]
+
+
+def triggers(bag: Bag) -> list[tuple[str, str]]:
+    return [(each['name'], each['by']) for each in bag.manifest['event']['triggers']]
+
+
+def event_of(node: Node, processes: Processes, store: ObjectStore, folder: Path) -> Bag:
+    """The one event, once it is delivered."""
+    until(lambda: status(node)['written'] == 1, 'the event is written')
+    node.delivered()
+    (bag,) = bags(store, processes.robot, folder)
+    return bag
+
+
+def test_what_came_before_a_trigger_and_after_it_is_in_a_bag(
+    processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
+) -> None:
+    """Of topics that no sensor takes; the manifest says who triggered, the ledger counts what was asked for, and nothing else."""
+    node = processes.node(seaweed.environment(), SETTINGS)
+    publisher = publisher_of(processes)
+    publisher.publish(TOPIC, texts(range(20)))
+    until(lambda: status(node)['bytes'] > 20 * 256, 'the ring has them')
+    assert node.ledger()['events'] == {}
+    done, text = station.event()
+    assert done, text
+    publisher.publish(TOPIC, texts(range(20, 30)))
+    assert station.event()[1].endswith('lasts longer')
+    bag = event_of(node, processes, store, processes.folder / 'bags')
+    publisher.publish(TOPIC, texts(range(30, 40)))
+    assert bag.folder.name.startswith('event_manual_')
+    assert text == f'{bag.folder.name} begins'
+    assert bag.check() == {TOPIC: 30}
+    assert numbers(bag) == list(range(30))
+    event = bag.manifest['event']
+    assert (event['name'], event['pre_s'], event['post_s']) == ('manual', 60.0, 1.0)
+    assert triggers(bag) == [('manual', 'service')] * 2
+    row = node.ledger()['events'][TOPIC]
+    assert (row['received'], row['stored'], row['missed'], row['open']) == (30, 30, 0, 0)
+    with sqlite3.connect(node.home / 'spool' / 'index.db') as db:
+        slices = db.execute("SELECT priority, protected FROM objects WHERE key LIKE '%.mcap'").fetchall()
+    assert slices == [(1, 1)]
+    assert node.stop()['events'][TOPIC]['received'] == 30
+
+
+def test_conditions_and_what_an_agent_logs_trigger(processes: Processes, seaweed: Tower, store: ObjectStore) -> None:
+    """Over all topics of the robot, from the subscriptions that serve objects and a bag as well; nothing of it is lost."""
+    parameters = {
+        'events.regex': '.*', 'events.exclude': 'image_raw|rosout|events|sensor_logger_node|diagnostics', 'events.post_s': 3.0,
+        'events.conditions': ['awake: imu:temperature > -100 for 1', 'never: odom:pose.pose.position.x > 1e9'],
+        'events.log_event': '^f', 'bag.record': 'always',
+    }  # fmt: skip
+    node = processes.node(seaweed.environment(), parameters)
+    processes.sim('duration_s:=60.0')
+    logger = MissionDataLogger(home=node.home, robot=processes.robot, replay=False, start_timeout_s=0.0)
+    try:
+        until(lambda: status(node)['bag'], 'the condition triggers')
+        mission_id = logger.start_mission('patrol', 'go round')
+        logger.log_event('way_point', number=1)
+        logger.log_event('fall', leg=2)
+        logged_s = time.monotonic()
+        until(lambda: status(node)['triggers'] == 2, 'what the agent logs triggers')
+        assert time.monotonic() - logged_s < 10.0
+        until(lambda: status(node)['written'] == 1, 'the event is written')
+        logger.end_mission(True, 0.0, 0.0)
+    finally:
+        logger.close()
+    ledger = node.stop()
+    found = bags(store, processes.robot, processes.folder / 'bags')
+    (event,) = [bag for bag in found if bag.folder.name.startswith('event_')]
+    assert event.folder.name.startswith('event_awake_')
+    assert triggers(event) == [('awake', 'condition'), ('fall', 'log_event')]
+    assert [json.loads(each['detail']) for each in event.manifest['event']['triggers'][1:]] == [{'leg': 2}]
+    assert event.manifest['mission'] in (None, {'type': 'patrol', 'mission_id': mission_id, 'run_id': None})
+    counts = event.check()
+    assert set(counts) == set(TYPES)
+    for topic in TYPES:
+        row = ledger['events'][topic]
+        assert (row['received'], row['stored'], row['missed'], row['dropped']) == (counts[topic], counts[topic], 0, {})
+        assert ledger['topics'][topic]['missed'] == ledger['bags'][topic]['missed'] == 0
+    recorded = {mark for bag in found if bag is not event for mark in marks(bag)}
+    in_event = marks(event)
+    assert len(in_event) == len(set(in_event))
+    assert recorded.issuperset(in_event)
+
+
+def test_a_kill_in_the_middle_of_an_event(processes: Processes, seaweed: Tower, store: ObjectStore, station: Station) -> None:
+    """The next start makes its bag whole with what was written; the bag and the ledger say what is missing."""
+    node = processes.node(seaweed.environment(), {**SETTINGS, 'events.post_s': 60.0})
+    publisher = publisher_of(processes)
+    publisher.publish(TOPIC, texts(range(20)))
+    until(lambda: status(node)['bytes'] > 20 * 256, 'the ring has them')
+    done, text = station.event()
+    assert done
+    bag_name = text.partition(' ')[0]
+    open_slice = node.home / 'bags' / processes.robot / bag_name / f'{bag_name}_0.mcap.open'
+    until(lambda: open_slice.exists() and open_slice.stat().st_size > 500, 'it is written and synced')
+    publisher.publish(TOPIC, texts(range(20, 30)))
+    node.kill()
+    node = processes.node(seaweed.environment(), SETTINGS)
+    until(lambda: node.ledger()['events'].get(TOPIC, {}).get('stored'), 'what there was is spooled')
+    node.delivered(3)
+    (bag,) = bags(store, processes.robot, processes.folder / 'bags')
+    assert bag.folder.name == bag_name
+    assert numbers(bag)[:20] == list(range(20))
+    assert bag.check() == {TOPIC: len(numbers(bag))}
+    assert bag.manifest['state'] == 'recovered'
+    assert triggers(bag) == [('manual', 'service')]
+    row = node.stop()['events'][TOPIC]
+    assert row['received'] == row['stored'] + row['dropped'].get('restart', 0)
+    assert row['open'] == 0
