@@ -29,16 +29,19 @@ setup(
         'backports-zstd>=1.0; python_version < "3.14"',
         'boto3>=1.36',
         'click>=8.1',
+        'lz4>=4.0',
         'numpy>=1.21',
         'orjson>=3.9',
         'pillow>=9',
         'rich>=13',
         'rosbags>=0.11.9',
+        'ruamel-yaml>=0.17',
         'simplejpeg>=1.7',
     ],
     extras_require={
         'lake': ['daft>=0.7.26,<0.8', 'obstore>=0.11', 'pyarrow>=16'],
         'missions': ['matplotlib>=3.6', 'mlflow-skinny>=2.14'],
+        'train': ['mlflow-skinny>=2.14', 'torch>=2.2'],  # examples/train_navigation_policy.py; torch alone needs 200 MB and more
         'test': ['pytest'],  # colcon runs pytest where a test extra names it
     },
     entry_points={

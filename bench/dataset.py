@@ -1,6 +1,6 @@
 """``MissionDataset`` through torch's DataLoader with two workers beside the integration guide's loop, from first byte to array.
 
-Run it as ``python bench/dataset.py [--frames 600] [--rounds 3] [--json]`` where torch is installed (the extra ``train``). The
+Run it as ``python bench/dataset.py [--frames 900] [--rounds 3] [--json]`` where torch is installed (the extra ``train``). The
 guide's loop is its own: boto3's paginator, ``download_file`` one by one, then each file read and decoded (by Pillow). Both take
 turns on the same frames, 640 x 480, in the same SeaweedFS; a round's ratio is of two runs side by side. Ours is measured three
 times: single JPEGs from the stream, the same by number (shuffled), and archives of a second. Making the data set (the
@@ -156,7 +156,7 @@ def measure(options: argparse.Namespace) -> Report:
 
 
 def _more(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--frames', type=int, default=600)
+    parser.add_argument('--frames', type=int, default=900)
     parser.add_argument('--rounds', type=int, default=3)
 
 

@@ -52,6 +52,10 @@ class StoreUnavailable(StoreError):
     """Transient: refused, reset, timed out, 5xx, throttled. The same request may succeed later."""
 
 
+class StoreUntrusted(StoreUnavailable):
+    """The store's certificate is not believed: nothing was sent, nothing will be until it is."""
+
+
 class CredentialsRejected(StoreError):
     """The store refuses the key, the signature or the clock: no object's fault, everything waits."""
 

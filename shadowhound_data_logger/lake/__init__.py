@@ -1,7 +1,7 @@
 """The lake: what is stored, as a catalogue of Parquet files beside the objects themselves, and how to ask it.
 
-``lake.objects(sensor='camera', since='yesterday')`` is a Daft DataFrame (docs/lake.md). The names below load Daft when they are
-used: a robot, which writes the catalogue, needs none of it.
+``lake.objects(sensor='camera', since='yesterday')`` is a Daft DataFrame (docs/lake.md), ``lake.MissionDataset`` what to train on.
+The names below load Daft when they are used: a robot, which writes the catalogue, needs none of it.
 """
 
 from __future__ import annotations
@@ -10,12 +10,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from shadowhound_data_logger.lake.dataset import MissionDataset
     from shadowhound_data_logger.lake.query import missions, objects, sql, topics
+    from shadowhound_data_logger.lake.samples import Near, Window
 
-__all__ = ['missions', 'objects', 'sql', 'topics']
+__all__ = ['MissionDataset', 'Near', 'Window', 'missions', 'objects', 'sql', 'topics']
+_MODULES = {'MissionDataset': 'dataset', 'Near': 'samples', 'Window': 'samples'}
 
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
-        return getattr(import_module('shadowhound_data_logger.lake.query'), name)
+        return getattr(import_module(f'{__name__}.{_MODULES.get(name, "query")}'), name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

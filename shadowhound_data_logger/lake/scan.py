@@ -38,6 +38,8 @@ SMALL_BYTES: Final = 256 << 10
 PARTS_A_TASK: Final = 180
 _Answer = TypeVar('_Answer')
 KEY: Final = ('bucket', 'key')
+_ROW: Final = (*KEY, 't_start_ns')
+"""Of a repeat the key is that of another row (spool/repeats.py)."""
 
 
 class Catalogue(DataSource):
@@ -82,7 +84,7 @@ class _Parts(DataSourceTask):
     """Parts that are read together, from the store to one batch of the columns that are needed."""
 
     def __init__(self, source: Source, keys: Sequence[str], columns: Sequence[str], *, once: bool = False) -> None:
-        """``once``: of rows with the same key one is kept."""
+        """``once``: of rows with the same key and time one is kept."""
         self._source = source
         self._keys = tuple(keys)
         self._columns = tuple(columns)
@@ -98,7 +100,7 @@ class _Parts(DataSourceTask):
             yield RecordBatch.from_arrow_record_batches([batch], batch.schema)
 
     def _table(self) -> pa.Table:
-        wide = (*self._columns, *(name for name in KEY if name not in self._columns)) if self._once else self._columns
+        wide = (*self._columns, *(name for name in _ROW if name not in self._columns)) if self._once else self._columns
         table = read(self._source, self._keys, wide)
         return (unrepeated(table) if self._once else table).select(self._columns)
 
@@ -130,9 +132,9 @@ def read(source: Source, keys: Sequence[str], columns: Sequence[str]) -> pa.Tabl
 
 
 def unrepeated(table: pa.Table) -> pa.Table:
-    """The first row of each key, in order."""
+    """The first row of each key and time, in order."""
     numbered = table.append_column('_row', pa.array(range(len(table)), pa.int64()))
-    first = numbered.group_by(list(KEY)).aggregate([('_row', 'min')])['_row_min']
+    first = numbered.group_by(list(_ROW)).aggregate([('_row', 'min')])['_row_min']
     return table if len(first) == len(table) else table.take(first.combine_chunks().sort())
 
 

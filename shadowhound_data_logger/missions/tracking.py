@@ -18,12 +18,14 @@ from typing import Any, Final, Protocol
 from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.folder import Run
 from shadowhound_data_logger.missions.story import Point
+from shadowhound_data_logger.tls import distrust
 
 MISSION_TAG: Final = 'shadowhound.mission_id'
 DUPLICATE_TAG: Final = 'shadowhound.duplicate_of'
 ENVIRONMENT: Final = {
     'MLFLOW_HTTP_REQUEST_TIMEOUT': '10',
     'MLFLOW_HTTP_REQUEST_MAX_RETRIES': '0',
+    'MLFLOW_ALLOW_HTTP_REDIRECTS': 'false',
     'MLFLOW_DISABLE_TELEMETRY': 'true',
     'MLFLOW_ALLOW_FILE_STORE': 'true',
     'MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR': 'false',
@@ -195,10 +197,18 @@ class MlflowTracking:
             text = f'{self.where} {what}: {_USER.sub("//", str(error))[:500]}'
             if code in REFUSALS and is_own:
                 raise TrackingRefused(text, code=code) from error
+            self._raise_distrust(error)
             raise TrackingUnavailable(text, remedy=remedy_for(code), code=code) from error
         except Exception as error:  # whatever else a client raises (a captive portal's page is no JSON) is no mission's fault
+            self._raise_distrust(error)
             text = f'{self.where} {what}: {type(error).__name__}: {_USER.sub("//", str(error))[:500]}'
             raise TrackingUnavailable(text, remedy=remedy_for('')) from error
+
+    def _raise_distrust(self, error: Exception) -> None:
+        """Raises TrackingUnavailable where the certificate of the server is not believed, or of the store of artifacts."""
+        bundle = 'MLFLOW_TRACKING_SERVER_CERT_PATH (AWS_CA_BUNDLE where artifacts go to the S3 server itself)'
+        if found := distrust(error, self.where, bundle=bundle, address='MLFLOW_TRACKING_URI'):
+            raise TrackingUnavailable(found[0], remedy=found[1], code='CERTIFICATE') from error
 
 
 @contextmanager

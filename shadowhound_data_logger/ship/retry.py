@@ -14,6 +14,7 @@ from shadowhound_data_logger.errors import (
     ForeignObject,
     ObjectRefused,
     StoreError,
+    StoreUntrusted,
 )
 
 BASE_S: Final = 0.5
@@ -27,7 +28,7 @@ class Verdict(Enum):
     RETRY = 'retry'
     """The store is away, or this object does not get through: wait, then try again, for ever."""
     PAUSE = 'pause'
-    """No object's fault: nothing is sent until the credentials are right, but for one probe at a time."""
+    """No object's fault: nothing is sent until credentials and certificate are right, but for one probe at a time."""
     BUCKET = 'bucket'
     """The objects of this bucket wait, those of others go on."""
     DENIED = 'denied'
@@ -38,6 +39,7 @@ class Verdict(Enum):
 
 _TABLE: Final[tuple[tuple[type[StoreError], Verdict], ...]] = (
     (CredentialsRejected, Verdict.PAUSE),
+    (StoreUntrusted, Verdict.PAUSE),
     (BucketMissing, Verdict.BUCKET),
     (AccessDenied, Verdict.DENIED),
     (ObjectRefused, Verdict.QUARANTINE),

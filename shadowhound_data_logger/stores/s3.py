@@ -19,7 +19,14 @@ from enum import Enum
 from typing import IO, Final
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ForeignObject, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.errors import (
+    AccessDenied,
+    BucketMissing,
+    CredentialsRejected,
+    ForeignObject,
+    ObjectRefused,
+    StoreUnavailable,
+)
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.content import check_target, chunks, identical_or_foreign
 from shadowhound_data_logger.stores.pace import Pace
@@ -73,12 +80,13 @@ class S3Store:
 
     def put(self, item: SpooledObject) -> Put:
         check_target(item.bucket, item.key)
-        put = self._put_in_parts if item.size > MULTIPART_BYTES else self._put_whole
+        generation = self._s3.generation
         try:
-            return put(item)
-        except BucketMissing as error:
-            self._create_bucket(item.bucket, error)
-            return put(item)
+            return self._put_somehow(item)
+        except CredentialsRejected:
+            if self._s3.generation == generation:
+                raise
+            return self._put_somehow(item)  # somebody changed the keys, and the new ones were read meanwhile
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
         check_target(bucket, key)
@@ -102,6 +110,14 @@ class S3Store:
 
     def probe(self) -> None:
         self._s3.probe()
+
+    def _put_somehow(self, item: SpooledObject) -> Put:
+        put = self._put_in_parts if item.size > MULTIPART_BYTES else self._put_whole
+        try:
+            return put(item)
+        except BucketMissing as error:
+            self._create_bucket(item.bucket, error)
+            return put(item)
 
     def _put_in_parts(self, item: SpooledObject) -> Put:
         """It looks first: an answer that was lost, or a key that is taken, is known before megabytes are sent in vain."""
@@ -176,9 +192,16 @@ class S3Store:
                 if self._s3.head(item.bucket, item.key) == held:
                     raise
             raise StoreUnavailable(f'{what} is not described twice the same: an answer broke off', **where)
-        if next(self._s3.list(item.bucket, f'{item.key}/'), None):  # SeaweedFS answers 412 to the name of a folder
+        if self._is_folder(item):  # SeaweedFS answers 412 to the name of one
             raise ObjectRefused(f'{what} is a folder', **where, reason='name')
         raise StoreUnavailable(f'{what} was there and is gone again', **where)
+
+    def _is_folder(self, item: SpooledObject) -> bool:
+        """Credentials that may not list cannot tell: the object then waits instead of being refused."""
+        try:
+            return next(self._s3.list(item.bucket, f'{item.key}/'), None) is not None
+        except AccessDenied:
+            return False
 
     def _sha256(self, item: SpooledObject) -> str:
         digest = hashlib.sha256()

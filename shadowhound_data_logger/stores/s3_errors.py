@@ -7,8 +7,6 @@ Codes: https://docs.aws.amazon.com/AmazonS3/latest/API/ErrorResponses.html, and 
 from __future__ import annotations
 
 import socket
-import ssl
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -23,7 +21,9 @@ from shadowhound_data_logger.errors import (
     ObjectRefused,
     StoreError,
     StoreUnavailable,
+    StoreUntrusted,
 )
+from shadowhound_data_logger.tls import causes, distrust
 
 REQUEST_ERRORS: Final = (boto.BotoCoreError, boto.ClientError, ResponseParserError, OSError, ValueError)
 """Everything a request through botocore can raise; ValueError comes of a header that broke off."""
@@ -43,7 +43,7 @@ class Request:
 
 _Row = tuple[type[StoreError], str, str]
 
-_KEYS = 'check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY'
+_KEYS = 'check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or the file of the profile'
 _SESSION = 'check AWS_SESSION_TOKEN; a server of your own needs none'
 _CLOCK = 'set the clock of this machine and of Tower: `timedatectl` on both'
 _REGION = 'set AWS_DEFAULT_REGION to the region of the server'
@@ -106,17 +106,16 @@ _CODES: Final[dict[str, _Row]] = {
     'XMinioInsecureClientRequest': (StoreUnavailable, 'Tower at {endpoint} wants TLS', 'use https:// in AWS_ENDPOINT_URL'),
 }  # fmt: skip
 
-_NO_KEYS: Final = (boto.NoCredentialsError, boto.PartialCredentialsError, boto.CredentialRetrievalError, boto.NoAuthTokenError)
+_NO_KEYS: Final = (boto.NoCredentialsError, boto.PartialCredentialsError, boto.CredentialRetrievalError, boto.NoAuthTokenError,
+                   boto.ProfileNotFound, boto.ConfigParseError)  # fmt: skip
 _BROKEN: Final = (boto.ConnectionClosedError, boto.ResponseStreamingError, boto.IncompleteReadError, ConnectionResetError)
 
 _FAILURES: Final[tuple[tuple[type[BaseException] | tuple[type[BaseException], ...], _Row], ...]] = (
     (_NO_KEYS, (CredentialsRejected, 'there are no credentials for Tower at {endpoint}',
-                'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY')),
+                'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SHARED_CREDENTIALS_FILE to a file with them')),
     (boto.ParamValidationError, (ObjectRefused,
                                  'no S3 request can carry {bucket}/{key}: its metadata or type is no plain text', '')),
     (ResponseParserError, (StoreUnavailable, '{endpoint} does not answer like an S3 server', _NOT_S3)),
-    (ssl.SSLCertVerificationError, (StoreUnavailable, 'the certificate of Tower at {endpoint} is not trusted',
-                                    'set AWS_CA_BUNDLE to the certificate of the authority that signed it')),
     (boto.SSLError, (StoreUnavailable, 'no TLS connection to Tower at {endpoint}',
                      'does the server speak TLS there? else use http:// in AWS_ENDPOINT_URL')),
     (boto.ProxyConnectionError, (StoreUnavailable, 'the proxy to {endpoint} cannot be reached', 'add Tower to NO_PROXY')),
@@ -141,7 +140,8 @@ def classify(error: Exception, request: Request) -> StoreError:
     """
     if isinstance(error, boto.ClientError):
         return _answered(error, request)
-    kind, message, remedy = _unanswered(error)
+    untrusted = distrust(error, 'Tower at {endpoint}', bundle='AWS_CA_BUNDLE', address='AWS_ENDPOINT_URL')
+    kind, message, remedy = (StoreUntrusted, *untrusted) if untrusted else _unanswered(error)
     return _error(kind, message, remedy, request, code=type(error).__name__)
 
 
@@ -182,26 +182,13 @@ def _answered(error: boto.ClientError, request: Request) -> StoreError:
 def _unanswered(error: Exception) -> _Row:
     if isinstance(error, boto.ParamValidationError) and 'nvalid bucket name' in str(error):
         return _CODES['InvalidBucketName']
-    causes = tuple(_causes(error))
+    found = tuple(causes(error))
     for kinds, row in _FAILURES:
-        if any(isinstance(cause, kinds) for cause in causes):
+        if any(isinstance(cause, kinds) for cause in found):
             return row
-    reason = next((cause.strerror for cause in reversed(causes) if isinstance(cause, OSError) and cause.strerror), '')
+    reason = next((cause.strerror for cause in reversed(found) if isinstance(cause, OSError) and cause.strerror), '')
     reason = reason or type(error).__name__
     return StoreUnavailable, f'Tower at {{endpoint}} cannot be reached: {reason}', 'is the WiFi connected?'
-
-
-def _causes(error: BaseException) -> Iterator[BaseException]:
-    """What led to the error, the first cause last; urllib3 hides some in ``args`` and botocore in ``kwargs``."""
-    seen: list[BaseException | None] = [None]
-    waiting: list[Any] = [error]
-    while waiting:
-        cause = waiting.pop(0)
-        if isinstance(cause, BaseException) and cause not in seen:
-            seen.append(cause)
-            yield cause
-            inner = getattr(cause, 'kwargs', {})
-            waiting += [*cause.args, getattr(cause, 'reason', None), cause.__cause__, cause.__context__, inner.get('error')]
 
 
 def _error(kind: type[StoreError], message: str, remedy: str, request: Request, **data: Any) -> StoreError:

@@ -21,15 +21,15 @@ from botocore.awsrequest import (
     AWSHTTPSConnectionPool,
     AWSPreparedRequest,
 )
-from botocore.exceptions import ClientError, NoCredentialsError, ParamValidationError
+from botocore.exceptions import ClientError, ParamValidationError
 from botocore.httpsession import URLLib3Session
 from botocore.parsers import create_parser
-from botocore.session import Session
 from botocore.utils import get_environ_proxies
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.stores.content import object_metadata
+from shadowhound_data_logger.stores.credentials import Keys
 from shadowhound_data_logger.stores.pace import Body, Pace
 from shadowhound_data_logger.stores.parts import Part
 from shadowhound_data_logger.stores.sigv4 import signed
@@ -56,17 +56,17 @@ _awaiting: Any = AWSConnection
 class ObjectPut:
     """Thread-safe. New; ``put`` any number of times; close once. Raises what botocore's client would."""
 
-    def __init__(self, session: Session, settings: StoreSettings, upload: UploadSettings, pace: Pace) -> None:
+    def __init__(self, keys: Keys, trust: str | bool, settings: StoreSettings, upload: UploadSettings, pace: Pace) -> None:
         url = urlsplit(settings.endpoint_url or '')
         self._host = url.netloc.rpartition('@')[2]  # a user name in the URL is no host's
         self._server = f'{url.scheme}://{self._host}'
         self._root = url.path.rstrip('/')
         self._region = settings.region
         self._pace = pace
-        self._credentials = session.get_credentials()
+        self._keys = keys
         self._parser = _create_parser('rest-xml')
         self._session = _open_session(
-            verify=session.get_config_variable('ca_bundle') or True, proxies=get_environ_proxies(self._server),
+            verify=trust, proxies=get_environ_proxies(self._server),
             timeout=(upload.connect_timeout_s, upload.read_timeout_s), max_pool_connections=max(10, upload.threads),
             socket_options=[*_SOCKET],
         )  # fmt: skip
@@ -89,11 +89,9 @@ class ObjectPut:
 
     def _send(self, item: SpooledObject, query: str, headers: Mapping[str, str], sha256: str,
               pieces: Iterator[bytes]) -> Mapping[str, str]:  # fmt: skip
-        if self._credentials is None:
-            raise NoCredentialsError
         target = f'{self._root}/{item.bucket}/{quote(item.key)}{"?" if query else ""}{query}'
         full = signed('PUT', target, headers, sha256, now=datetime.now(timezone.utc),
-                      credentials=self._credentials.get_frozen_credentials(), region=self._region)  # fmt: skip
+                      credentials=self._keys.get_frozen_credentials(), region=self._region)  # fmt: skip
         sent: dict[str, Any] = {**full, 'user-agent': AGENT}
         if int(headers['content-length']) > UNASKED_BYTES:
             sent['Expect'] = b'100-continue'  # botocore's connection looks for exactly this

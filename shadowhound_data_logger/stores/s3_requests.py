@@ -16,9 +16,10 @@ from botocore.exceptions import BotoCoreError, ClientError
 from botocore.session import Session
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.errors import AccessDenied, SettingError, StoreUnavailable
+from shadowhound_data_logger.errors import AccessDenied, CredentialsRejected, SettingError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.stores.content import CHUNK_BYTES
+from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted
 from shadowhound_data_logger.stores.pace import Body, Pace
 from shadowhound_data_logger.stores.parts import Part
 from shadowhound_data_logger.stores.s3_errors import REQUEST_ERRORS, Request, classify, code_of, public_url, status_of
@@ -50,15 +51,21 @@ class S3Requests:
         self._settings = settings
         self._upload = upload
         self.pace = Pace(upload.max_mbps)
+        self._keys: Keys | None = None
         self._client: Any = None
         self._put: ObjectPut | None = None
+
+    @property
+    def generation(self) -> int:
+        """Of the keys: another one once refused keys were replaced by newer ones, with which the same request may work."""
+        return self._keys.generation if self._keys else 0
 
     def open(self) -> None:
         """Raises SettingError for an endpoint no request can be sent to, or a botocore that is too old."""
         if self._client is None:
-            session = _session(self._settings)
-            self._client = _client(session, self._settings, self._upload)
-            self._put = ObjectPut(session, self._settings, self._upload, self.pace)
+            self._keys = Keys(self._settings)
+            self._client, trust = _client(session_with(self._keys), self._settings, self._upload)
+            self._put = ObjectPut(self._keys, trust, self._settings, self._upload, self.pace)
 
     def close(self) -> None:
         client, self._client = self._client, None
@@ -198,18 +205,22 @@ class S3Requests:
 
     @contextmanager
     def _asking(self, bucket: str, key: str, asked: _Asked | None) -> Iterator[_Asked]:
-        """Nothing but a StoreError leaves, also when what is asked was closed."""
+        """Nothing but a StoreError leaves, also when what is asked was closed. Keys that are refused are read again."""
         if asked is None:
             raise StoreUnavailable('the store is not open', endpoint=self.endpoint, bucket=bucket, key=key)
+        generation = self.generation
         try:
             yield asked
         except REQUEST_ERRORS as error:
             timeouts = (self._upload.connect_timeout_s, self._upload.read_timeout_s)
-            raise classify(error, Request(self.endpoint, bucket, key, *timeouts)) from error
+            problem = classify(error, Request(self.endpoint, bucket, key, *timeouts))
+            if isinstance(problem, CredentialsRejected) and self._keys:
+                self._keys.renew(generation)
+            raise problem from error
 
 
-def _client(session: Session, settings: StoreSettings, upload: UploadSettings) -> Any:
-    """A botocore client without retries of its own: delivery decides when to try again."""
+def _client(session: Session, settings: StoreSettings, upload: UploadSettings) -> tuple[Any, str | bool]:
+    """A botocore client without retries of its own, since delivery decides when to try again, and whom it trusts."""
     if tuple(int(part) for part in botocore.__version__.split('.')[:2]) < OLDEST_BOTOCORE:
         raise SettingError('botocore', botocore.__version__, 'version 1.36 or later (`pip install --upgrade boto3`)')
     config = Config(
@@ -219,14 +230,16 @@ def _client(session: Session, settings: StoreSettings, upload: UploadSettings) -
         request_checksum_calculation='when_required', response_checksum_validation='when_required',
     )  # fmt: skip
     try:
-        client = session.create_client('s3', endpoint_url=settings.endpoint_url, region_name=settings.region, config=config)
+        trust = trusted(session, settings.endpoint_url or '')
+        client = session.create_client('s3', endpoint_url=settings.endpoint_url, region_name=settings.region, config=config,
+                                       verify=trust)  # fmt: skip
     except ValueError as error:
         endpoint = public_url(settings.endpoint_url or '')
         raise SettingError('AWS_ENDPOINT_URL', endpoint, 'a URL such as http://TOWER_IP:9000') from error
     except BotoCoreError as error:
         raise SettingError('the AWS configuration', type(error).__name__, f'one that botocore can read: {error}') from error
     client.meta.events.register_last('before-parameter-build.s3', _follow_no_redirect)
-    return client
+    return client, trust
 
 
 def _follow_no_redirect(context: dict[str, Any], **_: Any) -> None:
@@ -235,18 +248,3 @@ def _follow_no_redirect(context: dict[str, Any], **_: Any) -> None:
     With a login page that redirects everything it goes on until Python's recursion limit.
     """
     context.setdefault('s3_redirect', {})['redirected'] = True
-
-
-def _session(settings: StoreSettings) -> Session:
-    """Credentials in hand need no profile; a server of one's own is not asked for through the cloud's metadata service."""
-    if bool(settings.access_key_id) != bool(settings.secret_access_key):
-        name = 'AWS_SECRET_ACCESS_KEY' if settings.access_key_id else 'AWS_ACCESS_KEY_ID'
-        raise SettingError(name, '', 'both of AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or neither')
-    if settings.access_key_id and settings.secret_access_key:
-        session = Session(session_vars={'profile': (None, None, None, None)})
-        session.set_credentials(settings.access_key_id, settings.secret_access_key, settings.session_token)
-        return session
-    session = Session()
-    if '.amazonaws.com' not in (settings.endpoint_url or ''):
-        session.get_component('credential_provider').remove('iam-role')
-    return session

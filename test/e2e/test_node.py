@@ -125,10 +125,11 @@ def test_without_a_server_the_store_is_a_folder(processes: Processes) -> None:
         ({'camera.rate_hertz': 2.0}, ('camera.rate_hertz = 2.0', 'camera.enabled', 'camera.rate_hz')),
         ({'queue.max_bytes': 17}, ('queue.max_bytes = 17', 'at least')),
         ({'imu.topics': ['no topic!']}, ("imu.topics = ['no topic!']", 'valid topic names')),
+        ({'events.regex': '.*', 'events.conditions': ['x: t!:f < 1']}, ("events.conditions = 'x: t!:f < 1'", 'valid topic')),
         ({'imu.topics': ['/odom']}, ("odom.topics = ['odom']", '/odom is in imu.topics already')),
         ({'robot': '../x'}, ("robot = '../x'", 'letters, digits')),
     ],
-    ids=['unknown', 'range', 'topic name', 'topic twice', 'robot'],
+    ids=['unknown', 'range', 'topic name', 'condition', 'topic twice', 'robot'],
 )
 def test_a_wrong_parameter_refuses_the_start(processes: Processes, parameters: dict[str, Any], words: tuple[str, ...]) -> None:
     """Exit code 2, and one line with the name, its value and what is allowed; nothing is left behind."""

@@ -11,6 +11,10 @@ import numpy as np
 import pytest
 import simplejpeg
 
+from shadowhound_data_logger.bags.channel import Channel
+from shadowhound_data_logger.bags.definitions import describe
+from shadowhound_data_logger.bags.metadata import metadata_yaml
+from shadowhound_data_logger.bags.slice_writer import SliceWriter
 from shadowhound_data_logger.lake.parts import encode
 from shadowhound_data_logger.lake.schema import row_of
 
@@ -20,6 +24,15 @@ START, *EXAMPLES = re.findall(r'^```python\n(.*?)^```', PAGE, re.DOTALL | re.MUL
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 IMAGE = 'sensor_msgs/msg/Image'
+
+
+def write_bag(folder: Path, imu: bytes) -> None:
+    """One slice with a message that can be read."""
+    folder.mkdir()
+    writer = SliceWriter(folder / f'{folder.name}_0.mcap')
+    channel = Channel('/imu', 'go2_interfaces/msg/IMU', *describe('go2_interfaces/msg/IMU'), '')
+    writer.write(channel, 1_800_000_000_000_000_000, 1_800_000_000_000_000_000, 1, imu)
+    (folder / 'metadata.yaml').write_bytes(metadata_yaml([writer.close()], ros_distro='humble'))
 
 
 @pytest.fixture
@@ -48,6 +61,7 @@ def bucket(ros: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     day.mkdir(parents=True)
     (day / 'part.parquet').write_bytes(encode([row_of('sensor-data', 'thor/camera/a.jpg', 1, '', {'pose': '3 1 0 odom'})]))
     shutil.copy(ROOT / 'interfaces' / 'go2_interfaces' / 'msg' / 'VoxelMapCompressed.msg', tmp_path)
+    write_bag(tmp_path / 'patrol_20261121_120000', imu)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -66,6 +66,8 @@ class Line:
     """The network between one process and a server. ``started`` is told of each put that begins."""
 
     endpoint = 'simulated'
+    generation = 0
+    """Of its keys."""
 
     def __init__(self, time: VirtualTime, server: Server, script: Script, rng: random.Random) -> None:
         self.pace = Pace()

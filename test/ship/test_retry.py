@@ -10,6 +10,7 @@ from shadowhound_data_logger.ship.retry import BASE_S, Verdict, backoff, decide,
 TABLE = [
     (errors.StoreUnavailable, Verdict.RETRY),
     (errors.CredentialsRejected, Verdict.PAUSE),
+    (errors.StoreUntrusted, Verdict.PAUSE),
     (errors.BucketMissing, Verdict.BUCKET),
     (errors.AccessDenied, Verdict.DENIED),
     (errors.ObjectRefused, Verdict.QUARANTINE),

@@ -1,11 +1,9 @@
-"""What stands between us and an S3 store: no answer, a wrong one, damage on the way, no trust. Each is told, and passes."""
+"""What stands between us and an S3 store: no answer, a wrong one, damage on the way. Each is told, and passes."""
 
 from __future__ import annotations
 
 import base64
-import datetime
 import hashlib
-import ipaddress
 import time
 import zlib
 from collections.abc import Callable
@@ -14,9 +12,6 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 from stores import fake_s3
 from stores.asking import error_of
 from stores.fake_s3 import FakeS3, served
@@ -145,47 +140,6 @@ def test_the_server_verifies_the_checksum(seaweed: Tower, spool: Spool, bucket: 
     right = base64.b64encode(zlib.crc32(b'content').to_bytes(4, 'big')).decode()
     assert requests.put(spool('a', b'content'), b'content', right, conditional=True) is Sent.CREATED
     requests.close()
-
-
-@pytest.fixture(scope='session')
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
-    """A certificate for 127.0.0.1 that nobody but itself signed, and its key."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, 'tower')])
-    now = datetime.datetime.now(datetime.timezone.utc)
-    signed = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(1)
-        .not_valid_before(now - datetime.timedelta(days=1))
-        .not_valid_after(now + datetime.timedelta(days=1))
-        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address('127.0.0.1'))]), critical=False)
-        .sign(key, hashes.SHA256())
-    )
-    folder = tmp_path_factory.mktemp('tls')
-    pem = serialization.Encoding.PEM
-    (folder / 'crt').write_bytes(signed.public_bytes(pem))
-    (folder / 'key').write_bytes(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()))
-    return str(folder / 'crt'), str(folder / 'key')
-
-
-def test_a_certificate_nobody_trusts(opened: Callable[..., S3Store], certificate: tuple[str, str]) -> None:
-    """A private authority is told from a missing server, with the variable that makes it trusted."""
-    with fake_s3.with_tls(*certificate) as url:
-        said = error_of(StoreUnavailable, opened(url).probe)
-    assert 'is not trusted' in said
-    assert 'AWS_CA_BUNDLE' in said
-
-
-def test_aws_ca_bundle_is_honoured(
-    opened: Callable[..., S3Store], certificate: tuple[str, str], spool: Spool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With AWS_CA_BUNDLE the private authority is trusted."""
-    monkeypatch.setenv('AWS_CA_BUNDLE', certificate[0])
-    with fake_s3.with_tls(*certificate) as url:
-        assert opened(url).put(spool('a', b'x')) is Put.CREATED
 
 
 def test_https_to_a_plain_port(opened: Callable[..., S3Store]) -> None:

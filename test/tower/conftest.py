@@ -2,14 +2,35 @@
 
 from __future__ import annotations
 
+import random
+import socket
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Final
 
 import boto3
 import pytest
 from tower_scripts import make_secrets, prepare
 
 from shadowhound_data_logger.sim.tower import Tower
+
+PORTS: Final = (9000, 5001, 5432, 9333, 8080, 8888, 23646)
+
+
+@pytest.fixture(scope='module')
+def offset() -> int:
+    """Something to add to all ports so that none of them is taken."""
+    for number in random.sample(range(500, 3000), 50):
+        sockets = [socket.socket() for _ in PORTS]
+        try:
+            for one, port in zip(sockets, PORTS, strict=True):
+                one.bind(('127.0.0.1', port + number))
+            return number
+        except OSError:
+            continue
+        finally:
+            for one in sockets:
+                one.close()
+    raise AssertionError('no free ports')
 
 
 @pytest.fixture(scope='session')

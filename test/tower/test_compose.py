@@ -63,11 +63,37 @@ def test_every_variable_is_in_the_file_that_is_made(tmp_path: Path) -> None:
     assert all(value.startswith('${') for value in re.findall(r'(?:SECRET\w*|PASSWORD): (\S+)', text))
 
 
+class _Override(yaml.SafeLoader):
+    """Knows what Compose's ``!override`` is: the list itself, in place of the other file's."""
+
+
+_Override.add_constructor('!override', lambda loader, node: loader.construct_sequence(node))  # type: ignore[no-untyped-call]
+
+
+@pytest.fixture(scope='module')
+def secured() -> dict[str, Any]:
+    """What compose.tls.yaml changes."""
+    text = (TOWER / 'compose.tls.yaml').read_text(encoding='utf-8')
+    found: dict[str, Any] = yaml.load(text, _Override)['services']  # noqa: S506 - a safe loader
+    return found
+
+
+def test_with_tls_nothing_else_changes(services: dict[str, Any], secured: dict[str, Any]) -> None:
+    """The commands only grow, the one published port of the S3 server is that of https, and MLflow has no other than its own."""
+    assert set(secured) == {'s3', 'mlflow'}
+    for name, service in secured.items():
+        assert service['command'].startswith(services[name]['command'].rstrip())
+    assert '-s3.port.https=8334' in secured['s3']['command']
+    assert [port.split('}')[1] for port in secured['s3']['ports']] == [':9000:8334']
+    assert 'ports' not in secured['mlflow']
+    assert "https://127.0.0.1:5000/health'" in secured['mlflow']['healthcheck']['test'][-1]
+
+
 @pytest.mark.seaweedfs
-def test_the_server_knows_its_options(services: dict[str, Any]) -> None:
+def test_the_server_knows_its_options(services: dict[str, Any], secured: dict[str, Any]) -> None:
     """Every option of the S3 server is one of `weed server`, of the version that the image has."""
     weed = find_program('weed', '')
-    command = shlex.split(services['s3']['command'])
+    command = shlex.split(secured['s3']['command'])
     told = subprocess.run([weed, command[0], '-h'], capture_output=True, text=True, check=False)
     known = set(re.findall(r'^  -([\w.]+)', told.stderr + told.stdout, re.MULTILINE))
     assert {option.lstrip('-').partition('=')[0] for option in command[1:]} <= known

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from botocore.configloader import raw_config_parse
 from tower_scripts import TOWER, make_secrets
 
 
@@ -64,6 +65,29 @@ def test_a_key_is_changed_without_a_gap(tmp_path: Path) -> None:
     assert [key['secretKey'] for key in make_secrets.load_users(tmp_path / 'secrets' / 'users.json')['thor']] == [new]
     assert _key(tmp_path, 'spark') == spark
     assert old != new
+
+
+def test_a_file_of_keys_is_the_environment_of_its_user(tmp_path: Path) -> None:
+    """The same pair is read from it by botocore, the newest."""
+    make_secrets.make(tmp_path, None, ['thor'])
+    make_secrets.make(tmp_path, None, [], rotate=['thor'])
+    found = raw_config_parse(str(tmp_path / 'secrets' / 'thor.credentials'))['default']
+    environ = make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')
+    assert found == {
+        'aws_access_key_id': environ['AWS_ACCESS_KEY_ID'], 'aws_secret_access_key': environ['AWS_SECRET_ACCESS_KEY'],
+    }  # fmt: skip
+
+
+def test_a_certificate_makes_the_addresses_https(tmp_path: Path) -> None:
+    """And names the authority to both clients; without one there is neither."""
+    make_secrets.make(tmp_path, None, ['thor'])
+    plain = make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')
+    (tmp_path / 'tls').mkdir()
+    (tmp_path / 'tls' / 'tower.crt').touch()
+    make_secrets.make(tmp_path, None, ['thor'])
+    secured = make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')
+    assert {name: value.replace('http:', 'https:') for name, value in plain.items()}.items() <= secured.items()
+    assert secured.keys() - plain.keys() == {'AWS_CA_BUNDLE', 'MLFLOW_TRACKING_SERVER_CERT_PATH'}
 
 
 @pytest.mark.parametrize('name', ['../thor', 'thor*', 'Thor', '', 'a b', '-x'])

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -17,31 +15,13 @@ from typing import Any, Final
 import boto3
 import pytest
 from botocore.exceptions import ClientError
-from tower_scripts import TOWER, make_secrets
+from tower_scripts import TOWER, make_secrets, processes_of, reload_s3
 
 pytestmark = [
     pytest.mark.seaweedfs,
     pytest.mark.skipif('SHADOWHOUND_TEST_LONG' not in os.environ, reason='half a minute: set SHADOWHOUND_TEST_LONG=1'),
 ]
 START_S: Final = 120.0
-PORTS: Final = (9000, 5001, 5432, 9333, 8080, 8888, 23646)
-
-
-@pytest.fixture(scope='module')
-def offset() -> int:
-    """Something to add to all ports so that none of them is taken."""
-    for number in random.sample(range(500, 3000), 50):
-        sockets = [socket.socket() for _ in PORTS]
-        try:
-            for one, port in zip(sockets, PORTS, strict=True):
-                one.bind(('127.0.0.1', port + number))
-            return number
-        except OSError:
-            continue
-        finally:
-            for one in sockets:
-                one.close()
-    raise AssertionError('no free ports')
 
 
 @pytest.fixture(scope='module')
@@ -57,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, offset: int) -> Iterator[Pa
         finally:
             tower.send_signal(signal.SIGTERM)
             assert tower.wait(60) == 0
-    _until(lambda: not _processes(folder), 10)
+    _until(lambda: not processes_of(folder), 10)
 
 
 def _until(ready: Callable[[], bool], seconds: float) -> None:
@@ -65,18 +45,6 @@ def _until(ready: Callable[[], bool], seconds: float) -> None:
     while not ready():
         assert time.monotonic() < end
         time.sleep(0.05)
-
-
-def _processes(folder: Path) -> list[int]:
-    """Those whose command line names the folder."""
-    found: list[int] = []
-    for entry in Path('/proc').iterdir():
-        try:
-            if entry.name.isdigit() and str(folder) in (entry / 'cmdline').read_text():
-                found.append(int(entry.name))
-        except OSError:
-            continue
-    return found
 
 
 def _works(folder: Path, offset: int, key: dict[str, str]) -> bool:
@@ -109,16 +77,10 @@ def test_a_key_is_changed_while_it_runs(folder: Path, offset: int) -> None:
     make_secrets.make(folder, None, [], rotate=['thor'])
     new = make_secrets.load_users(users)['thor'][0]
     assert not _works(folder, offset, new)
-    _reload(folder)
+    reload_s3(folder)
     _until(lambda: _works(folder, offset, new), 20)
     assert _works(folder, offset, old)
     make_secrets.make(folder, None, [], retire=['thor'])
-    _reload(folder)
+    reload_s3(folder)
     _until(lambda: not _works(folder, offset, old), 20)
     assert _works(folder, offset, new)
-
-
-def _reload(folder: Path) -> None:
-    for number in _processes(folder):
-        if Path(f'/proc/{number}/cmdline').read_text().partition('\0')[0].endswith('weed'):
-            os.kill(number, signal.SIGHUP)

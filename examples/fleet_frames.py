@@ -1,0 +1,122 @@
+"""The sharp frames of a fleet, found by several worker processes: the catalogue asked, the frames fetched, decoded and judged.
+
+    python examples/fleet_frames.py --since yesterday --near=-0.6,3.1,2 --workers 4
+    python examples/fleet_frames.py --since yesterday --runner ray --address ray://HEAD:10001 --workers 64
+
+The question and the code are the same on a laptop (Daft's own runner, processes) and on a Ray cluster. A frame never comes to
+this process: workers send back two numbers for each. Sharpness is the variance of the Laplacian: blurred frames have little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from shadowhound_data_logger.config import home, store_settings
+from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.lake import decode, query
+from shadowhound_data_logger.lake.bodies import Bodies, Place
+from shadowhound_data_logger.lake.track import Object
+
+import daft  # isort: skip - after query, which turns its telemetry off
+from daft import DataType, Series, col  # isort: skip
+
+THREADS = 8
+ROWS = 64
+"""Frames that a worker is handed at a time."""
+JUDGED = DataType.struct({'sharpness': DataType.float64(), 'brightness': DataType.float64()})
+
+
+class Judge:
+    """Lives in a worker. It is told where the store is; the repr of that has no secret, so neither has a plan or a log."""
+
+    def __init__(self, place: Place) -> None:
+        self._place = place
+
+    @daft.method.batch(return_dtype=JUDGED, batch_size=ROWS)
+    def judge(self, bucket: Series, key: Series, size: Series, sha256: Series) -> list[dict[str, float | None]]:
+        """Of each frame; nulls for one that cannot be read any more."""
+        columns = (each.to_pylist() for each in (bucket, key, size, sha256))
+        objects = [Object(one, two, three, four or '') for one, two, three, four in zip(*columns, strict=True)]
+        found = []
+        with Bodies(self._place.read, 1, THREADS) as bodies:
+            bodies.ahead(objects)
+            for each in objects:
+                try:
+                    found.append(judged(decode.image(bodies.get(each))))
+                except DataLoggerError:
+                    found.append({'sharpness': None, 'brightness': None})
+        return found
+
+
+def judged(pixels: Any) -> dict[str, float | None]:
+    """Sharpness and mean brightness of an image, by its green, which most of what the eye takes for light is."""
+    grey = (pixels[..., 1] if pixels.ndim == 3 else pixels).astype(np.float32)
+    inner = grey[1:-1, 1:-1]
+    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
+    return {'sharpness': float(np.var(laplacian)), 'brightness': float(grey.mean())}
+
+
+def frames(place: Place, workers: int, least: float, **flags: Any) -> daft.DataFrame:
+    """A lazy frame: the rows of the sharp frames and how sharp they are, the sharpest first."""
+    judge = daft.cls(Judge, use_process=True, max_concurrency=workers)(place)
+    rows = query.objects(sensor='camera', **flags).where(col('content_type').is_in(['image/jpeg', 'image/png']))
+    told = rows.select('robot', 'bucket', 'key', 't_start', 'x', 'y', 'bytes', 'sha256').into_batches(ROWS)
+    made = told.with_column('judged', judge.judge(col('bucket'), col('key'), col('bytes'), col('sha256')))
+    plain = made.select('robot', 'key', 't_start', 'x', 'y', col('judged').get('sharpness').alias('sharpness'),
+                        col('judged').get('brightness').alias('brightness'))  # fmt: skip
+    return plain.where(col('sharpness') >= least).sort('sharpness', desc=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    options = _parser().parse_args(arguments)
+    if options.runner == 'ray':
+        daft.set_runner_ray(options.address)
+    else:
+        daft.set_runner_native()
+    place = Place(store_settings(os.environ, home(os.environ)))
+    names = ('robot', 'since', 'until', 'near', 'mission_type', 'where')
+    flags = {name: getattr(options, name) for name in names if getattr(options, name)}
+    try:
+        begun = time.perf_counter()
+        found = frames(place, options.workers, options.least, **flags).to_pydict()
+        took = time.perf_counter() - begun
+    except DataLoggerError as error:
+        print(f'fleet_frames: {error}', file=sys.stderr)
+        return 1
+    if options.json:
+        print(json.dumps({'frames': len(found['key']), 'took_s': round(took, 3), 'keys': found['key']}))
+        return 0
+    for robot, key, sharpness, brightness in list(zip(*(found[name] for name in ('robot', 'key', 'sharpness', 'brightness')),
+                                                      strict=True))[: options.show]:  # fmt: skip
+        print(f'{sharpness:10.1f} {brightness:6.1f}  {robot}  {key}')
+    print(
+        f'{len(found["key"])} frames of a sharpness of {options.least:g} or more, by {options.workers} processes in {took:.1f} s'
+    )
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='fleet_frames', description=__doc__.partition('\n')[0])
+    for name, text in (('robot', 'of this robot'), ('since', 'yesterday, 2h, ...'), ('until', 'likewise'), ('near', 'X,Y,RADIUS'),
+                       ('mission-type', 'such as patrol'), ('where', 'SQL, such as battery_pct < 30')):  # fmt: skip
+        parser.add_argument(f'--{name}', help=text)
+    parser.add_argument('--least', type=float, default=0.0, help='sharpness of what is shown')
+    parser.add_argument('--workers', type=int, default=2, help='processes')
+    parser.add_argument('--runner', choices=('native', 'ray'), default='native')
+    parser.add_argument('--address', help='of a Ray cluster; without one Ray is started on this machine')
+    parser.add_argument('--show', type=int, default=10, metavar='N', help='lines')
+    parser.add_argument('--json', action='store_true')
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(main())

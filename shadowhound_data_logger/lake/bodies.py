@@ -1,0 +1,130 @@
+"""The contents of objects for one process that reads a data set: fetched ahead by a few threads, verified, in bounded memory."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Final
+
+from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.lake.track import Object
+from shadowhound_data_logger.options import StoreSettings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from typing_extensions import Self
+
+Read = Callable[[str, str], bytes]
+"""From bucket and key to content."""
+TRIES: Final = 3
+"""Of content that is damaged on its way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where contents come from, as a value that another process can be given."""
+
+    settings: StoreSettings
+    folder: Path | None = None
+    """Of fetched objects (``DIR/KEY``); they count alone."""
+
+    def read(self, bucket: str, key: str) -> bytes:
+        """Raises StoreError."""
+        if self.folder is None and self.settings.endpoint_url:
+            from shadowhound_data_logger.stores import s3_get  # noqa: PLC0415 - a folder needs no botocore
+
+            return s3_get.read(self.settings, bucket, key)
+        path = (self.folder or self.settings.directory / bucket) / key
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise ObjectRefused(f'{path} cannot be read: {error.strerror}', bucket=bucket, key=key, reason='missing') from error
+
+
+class Bodies:
+    """New; ``ahead`` and ``get`` on one thread; close. What was got is kept while it fits into ``keep_bytes``.
+
+    The threads begin with the first ``ahead``; all but reading is the caller's, so nothing needs a lock.
+    """
+
+    def __init__(self, read: Read, keep_bytes: int, threads: int) -> None:
+        self._read = read
+        self._keep_bytes = keep_bytes
+        self._threads = threads
+        self._pool: ThreadPoolExecutor | None = None
+        self._waiting: dict[tuple[str, str], Future[bytes]] = {}
+        self._kept: OrderedDict[tuple[str, str], bytes] = OrderedDict()
+        self._held_bytes = 0
+        self.waiting_bytes = 0
+        """Of objects that were asked for ahead and not got yet."""
+        self._over = threading.Event()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Waits for the requests under way; idempotent."""
+        self._over.set()
+        pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.shutdown(cancel_futures=True)
+        self._waiting.clear()
+
+    def ahead(self, objects: Iterable[Object]) -> None:
+        """These may be asked for; ``settle`` them once it is over."""
+        for each in objects:
+            name = (each.bucket, each.key)
+            if name not in self._kept and name not in self._waiting:
+                if self._pool is None:
+                    self._pool = ThreadPoolExecutor(self._threads, 'dataset')
+                self._waiting[name] = self._pool.submit(self._verified, each)
+                self.waiting_bytes += each.size
+
+    def get(self, wanted: Object) -> bytes:
+        """The content. Raises StoreError, LakeError for one that is not what was stored."""
+        name = (wanted.bucket, wanted.key)
+        if (body := self._kept.get(name)) is not None:
+            self._kept.move_to_end(name)
+            return body
+        body = self._awaited(wanted) if name in self._waiting else self._verified(wanted)
+        self._keep(name, body)
+        return body
+
+    def settle(self, objects: Iterable[Object]) -> None:
+        """What of these nobody asked for is forgotten."""
+        for each in objects:
+            waiting = self._waiting.pop((each.bucket, each.key), None)
+            if waiting is not None:
+                waiting.cancel()
+                self.waiting_bytes -= each.size
+
+    def _awaited(self, wanted: Object) -> bytes:
+        waiting = self._waiting.pop((wanted.bucket, wanted.key))
+        self.waiting_bytes -= wanted.size
+        return waiting.result()
+
+    def _keep(self, name: tuple[str, str], body: bytes) -> None:
+        self._kept[name] = body
+        self._held_bytes += len(body)
+        while self._held_bytes > self._keep_bytes and len(self._kept) > 1:
+            self._held_bytes -= len(self._kept.popitem(last=False)[1])
+
+    def _verified(self, wanted: Object) -> bytes:
+        for left in reversed(range(TRIES)):
+            body = self._read(wanted.bucket, wanted.key)
+            if not wanted.sha256 or hashlib.sha256(body).hexdigest() == wanted.sha256:
+                return body
+            if not left or self._over.is_set():
+                break
+        raise LakeError(
+            f'the content of {wanted.bucket}/{wanted.key} is not what was stored', bucket=wanted.bucket, key=wanted.key
+        )

@@ -1,0 +1,211 @@
+"""What robots stored as a data set to train on: aligned samples of numpy arrays, by number or streamed, from a store or a folder.
+
+It works with ``torch.utils.data.DataLoader`` and does not import torch. The catalogue is asked once, when a data set is made;
+then any number of processes, forked or spawned, read objects and nothing else.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.lake import shards
+from shadowhound_data_logger.lake.bodies import Bodies
+from shadowhound_data_logger.lake.samples import Near, Sample, Samples, Window, is_complete
+from shadowhound_data_logger.lake.track import Object, Track
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from shadowhound_data_logger.lake.source import Source
+
+THREADS: Final = 8
+"""Requests on their way at a time, in each process."""
+AHEAD_BYTES: Final = 32 << 20
+"""Of objects that were asked for before they are needed, in each process."""
+AHEAD: Final = 64
+"""Objects likewise."""
+KEEP_BYTES: Final = 32 << 20
+"""Of contents that were needed and may be once more, in each process."""
+
+
+class MissionDataset:
+    """Map-style. Pickled it is a value: no socket, thread or content goes along.
+
+    A sample is a dict: ``image`` (height, width, 3) uint8 RGB or ``cloud`` (n, 4) float32, ``stamp_ns``, ``pose`` (x y yaw),
+    ``battery_pct``; and for each aligned sensor NAME its numbers, ``NAME_ok`` (of a window for each row) and ``NAME_dt_s``, how
+    much later than the anchor it was. What is missing is NaN, of a cloud no point.
+    """
+
+    def __init__(
+        self, source: Source | Path | str | None = None, *, anchor: str = 'camera',
+        align: Mapping[str, float | Near | Window] | None = None, size: tuple[int, int] | None = None,
+        drop_incomplete: bool = False, **flags: Any,
+    ) -> None:  # fmt: skip
+        """``source``: None for the store that the environment names, or a folder of ``shadowhound-data fetch``.
+
+        ``align`` has sensors and how near in time they must be: seconds for the nearest message, or a ``Window``. ``flags`` are
+        those of ``lake.objects``, for the anchor's objects. ``drop_incomplete`` leaves out objects about whose time the catalogue
+        knows nothing of an aligned sensor; a stream leaves out single messages as well. Objects without a date are not in it.
+        Raises SettingError, StoreError, LakeError.
+        """
+        from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no Daft
+
+        if 'sensor' in flags:
+            raise SettingError('sensor', flags['sensor'], 'anchor="camera" instead')
+        self.aligned = {name: how if isinstance(how, (Near, Window)) else Near(float(how)) for name, how in (align or {}).items()}
+        self._place, asked = selecting.place(source)
+        self._selection = selecting.select(asked, anchor, self.aligned, size, flags)
+        self._drop_incomplete = drop_incomplete
+        self._chosen = [self._complete(track) for track in self._selection.anchors]
+        counts = [track.count[chosen] for track, chosen in zip(self._selection.anchors, self._chosen, strict=True)]
+        self._ends = np.cumsum(np.concatenate([np.empty(0, np.int64), *counts]))
+        self._reading: tuple[int, Bodies, Samples] | None = None
+
+    def __len__(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def __getitem__(self, index: int) -> Sample:
+        return self._samples().sample(*self._at(self._reference(index)))
+
+    def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
+        """Several at once, whose objects are read at the same time; torch's DataLoader asks for whole batches so."""
+        references = [self._reference(index) for index in indices]
+        samples = self._samples()
+        assert self._reading is not None
+        for reference in references:
+            self._reading[1].ahead(self._selection.needed(*self._at(reference)[:2]))
+        return [samples.sample(*self._at(reference)) for reference in references]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, '_reading': None}
+
+    def __repr__(self) -> str:
+        return f'MissionDataset({len(self):,} samples in {sum(map(len, self._chosen)):,} objects)'
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """The time of each sample by the catalogue: exact of single messages, evenly spread in an archive."""
+        found = [
+            track.stamps_ns(int(number))
+            for track, chosen in zip(self._selection.anchors, self._chosen, strict=True)
+            for number in chosen
+        ]
+        return np.concatenate([np.empty(0, np.int64), *found])
+
+    @property
+    def poses(self) -> NDArray[np.float64]:
+        """(samples, 3): x y yaw of each by the catalogue, in an archive that of its middle; NaN where it is not known."""
+        found = [np.repeat(track.pose[chosen], track.count[chosen], axis=0)
+                 for track, chosen in zip(self._selection.anchors, self._chosen, strict=True)]  # fmt: skip
+        return np.concatenate([np.empty((0, 3)), *found])
+
+    def stream(self, *, shuffle: bool = False, seed: int = 0, rank: int = 0, ranks: int = 1) -> MissionStream:
+        """The same samples one after another, read ahead; a DataLoader takes it for an IterableDataset.
+
+        Each worker has whole shards; ``rank`` of ``ranks`` is for several processes that train together.
+        """
+        return MissionStream(self, seed if shuffle else None, (rank, ranks))
+
+    def streamed(self, share: tuple[int, int], seed: int | None, epoch: int) -> Iterator[Sample]:
+        """One share of (share, shares) of one epoch of a stream."""
+        references = shards.order(self._selection.anchors, self._chosen, share=share, seed=seed, epoch=epoch)
+        with Bodies(self._place.read, KEEP_BYTES, THREADS) as bodies:
+            samples = Samples(self._selection, bodies)
+            waiting: deque[tuple[shards.Reference, tuple[Object, ...]]] = deque()
+            while True:
+                self._go_ahead(references, waiting, bodies)
+                if not waiting:
+                    return
+                reference, objects = waiting.popleft()
+                sample = samples.sample(*self._at(reference))
+                if not waiting or waiting[0][0][:2] != reference[:2]:
+                    bodies.settle(objects)
+                if not self._drop_incomplete or is_complete(sample, self.aligned):
+                    yield sample
+
+    def _go_ahead(self, references: Iterator[shards.Reference], waiting: deque[tuple[shards.Reference, tuple[Object, ...]]],
+                  bodies: Bodies) -> None:  # fmt: skip
+        """At least one reference waits afterwards, if there are any."""
+        while not waiting or (len(waiting) < AHEAD and bodies.waiting_bytes < AHEAD_BYTES):
+            reference = next(references, None)
+            if reference is None:
+                return
+            if waiting and waiting[-1][0][:2] == reference[:2]:
+                objects = waiting[-1][1]
+            else:
+                objects = tuple(self._selection.needed(*self._at(reference)[:2]))
+            bodies.ahead(objects)
+            waiting.append((reference, objects))
+
+    def close(self) -> None:
+        """Ends the threads of this process; the next sample starts them again."""
+        if self._reading is not None:
+            self._reading[1].close()
+            self._reading = None
+
+    def _complete(self, track: Track) -> NDArray[np.intp]:
+        every = np.arange(len(track))
+        if not self._drop_incomplete:
+            return every
+        return np.array([number for number in every if self._selection.can_be_complete(track, int(number))], np.intp)
+
+    def _reference(self, index: int) -> shards.Reference:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f'{index} of {len(self)} samples')
+        index %= len(self)
+        place = int(np.searchsorted(self._ends, index, 'right'))
+        member = index - (int(self._ends[place - 1]) if place else 0)
+        for number, chosen in enumerate(self._chosen):
+            if place < len(chosen):
+                return shards.Reference(number, int(chosen[place]), member)
+            place -= len(chosen)
+        raise AssertionError('unreachable')
+
+    def _at(self, reference: shards.Reference) -> tuple[Track, int, int]:
+        return self._selection.anchors[reference.track], reference.number, reference.member
+
+    def _samples(self) -> Samples:
+        """Of this process: what a parent had is useless in its child."""
+        if self._reading is None or self._reading[0] != os.getpid():
+            bodies = Bodies(self._place.read, KEEP_BYTES, THREADS)
+            self._reading = os.getpid(), bodies, Samples(self._selection, bodies)
+        return self._reading[2]
+
+
+class MissionStream:
+    """Iterable, once or several times at a time. The order of a shuffled one depends on ``set_epoch`` and earlier iterations."""
+
+    def __init__(self, dataset: MissionDataset, seed: int | None, part: tuple[int, int]) -> None:
+        self._dataset = dataset
+        self._seed = seed
+        self._part = part
+        self._epoch = 0
+        _be_iterable()
+
+    def set_epoch(self, epoch: int) -> None:
+        """The order of the next iteration is that of this epoch; the one after it has the next.
+
+        Needed where each epoch has new workers; those of ``persistent_workers`` count by themselves.
+        """
+        self._epoch = epoch
+
+    def __iter__(self) -> Iterator[Sample]:
+        worker, workers = shards.worker_share()
+        share = self._part[0] * workers + worker, self._part[1] * workers
+        epoch, self._epoch = self._epoch, self._epoch + 1
+        return self._dataset.streamed(share, self._seed, epoch)
+
+
+def _be_iterable() -> None:
+    """A DataLoader asks what something is by torch's class; where torch is loaded, ours is one of those."""
+    loading = sys.modules.get('torch.utils.data')
+    if loading is not None:
+        loading.IterableDataset.register(MissionStream)

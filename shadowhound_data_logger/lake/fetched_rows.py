@@ -1,0 +1,42 @@
+"""The rows of fetched objects, kept in the folder as a robot keeps them in the bucket: the folder is a lake of its own.
+
+So ``MissionDataset('DIR')`` needs no store any more. Rows that two fetches brought are shown once (they count as mended parts).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.lake import parts
+from shadowhound_data_logger.lake.schema import COLUMNS
+from shadowhound_data_logger.lake.standing import mended_key
+
+
+def keep(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """One part for each robot and date among rows as Daft gives them. Raises LakeError where it cannot be written."""
+    plain = [
+        {**{name: row[name] for name in COLUMNS}, **{name: _micros(row, name) for name in ('t_start', 't_end')}} for row in rows
+    ]
+    for robot, date, found in parts.by_folder(enumerate(plain)):
+        if robot is None:
+            continue
+        ours = [row for _, row in found]
+        path = folder / mended_key(robot, date, [f'{row["bucket"]}/{row["key"]} {row["t_start_ns"]}' for row in ours])
+        if path.is_file():
+            continue
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part = path.with_suffix(f'.{os.getpid()}.part')
+            part.write_bytes(parts.encode(ours))
+            part.replace(path)
+        except OSError as error:
+            raise LakeError(f'{path} cannot be written: {error.strerror}', folder=str(folder)) from error
+
+
+def _micros(row: Mapping[str, Any], name: str) -> int | None:
+    """As a robot writes them: of what has no date there is none."""
+    return None if row[name] is None else int(row[f'{name}_ns']) // 1000

@@ -1,0 +1,262 @@
+"""One sample of a data set: a message of the anchor as arrays, with what other sensors said about the same time."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.lake import decode
+from shadowhound_data_logger.lake.bodies import Bodies
+from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, Member
+from shadowhound_data_logger.lake.numbers import Table, table
+from shadowhound_data_logger.lake.track import Object, Track
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Sample = dict[str, Any]
+POSE_GAP_NS: Final = 1_500_000_000
+"""As on the robot: between poses that are farther apart there is none (capture/pose_track.py)."""
+DECODED_BYTES: Final = 48 << 20
+"""Of tables and archives that are kept: a batch of 1 s serves all frames of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """The one message of a sensor that is nearest in time."""
+
+    tolerance_s: float
+    """At most so far away."""
+    fields: tuple[str, ...] = ()
+    """Paths of numbers such as ``bms_state.soc``; none: those of ``numbers.FIELDS``."""
+
+    @property
+    def reach_ns(self) -> tuple[int, int]:
+        """How long before and after the anchor's time a message may be."""
+        return round(self.tolerance_s * SECOND), round(self.tolerance_s * SECOND)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The last ``rows`` messages of a sensor from ``before_s`` before the anchor's time to ``after_s`` after it, oldest first.
+
+    Where there are fewer, the first rows are NaN, so that all samples have one shape.
+    """
+
+    before_s: float
+    rows: int
+    after_s: float = 0.0
+    fields: tuple[str, ...] = ()
+
+    @property
+    def reach_ns(self) -> tuple[int, int]:
+        """How long before and after the anchor's time a message may be."""
+        return round(self.before_s * SECOND), round(self.after_s * SECOND)
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """What a data set consists of; a value that can be pickled."""
+
+    anchors: tuple[Track, ...]
+    """By robot."""
+    aligned: Mapping[str, Near | Window]
+    sides: Mapping[tuple[str, str], Track]
+    """(robot, sensor) -> what there is of an aligned sensor."""
+    size: tuple[int, int] | None
+    """(height, width) of images; None: as they are."""
+
+    def needed(self, track: Track, number: int) -> Iterator[Object]:
+        """The objects that the samples of this object of an anchor are made of, the object itself among them."""
+        yield track.object(number)
+        first, last = int(track.start_ns[number]), int(track.end_ns[number])
+        for sensor, how in self.aligned.items():
+            side = self.sides.get((track.robot, sensor))
+            if side is None:
+                continue
+            before, after = how.reach_ns
+            if isinstance(how, Near) and first == last:
+                best = list(side.nearest(first, before))[:1]
+                yield from (side.object(found) for _, found in best)
+            else:
+                if isinstance(how, Near):  # of each moment in it, only what is next to it
+                    before, after = (min(reach, SECOND) for reach in (before, after))
+                yield from (side.object(int(found)) for found in side.within(first - before, last + after))
+
+    def can_be_complete(self, track: Track, number: int) -> bool:
+        """Whether the catalogue knows of messages of all aligned sensors about the time of an object."""
+        first, last = int(track.start_ns[number]), int(track.end_ns[number])
+        for sensor, how in self.aligned.items():
+            side, (before, after) = self.sides.get((track.robot, sensor)), how.reach_ns
+            if side is None or not len(side.within(first - before, last + after)):
+                return False
+        return True
+
+
+class Samples:
+    """Makes them, on one thread; keeps what it decoded, because neighbours need it again."""
+
+    def __init__(self, selection: Selection, bodies: Bodies) -> None:
+        self._selection = selection
+        self._bodies = bodies
+        self._decoded: OrderedDict[tuple[str, str, str], tuple[Any, int]] = OrderedDict()
+        self._decoded_bytes = 0
+
+    def sample(self, track: Track, number: int, member: int = 0) -> Sample:
+        """The sample of the message ``member`` of an object of an anchor. Raises StoreError, LakeError."""
+        wanted = track.object(number)
+        name, content, stamp_ns = self._anchor(track, number, member, wanted)
+        sample: Sample = {
+            name: content,
+            'stamp_ns': np.int64(stamp_ns),
+            'pose': track.pose_at(number, stamp_ns, POSE_GAP_NS).copy(),
+            'battery_pct': np.float64(track.battery_pct[number]),
+        }
+        for sensor, how in self._selection.aligned.items():
+            side = self._selection.sides.get((track.robot, sensor))
+            sample |= self._aligned(sensor, how, side, stamp_ns)
+        return sample
+
+    def _anchor(self, track: Track, number: int, member: int, wanted: Object) -> tuple[str, NDArray[Any], int]:
+        extension = decode.extension_of(wanted.key)
+        if extension not in ARCHIVES:
+            return (*self._picture(wanted, self._bodies.get(wanted), extension), int(track.start_ns[number]))
+        found = self._members(wanted)
+        if member >= len(found):
+            raise LakeError(f'{wanted.key} has {len(found)} messages, the catalogue says {track.count[number]}', key=wanted.key)
+        one = found[member]
+        return (*self._picture(wanted, one.body, one.extension), one.stamp_ns + int(track.offset_ns[number]))
+
+    def _picture(self, wanted: Object, body: bytes, extension: str) -> tuple[str, NDArray[Any]]:
+        with _naming(wanted):
+            return ('cloud', decode.cloud(body)) if extension in CLOUDS else ('image', decode.image(body, self._selection.size))
+
+    def _members(self, wanted: Object) -> list[Member]:
+        def read() -> list[Member]:
+            return decode.members(self._bodies.get(wanted), decode.extension_of(wanted.key))
+
+        found: list[Member] = self._once(('members', wanted.bucket, wanted.key), wanted, read)
+        return found
+
+    def _aligned(self, sensor: str, how: Near | Window, side: Track | None, stamp_ns: int) -> Sample:
+        if isinstance(how, Window):
+            values, present = self._window(how, side, stamp_ns)
+            return {sensor: values, f'{sensor}_ok': present}
+        if side is not None and _is_cloud(side):
+            points, away_ns = self._nearest_cloud(how, side, stamp_ns)
+            return {sensor: points, f'{sensor}_ok': np.bool_(away_ns is not None), f'{sensor}_dt_s': _seconds(away_ns)}
+        row, away_ns = self._nearest(how, side, stamp_ns)
+        return {sensor: row, f'{sensor}_ok': np.bool_(away_ns is not None), f'{sensor}_dt_s': _seconds(away_ns)}
+
+    def _nearest(self, how: Near, side: Track | None, stamp_ns: int) -> tuple[NDArray[np.float64], int | None]:
+        """Its numbers, and how much later it is than the anchor; NaN and None where there is none."""
+        best: tuple[int, NDArray[np.float64]] | None = None
+        if side is not None:
+            tolerance = how.reach_ns[0]
+            for least, number in side.nearest(stamp_ns, tolerance):
+                if best is not None and abs(best[0]) <= least:
+                    break
+                found = self._table(side, number, how.fields)
+                if len(found.stamps):
+                    place = _closest(found.stamps, stamp_ns)
+                    away = int(found.stamps[place]) - stamp_ns
+                    if abs(away) <= tolerance and (best is None or abs(away) < abs(best[0])):
+                        best = away, found.values[place]
+        if best is None:
+            return np.full(self._width(side, how.fields), np.nan), None
+        return best[1].copy(), best[0]
+
+    def _nearest_cloud(self, how: Near, side: Track, stamp_ns: int) -> tuple[NDArray[np.float32], int | None]:
+        best: tuple[int, Object, Member | None] | None = None
+        for least, number in side.nearest(stamp_ns, how.reach_ns[0]):
+            if best is not None and abs(best[0]) <= least:
+                break
+            wanted, offset = side.object(number), int(side.offset_ns[number])
+            is_packed = decode.extension_of(wanted.key) in ARCHIVES
+            options: list[Member | None] = [*self._members(wanted)] if is_packed else [None]
+            for one in options:
+                away = (int(side.start_ns[number]) if one is None else one.stamp_ns + offset) - stamp_ns
+                if abs(away) <= how.reach_ns[0] and (best is None or abs(away) < abs(best[0])):
+                    best = away, wanted, one
+        if best is None:
+            return np.empty((0, 4), np.float32), None
+        away, wanted, one = best
+        with _naming(wanted):
+            return decode.cloud(self._bodies.get(wanted) if one is None else one.body), away
+
+    def _window(self, how: Window, side: Track | None, stamp_ns: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        width = self._width(side, how.fields)
+        values, present = np.full((how.rows, width), np.nan), np.zeros(how.rows, np.bool_)
+        if side is None:
+            return values, present
+        before, after = how.reach_ns
+        found = [self._table(side, int(number), how.fields) for number in side.within(stamp_ns - before, stamp_ns + after)]
+        stamps = np.concatenate([each.stamps for each in found]) if found else np.empty(0, np.int64)
+        inside = np.flatnonzero((stamps >= stamp_ns - before) & (stamps <= stamp_ns + after))
+        last = inside[np.argsort(stamps[inside], kind='stable')][-how.rows :]
+        if len(last):
+            values[-len(last) :] = np.concatenate([each.values for each in found])[last]
+            present[-len(last) :] = True
+        return values, present
+
+    def _width(self, side: Track | None, fields: tuple[str, ...]) -> int:
+        """Columns of a sensor, those of its first object; none of one that stored nothing."""
+        return 0 if side is None or not len(side) else int(self._table(side, 0, fields).values.shape[1])
+
+    def _table(self, side: Track, number: int, fields: tuple[str, ...]) -> Table:
+        wanted = side.object(number)
+
+        def read() -> Table:
+            found = decode.records(self._bodies.get(wanted))
+            return table(found, side.kind, fields, int(side.offset_ns[number]))
+
+        made: Table = self._once((side.sensor, wanted.bucket, wanted.key), wanted, read)
+        return made
+
+    def _once(self, name: tuple[str, str, str], wanted: Object, make: Callable[[], Any]) -> Any:
+        if name not in self._decoded:
+            with _naming(wanted):
+                made = make()
+            size = made.nbytes if isinstance(made, Table) else sum(len(one.body) for one in made)
+            self._decoded[name] = made, size
+            self._decoded_bytes += size
+            while self._decoded_bytes > DECODED_BYTES and len(self._decoded) > 1:
+                self._decoded_bytes -= self._decoded.popitem(last=False)[1][1]
+        self._decoded.move_to_end(name)
+        return self._decoded[name][0]
+
+
+@contextmanager
+def _naming(wanted: Object) -> Iterator[None]:
+    """A LakeError about content says of which object."""
+    try:
+        yield
+    except LakeError as error:
+        if 'key' in error.data:
+            raise
+        name = f'{wanted.bucket}/{wanted.key}'
+        raise LakeError(f'{name}: {error}', bucket=wanted.bucket, key=wanted.key) from error
+
+
+def _is_cloud(side: Track) -> bool:
+    return side.kind == 'sensor_msgs/msg/PointCloud2'
+
+
+def _closest(stamps: NDArray[np.int64], stamp_ns: int) -> int:
+    return int(np.argmin(np.abs(stamps - stamp_ns)))
+
+
+def _seconds(away_ns: int | None) -> Any:
+    return np.float64(np.nan if away_ns is None else away_ns / SECOND)
+
+
+def is_complete(sample: Sample, aligned: Mapping[str, Near | Window]) -> bool:
+    """Whether the pose and all aligned sensors are there; of a window one message is enough."""
+    return not bool(np.isnan(sample['pose']).any()) and all(bool(np.any(sample[f'{name}_ok'])) for name in aligned)

@@ -1,0 +1,84 @@
+"""From a question to the tracks of a data set: the only part of data sets that asks the catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.lake import query  # first: it turns Daft's telemetry off
+from shadowhound_data_logger.lake.bodies import Place
+from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES, extension_of
+from shadowhound_data_logger.lake.folder_source import FolderSource
+from shadowhound_data_logger.lake.samples import Near, Selection, Window
+from shadowhound_data_logger.lake.source import Source
+from shadowhound_data_logger.lake.track import NEEDED, Track
+from shadowhound_data_logger.options import StoreSettings
+
+from daft import col  # isort: skip
+
+Row = dict[str, Any]
+
+
+def place(source: Source | Path | str | None) -> tuple[Place, Source]:
+    """Where contents come from, and where the catalogue is."""
+    if isinstance(source, (str, Path)):
+        return Place(StoreSettings(), Path(source).absolute()), fetched(Path(source))
+    found = source or query.default_source()
+    return Place(found.settings), found
+
+
+def fetched(folder: Path) -> Source:
+    """A folder of fetched objects as a lake: their rows lie in it as well (lake/fetched_rows.py)."""
+    whole = folder.absolute()
+    return FolderSource(StoreSettings(directory=whole.parent), whole.name)
+
+
+def select(source: Source, anchor: str, aligned: Mapping[str, Near | Window], size: tuple[int, int] | None,
+           flags: Mapping[str, Any]) -> Selection:  # fmt: skip
+    """Raises SettingError for what is no question, LakeError where an aligned sensor is in no catalogue at all, StoreError."""
+    for name, how in aligned.items():
+        if min(how.reach_ns) < 0 or not sum(how.reach_ns):
+            raise SettingError(f'align[{name!r}]', how, 'a time of more than 0 s')
+    found = _rows(query.objects(source, sensor=anchor, **flags))
+    anchors = _tracks(row for row in found if extension_of(row['key']) in IMAGES | CLOUDS | ARCHIVES)
+    sides = _sides(source, list(anchors.values()), aligned) if anchors else {}
+    return Selection(tuple(anchors.values()), dict(aligned), sides, size)
+
+
+def _sides(source: Source, anchors: list[Track], aligned: Mapping[str, Near | Window]) -> dict[tuple[str, str], Track]:
+    if not aligned:
+        return {}
+    reach = max(max(how.reach_ns) for how in aligned.values()) + SECOND
+    longest_ns = 3600 * SECOND  # a batch that began so long before can reach into the time (sensor.batch_s)
+    since = utc(min(int(track.start_ns[0]) for track in anchors) - reach - longest_ns)
+    until = utc(max(int(track.latest_ns[-1]) for track in anchors) + reach)
+    rows = query.objects(source, since=since, until=until).where(col('sensor').is_in(list(aligned)))
+    found = _rows(rows)
+    for name in aligned:
+        if len(kinds := {row['type'] for row in found if row['sensor'] == name}) > 1:
+            raise LakeError(f'{name} has messages of {" and of ".join(sorted(map(str, kinds)))}', remedy='restrict the time')
+    return {key: _near(track, anchors, reach) for key, track in _tracks(found).items()}
+
+
+def _near(track: Track, anchors: list[Track], reach: int) -> Track:
+    """Of a side only what is about the time of an anchor of its robot: months can lie between two of them."""
+    same = [anchor for anchor in anchors if anchor.robot == track.robot]
+    first = min((int(anchor.start_ns[0]) for anchor in same), default=0) - reach
+    last = max((int(anchor.latest_ns[-1]) for anchor in same), default=0) + reach
+    return track.only(track.within(first, last))
+
+
+def _rows(frame: Any) -> list[Row]:
+    with query.answering():
+        found: list[Row] = frame.where(col('t_start').not_null()).select(*NEEDED).to_pylist()
+    return found
+
+
+def _tracks(rows: Iterable[Row]) -> dict[tuple[str, str], Track]:
+    grouped: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        grouped.setdefault((row['robot'] or '', row['sensor'] or ''), []).append(row)
+    return {name: Track.of(found) for name, found in sorted(grouped.items())}

@@ -1,0 +1,54 @@
+"""Why a server's certificate is not believed, in words for the operator: by whom it is signed, until when, and for which name."""
+
+from __future__ import annotations
+
+import ssl
+from collections.abc import Iterator
+from typing import Any, Final
+
+_NOT_YET, _EXPIRED, _HOST, _ADDRESS = 9, 10, 62, 64
+"""X509_V_ERR_CERT_NOT_YET_VALID, _CERT_HAS_EXPIRED, _HOSTNAME_MISMATCH, _IP_ADDRESS_MISMATCH of OpenSSL's x509_vfy.h."""
+_OTHER_NAME: Final = (
+    'the certificate of {server} is for another name',
+    'put a name that is in it (subjectAltName) into {address}, or make one on Tower that has this name',
+)
+_REASONS: Final = {
+    _NOT_YET: ('the certificate of {server} is not valid yet', 'set the clock of this machine: `timedatectl`'),
+    _EXPIRED: ('the certificate of {server} has expired', 'renew it on Tower; unless the clock of this machine is ahead: `date`'),
+    _HOST: _OTHER_NAME,
+    _ADDRESS: _OTHER_NAME,
+}
+_UNKNOWN: Final = (
+    'the certificate of {server} is not trusted',
+    'set {bundle} to the certificate of the authority that signed it',
+)
+
+
+def distrust(error: BaseException, server: str, *, bundle: str, address: str) -> tuple[str, str] | None:
+    """What is wrong with the server's certificate and what to do; None for an error that is about something else.
+
+    ``bundle`` and ``address`` are the variables that name the authorities to trust and the server.
+    """
+    for cause in causes(error):
+        if type(cause).__name__ == 'CertificateError':  # urllib3's own, before 2.0: it compares names itself
+            found = _OTHER_NAME
+        elif isinstance(cause, ssl.SSLCertVerificationError):
+            found = _REASONS.get(getattr(cause, 'verify_code', 0), _UNKNOWN)
+        else:
+            continue
+        what, remedy = (text.format(server=server, bundle=bundle, address=address) for text in found)
+        return what, remedy
+    return None
+
+
+def causes(error: BaseException) -> Iterator[BaseException]:
+    """What led to the error, the first cause last; urllib3 hides some in ``args`` and botocore in ``kwargs``."""
+    seen: list[BaseException | None] = [None]
+    waiting: list[Any] = [error]
+    while waiting:
+        cause = waiting.pop(0)
+        if isinstance(cause, BaseException) and cause not in seen:
+            seen.append(cause)
+            yield cause
+            inner = getattr(cause, 'kwargs', {})
+            waiting += [*cause.args, getattr(cause, 'reason', None), cause.__cause__, cause.__context__, inner.get('error')]

@@ -1,0 +1,233 @@
+"""A data set has every message of its anchor once, with what the other sensors said at that time, as the robot published it."""
+
+from __future__ import annotations
+
+import pickle
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import simplejpeg
+from lake.making import NOON_NS, folder_store
+from lake.training import FRAMES_HZ, IMU_HZ, LATE_NS, Drive, imu_reading, jpeg, seconds_of
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.lake import MissionDataset, Near, Window, fetched_rows, query, selecting
+from shadowhound_data_logger.lake.compact import compact
+from shadowhound_data_logger.lake.fetch import Wish, fetch
+from shadowhound_data_logger.lake.schema import BUCKET
+from shadowhound_data_logger.lake.source import Source, open_source
+from shadowhound_data_logger.stores import open_store
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.sim.tower import Tower
+
+ALIGN = {'odom': 0.5, 'imu': Window(0.5, rows=8), 'joints': 0.2, 'lowstate': 5.0, 'lidar': 0.5}
+SECONDS = 6
+
+
+def drive(tmp_path: Path, seconds: int = SECONDS, **how: Any) -> Source:
+    settings = folder_store(tmp_path)
+    Drive(settings, tmp_path).record(seconds, **how)
+    return open_source(settings, BUCKET)
+
+
+def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name], equal_nan=True) for name in one)
+
+
+def test_a_sample_is_what_was_published(tmp_path: Path) -> None:
+    """Picture, time, pose, and of each sensor the numbers next to it, with how far away they were."""
+    dataset = MissionDataset(drive(tmp_path), align=ALIGN)
+    assert len(dataset) == SECONDS
+    for number in range(SECONDS):
+        sample, stamp = dataset[number], NOON_NS + number * SECOND
+        assert sample['stamp_ns'] == stamp
+        assert np.array_equal(sample['image'], simplejpeg.decode_jpeg(jpeg(number)))
+        assert sample['pose'] == pytest.approx([number, -number, 0.5])
+        assert sample['battery_pct'] == 77.5
+        assert sample['odom'].shape == (13,)
+        assert (sample['odom'][0], sample['odom_dt_s']) == (number, LATE_NS / SECOND)
+        assert sample['joints'] == pytest.approx(np.full(12, number))
+        assert sample['lowstate'] == pytest.approx([77, 29.5, 0])
+        assert sample['lidar'].shape == (number + 2, 4)
+        assert np.array_equal(sample['lidar'].ravel(), np.arange(4 * (number + 2)))
+        assert all(sample[f'{name}_ok'].all() for name in ALIGN if name != 'imu')
+    dataset.close()
+
+
+def test_a_window_is_the_messages_before_the_frame(tmp_path: Path) -> None:
+    """The last eight of the half second before it, oldest first, over the border of two batches; where they are missing, NaN."""
+    dataset = MissionDataset(drive(tmp_path), align={'imu': Window(0.5, rows=8)})
+    stamp = NOON_NS + 2 * SECOND
+    expected = [imu_reading(stamp - step * SECOND // IMU_HZ) for step in reversed(range(8))]
+    assert dataset[2]['imu'] == pytest.approx(np.array(expected), abs=1e-6)
+    assert dataset[2]['imu_ok'].all()
+    first = dataset[0]
+    assert list(first['imu_ok']) == [False] * 7 + [True]
+    assert np.isnan(first['imu'][:7]).all()
+    assert first['imu'][7] == pytest.approx(imu_reading(NOON_NS))
+
+
+@pytest.mark.parametrize('frames', ['tar', 'zip'])
+def test_an_archive_is_as_many_samples_as_it_has_frames(tmp_path: Path, frames: str) -> None:
+    """Each with its own time, its own neighbours, and a pose between those of the archives."""
+    dataset = MissionDataset(drive(tmp_path, frames=frames), align=ALIGN)
+    assert len(dataset) == SECONDS * FRAMES_HZ
+    for number in (0, 5, 11, 20):
+        sample, stamp = dataset[number], NOON_NS + number * SECOND // FRAMES_HZ
+        assert sample['stamp_ns'] == stamp
+        assert np.array_equal(sample['image'], simplejpeg.decode_jpeg(jpeg(number)))
+        assert sample['imu'][-1] == pytest.approx(imu_reading(stamp), abs=1e-6)
+        assert sample['joints'][0] == pytest.approx(seconds_of(stamp), abs=0.11)
+        assert sample['odom'][0] == round(number / FRAMES_HZ - LATE_NS / SECOND)
+    assert dataset[9]['pose'] == pytest.approx([9 / FRAMES_HZ, -9 / FRAMES_HZ, 0.5])
+    assert list(dataset.stamps_ns) == [NOON_NS + number * SECOND // FRAMES_HZ for number in range(len(dataset))]
+
+
+def test_repeats_are_samples_of_their_own(tmp_path: Path) -> None:
+    """A frame that was stored once and seen thrice is three samples: as rows with a time of their own, and in an archive."""
+    settings = folder_store(tmp_path)
+    still = Drive(settings, tmp_path)
+    stamps = [NOON_NS + number * SECOND // 10 for number in range(3)]
+    made = still.one('sensor_msgs/msg/CompressedImage', stamps, [still.frame(5)] * 3, format='tar', batch_s=1.0, dedup=True)
+    still.store([made])
+    one = still.one('sensor_msgs/msg/CompressedImage', [NOON_NS + SECOND], [still.frame(6)])
+    still.store([one])
+    repeats = [
+        {**one.metadata, 't_start_ns': str(at), 't_end_ns': str(at)} for at in (NOON_NS + 2 * SECOND, NOON_NS + 3 * SECOND)
+    ]
+    still.catalogue([(one, told) for told in repeats])
+    dataset = MissionDataset(open_source(settings, BUCKET))
+    assert [int(dataset[number]['stamp_ns']) for number in range(len(dataset))] == [
+        *stamps, *(NOON_NS + second * SECOND for second in (1, 2, 3))
+    ]  # fmt: skip
+    shown = [simplejpeg.decode_jpeg(jpeg(number)) for number in (5, 5, 5, 6, 6, 6)]
+    assert all(np.array_equal(dataset[number]['image'], shown[number]) for number in range(6))
+
+
+def test_what_is_too_far_away_is_missing(tmp_path: Path) -> None:
+    """Numbers are NaN, a cloud has no point, the mask says so; all samples keep one shape."""
+    source = drive(tmp_path, without=['imu'])
+    dataset = MissionDataset(source, align={'odom': Near(0.02), 'lowstate': 0.1, 'imu': Window(0.5, rows=3)})
+    sample = dataset[3]
+    assert np.isnan(sample['odom']).all()
+    assert sample['odom'].shape == (13,)
+    assert (bool(sample['odom_ok']), bool(sample['lowstate_ok']), sample['imu_ok'].any()) == (False, True, False)
+    assert sample['imu'].shape[0] == 3
+
+
+def test_incomplete_samples_can_be_left_out(tmp_path: Path) -> None:
+    """By the catalogue in what is counted, and message by message in a stream."""
+    settings = folder_store(tmp_path)
+    partly = Drive(settings, tmp_path)
+    partly.record(3, frames='tar')
+    partly.record(3, frames='tar', without=['joints'], first=3)
+    source = open_source(settings, BUCKET)
+    whole = MissionDataset(source, align={'joints': 0.05}, drop_incomplete=True)
+    assert len(whole) == 3 * FRAMES_HZ
+    streamed = list(whole.stream())
+    assert len(streamed) == sum(bool(MissionDataset(source, align={'joints': 0.05})[number]['joints_ok']) for number in range(12))
+    assert 0 < len(streamed) < len(whole)
+
+
+@pytest.mark.parametrize('frames', ['jpeg', 'tar'])
+def test_all_ways_give_the_same(tmp_path: Path, frames: str) -> None:
+    """By number, several at once, streamed, and from a copy that went through pickle."""
+    dataset = MissionDataset(drive(tmp_path, frames=frames), align=ALIGN)
+    expected = [dataset[number] for number in range(len(dataset))]
+    assert all(map(same, expected, dataset.__getitems__(range(len(dataset)))))
+    assert all(map(same, expected, dataset.stream()))
+    copy = pickle.loads(pickle.dumps(dataset))  # noqa: S301 - our own
+    assert all(map(same, expected, (copy[number] for number in range(len(copy)))))
+    for each in (dataset, copy):
+        each.close()
+
+
+@pytest.mark.parametrize('frames', ['jpeg', 'tar'])
+def test_a_fetched_folder_gives_the_same(tmp_path: Path, frames: str) -> None:
+    """Objects and rows that two fetches brought, some of them twice, are the data set that the store is."""
+    source, to = drive(tmp_path, frames=frames), tmp_path / 'data'
+    for flags in ({'sensor': 'camera'}, {'robot': 'thor'}):
+        rows = query.objects(source, **flags).to_pylist()
+        fetch([Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows], to, lambda _: source)
+        fetched_rows.keep(to, rows)
+    store, folder = MissionDataset(source, align=ALIGN), MissionDataset(to, align=ALIGN)
+    assert len(store) == len(folder) > 0
+    assert all(map(same, store.stream(), folder.stream()))
+    assert len(query.objects(selecting.fetched(to)).to_pylist()) == len(query.objects(source).to_pylist())
+
+
+def test_repeats_survive_compaction(tmp_path: Path) -> None:
+    """Rows of one key and different times are different rows, to the reader and to ``lake compact``."""
+    settings = folder_store(tmp_path)
+    still = Drive(settings, tmp_path)
+    one = still.one('sensor_msgs/msg/CompressedImage', [NOON_NS], [still.frame(6)])
+    still.store([one])
+    still.catalogue([(one, {**one.metadata, 't_start_ns': str(NOON_NS + SECOND), 't_end_ns': str(NOON_NS + SECOND)})])
+    source = open_source(settings, BUCKET)
+    with closing(open_store(settings, UploadSettings())) as store:
+        assert [each.rows for each in compact(source, store, grace=None)] == [2]
+    assert list(MissionDataset(source).stamps_ns) == [NOON_NS, NOON_NS + SECOND]
+
+
+def test_an_image_of_another_size(tmp_path: Path) -> None:
+    """A picture of half the size is the average, not every other pixel."""
+    source = drive(tmp_path, 1)
+    small = MissionDataset(source, size=(12, 16))[0]['image']
+    whole = MissionDataset(source)[0]['image'].astype(float)
+    assert small.shape == (12, 16, 3)
+    assert np.abs(small - whole.reshape(12, 2, 16, 2, 3).mean(axis=(1, 3))).max() < 4
+    assert MissionDataset(source, size=(10, 14))[0]['image'].shape == (10, 14, 3)
+
+
+def test_questions_are_those_of_the_catalogue(tmp_path: Path) -> None:
+    """The flags restrict the frames and not what is beside them; several robots keep to their own."""
+    settings = folder_store(tmp_path)
+    Drive(settings, tmp_path).record(4)
+    Drive(settings, tmp_path, 'tachi').record(4, without=['odom'])
+    source = open_source(settings, BUCKET)
+    near = MissionDataset(source, robot='thor', near=(2.0, -2.0, 0.5), align={'odom': 0.5})
+    assert [sample['odom'][0] for sample in near.stream()] == [2]
+    both = MissionDataset(source, align={'odom': 0.5})
+    assert sorted(bool(sample['odom_ok']) for sample in both.stream()) == [False] * 4 + [True] * 4
+    with pytest.raises(SettingError):
+        MissionDataset(source, sensor='camera')
+    with pytest.raises(SettingError):
+        MissionDataset(source, align={'odom': 0.0})
+    assert len(MissionDataset(source, mission='nobody')) == 0
+
+
+def test_content_that_is_not_what_was_stored(tmp_path: Path) -> None:
+    """Is an error that names the object, as is an object that is gone."""
+    source = drive(tmp_path, 2)
+    dataset = MissionDataset(source)
+    path = source.settings.directory / BUCKET / 'thor/camera/20261028/120000_front.jpg'
+    path.write_bytes(jpeg(1))
+    with pytest.raises(LakeError, match=r'120000_front\.jpg is not what was stored'):
+        dataset[0]
+    path.unlink()
+    with pytest.raises(ObjectRefused, match=r'120000_front\.jpg'):
+        dataset[0]
+    assert dataset[1]['stamp_ns'] == NOON_NS + SECOND
+
+
+@pytest.mark.seaweedfs
+@pytest.mark.parametrize('frames', ['jpeg', 'tar'])
+def test_from_a_real_server(tmp_path: Path, seaweed: Tower, frames: str) -> None:
+    """The same samples as from a folder of the same objects."""
+    robot = f'thor{frames}'
+    ours = Drive(seaweed.store_settings(), tmp_path / 's3', robot)
+    there = Drive(folder_store(tmp_path), tmp_path / 'folder', robot)
+    for each in (ours, there):
+        each.record(SECONDS, frames=frames)
+    one, other = (MissionDataset(open_source(each.settings, BUCKET), robot=robot, align=ALIGN) for each in (ours, there))
+    assert len(one) == len(other) > 0
+    assert all(map(same, one.stream(), other.stream()))
+    assert all(same(one[number], other[number]) for number in range(len(one)))
+    for each in (one, other):
+        each.close()

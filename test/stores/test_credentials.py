@@ -1,0 +1,212 @@
+"""Keys of a profile: found as botocore finds them, read again once they are refused, and shown by nothing."""
+
+from __future__ import annotations
+
+import configparser
+import dataclasses
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from botocore.credentials import InstanceMetadataProvider
+from botocore.exceptions import NoCredentialsError, PartialCredentialsError
+from stores.asking import SECRET, error_of
+from stores.fake_s3 import FakeS3, error, served
+from stores.spooled import Spool
+
+from shadowhound_data_logger.config import StoreSettings
+from shadowhound_data_logger.errors import CredentialsRejected, SettingError
+from shadowhound_data_logger.model import Put
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.credentials import REREAD_S, Keys
+from shadowhound_data_logger.stores.s3 import S3Store
+from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES
+
+OWN = StoreSettings(endpoint_url='http://127.0.0.1:1')
+
+
+class File:
+    """A shared-credentials file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def write(self, key: str, secret: str, profile: str = 'default', **more: str) -> None:
+        content = configparser.ConfigParser(interpolation=None)
+        content[profile] = {'aws_access_key_id': key, 'aws_secret_access_key': secret, **more}
+        with self.path.open('w', encoding='utf-8') as file:
+            content.write(file)
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> File:
+    """The one that AWS_SHARED_CREDENTIALS_FILE names, not there yet; nothing else has keys."""
+    for name in ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY', 'AWS_SESSION_TOKEN', 'AWS_PROFILE', 'AWS_DEFAULT_PROFILE'):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.setenv('AWS_CONFIG_FILE', str(tmp_path / 'config'))
+    monkeypatch.setenv('AWS_SHARED_CREDENTIALS_FILE', str(tmp_path / 'credentials'))
+    return File(tmp_path / 'credentials')
+
+
+@pytest.fixture
+def clock() -> list[float]:
+    """Its only element is the time."""
+    return [100.0]
+
+
+def test_the_default_profile(file: File) -> None:
+    """Of the file that the variable names, with its token."""
+    file.write('KEY', SECRET, aws_session_token='token')
+    assert Keys(OWN).get_frozen_credentials()[:3] == ('KEY', SECRET, 'token')
+
+
+def test_the_file_in_the_home(file: File, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no variable names another one."""
+    monkeypatch.delenv('AWS_SHARED_CREDENTIALS_FILE')
+    (tmp_path / '.aws').mkdir()
+    File(tmp_path / '.aws' / 'credentials').write('KEY', SECRET)
+    assert Keys(OWN).get_frozen_credentials().access_key == 'KEY'
+
+
+def test_another_profile(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
+    """AWS_PROFILE names it; of the configuration file as well."""
+    file.write('KEY', SECRET, 'robot')
+    monkeypatch.setenv('AWS_PROFILE', 'robot')
+    assert Keys(OWN).get_frozen_credentials().access_key == 'KEY'
+    file.path.rename(file.path.with_name('config'))
+    assert '[robot]' in file.path.with_name('config').read_text()
+    file.path.with_name('config').write_text(f'[profile robot]\naws_access_key_id=OTHER\naws_secret_access_key={SECRET}\n')
+    assert Keys(OWN).get_frozen_credentials().access_key == 'OTHER'
+
+
+def test_keys_in_the_settings_come_first_and_stay(file: File) -> None:
+    """The environment of a process cannot change: nothing is read again."""
+    file.write('KEY', SECRET)
+    keys = Keys(dataclasses.replace(OWN, access_key_id='FIRST', secret_access_key='first'))
+    assert keys.get_frozen_credentials()[:2] == ('FIRST', 'first')
+    assert not keys.renew(keys.generation)
+
+
+def test_half_a_pair_stops_the_start() -> None:
+    """The other half is named."""
+    with pytest.raises(SettingError, match='AWS_SECRET_ACCESS_KEY'):
+        Keys(dataclasses.replace(OWN, access_key_id='FIRST'))
+
+
+def test_no_network_is_asked_for_keys_to_a_server_of_ones_own(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither the cloud's metadata service nor a container's, and so a start without keys takes no time."""
+    monkeypatch.setenv('AWS_CONTAINER_CREDENTIALS_FULL_URI', 'http://127.0.0.1:1/keys')
+    monkeypatch.setattr(InstanceMetadataProvider, 'load', lambda _: pytest.fail('the metadata service is asked'))
+    with pytest.raises(NoCredentialsError):
+        Keys(OWN).get_frozen_credentials()
+
+
+def test_refused_keys_are_read_again(file: File, clock: list[float]) -> None:
+    """Another pair is another generation; the same one, a broken file or none at all leave what there was."""
+    file.write('OLD', 'old')
+    keys = Keys(OWN, lambda: clock[0])
+    keys.get_frozen_credentials()
+    changes: tuple[Callable[[], object], ...] = (
+        lambda: None, lambda: file.path.write_text('[default]\naws_access_key_id = NEW\n'), lambda: file.path.write_text('x['),
+        file.path.unlink,
+    )  # fmt: skip
+    for change in changes:
+        change()
+        clock[0] += 2 * REREAD_S
+        assert not keys.renew(0)
+        assert keys.get_frozen_credentials().access_key == 'OLD'
+    file.write('NEW', 'new')
+    clock[0] += 2 * REREAD_S
+    assert keys.renew(0)
+    assert keys.generation == 1
+    assert keys.get_frozen_credentials()[:2] == ('NEW', 'new')
+
+
+def test_many_refusals_are_one_reading(file: File, clock: list[float]) -> None:
+    """Who was refused with the old keys hears of the new ones without reading; who was refused with the new ones waits."""
+    file.write('OLD', 'old')
+    keys = Keys(OWN, lambda: clock[0])
+    keys.get_frozen_credentials()
+    file.write('NEW', 'new')
+    assert not keys.renew(0)
+    clock[0] += REREAD_S
+    assert keys.renew(0)
+    assert keys.renew(0)
+    file.write('NEWER', 'newer')
+    assert not keys.renew(1)
+    assert keys.get_frozen_credentials().access_key == 'NEW'
+
+
+def test_keys_that_come_later(file: File, clock: list[float]) -> None:
+    """A file that is put there while the program runs is found; half of one is said to be half."""
+    keys = Keys(OWN, lambda: clock[0])
+    with pytest.raises(NoCredentialsError):
+        keys.get_frozen_credentials()
+    file.path.write_text('[default]\naws_access_key_id = KEY\n')
+    with pytest.raises(PartialCredentialsError):
+        keys.get_frozen_credentials()
+    file.write('KEY', SECRET)
+    assert keys.get_frozen_credentials().access_key == 'KEY'
+
+
+def test_a_put_goes_on_with_new_keys(
+    file: File, opened: Callable[..., S3Store], spool: Spool, seaweed: Tower, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    """A refusal, of a whole object or of one in parts, is no failure where other keys are in the file by now."""
+    caplog.set_level(logging.DEBUG)
+    good = seaweed.store_settings()
+    store = opened(dataclasses.replace(good, access_key_id=None, secret_access_key=None))
+    for item in (spool('small', b'x'), spool('large', bytes(MULTIPART_BYTES + 1))):
+        file.write('GONE', SECRET)
+        until_read(store, 'GONE')
+        error_of(CredentialsRejected, lambda item=item: store.put(item))  # type: ignore[misc]
+        file.write(str(good.access_key_id), str(good.secret_access_key))
+        time_passes(store)
+        assert store.put(item) is Put.CREATED
+    assert SECRET not in caplog.text
+    assert str(good.secret_access_key) not in caplog.text
+
+
+def until_read(store: S3Store, key: str) -> None:
+    """As if it had been refused before."""
+    time_passes(store)
+    keys: Any = store._s3._keys
+    keys.renew(keys.generation)
+    assert keys.get_frozen_credentials().access_key == key
+
+
+def time_passes(store: S3Store) -> None:
+    keys: Any = store._s3._keys
+    keys._read_s = float('-inf')
+
+
+@pytest.mark.parametrize('code', ['InvalidAccessKeyId', 'SignatureDoesNotMatch', 'ExpiredToken', 'InvalidToken'])
+def test_every_refusal_of_keys_reads_them_again(
+    code: str, file: File, opened: Callable[..., S3Store], spool: Spool
+) -> None:  # fmt: skip
+    """And what the new ones are refused for is said, after two tries and no more."""
+    file.write('OLD', SECRET)
+    with served(FakeS3(answer=(403, error(code)))) as server:
+        store = opened(StoreSettings(endpoint_url=server.url))
+        error_of(CredentialsRejected, store.probe)
+        file.write('NEW', SECRET)
+        time_passes(store)
+        server.requests.clear()
+        began_s = time.monotonic()
+        error_of(CredentialsRejected, lambda: store.put(spool('a', b'x')))
+        assert store._s3.generation == 1
+        assert len(server.requests) <= 4, 'HEAD and GET for the reason, twice'
+        assert time.monotonic() - began_s < 10
+
+
+def test_nothing_shows_a_secret(file: File) -> None:
+    """Not the keys, and not their reader."""
+    file.write('KEY', SECRET)
+    keys = Keys(OWN)
+    keys.get_frozen_credentials()
+    assert SECRET not in repr(keys) + str(keys) + repr(keys._found) + repr(OWN)

@@ -1,0 +1,48 @@
+"""The tables of docs/scale.md are what the program computes from the rates that it names."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+PROGRAM = Path(__file__).parents[1] / 'bench' / 'scale.py'
+
+
+@pytest.fixture(scope='module')
+def scale() -> Any:
+    spec = importlib.util.spec_from_file_location('bench_scale', PROGRAM)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules['bench_scale'] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_has_its_tables(scale: Any) -> None:
+    """``python bench/scale.py --write`` would change nothing."""
+    page = scale.PAGE.read_text(encoding='utf-8')
+    assert scale.filled(page) == page
+    assert page.count('<!-- scale ') == len(scale.TABLES)
+
+
+def test_the_rates_are_those_of_the_other_pages(scale: Any) -> None:
+    """36 and 384 GB a day, 6 and 8 objects a second, as docs/thor.md says."""
+    thor = (PROGRAM.parents[1] / 'docs' / 'thor.md').read_text(encoding='utf-8')
+    default, _, full = scale.PROFILES
+    assert f'**{default.bytes_s * 86_400 / 1e9:.0f} GB a day**' in thor
+    assert f'**{full.bytes_s * 86_400 / 1e9:.0f} GB a day**' in thor
+    assert f'| objects | {default.objects_s} a second | {full.objects_s} a second |' in thor
+
+
+def test_it_is_arithmetic(scale: Any) -> None:
+    """One robot by hand: 8 hours at 6 objects a second."""
+    row = next(iter(scale.flow(scale.PROFILES[0])))
+    assert row[:5] == ('1', '3 Mbit/s', '6.0', '172,800', '12 GB')
+    row = next(iter(scale.catalogue(scale.PROFILES[0])))
+    assert row[:3] == ('1', '172,800', '480')
+    assert row[4] == '481'
