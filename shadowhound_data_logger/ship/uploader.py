@@ -60,7 +60,7 @@ class UploadStatus:
     """Delivery at one instant, for the status and the progress line."""
 
     state: str
-    """``idle``, ``shipping``, ``store_down``, ``paused`` (credentials, certificate, rights) or ``not_draining`` (another does)."""
+    """``idle``, ``shipping``, ``store_down``, ``paused`` (keys, certificate, rights) or ``not_draining`` (another does)."""
     last_error: str
     """The newest failure of this session, with its remedy; it may be over."""
     delivered: int
