@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -43,3 +44,8 @@ def reload_s3(folder: Path) -> None:
     for number in processes_of(folder):
         if Path(f'/proc/{number}/cmdline').read_text().partition('\0')[0].endswith('weed'):
             os.kill(number, signal.SIGHUP)
+
+
+def remove_database(folder: Path, offset: int) -> None:
+    """Where run.py puts PostgreSQL's files for root, whose own folders its user cannot enter."""
+    shutil.rmtree(Path('/var/lib') / f'shadowhound-tower-{folder.name}-{offset}', ignore_errors=True)

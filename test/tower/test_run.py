@@ -15,7 +15,7 @@ from typing import Any, Final
 import boto3
 import pytest
 from botocore.exceptions import ClientError
-from tower_scripts import TOWER, make_secrets, processes_of, reload_s3
+from tower_scripts import TOWER, make_secrets, processes_of, reload_s3, remove_database
 
 pytestmark = [
     pytest.mark.seaweedfs,
@@ -37,6 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, offset: int) -> Iterator[Pa
         finally:
             tower.send_signal(signal.SIGTERM)
             assert tower.wait(60) == 0
+            remove_database(folder, offset)
     _until(lambda: not processes_of(folder), 10)
 
 

@@ -16,7 +16,7 @@ import pytest
 from e2e.conftest import running
 from e2e.processes import Processes, until
 from missions.server import complete
-from tower_scripts import TOWER, make_secrets, reload_s3
+from tower_scripts import TOWER, make_secrets, reload_s3, remove_database
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
@@ -63,6 +63,7 @@ def tower(tmp_path: Path, offset: int) -> Iterator[Path]:
         finally:
             process.terminate()
             process.wait(60)
+            remove_database(folder, offset)
 
 
 @pytest.fixture
