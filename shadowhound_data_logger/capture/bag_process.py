@@ -114,7 +114,9 @@ def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[st
         opened.enter_context(_alone(settings))
         store = open_store(settings.store, settings.upload)
         opened.callback(store.close)
-        spool = Spool(settings.spool_path, settings.spool, SystemClock.of_this_machine(), settings.robot)
+        # An owner of its own: what a killed one left open is for the next one to settle, and none of the node's.
+        owner = f'{settings.robot} {RECORDS}'
+        spool = Spool(settings.spool_path, settings.spool, SystemClock.of_this_machine(), owner)
         spool.open()
         opened.callback(spool.close)
         writer = SpoolWriter(spool, settings.spool.commit_s, spooled=lambda new: uploader.wake(new),  # noqa: PLW0108

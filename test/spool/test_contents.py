@@ -10,6 +10,7 @@ import pytest
 from spool.conftest import Open
 from spool.making import FakeClock, make, new_spool, receive, settle
 
+from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import DataObject, State
 from shadowhound_data_logger.spool import ledger, plausible, uncatalogued
 from shadowhound_data_logger.spool.accounts import BAG
@@ -110,6 +111,30 @@ def test_what_a_dead_session_left_open_is_settled_by_what_its_files_hold(
     assert after.accounts.drop_carried('restart') == max(0, 10 - recorded)
     after.close()
     assert bags(left) == {'/imu': expected}
+
+
+def test_each_settles_its_own(opened: Open, root: Path, clock: FakeClock) -> None:
+    """What a killed ``bag record`` left open is not the node's to give up: its file is found by the next ``bag record``."""
+    opened().close()
+    recording = Spool(root, SpoolSettings(min_free_bytes=0), clock, 'thor records')
+    recording.open()
+    receive(recording, 10, IMU)
+    recording.commit()
+    left = die(recording, root)
+    node = new_spool(left, clock)
+    node.open()
+    node.carry(BAG)
+    assert node.accounts.drop_carried('restart') == 0
+    node.close()
+    again = Spool(left, SpoolSettings(min_free_bytes=0), clock, 'thor records')
+    again.open()
+    again.carry(BAG)
+    item = a_slice(0, imu=8)
+    again.accounts.find(item.counts)
+    again.commit([item])
+    assert again.accounts.drop_carried('restart') == 2
+    again.close()
+    assert bags(left) == {'/imu': (10, 8, {'restart': 2}, 0)}
 
 
 def test_a_death_in_the_middle_of_settling_costs_nothing(opened: Open, root: Path, clock: FakeClock) -> None:
