@@ -16,23 +16,33 @@ from shadowhound_data_logger.capture.endpoints import Senders
 from shadowhound_data_logger.capture.stream import Repeats, Shared, is_named
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.model import Taken
-from shadowhound_data_logger.spool.accounts import BAG, PAUSED, Accounts
+from shadowhound_data_logger.spool.accounts import BAG, PAUSED, Accounts, TopicAccount
 
 
 class BagTap:
     """New; ``topics`` says what is recorded now."""
 
     def __init__(self, node: Node, accounts: Accounts, queue: BagQueue) -> None:
-        self.topics: frozenset[str] = frozenset()
-        """Full names."""
+        self._topics: frozenset[str] = frozenset()
+        self._before: dict[str, dict[str, int]] = {}
+        self._again: set[tuple[str, str, int]] = set()
         self._node = node
         self._accounts = accounts
         self._queue = queue
         self._qos: dict[tuple[str, str], str] = {}
 
-    def begin(self) -> None:
-        """A recording begins: publishers are asked for their QoS anew."""
-        self._qos.clear()
+    @property
+    def topics(self) -> frozenset[str]:
+        """Full names."""
+        return self._topics
+
+    @topics.setter
+    def topics(self, topics: frozenset[str]) -> None:
+        if topics and not self._topics:  # a recording begins: what earlier ones had of latched topics belongs into it as well
+            self._qos.clear()
+            self._again.clear()
+            self._before = self._accounts.last_numbers(BAG)
+        self._topics = topics
 
     def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: int | None, *, paused: bool) -> None:
         """Count messages that are no repeats, their senders named, and hand them on; ``lost`` as in ``Stream.add``."""
@@ -42,7 +52,10 @@ class BagTap:
         with self._accounts.entry(f'{BAG}{topic}') as account:
             account.type = type_name
             receive, reported = account.receive, lost is not None
-            fresh = [message for message in taken if receive(message.publisher, message.number, reported=reported)]
+            fresh = [
+                message for message in taken
+                if receive(message.publisher, message.number, reported=reported) or self._is_earlier(topic, message, account)
+            ]  # fmt: skip
             account.lose(lost)
             if paused:
                 account.dropped[PAUSED] += len(fresh)
@@ -52,6 +65,18 @@ class BagTap:
             dropped = self._queue.put(Lot(topic, type_name, self._qos_of(topic, type_name), fresh))
             if dropped:
                 self._accounts.drop(f'{BAG}{topic}', QUEUE_FULL, dropped)
+
+    def _is_earlier(self, topic: str, message: Taken, account: TopicAccount) -> bool:
+        """Whether it is a latched message that an earlier recording had already, and that this one has not yet: counted again."""
+        last = self._before.get(f'{BAG}{topic}', {}).get(message.publisher or '')
+        if last is None or message.number is None or message.number > last:
+            return False
+        mark = topic, message.publisher or '', message.number
+        if mark in self._again:
+            return False
+        self._again.add(mark)
+        account.receive_again(mark[1])
+        return True
 
     def _qos_of(self, topic: str, type_name: str) -> str:
         """What the publishers of the topic offer, as it was when the recording first heard of it."""

@@ -74,6 +74,11 @@ class TopicAccount:
         self.received += 1
         return True
 
+    def receive_again(self, publisher: str) -> None:
+        """Count a message that was counted before, and that is wanted once more."""
+        self._span(publisher).count()
+        self.received += 1
+
     def lose(self, count: int | None) -> None:
         """What the middleware reports to have lost since it was last asked; None where it may have lost more without a word."""
         if self.accounting == REPORTED:
@@ -190,6 +195,15 @@ class Accounts:
             account = self._topics.get(topic)
             for span in (account.publishers if account else self._inherited.get(topic, {})).values():
                 span.rebase()
+
+    def last_numbers(self, sink: str) -> dict[str, dict[str, int]]:
+        """Account -> publisher -> the highest number that it counted, in this session or an earlier one."""
+        with self._lock:
+            spans = {topic: account.publishers for topic, account in self._topics.items()}
+            return {
+                topic: {name: span.last for name, span in found.items() if span.last is not None}
+                for topic, found in {**self._inherited, **spans}.items() if topic.startswith(sink)
+            }  # fmt: skip
 
     def rebase_all(self, sink: str) -> None:
         """As ``rebase``, of every account whose name begins so."""
