@@ -119,4 +119,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    code = main()
+    sys.stdout.flush()
+    os._exit(code)  # Daft's threads outlive its workers: once in a while the interpreter's own end met them and crashed

@@ -148,7 +148,7 @@ def test_diagnostics_tell_each_part(operated: Operated) -> None:
     operated.publisher.matched('/told')
     operated.publish('told', range(COUNT))
     found = operated.station.diagnostics()
-    parts = [f'/{name}' for name in SENSORS] + ['node', 'bag', 'spool', 'store', 'clock', 'workers']
+    parts = [f'/{name}' for name in SENSORS] + ['node', 'bag', 'events', 'spool', 'store', 'clock', 'workers']
     assert set(found) == {f'sensor_logger: {part}' for part in parts}
     assert {entry.hardware_id for entry in found.values()} == {operated.node.robot}
     assert found['sensor_logger: /told'].level == DiagnosticStatus.OK
