@@ -133,7 +133,7 @@ def audit(found: Found, stored: Sequence[Bag], happened: Run, said: dict[str, An
     for topic, row in said['bags'].items():
         in_bags = counts[topic]
         if (row['stored'], row['open'], row['published']) != (in_bags, 0, happened.published[topic]):
-            text = f'{topic}: {in_bags} in bags of {published[topic]}, but {row}'
+            text = f'{topic}: {in_bags} in bags of {happened.published[topic]}, but {row}'
             found.say('the ledger knows all', text)
     if not said['balanced']:
         found.say('the ledger knows all', str(ledger.imbalances(said)))

@@ -94,7 +94,7 @@ class TopicAccount:
             spans = list(self.publishers.values()) or [self._span(TOPIC_WIDE)]
             for span in spans:
                 count -= span.find(count)
-            spans[-1].late(count)
+            spans[-1].late(count, alone=len(spans) == 1)
 
     def _span(self, publisher: str) -> Span:
         span = self.publishers.get(publisher)

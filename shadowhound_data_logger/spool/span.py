@@ -82,12 +82,18 @@ class Span:
         self.changed = self.changed or bool(found)
         return found
 
-    def late(self, count: int) -> None:
-        """Count messages after the inherited ``last``, whose numbers are not known."""
+    def late(self, count: int, *, alone: bool = False) -> None:
+        """Count messages after the inherited ``last``, whose numbers are not known.
+
+        Of a publisher that is ``alone`` they are the next ones; a death before its next message then does not count them again.
+        """
         if count:
             self.received += count
             self.published += count
-            self._late += count if self.inherited else 0
+            if alone and self.inherited and self.last is not None:
+                self.last += count
+            elif self.inherited:
+                self._late += count
             self.changed = True
 
     def rebase(self) -> None:

@@ -175,6 +175,29 @@ def test_what_is_open_at_a_stop_waits_for_the_next_start(opened: Open, root: Pat
     assert after.accounts.drop_carried('restart') == 5
 
 
+def test_what_is_found_is_counted_once_whatever_dies_next(opened: Open, root: Path, clock: FakeClock) -> None:
+    """A session that found messages and dies before the next one comes leaves no gap for them to the session after it."""
+    spool = opened()
+    receive(spool, 10, IMU)
+    spool.commit()
+    first = die(spool, root)
+    second = new_spool(first, clock)
+    second.open()
+    second.carry(BAG)
+    item = a_slice(0, imu=14)
+    second.accounts.find(item.counts)
+    second.commit([item])
+    left = die(second, first)
+    last = new_spool(left, clock)
+    last.open()
+    last.carry(BAG)
+    with last.accounts.entry(IMU) as account:
+        assert account.receive('p', 20)
+    last.close()
+    row = ledger.read(left, 'thor')['bags']['/imu']
+    assert (row['published'], row['missed']) == (20, 5)
+
+
 @pytest.mark.parametrize('found_first', [True, False])
 def test_a_recorded_message_is_not_missed_as_well(opened: Open, root: Path, clock: FakeClock, found_first: bool) -> None:
     """Numbers that the accounts of the dead session did not reach are in its file: the gap before the next one is shorter."""
