@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -172,6 +173,7 @@ def test_what_the_robot_says_is_journalled(tmp_path: Path, opened: ExitStack) ->
     (folder,) = missions(tmp_path)
     start_ns = int(journal.first(folder.journal)['t'])
     setting.watch.observe(batch('odom', '/odom', 'nav_msgs/msg/Odometry', odometry(0, 0), odometry(0.3, 1.0), start_ns=start_ns))
+    until(lambda: time.time_ns() > start_ns + SECOND // 10, 'the second pose is of the mission')
     logger.end_mission(True, 1.0, 1.0)
     until(lambda: not setting.watch.status(), 'the end is noticed')
     until(lambda: not journal.is_locked(folder.node.journal), 'the journal is let go of')
