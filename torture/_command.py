@@ -42,6 +42,15 @@ def parser(module: str, description: str) -> argparse.ArgumentParser:
     return made
 
 
+def asked_kills(options: argparse.ArgumentParser, argv: Sequence[str] | None, *, usual: int, short: int) -> argparse.Namespace:
+    """What the command line of a campaign of kills asks for, told to whoever watches."""
+    options.add_argument('--kills', type=int, default=0, help=f'how many, {usual} unless told')
+    given = options.parse_args(argv)
+    given.kills = given.kills or (short if given.short else usual)
+    progress(f'{given.kills} kills, seed {given.seed}')
+    return given
+
+
 @contextmanager
 def workshop(given: argparse.Namespace) -> Iterator[Workshop]:
     """A folder for data and logs, which goes when ``passed`` was set and no other place was asked for."""

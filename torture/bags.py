@@ -26,7 +26,7 @@ from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
 from torture.kills import ROBOT, running
 
 KILLS: Final = 50
@@ -190,17 +190,13 @@ def campaign(folder: Path, kills: int, seed: int) -> Found:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The campaign; 0 when everything held."""
-    options = parser('bags', __doc__ or '')
-    options.add_argument('--kills', type=int, default=0, help=f'how many, {KILLS} unless told')
-    given = options.parse_args(argv)
-    kills = given.kills or (SHORT_KILLS if given.short else KILLS)
-    progress(f'{kills} kills, seed {given.seed}')
+    given = asked_kills(parser('bags', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     with workshop(given) as shop:
-        found = campaign(shop.folder, kills, given.seed)
+        found = campaign(shop.folder, given.kills, given.seed)
         bars = list(found.bars())
         shop.passed = all(bar.holds for bar in bars)
     figures = {
-        'seed': given.seed, 'kills': kills, 'bags': found.bags, 'slices': found.slices, 'messages': found.messages,
+        'seed': given.seed, 'kills': given.kills, 'bags': found.bags, 'slices': found.slices, 'messages': found.messages,
         'lost_ms': found.lost_ms,
     }  # fmt: skip
     return verdict(figures, bars, as_json=given.json)

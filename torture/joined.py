@@ -32,7 +32,7 @@ from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missi
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
 from torture.kills import running
 
 KILLS: Final = 50
@@ -264,13 +264,9 @@ def campaign(folder: Path, kills: int, seed: int) -> tuple[Found, Counter[str]]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The campaign; 0 when everything held."""
-    options = parser('joined', __doc__ or '')
-    options.add_argument('--kills', type=int, default=0, help=f'how many, {KILLS} unless told')
-    given = options.parse_args(argv)
-    kills = given.kills or (SHORT_KILLS if given.short else KILLS)
-    progress(f'{kills} kills, seed {given.seed}')
+    given = asked_kills(parser('joined', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     with workshop(given) as shop:
-        found, counts = campaign(shop.folder, kills, given.seed)
+        found, counts = campaign(shop.folder, given.kills, given.seed)
         bars = [Bar(text, not found.wrong[name], '; '.join(found.wrong[name][:3])) for name, text in WHAT.items()]
         looked = {name: found.looked[name] for name in ('points', 'poses', 'frames', 'node frames', 'marked')}
         bars.append(Bar('there was something to look at', all(looked.values()), str(dict(found.looked))))

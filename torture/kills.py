@@ -27,7 +27,7 @@ from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
 from torture._kill_audit import CALIBRATION, CLOUDS, Audit, Heard, Kill, audit
 
 KILLS: Final = 100
@@ -199,22 +199,18 @@ def print_losses(table: dict[str, dict[str, float]]) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The campaign; 0 when everything held."""
-    options = parser('kills', __doc__ or '')
-    options.add_argument('--kills', type=int, default=0, help=f'how many, {KILLS} unless told')
-    given = options.parse_args(argv)
-    kills = given.kills or (SHORT_KILLS if given.short else KILLS)
-    progress(f'{kills} kills, seed {given.seed}')
+    given = asked_kills(parser('kills', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     began = time.monotonic()
     with workshop(given) as shop:
-        run, found = campaign(shop.folder, kills, given.seed)
-        bars = [Bar('kills', len(run.kills) == kills, str(kills)), *found.bars()]
+        run, found = campaign(shop.folder, given.kills, given.seed)
+        bars = [Bar('kills', len(run.kills) == given.kills, str(given.kills)), *found.bars()]
         shop.passed = all(bar.holds for bar in bars)
     losses = found.losses()
     if not given.json:
-        print(f'{kills} kills in {time.monotonic() - began:.0f} s, seed {given.seed}:', found.objects, 'objects,',
+        print(f'{given.kills} kills in {time.monotonic() - began:.0f} s, seed {given.seed}:', found.objects, 'objects,',
               found.samples, 'samples')  # fmt: skip
         print_losses(losses)
-    figures = {'seed': given.seed, 'kills': kills, 'objects': found.objects, 'samples': found.samples, 'losses': losses}
+    figures = {'seed': given.seed, 'kills': given.kills, 'objects': found.objects, 'samples': found.samples, 'losses': losses}
     return verdict(figures, bars, as_json=given.json)
 
 

@@ -30,7 +30,7 @@ from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missi
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
 
 KILLS: Final = 50
 SHORT_KILLS: Final = 5
@@ -178,13 +178,9 @@ def campaign(folder: Path, kills: int, seed: int) -> Found:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The campaign; 0 when everything held."""
-    options = parser('missions', __doc__ or '')
-    options.add_argument('--kills', type=int, default=0, help=f'how many, {KILLS} unless told')
-    given = options.parse_args(argv)
-    kills = given.kills or (SHORT_KILLS if given.short else KILLS)
-    progress(f'{kills} kills, seed {given.seed}')
+    given = asked_kills(parser('missions', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     with workshop(given) as shop:
-        found = campaign(shop.folder, kills, given.seed)
+        found = campaign(shop.folder, given.kills, given.seed)
         what = {
             'runs': 'each mission is one run, KILLED at its last record', 'points': 'each point that was logged is there once',
             'artifacts': 'each artifact that was logged is there', 'store': 'each object is in the store once',
@@ -194,7 +190,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             Bar('points and frames were looked at', found.points > 0 and found.frames > 0, f'{found.points}, {found.frames}')
         )
         shop.passed = all(bar.holds for bar in bars)
-    figures = {'seed': given.seed, 'kills': kills, 'points': found.points, 'frames': found.frames}
+    figures = {'seed': given.seed, 'kills': given.kills, 'points': found.points, 'frames': found.frames}
     return verdict(figures, bars, as_json=given.json)
 
 

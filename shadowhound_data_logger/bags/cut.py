@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from shadowhound_data_logger.bags.channel import Channel
-from shadowhound_data_logger.bags.description import METADATA, of_metadata
+from shadowhound_data_logger.bags.description import of_metadata
 from shadowhound_data_logger.bags.fetch import fetch, on_disk
 from shadowhound_data_logger.bags.mcap_messages import Message, Wanted
 from shadowhound_data_logger.bags.metadata import metadata_yaml
-from shadowhound_data_logger.bags.naming import BUCKET
+from shadowhound_data_logger.bags.naming import BUCKET, METADATA
 from shadowhound_data_logger.bags.packed import Packed
 from shadowhound_data_logger.bags.plain import Plain, is_plain
 from shadowhound_data_logger.bags.ranges import LocalFile, Meter, StoredFile

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
@@ -13,8 +13,6 @@ from ruamel.yaml.error import YAMLError
 from shadowhound_data_logger.bags.mcap_index import McapIndex
 from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.errors import BagDamaged
-
-METADATA: Final = 'metadata.yaml'
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.description import METADATA, slice_info
+from shadowhound_data_logger.bags.description import slice_info
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.mcap_index import read_index
 from shadowhound_data_logger.bags.metadata import metadata_yaml
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.ranges import LocalFile, Meter
-from shadowhound_data_logger.bags.recovery import file_digest
 from shadowhound_data_logger.bags.remote import Listing, RemoteBag, RemoteFile, missing_of
+from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import BagDamaged, BagError, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import ObjectInfo
@@ -116,7 +116,7 @@ def _have(store: Listing, file: RemoteFile, folder: Path, promised: str | None, 
     """Make it be there; returns the SHA-256 that it was checked against, empty where none is known."""
     path = folder / check_key(file.name)
     sha256 = promised or _recorded(store, file)
-    if path.is_file() and path.stat().st_size == file.size and (not sha256 or file_digest(path) == sha256):
+    if path.is_file() and path.stat().st_size == file.size and (not sha256 or fingerprint(path)[1] == sha256):
         told.have(file.size)
         return sha256
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -134,7 +134,7 @@ def _have(store: Listing, file: RemoteFile, folder: Path, promised: str | None, 
                 raise
             told.have(-file.size)  # a power cut may leave a file of the right length without its content
             info = _steadily(lambda: download(store, BUCKET, file.key, path, tell=tell))
-    if promised and info.sha256 != promised and file_digest(path) != promised:
+    if promised and info.sha256 != promised and fingerprint(path)[1] != promised:
         path.unlink()
         raise BagDamaged(f'{file.key} is not in the store what was recorded: its SHA-256 is not {promised}',
                          remedy='shadowhound-data bag verify tells of all files', path=file.key)  # fmt: skip

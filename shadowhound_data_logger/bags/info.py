@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.description import METADATA, Description, of_metadata, of_slices, slice_info
+from shadowhound_data_logger.bags.description import Description, of_metadata, of_slices, slice_info
 from shadowhound_data_logger.bags.local import LocalFile as Waiting
 from shadowhound_data_logger.bags.local import local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.mcap_index import read_index
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile
 from shadowhound_data_logger.bags.remote import (
     FOREIGN,

@@ -23,7 +23,7 @@ from typing import Any, Final
 from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.manifest import EventOf, Missing, MissionOf, TriggerOf
 from shadowhound_data_logger.bags.slice_info import SliceInfo
-from shadowhound_data_logger.bags.slice_writer import sync_folder
+from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.spool.accounts import BAG, EVENT
 
 FILE: Final = 'recording.jsonl'
@@ -52,8 +52,8 @@ class Notes:
         notes._append({
             'bag': notes.bag, 'robot': robot, 'mission': mission and asdict(mission), 'event': event and asdict(event),
         })  # fmt: skip
-        sync_folder(folder)
-        sync_folder(folder.parent)
+        sync(folder)
+        sync(folder.parent)
         return notes
 
     @classmethod

@@ -9,10 +9,10 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.description import METADATA, of_metadata
+from shadowhound_data_logger.bags.description import of_metadata
 from shadowhound_data_logger.bags.local import LocalFile, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.remote import (
     ARCHIVE,
     GROWING,

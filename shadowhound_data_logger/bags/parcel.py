@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Final, cast
 
-from shadowhound_data_logger.bags.description import METADATA, Description, Part, of_metadata, slice_info
+from shadowhound_data_logger.bags.description import Description, Part, of_metadata, slice_info
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, RecordedTopic, SliceEntry
 from shadowhound_data_logger.bags.mcap_index import read_index
-from shadowhound_data_logger.bags.naming import MANIFEST, prefix_of
+from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, prefix_of
 from shadowhound_data_logger.bags.ranges import LocalFile
-from shadowhound_data_logger.bags.recovery import file_digest
 from shadowhound_data_logger.bags.remote import ARCHIVE, natural
+from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.keys import check_key, check_name
 
@@ -115,7 +115,7 @@ def archive_of(folder: Path, robot: str, bag: str, work: Path) -> Parcel:
             archive.add(file, f'{bag}/{file.relative_to(folder)}', recursive=False, filter=_nobodys)
     key = check_key(f'{prefix_of(robot)}{name}')
     metadata = {'robot': robot, 'bag': bag, 'messages': str(described.messages)}
-    item = Outgoing(name, key, path, path.stat().st_size, file_digest(path), metadata, described.t_start_ns, described.t_end_ns)
+    item = Outgoing(name, key, path, *fingerprint(path), metadata, described.t_start_ns, described.t_end_ns)
     return Parcel(robot, bag, folder, (item,))
 
 
@@ -127,7 +127,7 @@ def _nobodys(member: tarfile.TarInfo) -> tarfile.TarInfo:
 
 def _outgoing(path: Path, name: str, robot: str, bag: str) -> Outgoing:
     key = check_key(f'{prefix_of(robot, bag)}{name}')
-    return Outgoing(name, key, path, path.stat().st_size, file_digest(path), {'robot': robot, 'bag': bag})
+    return Outgoing(name, key, path, *fingerprint(path), {'robot': robot, 'bag': bag})
 
 
 def _marked(file: Outgoing, part: Part | None, robot: str, bag: str) -> Outgoing:

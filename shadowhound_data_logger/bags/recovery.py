@@ -7,7 +7,6 @@ lies, so a large slice takes neither memory nor a second copy. Every step can be
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 from pathlib import Path
@@ -17,12 +16,12 @@ from shadowhound_data_logger.bags.mcap_messages import Wanted, read_messages
 from shadowhound_data_logger.bags.metadata import bagfile_information, to_yaml
 from shadowhound_data_logger.bags.ranges import LocalFile
 from shadowhound_data_logger.bags.slice_info import SliceInfo
-from shadowhound_data_logger.bags.slice_writer import OPEN, sync_folder
+from shadowhound_data_logger.bags.slice_writer import OPEN
 from shadowhound_data_logger.bags.survey import survey
+from shadowhound_data_logger.disk import fingerprint, sync
 
 log = logging.getLogger(__name__)
 
-_BLOCK_BYTES = 1 << 20
 _EVER = (0, 1 << 64)
 
 
@@ -46,11 +45,11 @@ def recover(path: Path, *, ros_distro: str = '') -> SliceInfo:
         said = bagfile_information([found.contents.info(final)], ros_distro=ros_distro)
         _write(file, found.end, found.contents.ending(found.end, to_yaml(said)))
         os.fsync(file)
-        size, sha256 = os.fstat(file).st_size, _digest(file)
     finally:
         os.close(file)
+    size, sha256 = fingerprint(path)
     os.replace(path, final)
-    sync_folder(final.parent)
+    sync(final.parent)
     info = found.contents.info(final, size, sha256, found.damage)
     log.info('recovered %s: %d messages; left out %s', final, info.messages, found.damage)
     return info
@@ -63,7 +62,7 @@ def read_info(path: Path, *, digest: bool = False) -> SliceInfo:
     """
     source = LocalFile(path)
     index = read_index(source)
-    sha256 = file_digest(path) if digest else ''
+    sha256 = fingerprint(path)[1] if digest else ''
     channels, messages, span = list(index.channels.values()), index.messages, (index.t_start_ns, index.t_end_ns)
     counts = {channel.topic: 0 for channel in channels}
     told = messages and sum(index.counts.values()) == messages and index.counts.keys() <= index.channels.keys()
@@ -79,23 +78,6 @@ def read_info(path: Path, *, digest: bool = False) -> SliceInfo:
             span = (min(span[0], message.log_ns), max(span[1], message.log_ns)) if messages else (message.log_ns, message.log_ns)
             messages += 1
     return SliceInfo(path, source.size, sha256, *(span if messages else (0, 0)), messages, counts, tuple(channels))
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file, in hex."""
-    file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        return _digest(file)
-    finally:
-        os.close(file)
-
-
-def _digest(file: int) -> str:
-    digest, at = hashlib.sha256(), 0
-    while block := os.pread(file, _BLOCK_BYTES, at):
-        digest.update(block)
-        at += len(block)
-    return digest.hexdigest()
 
 
 def _write(file: int, at: int, content: bytes) -> None:

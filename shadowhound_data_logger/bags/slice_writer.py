@@ -28,6 +28,7 @@ from shadowhound_data_logger.bags.mcap_format import (
 )
 from shadowhound_data_logger.bags.metadata import bagfile_information, to_yaml
 from shadowhound_data_logger.bags.slice_info import SliceInfo
+from shadowhound_data_logger.disk import sync
 
 OPEN: Final = '.open'
 """Ends the name of a slice that is being written."""
@@ -67,7 +68,7 @@ class SliceWriter:
         self._written = 0
         try:
             self._append(head())
-            sync_folder(path.parent)  # a file that was synced is lost all the same while its folder does not know it
+            sync(path.parent)  # a file that was synced is lost all the same while its folder does not know it
         except OSError:
             self.abort()
             raise
@@ -114,7 +115,7 @@ class SliceWriter:
         os.close(self._file)
         self._file = -1
         os.replace(self._open_path, self.path)
-        sync_folder(self.path.parent)
+        sync(self.path.parent)
         return contents.info(self.path, self._written, self._digest.hexdigest())
 
     def abort(self) -> None:
@@ -163,15 +164,6 @@ class SliceWriter:
             while view:
                 view = view[os.write(self._file, view) :]
             self._written += len(part)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _zstd(raw: memoryview) -> bytes:

@@ -13,12 +13,12 @@ from hashlib import sha256 as sha256_new
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.description import METADATA, Description, of_metadata
+from shadowhound_data_logger.bags.description import Description, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest, Missing
 from shadowhound_data_logger.bags.mcap_format import Op
 from shadowhound_data_logger.bags.mcap_index import read_index, records
 from shadowhound_data_logger.bags.mcap_messages import unpack, walk
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile
 from shadowhound_data_logger.bags.remote import FOREIGN, Listing, RemoteBag, RemoteFile, state_of
 from shadowhound_data_logger.errors import BagDamaged, BagError

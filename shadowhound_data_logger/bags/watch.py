@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.bags.description import METADATA
 from shadowhound_data_logger.bags.fetch import on_disk
+from shadowhound_data_logger.bags.naming import METADATA
 from shadowhound_data_logger.bags.parcel import Outgoing, Parcel, finished
 from shadowhound_data_logger.bags.upload import deliver, is_confirmed, opened_spool, parcel, spool_parcel
 from shadowhound_data_logger.clock import Clock, iso

@@ -17,9 +17,10 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Final
 
+from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import AccessDenied, BucketMissing, LakeError, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.lake.fetched import FOLDER, Fetched, Verified
-from shadowhound_data_logger.lake.source import CHUNK_BYTES, Source
+from shadowhound_data_logger.lake.source import Source
 
 THREADS: Final = 16
 AHEAD: Final = 8
@@ -199,7 +200,7 @@ class _Fetch:
         info = None if wish.sha256 else source.head(wish.key)
         expected = wish.sha256 or (info and info.sha256)
         seen = path.stat()
-        if expected is None or _sha256(path) != expected:
+        if expected is None or fingerprint(path)[1] != expected:
             return None
         return _Done(Verified(wish.key, wish.bucket, wish.size, seen.st_mtime_ns, expected, wish.etag), moved=False, proved=True)
 
@@ -260,11 +261,3 @@ def _check(wish: Wish, size: int, sha256: str, expected: str | None) -> None:
         raise ObjectRefused(f'it has {size} bytes instead of {wish.size}', **where)
     if expected is not None and sha256 != expected:
         raise ObjectRefused(f'its SHA-256 is {sha256[:12]}... instead of {expected[:12]}...', **where)
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open('rb') as file:
-        while piece := file.read(CHUNK_BYTES):
-            digest.update(piece)
-    return digest.hexdigest()

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import Clock
+from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.missions import copies, values
 from shadowhound_data_logger.missions.dating import now_ns
@@ -146,7 +147,7 @@ class Mission:
         try:
             for path in (*files, *((self.folder.files,) if files else ())):
                 with suppress(FileNotFoundError):  # the replayer was faster: it is in the spool
-                    _fsync(path)
+                    sync(path)
             self._journal.sync()
         except OSError as error:
             self._lose(error)
@@ -225,11 +226,3 @@ class Mission:
             self._warned.add(reason)
         if not known:
             log.warning(text, *values_)
-
-
-def _fsync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

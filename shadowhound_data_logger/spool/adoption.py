@@ -14,12 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_key, check_name
 from shadowhound_data_logger.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.account_rows import Snapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
-from shadowhound_data_logger.spool.files import Tree, description_of, fingerprint
+from shadowhound_data_logger.spool.files import Tree, description_of
 from shadowhound_data_logger.spool.index import MISSING, Index
 
 log = logging.getLogger(__name__)

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.model import DataObject, FileBody, State
 
 log = logging.getLogger(__name__)
@@ -39,7 +40,6 @@ _UNSAFE: Final = re.compile(r'^\.+|[^A-Za-z0-9_.-]+')
 _PART: Final = re.compile(r'[1-9][0-9]{0,17}\.part')
 _SESSION: Final = re.compile(r'[1-9][0-9]{0,17}')
 _BODY: Final = re.compile(r'([1-9][0-9]{0,17})-[0-9a-f]{32}\.body')
-READ_BYTES: Final = 1 << 20
 """Of a file at a time: it may be larger than the memory."""
 _FOLDERS: Final = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine'}
 
@@ -104,11 +104,7 @@ class Tree:
 
     def sync_incoming(self) -> None:
         """Make the names of the written parts durable."""
-        descriptor = os.open(self.incoming, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        sync(self.incoming)
 
     def place(self, source: Path, target: Path) -> bool:
         """Rename, making the folders it takes; False when the file is not at its target now.
@@ -217,16 +213,6 @@ class Tree:
         """What an unprivileged writer may still use of the file system."""
         status = os.statvfs(self.root)
         return status.f_bavail * status.f_frsize
-
-
-def fingerprint(path: Path) -> tuple[int, str]:
-    """Bytes and SHA-256 (hex) of a file, read in bounded memory. Raises OSError."""
-    digest, size = hashlib.sha256(), 0
-    with path.open('rb', buffering=0) as file:
-        while chunk := file.read(READ_BYTES):
-            digest.update(chunk)
-            size += len(chunk)
-    return size, digest.hexdigest()
 
 
 def content_sha256(body: bytes | FileBody) -> str:

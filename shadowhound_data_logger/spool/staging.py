@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.model import DataObject, FileBody
 from shadowhound_data_logger.spool.files import Tree
 
@@ -74,5 +75,4 @@ def _link_or_copy(source: Path, target: Path) -> None:
         if error.errno not in _NO_LINK:
             raise
         shutil.copyfile(source, target)
-    with target.open('rb') as file:  # its writer has synced it: then this costs nothing
-        os.fsync(file.fileno())
+    sync(target)  # its writer has synced it: then this costs nothing

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import hashlib
 import json
 import os
 import uuid
@@ -17,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Final
 
+from shadowhound_data_logger.disk import fingerprint, sync
 from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_target, chunks, identical_or_foreign, object_metadata
@@ -66,7 +66,7 @@ class DirectoryStore:
             if target.is_dir():
                 raise OSError(errno.EISDIR, 'a folder has this name')
             held = self._info(item.bucket, item.key)
-            end = identical_or_foreign(item, held, lambda: _sha256(target))
+            end = identical_or_foreign(item, held, lambda: fingerprint(target)[1])
             if held.sha256 is None:  # power was cut between the content and its metadata
                 self._write_metadata(item)
             return end
@@ -144,7 +144,7 @@ class DirectoryStore:
         with self._part() as part:
             _write(part, iter((json.dumps(record).encode(),)))
             part.replace(beside)
-        _sync_folder(beside.parent)
+        sync(beside.parent)
 
     def _info(self, bucket: str, key: str) -> ObjectInfo:
         size = self._path(bucket, key).stat().st_size
@@ -194,7 +194,7 @@ def _appear(part: Path, target: Path) -> bool:
             raise
         if not _rename_alone(part, target):
             return False
-    _sync_folder(target.parent)
+    sync(target.parent)
     return True
 
 
@@ -220,23 +220,7 @@ def _make_folders(folder: Path) -> None:
             if not path.is_dir():
                 raise OSError(errno.ENOTDIR, 'a part of the key is an object') from None
         else:
-            _sync_folder(path.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open('rb', buffering=0) as file:
-        while chunk := file.read(CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.hexdigest()
+            sync(path.parent)
 
 
 def _keys(root: Path) -> Iterator[str]:

@@ -16,9 +16,9 @@ from shadowhound_data_logger.bags.mcap_messages import Message, Wanted, read_mes
 from shadowhound_data_logger.bags.metadata import metadata_yaml
 from shadowhound_data_logger.bags.naming import BUCKET, prefix_of
 from shadowhound_data_logger.bags.ranges import LocalFile
-from shadowhound_data_logger.bags.recovery import file_digest
 from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.bags.slice_writer import SliceWriter
+from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -74,7 +74,7 @@ def stored(store: ObjectStore, folder: Path, *, robot: str = 'thor', without: st
 
 def put_item(path: Path, key: str, bag: str, place: int) -> SpooledObject:
     """A file as delivery hands it to a store."""
-    sha256 = file_digest(path)
+    sha256 = fingerprint(path)[1]
     metadata = {'sha256': sha256}
     if path.suffix == '.mcap':
         index = read_index(LocalFile(path))

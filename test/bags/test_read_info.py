@@ -11,7 +11,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from shadowhound_data_logger.bags.recovery import file_digest, read_info
+from shadowhound_data_logger.bags.recovery import read_info
+from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import BagDamaged
 
 
@@ -20,7 +21,7 @@ def test_ours(tmp_path: Path) -> None:
     info, _ = closed(tmp_path / 'bag_0.mcap', 70, compression='zstd', sync_every=30)
     assert read_info(info.path, digest=True) == info
     assert read_info(info.path).sha256 == ''
-    assert file_digest(info.path) == info.sha256
+    assert fingerprint(info.path) == (info.bytes, info.sha256)
 
 
 def test_one_of_rosbags(tmp_path: Path) -> None:

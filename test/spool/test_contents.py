@@ -40,6 +40,20 @@ def stored_in(root: Path, topic: str) -> dict[str, int]:
     return {state: count for state, count in row['stored_in'].items() if count}
 
 
+def started(root: Path, clock: FakeClock) -> Spool:
+    """The next session, with bags."""
+    spool = new_spool(root, clock)
+    spool.open()
+    spool.carry(BAG)
+    return spool
+
+
+def find(spool: Spool, item: DataObject) -> None:
+    """What recovery does with a slice that was left behind."""
+    spool.accounts.find(item.counts)
+    spool.commit([item])
+
+
 def die(spool: Spool, root: Path) -> Path:
     """What another process would find after a SIGKILL of this one."""
     copy = root.with_name(f'{root.name}-copy')
@@ -100,9 +114,7 @@ def test_what_a_dead_session_left_open_is_settled_by_what_its_files_hold(
     receive(spool, 10, IMU)
     spool.commit()
     left = die(spool, root)
-    after = new_spool(left, clock)
-    after.open()
-    after.carry(BAG)
+    after = started(left, clock)
     assert bags(left) == {'/imu': (10, 0, {}, 10)}
     if recorded:
         item = a_slice(0, imu=recorded)
@@ -121,17 +133,13 @@ def test_each_settles_its_own(opened: Open, root: Path, clock: FakeClock) -> Non
     receive(recording, 10, IMU)
     recording.commit()
     left = die(recording, root)
-    node = new_spool(left, clock)
-    node.open()
-    node.carry(BAG)
+    node = started(left, clock)
     assert node.accounts.drop_carried('restart') == 0
     node.close()
     again = Spool(left, SpoolSettings(min_free_bytes=0), clock, 'thor records')
     again.open()
     again.carry(BAG)
-    item = a_slice(0, imu=8)
-    again.accounts.find(item.counts)
-    again.commit([item])
+    find(again, a_slice(0, imu=8))
     assert again.accounts.drop_carried('restart') == 2
     again.close()
     assert bags(left) == {'/imu': (10, 8, {'restart': 2}, 0)}
@@ -143,20 +151,12 @@ def test_a_death_in_the_middle_of_settling_costs_nothing(opened: Open, root: Pat
     receive(spool, 10, IMU)
     spool.commit()
     first = die(spool, root)
-    after = new_spool(first, clock)
-    after.open()
-    after.carry(BAG)
-    item = a_slice(0, imu=4)
-    after.accounts.find(item.counts)
-    after.commit([item])
+    after = started(first, clock)
+    find(after, a_slice(0, imu=4))
     second = die(after, first)
     after.close()
-    last = new_spool(second, clock)
-    last.open()
-    last.carry(BAG)
-    item = a_slice(1, imu=5)
-    last.accounts.find(item.counts)
-    last.commit([item])
+    last = started(second, clock)
+    find(last, a_slice(1, imu=5))
     assert last.accounts.drop_carried('restart') == 1
     last.close()
     assert bags(second) == {'/imu': (10, 9, {'restart': 1}, 0)}
@@ -181,16 +181,10 @@ def test_what_is_found_is_counted_once_whatever_dies_next(opened: Open, root: Pa
     receive(spool, 10, IMU)
     spool.commit()
     first = die(spool, root)
-    second = new_spool(first, clock)
-    second.open()
-    second.carry(BAG)
-    item = a_slice(0, imu=14)
-    second.accounts.find(item.counts)
-    second.commit([item])
+    second = started(first, clock)
+    find(second, a_slice(0, imu=14))
     left = die(second, first)
-    last = new_spool(left, clock)
-    last.open()
-    last.carry(BAG)
+    last = started(left, clock)
     with last.accounts.entry(IMU) as account:
         assert account.receive('p', 20)
     last.close()
@@ -205,9 +199,7 @@ def test_a_recorded_message_is_not_missed_as_well(opened: Open, root: Path, cloc
     receive(spool, 10, IMU)
     spool.commit()
     left = die(spool, root)
-    after = new_spool(left, clock)
-    after.open()
-    after.carry(BAG)
+    after = started(left, clock)
     item = a_slice(0, imu=14)
     if found_first:
         after.accounts.find(item.counts)
