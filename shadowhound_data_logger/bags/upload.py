@@ -25,10 +25,9 @@ from shadowhound_data_logger.errors import BagError, ForeignObject, StoreUnavail
 from shadowhound_data_logger.model import DataObject, FileBody, ObjectInfo, Put, SpooledObject, State
 from shadowhound_data_logger.ship.retry import backoff
 from shadowhound_data_logger.ship.uploader import Uploader
+from shadowhound_data_logger.spool.delivering import delivering
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.spool.writer import SpoolWriter
-from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 
 SENDING: Final = 'sending'
@@ -137,17 +136,8 @@ def deliver(settings: Settings, spool: Spool, sent: Parcel, *, deadline_s: float
     """Wait until the store has it, delivering where no node does. Raises BagError for what the store refuses, SettingError."""
     told = told or Told()
     told.begin(sent.size)
-    store = open_store(settings.store, settings.upload)
-    writer = SpoolWriter(spool, settings.spool.commit_s, settled=lambda ids: uploader.settled(ids))  # noqa: PLW0108 - made below
-    uploader = Uploader(spool, store, settings.upload, writer.settle)
-    writer.open()
-    uploader.open()
-    try:
+    with delivering(spool, settings, CLOSE_S) as (uploader, _):
         return _wait(spool, sent, uploader, time.monotonic() + deadline_s, told)
-    finally:
-        uploader.close(CLOSE_S)
-        writer.close(CLOSE_S)
-        store.close()
 
 
 def is_confirmed(store: Heads, files: Sequence[tuple[str, int, str]]) -> bool:

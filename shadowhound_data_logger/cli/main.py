@@ -13,6 +13,7 @@ from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.cli.ledger import ledger
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.query import query
+from shadowhound_data_logger.cli.spool import spool
 from shadowhound_data_logger.cli.status import status
 from shadowhound_data_logger.errors import DataLoggerError
 
@@ -33,6 +34,7 @@ cli.add_command(lake)
 cli.add_command(ledger)
 cli.add_command(missions)
 cli.add_command(query)
+cli.add_command(spool)
 cli.add_command(status)
 
 

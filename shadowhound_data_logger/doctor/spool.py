@@ -54,7 +54,7 @@ def check(context: Context) -> Iterator[Result]:
     yield ok('spool.index', 'the index is whole')
     yield _ledger(accounts)
     yield _backlog(piles, context, runs=found['running'])
-    yield from _quarantine(quarantined, folder)
+    yield from _quarantine(quarantined)
     yield from _lock(folder, found, context.root)
 
 
@@ -112,7 +112,7 @@ def _status_remedy(text: str) -> str:
         'the node is paused': 'ros2 service call /sensor_logger_node/resume std_srvs/srv/Trigger',
         'bucket': 'shadowhound-data doctor --only s3',
         'the clock': 'timedatectl  # docs/thor.md, Wrong clock',
-        'quarantined': 'ls -R ~/.shadowhound/spool/quarantine | head',
+        'quarantined': 'shadowhound-data spool list --state quarantined',
     }
     return next((remedy for start, remedy in remedies.items() if text.startswith(start)), 'shadowhound-data status')
 
@@ -171,14 +171,14 @@ def _drain_s(count: int, size: int, context: Context) -> float | None:
     return max(8e-6 * size / mbps, count * 2 * figures.get('latency_s', 0.0) / upload.threads)
 
 
-def _quarantine(reasons: Mapping[str, int], folder: Path) -> Iterator[Result]:
+def _quarantine(reasons: Mapping[str, int]) -> Iterator[Result]:
     if reasons:
         text = ', '.join(f'{count:,} ({reason})' for reason, count in sorted(reasons.items()))
         yield warning(
             'spool.quarantine',
             f'objects in quarantine: {text}',
             'the store will never take them as they are; nothing is lost',
-            f'ls -R {folder / "quarantine"} | head -40 ; docs/reliability.md',
+            'shadowhound-data spool list --state quarantined  # and once the cause is gone: shadowhound-data spool retry',
         )
 
 

@@ -21,13 +21,10 @@ from shadowhound_data_logger.lake.catalogue import Catalogue
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, safe_type, stamped
 from shadowhound_data_logger.missions.story import BUCKET, TRAJECTORIES
 from shadowhound_data_logger.model import Binding, DataObject
-from shadowhound_data_logger.ship.uploader import Uploader
+from shadowhound_data_logger.spool.delivering import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.spool.writer import SpoolWriter
-from shadowhound_data_logger.stores import open_store
-from shadowhound_data_logger.stores.base import ObjectStore
 
 FRAME_PRIORITY: Final = 6
 """As the camera's own images."""
@@ -162,33 +159,23 @@ class Shelf:
         with self._spool.drain_lock() as mine:
             self._node_drains = not mine
         if mine:
-            store = open_store(self._settings.store, self._settings.upload)
-            try:
-                self._drain(self._spool, store)
-            finally:
-                store.close()
+            self._drain(self._spool)
 
     def close(self) -> None:
         if self._spool is not None:
             self._spool.close()
             self._spool = None
 
-    def _drain(self, spool: Spool, store: ObjectStore) -> None:
-        writer = SpoolWriter(spool, self._settings.spool.commit_s, settled=lambda ids: uploader.settled(ids))  # noqa: PLW0108 - made below
-        uploader = Uploader(spool, store, self._settings.upload, writer.settle)
-        writer.open()
-        uploader.open()
+    def _drain(self, spool: Spool) -> None:
         try:
-            drained = uploader.drain(SLICE_S)
-            writer.flush(SLICE_S)
-            for part in self._catalogue.due():
-                writer.put(part)
-            status = uploader.status()
+            with delivering(spool, self._settings, SLICE_S) as (uploader, writer):
+                drained = uploader.drain(SLICE_S)
+                writer.flush(SLICE_S)
+                for part in self._catalogue.due():
+                    writer.put(part)
+                status = uploader.status()
         except sqlite3.Error as error:
             raise spool.unwritable(error) from error
-        finally:
-            uploader.close(1.0)
-            writer.close(SLICE_S)
         if not drained and not status.delivered and status.last_error:
             raise StoreUnavailable(status.last_error)
 

@@ -1,0 +1,110 @@
+"""What lies in a spool, object by object or in heaps, as its index says; and the way back for what was quarantined."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool.files import Tree, flock
+from shadowhound_data_logger.spool.index import MISSING, Index
+
+HERE: Final = (State.PENDING, State.HELD, State.QUARANTINED)
+"""States of objects whose bytes lie in the spool."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heap:
+    """The objects of a sensor that are in the same state for the same reason."""
+
+    sensor: str
+    state: str
+    reason: str | None
+    objects: int
+    bytes: int
+    oldest_ns: int
+    """When the one that has been here for the longest was spooled, by the wall clock of then."""
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """One object."""
+
+    bucket: str
+    key: str
+    sensor: str
+    state: str
+    reason: str | None
+    bytes: int
+    created_ns: int
+    path: str
+    """Of its file, within the spool's folder; it may be ``incoming/<id>.part`` for a moment yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Retried:
+    """What a retry did."""
+
+    objects: int
+    bytes: int
+    gone: int
+    """Asked for, but their files are not there."""
+
+
+def heaps(index: Index) -> list[Heap]:
+    """Of an open index, the most important first. Raises sqlite3.Error."""
+    rows = index.db.execute(
+        'SELECT sensor, state, reason, count(*), sum(bytes), min(created_ns) FROM objects'
+        " WHERE state IN ('pending', 'held', 'quarantined')"
+        ' GROUP BY sensor, state, reason ORDER BY min(priority), sensor, state, reason'
+    )
+    return [Heap(*row) for row in rows]
+
+
+def objects(index: Index, root: Path, *, state: State | None = None, sensor: str | None = None,
+            prefix: str = '') -> Iterator[Listed]:  # fmt: skip
+    """Of an open index, as they were spooled; ``prefix`` is how ``bucket/key`` begins. Raises sqlite3.Error."""
+    tree = Tree(root)
+    rows = index.db.execute(
+        'SELECT bucket, key, sensor, state, reason, bytes, created_ns FROM objects'
+        " WHERE state IN ('pending', 'held', 'quarantined') AND state = ifnull(?, state) AND sensor = ifnull(?, sensor)"
+        " AND substr(bucket || '/' || key, 1, length(?)) = ? ORDER BY id",
+        (state and state.value, sensor, prefix, prefix),
+    )
+    for bucket, key, of, now, reason, size, created_ns in rows:
+        path = tree.path(State(now), reason, bucket, key).relative_to(root)
+        yield Listed(bucket, key, of, now, reason, size, created_ns, str(path))
+
+
+def retry(root: Path, *, reason: str | None = None, names: Collection[str] = ()) -> Retried:
+    """Let quarantined objects wait for delivery again: all, those of a reason, or those of these names (``bucket/key``).
+
+    A node that runs finds them within a second. A file is moved before its row, so that a death in between is what somebody's
+    moving it by hand would be: the next start finishes it. Raises SpoolError, sqlite3.Error or OSError.
+    """
+    tree, index = Tree(root), Index(root / 'index.db')
+    if not (root / 'index.db').is_file():
+        raise SpoolError(f'there is no spool in {root}', remedy='SHADOWHOUND_HOME names its folder')
+    with flock(root / 'recovery.lock'):
+        index.open()
+        try:
+            rows = index.rows(
+                "state = 'quarantined' AND reason = ifnull(?, reason) AND reason <> ? ORDER BY id", (reason, MISSING)
+            )
+            wanted = [row for row in rows if not names or f'{row["bucket"]}/{row["key"]}' in names]
+            moved = [row for row in wanted if _moved(tree, row['reason'], row['bucket'], row['key'])]
+            with index.transaction():
+                for row in moved:
+                    index.set_found(row['id'])
+        finally:
+            index.close()
+    return Retried(len(moved), sum(row['bytes'] for row in moved), len(wanted) - len(moved))
+
+
+def _moved(tree: Tree, reason: str, bucket: str, key: str) -> bool:
+    source, target = tree.path(State.QUARANTINED, reason, bucket, key), tree.path(State.PENDING, None, bucket, key)
+    return os.path.lexists(target) or tree.place(source, target)

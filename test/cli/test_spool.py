@@ -1,0 +1,198 @@
+"""``shadowhound-data spool``: what it says of spools made here, what it delivers, and what it lets wait again."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+from spool.making import BUCKET, make, new_spool, put, rows, settle
+
+from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.model import State
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.files import flock
+from shadowhound_data_logger.spool.listing import retry
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A robot's, whose spool was left with three objects that wait, one that is refused, and one without a date."""
+    for name in ('AWS_ENDPOINT_URL', 'AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY', 'SHADOWHOUND_ROBOT'):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    spool = new_spool(tmp_path / 'spool', SystemClock.of_this_machine())  # type: ignore[arg-type]
+    spool.open()
+    for name in ('a', 'b', 'c'):
+        put(spool, make(f'thor/camera/{name}.jpg', name.encode()))
+    (refused,) = put(spool, make('thor/camera/d.jpg', b'd'))
+    settle(spool, refused, State.QUARANTINED, 'access_denied')
+    put(spool, make('thor/_unsynced/boot/e.jpg', b'e', held='clock'))
+    spool.close()
+    return tmp_path
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ['spool', *arguments], standalone_mode=False)
+
+
+def said(*arguments: str) -> Any:
+    return json.loads(run(*arguments, '--json').stdout)
+
+
+def states(home: Path) -> dict[str, str]:
+    """Key -> state; the files are where their states say, and the ledger balances."""
+    found = rows(home / 'spool')
+    for row in found:
+        if row['state'] == 'pending':
+            assert (home / 'spool/ready' / BUCKET / row['key']).is_file()
+    assert ledger.imbalances(ledger.read(home / 'spool', 'thor')) == []
+    return {row['key'].removeprefix('thor/camera/'): row['state'] for row in found}
+
+
+def test_what_lies_here(home: Path) -> None:
+    """By sensor and state, and what to do about each; exit code 1 because something was refused."""
+    answer = run()
+    assert answer.return_value == 1
+    text = ' '.join(answer.stdout.split())
+    assert f'In {home}/spool' in answer.stdout.replace('\n', '')
+    assert 'camera pending 3 3 B' in text
+    assert 'camera quarantined: access_denied 1 1 B' in text
+    assert 'camera held: clock 1 1 B' in text
+    assert 'No node runs here. Start one, or: shadowhound-data spool drain' in text
+    assert 'shadowhound-data spool retry --reason access_denied' in text
+    assert 'wait for their date' in text
+
+
+def test_the_same_for_programs(home: Path) -> None:
+    """As JSON, with the reason as a field of its own."""
+    found = said()
+    assert (found['spool'], found['running'], found['quarantined']) == (f'{home}/spool', [], 1)
+    heaps = {(heap['sensor'], heap['state'], heap['reason']): (heap['objects'], heap['bytes']) for heap in found['heaps']}
+    assert heaps == {
+        ('camera', 'pending', None): (3, 3), ('camera', 'quarantined', 'access_denied'): (1, 1),
+        ('camera', 'held', 'clock'): (1, 1),
+    }  # fmt: skip
+
+
+def test_an_empty_spool_is_fine(tmp_path: Path) -> None:
+    """Exit code 0, and a sentence."""
+    spool = new_spool(tmp_path / 'spool')
+    spool.open()
+    spool.close()
+    answer = run('--spool', str(tmp_path / 'spool'))
+    assert answer.return_value == 0
+    assert 'Nothing waits' in answer.stdout
+
+
+@pytest.mark.parametrize('verb', [(), ('list',), ('drain',), ('retry',)])
+def test_no_spool(tmp_path: Path, verb: tuple[str, ...]) -> None:
+    """Every verb says which folder, and what names it; none makes one."""
+    answer = run('--spool', str(tmp_path / 'none'), *verb)
+    assert isinstance(answer.exception, SpoolError)
+    assert f'there is no spool in {tmp_path}/none' in str(answer.exception)
+    assert 'SHADOWHOUND_HOME' in str(answer.exception)
+    assert not (tmp_path / 'none').exists()
+
+
+def test_a_list(home: Path) -> None:
+    """Each object with its file, which is there; by state, by sensor, by how its name begins, and no more than asked for."""
+    found = said('list')
+    assert [one['key'] for one in found] == [
+        'thor/camera/a.jpg', 'thor/camera/b.jpg', 'thor/camera/c.jpg', 'thor/camera/d.jpg', 'thor/_unsynced/boot/e.jpg',
+    ]  # fmt: skip
+    assert all((home / 'spool' / one['path']).read_bytes() for one in found)
+    assert [one['reason'] for one in said('list', '--state', 'quarantined')] == ['access_denied']
+    assert [one['key'] for one in said('list', f'{BUCKET}/thor/_')] == ['thor/_unsynced/boot/e.jpg']
+    assert said('list', '--sensor', 'lidar') == []
+    few = run('list', '--limit', '2')
+    assert 'camera/b.jpg' in few.stdout
+    assert 'camera/c.jpg' not in few.stdout
+    assert 'more than 2' in few.stderr
+
+
+def test_what_was_refused_waits_again(home: Path) -> None:
+    """By its reason; another reason moves nothing, and what waits already stays."""
+    assert said('retry', '--reason', 'foreign') == {'objects': 0, 'bytes': 0, 'gone': 0}
+    assert states(home)['d.jpg'] == 'quarantined'
+    answer = run('retry', '--reason', 'access_denied')
+    assert (answer.return_value, answer.stdout) == (0, '1 objects (1 B) wait for delivery again\n')
+    assert states(home) == {'a.jpg': 'pending', 'b.jpg': 'pending', 'c.jpg': 'pending', 'd.jpg': 'pending',
+                            'thor/_unsynced/boot/e.jpg': 'held'}  # fmt: skip
+
+
+def test_one_object_waits_again(home: Path) -> None:
+    """By its name; one that is not quarantined is a finding."""
+    assert run('retry', f'{BUCKET}/thor/camera/a.jpg').return_value == 1
+    assert run('retry', f'{BUCKET}/thor/camera/d.jpg').return_value == 0
+    assert states(home)['d.jpg'] == 'pending'
+
+
+def test_a_file_that_is_gone_does_not_wait(home: Path) -> None:
+    """It is said, and the object stays what it was."""
+    (home / 'spool/quarantine/access_denied' / BUCKET / 'thor/camera/d.jpg').unlink()
+    answer = run('retry')
+    assert answer.return_value == 1
+    assert '1 are not there any more' in answer.stdout
+    assert states(home)['d.jpg'] == 'quarantined'
+
+
+def test_a_death_in_the_middle_of_a_retry(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the file and its row: the next start finishes it."""
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as dying:
+        dying.setattr('shadowhound_data_logger.spool.index.Index.set_found', die)
+        with pytest.raises(KeyboardInterrupt):
+            retry(home / 'spool')
+    spool = new_spool(home / 'spool')
+    spool.open()
+    spool.close()
+    assert states(home)['d.jpg'] == 'pending'
+
+
+def test_all_is_delivered_without_a_node(home: Path, seaweed: Tower, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To a real server, each object with a row in the catalogue; what is held or refused stays, and is told."""
+    for name, value in seaweed.environment().items():
+        monkeypatch.setenv(name, value)
+    answer = run('drain', '--json')
+    found = json.loads(answer.stdout)
+    assert answer.return_value == 0, found
+    assert (found['delivered'], found['pending'], found['held'], found['quarantined']) == (4, 0, 1, 1)
+    assert states(home)['a.jpg'] == 'delivered'
+    assert sum(row['sensor'] == '_catalog' and row['state'] == 'delivered' for row in rows(home / 'spool')) == 1
+    with closing(sqlite3.connect(home / 'spool/index.db')) as db:
+        assert db.execute('SELECT count(*) FROM uncatalogued').fetchone() == (0,)
+        assert db.execute("SELECT count(*) FROM sessions WHERE robot = 'thor'").fetchone() == (1,)
+    assert run('retry').return_value == 0
+    assert said('drain')['delivered'] == 2  # the object and its part of the catalogue
+
+
+def test_a_store_that_is_away_is_told(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It gives up after its patience, says why, and everything is still there."""
+    monkeypatch.setenv('AWS_ENDPOINT_URL', 'http://127.0.0.1:9')
+    monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'KEYID')
+    monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', 'SECRET')
+    answer = run('drain', '--patience', '1')
+    assert answer.return_value == 1
+    assert '3 still wait: Tower at http://127.0.0.1:9 refused the connection' in ' '.join(answer.stdout.split())
+    assert 'SECRET' not in answer.output
+    assert states(home)['a.jpg'] == 'pending'
+
+
+def test_a_node_delivers_already(home: Path) -> None:
+    """Then it says who does, and changes nothing."""
+    with flock(home / 'spool/drain.lock'):
+        answer = run('drain', '--patience', '1')
+    assert answer.return_value == 1
+    assert 'another process delivers from this spool' in answer.stdout
+    assert states(home)['a.jpg'] == 'pending'
