@@ -50,6 +50,9 @@ class SensorSettings:
     bucket: str = _setting('sensor-data', 'Bucket of its objects.')
     key: str = _setting('{robot}/{sensor}/{date}/{time}_{sensor}.{ext}', 'Key of an object; {date} and {time} are UTC.')
     dedup: bool = _setting(False, 'Store content that follows itself byte for byte once; the repeats stay listed.')
+    dedup_distance: int = _setting(
+        0, 'With dedup: JPEGs that look alike are repeats too, where at most so many of 64 bits differ.', low=0, high=32
+    )
     priority: int = _setting(5, '0 ships first and is dropped or evicted last, 9 the other way round.', low=0, high=9, live=True)
 
     @property

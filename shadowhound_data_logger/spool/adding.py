@@ -10,7 +10,7 @@ from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.spool.binding import free_key
 from shadowhound_data_logger.spool.files import Tree, content_sha256, description, facts
 from shadowhound_data_logger.spool.index import MISSING, Index
-from shadowhound_data_logger.spool.repeats import CONTENT_KEY, Repeats
+from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.retention import NO_ROOM
 from shadowhound_data_logger.spool.staging import is_staged
 
@@ -37,9 +37,9 @@ class Adding:
         sha256 = content_sha256(item.body)
         metadata = {**facts(item), 'sha256': sha256}
         if state is State.PENDING:
-            content_key = self._repeats.content_key(self._index, item, sha256)
-            if content_key is not None:
-                self._add_repeat(item, key, sha256, {**metadata, CONTENT_KEY: content_key})
+            holder = self._repeats.holder(self._index, item, sha256)
+            if holder is not None:
+                self._add_repeat(replace(item, body=holder.body), key, {**metadata, **holder.said})
                 return
             metadata |= self._repeats.stored(item, key, sha256)
         number = self._index.insert(item, key, sha256, state, reason, metadata, self._now_ns)
@@ -76,6 +76,8 @@ class Adding:
                 self._tree.place(self._tree.part(item.id), item.path)
         return pending
 
-    def _add_repeat(self, item: DataObject, key: str, sha256: str, metadata: Mapping[str, str]) -> None:
-        number = self._index.insert(item, key, sha256, State.PENDING, None, metadata, self._now_ns)
+    def _add_repeat(self, item: DataObject, key: str, metadata: Mapping[str, str]) -> None:
+        sha256 = content_sha256(item.body)
+        said = {**metadata, 'sha256': sha256}
+        number = self._index.insert(item, key, sha256, State.PENDING, None, said, self._now_ns)
         self._index.move([number], State.DEDUPLICATED, None, self._now_ns)

@@ -1,21 +1,26 @@
-"""Equal content that follows itself is kept once: a camera that shows the same picture for minutes.
+"""Content that follows itself is kept once: a camera that shows the same picture for minutes.
 
-A repeat is a row of the index in state deduplicated, with its own time, and ``content_key`` in its metadata names the object that
-holds the content; so does its row in the catalogue. No file of it is written and nothing of it is sent. What was sent cannot
-be changed, so the first object with another content tells, as metadata, how many repeats there were before it.
+Equal are the same bytes or, where a sensor asks for it, pictures that look alike; each is compared with the one that was
+stored, not with its neighbour, so that what changes slowly is stored again. A repeat is a row of the index in state
+deduplicated, with its own time, and ``content_key`` in its metadata names the object that holds the content; so does its
+row in the catalogue. No file of it is written and nothing of it is sent. What was sent cannot be changed, so the first
+object with another content tells, as metadata, how many repeats there were before it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.model import DataObject, State
+from shadowhound_data_logger.model import DataObject, FileBody, Likeness, State
 from shadowhound_data_logger.spool.index import Index
 
 CONTENT_KEY: Final = 'content_key'
 """Metadata of a repeat: the key of the object that holds its content, in the same bucket."""
+DISTANCE: Final = 'content_distance'
+"""Metadata of a repeat that only looks like that object: how many of 64 bits differ (``encode.likeness``)."""
 REPEATS, REPEATS_OF, REPEATS_UNTIL = 'repeats', 'repeats_of', 'repeats_until_ns'
 """Metadata of the object after repeats: how many there were, of which key, and when the last one ended."""
 _HOLDS: Final = frozenset({State.PENDING.value, State.DELIVERED.value})
@@ -27,8 +32,19 @@ class _Last:
 
     key: str
     sha256: str
+    likeness: Likeness | None
     repeats: int = 0
     until_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """What a repeat stands for."""
+
+    body: FileBody
+    """Size and checksum of the object that holds the content; its path is of no use."""
+    said: Mapping[str, str]
+    """Metadata of the repeat."""
 
 
 class Repeats:
@@ -46,26 +62,38 @@ class Repeats:
         """It is durable."""
         self._last = self._next
 
-    def content_key(self, index: Index, item: DataObject, sha256: str) -> str | None:
-        """The key that holds this content already, if it is what the sensor stored last and is still on its way or there."""
+    def holder(self, index: Index, item: DataObject, sha256: str) -> Holder | None:
+        """The object that holds this content already, if it is what the sensor stored last and is still on its way or there."""
         last = self._next.get(_source(item))
-        if not item.dedup or item.held or last is None or last.sha256 != sha256:
+        if not item.dedup or item.held or last is None:
+            return None
+        distance = 0 if last.sha256 == sha256 else _distance(last.likeness, item.likeness)
+        if distance is None:
             return None
         rows = index.rows('bucket = ? AND key = ?', (item.bucket, last.key))
-        if not rows or rows[0]['state'] not in _HOLDS or rows[0]['sha256'] != sha256:
+        if not rows or rows[0]['state'] not in _HOLDS or rows[0]['sha256'] != last.sha256:
             return None  # evicted, say: a repeat of it would be lost with it
         self._next[_source(item)] = replace(last, repeats=last.repeats + 1, until_ns=item.t_end_ns)
-        return last.key
+        said = {CONTENT_KEY: last.key} if last.sha256 == sha256 else {CONTENT_KEY: last.key, DISTANCE: str(distance)}
+        return Holder(FileBody(Path(last.key), rows[0]['bytes'], last.sha256), said)
 
     def stored(self, item: DataObject, key: str, sha256: str) -> Mapping[str, str]:
         """The sensor stored this; returns what is to be said of the repeats before it."""
         if not item.dedup or item.held:
             return {}
         last = self._next.get(_source(item))
-        self._next[_source(item)] = _Last(key, sha256)
+        self._next[_source(item)] = _Last(key, sha256, item.likeness)
         if last is None or not last.repeats:
             return {}
         return {REPEATS: str(last.repeats), REPEATS_OF: last.key, REPEATS_UNTIL: str(last.until_ns)}
+
+
+def _distance(one: Likeness | None, other: Likeness | None) -> int | None:
+    """How many bits differ, where no more may."""
+    if one is None or other is None:
+        return None
+    distance = (one.hash ^ other.hash).bit_count()
+    return distance if distance <= other.within else None
 
 
 def _source(item: DataObject) -> tuple[str, str, str | None]:
