@@ -125,7 +125,7 @@ class World:
             os.environ[name] = ','.join(filter(None, (os.environ.get(name), '127.0.0.1')))
         if self.tower is not None:
             self.tower.start()
-            _make_bucket(self.tower)
+            make_bucket(self.tower)
         store = self.tower.environment() if self.tower is not None else {}
         self._environ = environment(self.folder / 'home', store, free_domain()) | {'ROS_LOG_DIR': str(self.folder / 'ros')}
         return self
@@ -185,8 +185,8 @@ class World:
         return int(self.topic(name).get('received', 0))
 
 
-def _make_bucket(tower: Tower) -> None:
-    """The node makes its buckets itself; a plain node takes them for granted."""
+def make_bucket(tower: Tower) -> None:
+    """The node makes its buckets itself; a plain node and bare puts take them for granted."""
     settings = tower.store_settings()
     client = boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
                           aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip

@@ -16,7 +16,6 @@ import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,17 +24,16 @@ import numpy as np
 import obstore
 import simplejpeg
 from _report import Bar, Report, main, progress
+from _world import make_bucket
 from obstore.store import S3Store
 from PIL import Image
 from torch.utils.data import DataLoader
 
 from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.encode.archive import Member, pack_tar
 from shadowhound_data_logger.lake import MissionDataset, parts, query, schema
 from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.sim.tower import Tower
-from shadowhound_data_logger.stores import open_store
 
 FIRST_NS: Final = 1_793_188_800 * SECOND
 BAR: Final = 2.0
@@ -122,8 +120,7 @@ def measure(options: argparse.Namespace) -> Report:
     (folder / 'tower').mkdir(parents=True)
     with Tower(folder / 'tower') as tower:
         settings = tower.store_settings()
-        with closing(open_store(settings, UploadSettings())) as store:
-            store._s3.create_bucket(schema.BUCKET)  # type: ignore[attr-defined]
+        make_bucket(tower)
         bare = S3Store(schema.BUCKET, endpoint=settings.endpoint_url, access_key_id=settings.access_key_id,
                        region=settings.region, secret_access_key=settings.secret_access_key, virtual_hosted_style_request=False,
                        client_options={'allow_http': True})  # fmt: skip

@@ -28,6 +28,7 @@ from typing import Any, Final
 
 import obstore
 from _report import Bar, Report, main, progress
+from _world import make_bucket
 from obstore.store import S3Store
 
 from shadowhound_data_logger.clock import SECOND, utc
@@ -282,8 +283,7 @@ def measure(options: argparse.Namespace) -> Report:
     (folder / 'tower').mkdir(parents=True)
     with Tower(folder / 'tower') as tower:
         settings = tower.store_settings()
-        with closing(open_store(settings, UploadSettings())) as store:
-            store._s3.create_bucket(schema.BUCKET)  # type: ignore[attr-defined]  # its puts make it, bare ones do not
+        make_bucket(tower)
         bars, figures = questions(settings, options.days)
         more, told = fetches(tower, settings, folder, options.objects)
     shutil.rmtree(folder / 'tower', ignore_errors=True)

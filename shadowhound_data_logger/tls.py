@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import ssl
 from collections.abc import Iterator
 from typing import Any, Final
@@ -18,6 +19,13 @@ _REASONS: Final = {
     _HOST: _OTHER_NAME,
     _ADDRESS: _OTHER_NAME,
 }
+_RUSTLS: Final = {'Expired': _EXPIRED, 'NotValidYet': _NOT_YET, 'NotValidForName': _HOST}
+"""What rustls calls these, some with ``Context`` behind it (https://docs.rs/rustls/latest/rustls/enum.CertificateError.html)."""
+_TOLD: Final = re.compile(r'InvalidCertificate\(\s*(\w+?)(?:Context)?\b')
+_AUTHORITY: Final = (
+    'the certificate of {server} is that of an authority itself, and rustls takes none such of a server',
+    'make one on Tower that the authority signs',
+)
 _UNKNOWN: Final = (
     'the certificate of {server} is not trusted',
     'set {bundle} to the certificate of the authority that signed it',
@@ -36,9 +44,23 @@ def distrust(error: BaseException, server: str, *, bundle: str, address: str) ->
             found = _REASONS.get(getattr(cause, 'verify_code', 0), _UNKNOWN)
         else:
             continue
-        what, remedy = (text.format(server=server, bundle=bundle, address=address) for text in found)
-        return what, remedy
+        return _worded(found, server, bundle, address)
     return None
+
+
+def distrust_told(text: str, server: str, *, bundle: str, address: str) -> tuple[str, str] | None:
+    """The same of a library that has only words for it, those of rustls: ``InvalidCertificate(UnknownIssuer)``."""
+    found = _TOLD.search(text)
+    if found is None:
+        return None
+    if 'CaUsedAsEndEntity' in text:
+        return _worded(_AUTHORITY, server, bundle, address)
+    return _worded(_REASONS.get(_RUSTLS.get(found[1], 0), _UNKNOWN), server, bundle, address)
+
+
+def _worded(found: tuple[str, str], server: str, bundle: str, address: str) -> tuple[str, str]:
+    what, remedy = (text.format(server=server, bundle=bundle, address=address) for text in found)
+    return what, remedy
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:

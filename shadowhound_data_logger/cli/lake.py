@@ -13,6 +13,7 @@ import click
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TaskID, TextColumn
 
+from shadowhound_data_logger.cli.lake_verify import verify
 from shadowhound_data_logger.cli.question import asking, settings
 from shadowhound_data_logger.cli.tables import number, plain, plain_table, show_whole, volume
 from shadowhound_data_logger.config import UploadSettings
@@ -26,6 +27,9 @@ _robot = click.option('--robot', metavar='NAME', help='Of this robot alone.')
 @click.group()
 def lake() -> None:
     """The catalogue of what is stored, in the store itself: BUCKET/ROBOT/_catalog/."""
+
+
+lake.add_command(verify)
 
 
 @lake.command()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from datetime import datetime, timezone
 from pathlib import Path
@@ -18,7 +18,7 @@ from rich.text import Text
 from shadowhound_data_logger.cli.tables import number, plain, show_whole
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings, home, store_settings
-from shadowhound_data_logger.ship.audit import KINDS, THREADS, Audit, audit
+from shadowhound_data_logger.ship.audit import KEYS, KINDS, THREADS, Audit, audit
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.status import targets
 from shadowhound_data_logger.stores import open_store
@@ -30,7 +30,7 @@ def verify(spool: Path, *, deep: bool, again: bool, as_json: bool) -> int:
     with closing(open_store(settings, UploadSettings(threads=THREADS))) as store, closing(Deliveries(spool)) as deliveries:
         deliveries.open(f'{"deep" if deep else "head"} {store.describe()}', again=again)
         earlier, known = deliveries.noted(), deliveries.known()
-        with _progress() as bar:
+        with progress() as bar:
             task = bar.add_task('read back' if deep else 'asked for', total=known, completed=earlier)
             found = audit(deliveries, store, deep=deep, tell=lambda: bar.advance(task))
         said = _said(found, deliveries, store.describe(), deep=deep, earlier=earlier)
@@ -44,7 +44,7 @@ def verify(spool: Path, *, deep: bool, again: bool, as_json: bool) -> int:
     return 0 if said['ok'] else 1
 
 
-def _progress() -> Progress:
+def progress() -> Progress:
     """On standard error, where that is a terminal; nothing else is ever written there."""
     console = Console(stderr=True)
     columns = (TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -52,30 +52,37 @@ def _progress() -> Progress:
 
 
 def _said(found: Audit, deliveries: Deliveries, store: str, *, deep: bool, earlier: int) -> dict[str, Any]:
-    known = deliveries.known()
     return {
-        'store': store, 'deep': deep, 'since_ns': deliveries.since_ns(), 'known': known, 'forgotten': deliveries.ever() - known,
+        'store': store, 'deep': deep, 'since_ns': deliveries.since_ns(),
+        'known': deliveries.known(), 'forgotten': deliveries.forgotten(),
         'asked': found.asked, 'asked_earlier': earlier, 'sound': earlier + found.sound,
-        'findings': {
-            kind: {
-                'count': count,
-                'first': [{'bucket': one.bucket, 'key': one.key, 'detail': one.detail} for one in found.first[kind]],
-            }
-            for kind, count in found.counts.items()
-        },
+        'findings': findings(found),
         'unreachable': None if found.away is None else str(found.away), 'ok': found.away is None and not found.counts,
     }  # fmt: skip
 
 
+def findings(found: Audit) -> dict[str, Any]:
+    """Kind -> how many there are, and those that the audit lists."""
+    listed = {
+        kind: [{'bucket': one.bucket, 'key': one.key, 'detail': one.detail} for one in first]
+        for kind, first in found.first.items()
+    }  # fmt: skip
+    return {kind: {'count': count, 'first': listed[kind]} for kind, count in found.counts.items()}
+
+
 def show(said: Mapping[str, Any], console: Console) -> None:
     """What was asked, each kind of finding with its first keys, and a verdict."""
-    lines: list[RenderableType] = [plain(_scope(said))]
-    for kind, piled in said['findings'].items():
-        lines += ['', Text.assemble((f'{number(piled["count"])} {KINDS[kind]}', 'red'))]
-        lines += [plain(f'  {one["bucket"]}/{one["key"]}: {one["detail"]}') for one in piled['first']]
-        if piled['count'] > len(piled['first']):
-            lines.append(f'  ... and {number(piled["count"] - len(piled["first"]))} more')
-    show_whole([*lines, '', _verdict(said), *_doubt(said)], console)
+    show_whole([plain(_scope(said)), *piles(said['findings'], KINDS), '', _verdict(said), *_doubt(said)], console)
+
+
+def piles(found: Mapping[str, Any], words: Mapping[str, str]) -> Iterator[RenderableType]:
+    """Each kind of finding in these words, and the first of it by name."""
+    for kind, piled in found.items():
+        first = piled['first'][:KEYS]
+        yield from ('', Text.assemble((f'{number(piled["count"])} {words[kind]}', 'red')))
+        yield from (plain(f'  {one["bucket"]}/{one["key"]}: {one["detail"]}') for one in first)
+        if piled['count'] > len(first):
+            yield f'  ... and {number(piled["count"] - len(first))} more'
 
 
 def _scope(said: Mapping[str, Any]) -> str:

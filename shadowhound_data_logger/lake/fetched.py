@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 FOLDER: Final = '.fetch'
+PARTS: Final = f'{FOLDER}/parts'
+"""Of files that are not whole yet."""
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS files (
     key TEXT PRIMARY KEY, bucket TEXT NOT NULL, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sha256 TEXT NOT NULL,
@@ -52,7 +54,7 @@ class Fetched:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.parts = folder / FOLDER / 'parts'
+        self.parts = folder / PARTS
         self._boot = SystemClock.of_this_machine().boot_id
         self._lock: IO[bytes] | None = None
         self._known: dict[str, Verified] = {}

@@ -12,6 +12,7 @@ from typing import Any
 
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import parts
+from shadowhound_data_logger.lake.fetched import PARTS
 from shadowhound_data_logger.lake.schema import COLUMNS
 from shadowhound_data_logger.lake.standing import mended_key
 
@@ -29,8 +30,9 @@ def keep(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         if path.is_file():
             continue
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part = path.with_suffix(f'.{os.getpid()}.part')
+            part = folder / PARTS / f'rows-{os.getpid()}'  # where the next fetch clears away what a kill left
+            for place in (part.parent, path.parent):
+                place.mkdir(parents=True, exist_ok=True)
             part.write_bytes(parts.encode(ours))
             part.replace(path)
         except OSError as error:

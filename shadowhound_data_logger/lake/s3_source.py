@@ -21,10 +21,13 @@ from shadowhound_data_logger.errors import (
     ObjectRefused,
     StoreError,
     StoreUnavailable,
+    StoreUntrusted,
 )
 from shadowhound_data_logger.lake.source import CHUNK_BYTES, Content, Entry
+from shadowhound_data_logger.lake.trust import authorities
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.tls import distrust_told
 
 _CONNECT: Final = timedelta(seconds=10)
 _SILENCE: Final = timedelta(seconds=60)
@@ -145,10 +148,12 @@ def _client(settings: StoreSettings, bucket: str) -> S3Store:
         from obstore.auth.boto3 import Boto3CredentialProvider  # noqa: PLC0415 - half a second that few need
 
         given = {'credential_provider': Boto3CredentialProvider()}
+    options: Any = {'allow_http': True, 'connect_timeout': _CONNECT, 'read_timeout': _SILENCE, 'timeout': _WHOLE}
+    if (trusted := authorities(settings)) is not None:
+        options['root_certificate'] = trusted
     return S3Store(
         bucket, endpoint=settings.endpoint_url, region=settings.region, virtual_hosted_style_request=False, **given,
-        client_options={'allow_http': True, 'connect_timeout': _CONNECT, 'read_timeout': _SILENCE, 'timeout': _WHOLE},
-        retry_config={'max_retries': _TRIES, 'retry_timeout': _PATIENCE},
+        client_options=options, retry_config={'max_retries': _TRIES, 'retry_timeout': _PATIENCE},
     )  # fmt: skip
 
 
@@ -181,5 +186,8 @@ def _translated(error: Exception, endpoint: str, bucket: str, key: str) -> Store
         return AccessDenied(f'Tower at {endpoint} denies these credentials {bucket}/{key} ({code})', **where)
     if isinstance(error, (refused.InvalidPathError, ValueError)):
         return ObjectRefused(f'the key {bucket}/{key:.80} cannot be asked for', reason='name', **where)
+    untrusted = distrust_told(str(error), f'Tower at {endpoint}', bundle='AWS_CA_BUNDLE', address='AWS_ENDPOINT_URL')
+    if untrusted:
+        return StoreUntrusted(untrusted[0], remedy=untrusted[1], **where)
     remedy = 'is Tower on, and the WiFi?'
     return StoreUnavailable(f'Tower at {endpoint} gave no answer for {bucket}/{key} ({code})', remedy=remedy, **where)

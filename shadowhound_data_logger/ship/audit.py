@@ -55,7 +55,7 @@ class Target(Protocol):
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None: ...
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]: ...
+    def content(self, bucket: str, key: str) -> Iterator[bytes]: ...
 
     def probe(self) -> None: ...
 
@@ -82,21 +82,25 @@ class Audit:
     """Kind -> the first of them."""
     away: StoreError | None = None
     """Why it ended before its time."""
+    keys: int | None = KEYS
+    """So many of each kind are listed; None: all."""
 
     def add(self, finding: Finding) -> None:
         self.counts[finding.kind] = self.counts.get(finding.kind, 0) + 1
         listed = self.first.setdefault(finding.kind, [])
-        if len(listed) < KEYS:
+        if self.keys is None or len(listed) < self.keys:
             listed.append(finding)
 
 
-def audit(source: Source, store: Target, *, deep: bool = False, threads: int = THREADS,
+def audit(source: Source, store: Target, *, deep: bool = False, threads: int = THREADS, keys: int | None = KEYS,
           tell: Callable[[], None] = lambda: None, pause: Callable[[float], object] = time.sleep) -> Audit:  # fmt: skip
     """Ask for everything that ``source`` has; ``deep`` reads each object back as well. ``tell`` is called after each one.
 
+    An object of which no SHA-256 is known is sound when its size is right.
+
     What is found sound is noted; findings are not, so that the next run of an audit that ended early looks again.
     """
-    found = Audit()
+    found = Audit(keys=keys)
     judge = partial(_judge, store, deep=deep, pause=pause)
     pool = ThreadPoolExecutor(threads, 'verify')
     try:
@@ -149,19 +153,19 @@ def _judge(store: Target, expected: ObjectInfo, *, deep: bool, pause: Callable[[
             return make(MISSING, detail=f'{expected.size} bytes were delivered')
         if held.size != expected.size:
             return make(SIZE, detail=f'{held.size} bytes, {expected.size} were delivered')
-        if deep:
+        if deep and expected.sha256 is not None:
             content = _steadily(lambda: _sha256(store, expected), pause)
             if content != expected.sha256:
                 return make(CHECKSUM, detail=f'SHA-256 {content}, {expected.sha256} was delivered')
-        elif held.sha256 is None:
-            return make(FOREIGN, detail='no sha256 in its metadata')
     except (BucketMissing, ObjectRefused) as error:
         return make(MISSING, detail=str(error))
     except AccessDenied as error:
         return make(DENIED, detail=str(error))
-    if held.sha256 not in {None, expected.sha256}:
-        return make(CHECKSUM, detail=f'sha256 {held.sha256} in its metadata, {expected.sha256} was delivered')
-    return None
+    if expected.sha256 in {None, held.sha256} or (deep and held.sha256 is None):
+        return None
+    if held.sha256 is None:
+        return make(FOREIGN, detail='no sha256 in its metadata')
+    return make(CHECKSUM, detail=f'sha256 {held.sha256} in its metadata, {expected.sha256} was delivered')
 
 
 def _sha256(store: Target, expected: ObjectInfo) -> str:

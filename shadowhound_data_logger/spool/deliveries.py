@@ -93,9 +93,10 @@ class Deliveries:
         """Delivered objects that the index remembers; those of longer ago are forgotten (``spool.remember_days``)."""
         return int(self._ask(f'SELECT count(*) {_DELIVERED}')[0][0])
 
-    def ever(self) -> int:
-        """Delivered objects since the index began, the forgotten ones among them."""
-        return int(self._ask("SELECT ifnull(sum(objects), 0) FROM spool.tally WHERE state = 'delivered'")[0][0])
+    def forgotten(self) -> int:
+        """Delivered objects of longer ago, which the index counts but cannot name any more; parts of the catalogue among them."""
+        ever = int(self._ask("SELECT ifnull(sum(objects), 0) FROM spool.tally WHERE state = 'delivered'")[0][0])
+        return ever - int(self._ask("SELECT count(*) FROM spool.objects WHERE state = 'delivered'")[0][0])
 
     def since_ns(self) -> int | None:
         """When the first of those that the index remembers was delivered; None without any."""

@@ -98,6 +98,15 @@ def test_what_the_index_forgot_is_said(home: Path) -> None:
     assert '1 older ones are not remembered' in ' '.join(run('--verify').stdout.split())
 
 
+def test_the_catalogue_is_not_called_forgotten(home: Path) -> None:
+    """Its parts are not asked for, others stand for them in time; but they are no objects that the index forgot."""
+    with closing(sqlite3.connect(home / 'spool/index.db')) as index:
+        index.execute("UPDATE objects SET sensor = '_catalog' WHERE key = 'thor/a'")
+        index.commit()
+    said = as_json('--verify')
+    assert (said['known'], said['forgotten']) == (2, 0)
+
+
 def test_a_store_that_is_away(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exit code 1, no object is called missing, how far it came, and no secret; then the folder is another store."""
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'http://127.0.0.1:9')

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import os
-import signal
 import sqlite3
-import subprocess
-import sys
-import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from faults.front import Front
-from faults.kinds import Fault
 from lake.making import Watched, add, folder_store, watched
 
 from shadowhound_data_logger.config import UploadSettings
@@ -259,45 +253,3 @@ def test_from_a_real_server(real: Tower, tmp_path: Path) -> None:
     assert moved(source) == []
     with pytest.raises(StoreUnavailable):
         run(watched(replace(real.store_settings(), endpoint_url='http://127.0.0.1:9')), to)
-
-
-PROGRAM = """
-import sys
-from pathlib import Path
-from shadowhound_data_logger.lake import fetch
-from shadowhound_data_logger.lake.source import open_source
-from shadowhound_data_logger.options import StoreSettings
-settings = StoreSettings(endpoint_url=sys.argv[2], access_key_id=sys.argv[3], secret_access_key=sys.argv[4])
-source = open_source(settings, 'sensor-data')
-fetch.NOTE_S = 0.0
-fetch.fetch(fetch.under(source, sys.argv[5]), Path(sys.argv[1]), lambda _: source, threads=2)
-"""
-
-
-@pytest.mark.seaweedfs
-def test_killed_it_goes_on_where_it_was(real: Tower, tmp_path: Path) -> None:
-    """After a kill -9 in the middle every file that is there is whole, and the next run moves only the others."""
-    to, plain = tmp_path / 'data', real.store_settings()
-    asked = 0
-
-    def hang_after_ten() -> Fault:
-        nonlocal asked
-        asked += 1
-        return Fault.NONE if asked <= 10 else Fault.HUNG
-
-    with Front(real.endpoint_url, hang_after_ten) as front:
-        arguments = [str(to), front.url, str(plain.access_key_id), str(plain.secret_access_key), PREFIX]
-        with subprocess.Popen([sys.executable, '-c', PROGRAM, *arguments]) as process:
-            end = time.monotonic() + 60
-            while len(list(to.rglob('*.jpg'))) < 6:
-                assert time.monotonic() < end, 'it fetches nothing'
-                assert process.poll() is None
-                time.sleep(0.02)
-            process.send_signal(signal.SIGKILL)
-    there = {str(path.relative_to(to)) for path in (to / 'thor').rglob('*.jpg')}
-    assert 6 <= len(there) < COUNT
-    assert all((to / key).read_bytes() == OBJECTS[key] for key in there)
-    source = watched(plain)
-    assert run(source, to).moved == COUNT - len(there)
-    assert not set(moved(source)) & there
-    assert whole(to)

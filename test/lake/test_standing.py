@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime, timedelta, timezone
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shadowhound_data_logger.errors import LakeError
@@ -66,6 +66,7 @@ class Folder:
                 del self.files[entry.key]
 
 
+@settings(deadline=None)
 @given(STEPS)
 def test_each_row_is_read_once_at_every_moment(steps: list[str | int]) -> None:
     """Parts come, compactions begin, end, die and overlap, what is stood for is deleted: a reader sees all rows once."""

@@ -40,12 +40,20 @@ class Authority:
             .add_extension(names, critical=False)
             .sign(self._key, hashes.SHA256())
         )
-        certificate, private = self._folder / f'{name}.crt', self._folder / f'{name}.key'
+        certificate = self._folder / f'{name}.crt'
         certificate.write_bytes(signed.public_bytes(serialization.Encoding.PEM))
+        return certificate, self._write(name, key)
+
+    def itself(self) -> tuple[Path, Path]:
+        """Its own certificate and key, as if it were a server."""
+        return self.path, self._write('itself', self._key)
+
+    def _write(self, name: str, key: ec.EllipticCurvePrivateKey) -> Path:
+        private = self._folder / f'{name}.key'
         private.write_bytes(key.private_bytes(
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         ))  # fmt: skip
-        return certificate, private
+        return private
 
 
 def _certificate(subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, begins: datetime.timedelta,

@@ -1,0 +1,124 @@
+"""``shadowhound-data lake verify``: what it says of a store that lost something, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from click.testing import CliRunner, Result
+from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, row
+
+from shadowhound_data_logger.cli.lake import lake
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.lake import schema
+from shadowhound_data_logger.stores import open_store
+
+TIMES = [NOON_NS + second * SECOND for second in range(5)]
+KEYS = sorted(row(sensor, stamp_ns)['key'] for sensor in SENSORS for stamp_ns in TIMES)
+PATH = 'thor/patrol_20261028_120000.csv'
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """Ten objects, one in another bucket, and two parts of the catalogue."""
+    with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
+        for sensor in SENSORS:
+            for stamp_ns in TIMES:
+                add(store, tmp_path / 'tmp', row(sensor, stamp_ns)['key'], content(sensor, stamp_ns))
+            add_part(store, [row(sensor, stamp_ns) for stamp_ns in TIMES], sensor, tmp_path / 'tmp')
+        add(store, tmp_path / 'tmp', PATH, b'x,y', bucket='trajectories')
+        path = schema.row_of('trajectories', PATH, 3, 'text/csv', {'t_start_ns': str(NOON_NS)})
+        add_part(store, [path], 'path', tmp_path / 'tmp')
+    return tmp_path
+
+
+def run(home: Path, *arguments: str) -> Result:
+    env = {'SHADOWHOUND_HOME': str(home), 'COLUMNS': '150', 'AWS_ENDPOINT_URL': ''}
+    return CliRunner().invoke(lake, ['verify', *arguments], env=env, standalone_mode=False)
+
+
+def as_json(home: Path, *arguments: str) -> dict[str, Any]:
+    answer = run(home, *arguments, '--json')
+    said: dict[str, Any] = json.loads(answer.stdout)
+    assert answer.return_value == (0 if said['ok'] else 1)
+    return said
+
+
+def found(said: dict[str, Any]) -> dict[str, list[str]]:
+    return {kind: [one['key'] for one in piled['first']] for kind, piled in said['findings'].items()}
+
+
+def file(home: Path, key: str) -> Path:
+    return home / 'store' / schema.BUCKET / key
+
+
+@pytest.mark.parametrize('deep', [[], ['--deep']])
+def test_all_is_there(home: Path, deep: list[str]) -> None:
+    """Exit code 0; every bucket is asked, and of what has no checksum in the catalogue it says so."""
+    answer = run(home, *deep)
+    assert answer.return_value == 0
+    assert 'asked for 11 of the 11 objects of its own catalogue' in answer.stdout
+    assert 'Of 1 no checksum is known' in answer.stdout
+    assert 'All of them are there' in answer.stdout
+    assert as_json(home, *deep, '--sensor', 'camera', '--since', '2026-10-28T12:00:02')['asked'] == 3
+
+
+def test_each_loss_is_named(home: Path) -> None:
+    """Deleted, cut, changed; what has the right size and metadata is found by reading it."""
+    gone, cut, changed, foreign = KEYS[:4]
+    file(home, gone).unlink()
+    file(home, cut).write_bytes(b'cut')
+    file(home, changed).write_bytes(file(home, changed).read_bytes()[::-1])
+    (home / 'store' / '.metadata' / schema.BUCKET / f'{foreign}.json').unlink()
+    assert found(as_json(home)) == {'missing': [gone], 'size': [cut], 'foreign': [foreign]}
+    assert found(as_json(home, '--deep')) == {'missing': [gone], 'size': [cut], 'checksum': [changed]}
+    text = run(home)
+    assert f'sensor-data/{gone}: ' in text.stdout
+    assert '3 are not as the catalogue says' in text.stdout
+
+
+def test_all_keys_are_in_the_json(home: Path) -> None:
+    """The text has the first of them."""
+    with closing(open_store(folder_store(home), UploadSettings())) as store:
+        lost = [row('camera', NOON_NS + (60 + number) * SECOND) for number in range(50)]
+        add_part(store, lost, 'lost', home / 'tmp')
+    assert found(as_json(home)) == {'missing': sorted(each['key'] for each in lost)}
+    assert '... and 30 more' in run(home).stdout
+
+
+def test_the_catalogue_of_another_store_counts_as_well(home: Path, tmp_path: Path) -> None:
+    """What the store lost of its own catalogue, and the objects that were in it, are found by that alone."""
+    old = tmp_path / 'old'
+    shutil.copytree(file(home, 'thor/_catalog'), old / 'thor' / '_catalog')
+    assert as_json(home, '--catalogue', str(old))['ok']
+    for part in file(home, 'thor/_catalog').rglob('*_camera.parquet'):
+        part.unlink()
+    cameras = [key for key in KEYS if '/camera/' in key]
+    file(home, cameras[0]).unlink()
+    own = as_json(home)
+    assert (own['ok'], own['asked']) == (True, 6)
+    said = as_json(home, '--catalogue', str(old))
+    assert said['asked'] == 11
+    assert found(said) == {'missing': [cameras[0]], 'unlisted': cameras}
+    text = run(home, '--catalogue', str(old)).stdout
+    assert '5 are not as the catalogue says' in text
+    assert 'lake reindex' in text
+
+
+def test_nothing_to_verify_is_no_success(home: Path) -> None:
+    """A catalogue that is lost says nothing."""
+    answer = run(home, '--sensor', 'lidar')
+    assert answer.return_value == 1
+    assert 'Nothing is verified' in answer.stdout
+
+
+def test_bad_usage(home: Path) -> None:
+    """A folder without a catalogue, a question that a catalogue alone cannot answer, a time that is none."""
+    for wrong in (['--catalogue', str(home / 'tmp')], ['--catalogue', str(home), '--failed'], ['--since', 'soon']):
+        assert isinstance(run(home, *wrong).exception, click.UsageError)
