@@ -16,21 +16,23 @@ MAX_SEGMENT_BYTES: Final = 200
 """Below the 255 of a file name, with room for ``_NNN`` and ``.part``: the spool's tree is the bucket's."""
 MAX_NAME_BYTES: Final = 64
 """A robot, sensor or mission type is a word, not a text."""
+MAX_BAG_BYTES: Final = 160
+"""Of a bag's name: such a word with a boot's id or a time behind it. Its files have it with a number in their names."""
 
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9_.-]*')
 _SEGMENT = re.compile(r"[A-Za-z0-9!_.*'()=+@-]+")
 _FIELDS: Final = ('robot', 'sensor', 'date', 'time', 'ext')
 
 
-def check_name(name: str, what: str) -> str:
-    """The name unchanged, if it can stand in a key: letters, digits, ``_ - .``, at most 64 bytes, no ``..``.
+def check_name(name: str, what: str, most: int = MAX_NAME_BYTES) -> str:
+    """The name unchanged, if it can stand in a key: letters, digits, ``_ - .``, at most 64 bytes (``most``), no ``..``.
 
     Raises NameRefused otherwise; ``what`` says in the error whose name it is.
     """
-    if not _NAME.fullmatch(name) or '..' in name or len(name.encode()) > MAX_NAME_BYTES:
+    if not _NAME.fullmatch(name) or '..' in name or len(name.encode(errors='replace')) > most:
         raise NameRefused(
             f'{what} {name[:80]!r} cannot be part of an object key',
-            remedy=f'use letters, digits, "_", "-" and ".", at most {MAX_NAME_BYTES}, beginning with a letter or digit',
+            remedy=f'use letters, digits, "_", "-" and ".", at most {most}, beginning with a letter or digit',
             name=name,
         )
     return name

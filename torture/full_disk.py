@@ -1,4 +1,4 @@
-"""Fills the disk under the node, for a minute, and breaks it: the node stays up, gives up the least important, and goes on.
+"""Fills the disk under a node that records, for a minute, and breaks it: it stays up, gives up the least important, and goes on.
 
 The spool lies on a small file system of its own; the store is away meanwhile. First the node fills it itself and keeps the
 reserve of free space; then somebody else writes until nothing is free at all; then there is space again. Last, where it is
@@ -11,12 +11,14 @@ import hashlib
 import random
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from e2e.bag_reading import bags
 from e2e.processes import Node, Processes, published, until
 from e2e.wire import PASS, REFUSE, Wire
 
@@ -26,6 +28,7 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.retention import NO_ROOM
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, parser, progress, verdict, workshop
@@ -40,6 +43,7 @@ WITHIN: Final = 4 * MEBI
 FULL_S: Final = 60.0
 SHORT_FULL_S: Final = 8.0
 EVENTS: Final = 8
+SLICE_S: Final = 3.0
 BUCKET: Final = 'sensor-data'
 
 
@@ -87,7 +91,7 @@ class FullDisk:
         return self.found
 
     def _node(self) -> Node:
-        parameters = PARAMETERS | {'spool.min_free_bytes': RESERVE}
+        parameters = PARAMETERS | {'spool.min_free_bytes': RESERVE, 'bag.record': 'always', 'bag.slice_s': SLICE_S}
         return self._processes.node(self._environ, parameters, home=str(self._home))
 
     def _protect(self) -> None:
@@ -154,6 +158,11 @@ class FullDisk:
         self._watch(node, 2.0)
         self._wire.set(PASS)
 
+        def is_recorded() -> bool:
+            return bool(node.ledger()['bags']['/imu']['stored_in']['delivered'])
+
+        until(is_recorded, 'a slice of after it is delivered', 60.0)
+
     def _at_the_end(self, said: dict[str, Any], published: dict[str, int]) -> None:
         found, objects = self.found, said['objects']
         found.figures |= {'objects': objects, 'topics': {
@@ -165,6 +174,7 @@ class FullDisk:
         for topic, row in said['topics'].items():
             found.check('every message is accounted for', row['published'] == published[topic] and row['open'] == 0, (topic, row))
         self._are_safe('protected objects are delivered whole')
+        self._are_recorded(said['bags'], published)
 
     def _are_safe(self, what: str) -> None:
         store = S3Store(self._tower.store_settings(), UploadSettings())
@@ -176,6 +186,30 @@ class FullDisk:
                 self.found.check(what, hashlib.sha256(held).digest() == hashlib.sha256(body).digest(), key)
         finally:
             store.close()
+
+    def _are_recorded(self, rows: dict[str, Any], published: dict[str, int]) -> None:
+        """Each slice that is there opens, and each message that is in none is in the manifest, and in the ledger."""
+        store = S3Store(self._tower.store_settings(), UploadSettings())
+        store.open()
+        try:
+            (bag,) = bags(store, ROBOT, self._processes.folder / 'bags')
+        finally:
+            store.close()
+        counts, lost = bag.check(), Counter[str]()
+        for each in bag.manifest['missing']:
+            lost[each['topic'] or 'slices'] += each['messages']
+        self.found.figures['bag'] = {'slices': len(bag.slices), 'messages': counts.total(), 'missing': dict(lost)}
+        self.found.check('the bag says that it has gaps', bag.manifest['state'] == 'gaps', bag.manifest['state'])
+        self.found.check('the bag went on after it', bag.slices)
+        for topic, row in rows.items():
+            dropped = sum(row['dropped'].values())
+            fine = row['published'] == published[topic] and row['open'] == 0 and set(row['dropped']) <= {NO_ROOM}
+            self.found.check('every message of the bag is accounted for', fine, (topic, row))
+            in_store = row['stored'] - row['stored_in']['evicted']
+            fine = (counts[topic], lost[topic]) == (in_store, dropped)
+            self.found.check('bag, manifest and ledger agree', fine, (topic, counts[topic], lost[topic], row))
+        evicted = sum(row['stored_in']['evicted'] for row in rows.values())
+        self.found.check('bag, manifest and ledger agree', lost['slices'] == evicted, (lost['slices'], evicted))
 
     def _breaks(self) -> None:
         """Read-only: the node stays up and tells, and the next one goes on where the disk was left."""

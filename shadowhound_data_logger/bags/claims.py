@@ -30,6 +30,10 @@ class Claims:
         with self._accounts.entry(f'{EVENT}{held.lot.topic}') as account:
             account.type = held.lot.type
             receive, reported = account.receive, held.lost is not None
+            if held.again:
+                for each in held.lot.messages:
+                    account.receive_again(each.publisher, reported=reported)
+                return list(held.lot.messages)
             fresh = [each for each in held.lot.messages if receive(each.publisher, each.number, reported=reported)]
             account.lose(held.lost)
         return fresh

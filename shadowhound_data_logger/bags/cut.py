@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from shadowhound_data_logger.bags.channel import Channel
-from shadowhound_data_logger.bags.description import of_metadata
+from shadowhound_data_logger.bags.description import Description, Part, of_metadata
 from shadowhound_data_logger.bags.fetch import fetch, on_disk
 from shadowhound_data_logger.bags.mcap_messages import Message, Wanted
 from shadowhound_data_logger.bags.metadata import metadata_yaml
@@ -30,9 +30,10 @@ from shadowhound_data_logger.bags.slice_writer import SliceWriter
 from shadowhound_data_logger.bags.span import when
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagError, SettingError
-from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
 
 UNFINISHED: Final = '.part'
+COMES: Final = 'it may not have arrived yet: shadowhound-data bag list'
 SOURCE: Final = 'source'
 """Of what has to be downloaded whole."""
 
@@ -62,6 +63,10 @@ class Cut:
     read_bytes: int
     read_requests: int
     bag_bytes: int
+    absent: tuple[str, ...] = ()
+    """Topics that were asked for and that the bag does not have."""
+    missing: tuple[str, ...] = ()
+    """Slices with something of that time that are not there."""
 
 
 class Material(Protocol):
@@ -85,7 +90,8 @@ def cut_remote(store: Listing, bag: RemoteBag, out: Path, choice: Choice) -> Cut
     with _new_folder(out) as folder:
         if is_plain(told, [each.name for each in bag.slices]):
             sources = [StoredFile(store, BUCKET, each.key, each.size, meter) for each in bag.slices]
-            return _cut(Plain(sources, told), folder, out, choice, meter, bag.size)
+            others = _others(told, [each.name for each in bag.slices])
+            return _cut(Plain(sources, told), folder, out, choice, meter, bag.size, others)
         fetched = fetch(store, bag, folder / SOURCE)
         meter.add(fetched.downloaded)
         return _cut(Packed(fetched.folder), folder, out, choice, meter, bag.size)
@@ -93,6 +99,8 @@ def cut_remote(store: Listing, bag: RemoteBag, out: Path, choice: Choice) -> Cut
 
 def cut_folder(folder: Path, out: Path, choice: Choice) -> Cut:
     """Of a bag on the disk. Raises BagError, BagDamaged, SettingError."""
+    if folder.resolve() in out.absolute().resolve().parents:
+        raise BagError(f'{out} is within the bag that is cut', remedy='choose a folder beside it')
     meter = Meter()
     names = sorted((path.name for path in folder.glob('*.*') if path.is_file()), key=natural)
     told = of_metadata((folder / METADATA).read_bytes(), str(folder / METADATA)) if METADATA in names else None
@@ -100,28 +108,52 @@ def cut_folder(folder: Path, out: Path, choice: Choice) -> Cut:
     size = sum((folder / name).stat().st_size for name in names)
     with _new_folder(out) as new:
         if is_plain(told, slices):
-            return _cut(Plain([LocalFile(folder / name, meter) for name in slices], told), new, out, choice, meter, size)
+            plain = Plain([LocalFile(folder / name, meter) for name in slices], told)
+            return _cut(plain, new, out, choice, meter, size, _others(told, slices))
         return _cut(Packed(folder), new, out, choice, meter, size)
 
 
-def _cut(source: Material, folder: Path, out: Path, choice: Choice, meter: Meter, bag_bytes: int) -> Cut:
+def _cut(source: Material, folder: Path, out: Path, choice: Choice, meter: Meter, bag_bytes: int,
+         others: Sequence[Part] = ()) -> Cut:  # fmt: skip
+    """``others`` are slices that are not there."""
     first_ns, last_ns = source.span()
     start_ns = when(choice.start, first_ns, last_ns, '--start') if choice.start else first_ns
     end_ns = when(choice.end, first_ns, last_ns, '--end') if choice.end else last_ns + 1
+    if start_ns > last_ns and not choice.end:
+        raise _nothing(source, choice, start_ns, start_ns)
     if end_ns <= start_ns:
         raise SettingError('--end', choice.end, f'a time after --start, which is {iso(start_ns)}')
-    writer = SliceWriter(folder / f'{out.name}_0.mcap')
+    writer = SliceWriter(folder / f'{out.name}_0.mcap', mode=0o666)
     try:
         for message in source.messages(Wanted(start_ns, end_ns, _chosen(choice))):
             writer.write(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
         info = writer.close()
     finally:
         writer.abort()
+    missing = tuple(part.name for part in others if _overlaps(part, start_ns, end_ns))
     if not info.messages:
+        if missing:
+            raise BagError(f'what was recorded then is in {", ".join(missing)}, which is not there', remedy=COMES)
         raise _nothing(source, choice, start_ns, end_ns)
     (folder / METADATA).write_bytes(metadata_yaml([info], ros_distro=''))
     return Cut(out, info.messages, sum(count > 0 for count in info.counts.values()), info.bytes, info.t_start_ns, info.t_end_ns,
-               meter.bytes, meter.requests, bag_bytes)  # fmt: skip
+               meter.bytes, meter.requests, bag_bytes, _absent(source, choice), missing)  # fmt: skip
+
+
+def _others(told: Description | None, there: Sequence[str]) -> list[Part]:
+    """Slices that the metadata names beside those that are there."""
+    return [part for part in told.parts if part.name not in there] if told is not None else []
+
+
+def _overlaps(part: Part, start_ns: int, end_ns: int) -> bool:
+    if part.t_start_ns is None or part.t_end_ns is None:
+        return part.messages != 0
+    return part.t_start_ns < end_ns and part.t_end_ns >= start_ns
+
+
+def _absent(source: Material, choice: Choice) -> tuple[str, ...]:
+    topics = source.topics() if choice.topics else set()
+    return tuple(name for name in choice.topics if '/' + name.lstrip('/') not in topics)
 
 
 def _chosen(choice: Choice) -> Callable[[Channel], bool]:
@@ -140,13 +172,14 @@ def _nothing(source: Material, choice: Choice, start_ns: int, end_ns: int) -> Ba
     """Says which topics there are, or which times."""
     topics = sorted(source.topics())
     first_ns, last_ns = source.span()
-    for name in choice.topics:
-        if '/' + name.lstrip('/') not in topics:
-            near = get_close_matches(name, topics, cutoff=0.3) or topics
-            return BagError(f'the bag has no topic {name}', remedy=f'it has {", ".join(near)}')
+    for name in _absent(source, choice):
+        near = get_close_matches(name, topics, cutoff=0.6)
+        return BagError(f'the bag has no topic {name}', remedy=f'is it {near[0]}?' if near else f'it has {", ".join(topics)}')
     if choice.regex and not any(re.search(choice.regex, topic) for topic in topics):
         return BagError(f'no topic of the bag matches {choice.regex}', remedy=f'it has {", ".join(topics)}')
     text = f'nothing of that was recorded between {iso(start_ns)} and {iso(end_ns)}'
+    if end_ns <= start_ns:
+        text = f'nothing was recorded from {iso(start_ns)} on'
     return BagError(text, remedy=f'the bag goes from {iso(first_ns)} to {iso(last_ns)}')
 
 
@@ -155,7 +188,7 @@ def _new_folder(out: Path) -> Iterator[Path]:
     """A folder that becomes ``out`` when all went well, and is gone otherwise."""
     if out.exists():
         raise BagError(f'{out} is there already', remedy='choose a new folder')
-    check_name(out.name, 'the new bag')
+    check_name(out.name, 'the new bag', MAX_BAG_BYTES)
     part = out.with_name(out.name + UNFINISHED)
     with on_disk(out):
         shutil.rmtree(part, ignore_errors=True)

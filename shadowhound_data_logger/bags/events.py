@@ -18,10 +18,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.claims import Claims
-from shadowhound_data_logger.bags.manifest import EventOf, MissionOf, TriggerOf
-from shadowhound_data_logger.bags.naming import bag_name
+from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, MissionOf, TriggerOf
 from shadowhound_data_logger.bags.notes import Notes, discard
-from shadowhound_data_logger.bags.recorder import SYNC_S, Answer, Place
+from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.recorder import SYNC_S, Answer
 from shadowhound_data_logger.bags.recording import UNWRITABLE, Outlet, Recording
 from shadowhound_data_logger.bags.ring import Ring
 from shadowhound_data_logger.clock import SECOND, iso
@@ -35,10 +35,13 @@ PREFIX: Final = 'event_'
 NOTICE_S: Final = 1.0
 """What the ring keeps beyond the time before a trigger: for so long a trigger may be on its way."""
 STEP_S: Final = 0.2
-IDLE_S: Final = 60.0
+IDLE_S: Final = 10.0
+"""A round without an event; well below ``PATIENCE_S``, or the writer would be said to hang while it has nothing to do."""
 RETRY_S: Final = 5.0
 """Between two tries to begin a bag on a disk that takes nothing."""
 FLUSH_S: Final = 5.0
+MAX_WAIT_NS: Final = 24 * 3600 * SECOND
+"""No trigger waits longer for its event; a difference beyond it is one between two clocks."""
 PATIENCE_S: Final = 30.0
 
 
@@ -70,6 +73,8 @@ class _Event:
     of: EventOf
     until_s: float
     at_most_s: float
+    unset: ClockOf | None
+    """The clock, where it was not set when it was triggered."""
     recording: Recording | None = None
     again_s: float = 0.0
     refused: str = ''
@@ -150,7 +155,6 @@ class Events:
 
     def trigger(self, name: str, by: str, detail: str | None = None, age_s: float = 0.0) -> Answer:
         """Something happened, so long ago: begin an event, or make the one that goes on last longer. Names the bag."""
-        said = TriggerOf(name, by, self._place.clock.wall_ns() - round(age_s * SECOND), detail)
         with self._lock:
             if not self._settings.enabled:
                 return False, 'no events: neither events.topics nor events.regex names a topic to keep'
@@ -158,6 +162,8 @@ class Events:
                 return False, 'no events any more: the node is closing'
             self._triggers += 1
             now_s, event = self._monotonic(), self._current
+            unset = self._place.unset() if event is None else event.unset
+            said = TriggerOf(name, by, max(0, self._place.now_ns(unset) - round(age_s * SECOND)), detail or None)
             if event is None:
                 event = self._current = self._begin([said], now_s - age_s)
                 self._ended.clear()
@@ -179,15 +185,17 @@ class Events:
     def _begin(self, triggers: Sequence[TriggerOf], at_s: float, since_s: float | None = None) -> _Event:
         """An event about a moment; ``since_s`` is the end of the one that it follows."""
         settings = self._settings
-        oldest_s = self._ring.claim(at_s - settings.pre_s if since_s is None else since_s)
+        oldest_s = self._ring.claim(at_s - settings.pre_s if since_s is None else since_s, self._place.clock.wall_ns())
         held_s = 0.0 if oldest_s is None or since_s is not None else min(max(0.0, at_s - oldest_s), settings.pre_s)
         name = safe_type(triggers[0].name)
         if since_s is None:
             self.claims.begin()
-        root, is_known = self._place.root, self._place.is_known
-        bag = bag_name(f'{PREFIX}{name}', triggers[0].at_ns, lambda bag: (root / bag).exists() or is_known(bag))
+        age_ns = max(0, self._place.clock.wall_ns() - triggers[0].at_ns)
+        age_ns = age_ns if age_ns < MAX_WAIT_NS else 0
+        unset = self._place.unset(age_ns)
+        bag = self._place.name(f'{PREFIX}{name}', unset, age_ns)
         of = EventOf(name, settings.pre_s, round(held_s, 3), settings.post_s, tuple(triggers))
-        return _Event(bag, of, at_s + settings.post_s, at_s + settings.max_s)
+        return _Event(bag, of, at_s + settings.post_s, at_s + settings.max_s, unset)
 
     def _end(self, event: _Event) -> bool:
         """Whether the event is over; if so another one that waits begins, or the ring is nobody's again."""
@@ -229,7 +237,7 @@ class Events:
         if now_s < event.again_s:
             return False
         try:
-            notes = Notes.begin(self._place.root / event.bag, self._place.robot, self._mission, event.of)
+            notes = Notes.begin(self._place.root / event.bag, self._place.robot, self._mission, event.of, event.unset)
         except OSError as error:
             event.again_s = now_s + RETRY_S
             discard(self._place.root / event.bag)
@@ -238,7 +246,7 @@ class Events:
             event.refused = UNWRITABLE
             return False
         event.refused = ''
-        event.recording = Recording(notes, self._bag, self._outlet)
+        event.recording = Recording(notes, self._bag, self._outlet, self._place)
         self._due_s = now_s + SYNC_S
         return True
 

@@ -50,6 +50,8 @@ class Fetched:
     """Whether the manifest was there and all that it promises; else the bag is growing, or foreign."""
     unverified: tuple[str, ...]
     """Files of a foreign writer, of which no checksum is known."""
+    missing: tuple[str, ...] = ()
+    """Slices that the manifest promises and that are not in the store."""
 
 
 class Told:
@@ -94,12 +96,13 @@ def _fetch(store: Listing, bag: RemoteBag, to: Path, threads: int, told: Told) -
         return _have(store, file, folder, promised.get(file.name), meter, told)
 
     checksums = dict(zip((file.name for file in others), _side_by_side(one, others, threads), strict=True))
-    if not bag.is_archive and not bag.file(METADATA):
+    missing = tuple(missing_of(bag, manifest)) if manifest is not None else ()
+    if not bag.is_archive and (missing or not bag.file(METADATA)):
         _describe(folder, bag)
     return Fetched(
         folder / bag.files[0].name if bag.is_archive else folder, len(bag.files), bag.size, meter.bytes,
-        is_complete=manifest is not None and not missing_of(bag, manifest),
-        unverified=tuple(name for name, known in checksums.items() if not known),
+        is_complete=manifest is not None and not missing,
+        unverified=tuple(name for name, known in checksums.items() if not known), missing=missing,
     )  # fmt: skip
 
 
@@ -169,7 +172,7 @@ def _alone(path: Path) -> Iterator[int]:
 
 
 def _describe(folder: Path, bag: RemoteBag) -> None:
-    """Of a bag that is still growing, so that players open what is there of it; the real one replaces it later."""
+    """Of a bag that is not all there, so that players open what is; the real one replaces it with the rest."""
     slices = [file for file in bag.slices if file.name.endswith('.mcap')]
     infos = [slice_info(read_index(LocalFile(folder / file.name)), folder / file.name, file.size) for file in slices]
     if infos:

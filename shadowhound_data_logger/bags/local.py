@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -47,8 +48,16 @@ def local_files(home: Path, robot: str) -> dict[tuple[str, str], LocalFile]:
     try:
         found |= {(file.bag, file.name): file for file in _spooled(home / 'spool', robot)}
     except sqlite3.Error as error:
-        raise SpoolError(f'the spool {home / "spool"} cannot be read: {error}', remedy='shadowhound-data status') from error
+        raise _unreadable(home, error) from error
     return found
+
+
+def given_up(home: Path, robot: str) -> Counter[str]:
+    """Bag -> files that the full spool gave up, as far as it remembers; some manifests know of them. Raises SpoolError."""
+    try:
+        return Counter(bag for bag, _, _ in _rows(home / 'spool', robot, "'evicted'"))
+    except sqlite3.Error as error:
+        raise _unreadable(home, error) from error
 
 
 def _recording(folder: Path) -> Iterator[LocalFile]:
@@ -61,17 +70,27 @@ def _recording(folder: Path) -> Iterator[LocalFile]:
 
 
 def _spooled(spool: Path, robot: str) -> Iterator[LocalFile]:
+    for bag, name, row in _rows(spool, robot, "'pending', 'held', 'quarantined'"):
+        is_refused = row['state'] == 'quarantined'
+        path = None if is_refused else spool / 'ready' / BUCKET / row['key']
+        where = QUARANTINE if is_refused else SPOOL
+        yield LocalFile(bag, name, where, row['bytes'], json.loads(row['metadata']), path)
+
+
+def _rows(spool: Path, robot: str, states: str) -> Iterator[tuple[str, str, sqlite3.Row]]:
+    """Bag, file and row of each object of a bag in these states."""
     if not (spool / 'index.db').exists():
         return
     prefix = prefix_of(robot)
     index = Index(spool / 'index.db', read_only=True)
     index.open()
     with closing(index):
-        condition = "bucket = ? AND key >= ? AND key < ? AND state IN ('pending', 'held', 'quarantined') ORDER BY id"
+        condition = f'bucket = ? AND key >= ? AND key < ? AND state IN ({states}) ORDER BY id'
         rows = index.rows(condition, (BUCKET, prefix, prefix[:-1] + chr(ord('/') + 1)))
     for row in rows:
         bag, _, name = row['key'][len(prefix) :].partition('/')
-        is_refused = row['state'] == 'quarantined'
-        path = None if is_refused else spool / 'ready' / BUCKET / row['key']
-        where = QUARANTINE if is_refused else SPOOL
-        yield LocalFile(bag, name or bag, where, row['bytes'], json.loads(row['metadata']), path)
+        yield bag, name or bag, row
+
+
+def _unreadable(home: Path, error: sqlite3.Error) -> SpoolError:
+    return SpoolError(f'the spool {home / "spool"} cannot be read: {error}', remedy='shadowhound-data status')

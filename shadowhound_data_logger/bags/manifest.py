@@ -1,7 +1,7 @@
 """``manifest.json``: what a bag's writer says of the whole bag. Written once, when it ended: a bag without one still grows.
 
     {"version": 1, "bag": "patrol_20261121_120000", "robot": "thor", "state": "complete",
-     "mission": {"type": "patrol", "mission_id": "...", "run_id": null}, "event": null,
+     "mission": {"type": "patrol", "mission_id": "...", "run_id": null}, "event": null, "clock": null,
      "missing": [{"file": "patrol_20261121_120000_3.mcap", "what": "...", "messages": null,
                  "topic": null, "reason": null}],
      "topics": [{"topic": "/imu", "type": "sensor_msgs/msg/Imu", "messages": 6000}],
@@ -15,6 +15,12 @@ fields are a later version's, and ignored.
 
     {"name": "low_battery", "pre_s": 30.0, "held_s": 30.0, "post_s": 10.0,
      "triggers": [{"name": "low_battery", "by": "condition", "at_ns": 1, "detail": "low_battery: ...soc < 20: 19"}]}
+
+``clock`` is null where the clock of the machine was set. Else all times of the bag are by the clock as it was, and to make UTC
+of them ``offset_ns`` is to be added (null with ``known`` ``unset``: nobody knows); ``wall_ns`` and ``boot_ns`` are what that
+clock and the boot clock showed when the bag began:
+
+    {"known": "set_later", "boot_id": "...", "boot_ns": 12000000000, "wall_ns": 22000000000, "offset_ns": 1760788778000000000}
 """
 
 from __future__ import annotations
@@ -23,8 +29,9 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Final
 
+from shadowhound_data_logger.bags.json_object import JsonObject
 from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.errors import BagDamaged
 
@@ -67,6 +74,18 @@ class EventOf:
     """How far back from the first trigger the ring went: less than ``pre_s`` where its bytes or its time did not suffice."""
     post_s: float
     triggers: tuple[TriggerOf, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ClockOf:
+    """The clock by which a bag's times are, where it was not set when the bag began."""
+
+    known: str
+    """``set_later`` or ``unset``, as in the metadata of objects."""
+    boot_id: str
+    boot_ns: int
+    wall_ns: int
+    offset_ns: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +139,7 @@ class Manifest:
     topics: tuple[RecordedTopic, ...]
     slices: tuple[SliceEntry, ...]
     event: EventOf | None = None
+    clock: ClockOf | None = None
 
     def to_json(self) -> bytes:
         """The file's content."""
@@ -133,18 +153,18 @@ class Manifest:
             found = json.loads(content)
         except (ValueError, RecursionError) as error:
             raise BagDamaged(f'{name} is no JSON: {error}', path=name) from error
-        top = _Object(found, name, '')
+        top = JsonObject(found, name, '')
         if (version := top.count('version')) != VERSION:
             raise BagDamaged(f'{name} has version {version}; this program reads {VERSION}', remedy='update it', path=name)
         state = top.text('state')
         if state not in STATES:
             raise top.wrong('state', f'one of {", ".join(sorted(STATES))}')
-        mission, event = top.object_or_none('mission'), top.object_or_none('event')
+        mission, event, clock = top.object_or_none('mission'), top.object_or_none('event'), top.object_or_none('clock')
         return cls(
-            top.text('bag'), top.text('robot'), _mission(mission) if mission else None, state,
-            tuple(map(_missing, top.objects('missing'))),
+            top.text('bag'), top.text('robot'), read_mission(mission) if mission else None, state,
+            tuple(map(read_missing, top.objects('missing'))),
             tuple(RecordedTopic(one.text('topic'), one.text('type'), one.count('messages')) for one in top.objects('topics')),
-            tuple(map(_slice, top.objects('slices'))), _event(event) if event else None,
+            tuple(map(_slice, top.objects('slices'))), read_event(event) if event else None, read_clock(clock) if clock else None,
         )  # fmt: skip
 
 
@@ -160,81 +180,33 @@ def topics_of(slices: Sequence[SliceInfo]) -> tuple[RecordedTopic, ...]:
     return tuple(RecordedTopic(topic, kind, counts.get(topic, 0)) for topic, kind in types.items())
 
 
-class _Object:
-    """A JSON object of a manifest, read field by field; what is not as it must be raises BagDamaged with its place."""
-
-    def __init__(self, value: object, file: str, place: str) -> None:
-        self._file, self._place = file, place
-        if not isinstance(value, dict):
-            raise BagDamaged(f'{file}: {place or "it"} is no JSON object', path=file)
-        self._fields: dict[str, Any] = value
-
-    def text(self, name: str) -> str:
-        found = self._fields.get(name)
-        if not isinstance(found, str) or not found:
-            raise self.wrong(name, 'a text')
-        return found
-
-    def text_or_none(self, name: str) -> str | None:
-        return None if self._fields.get(name) is None else self.text(name)
-
-    def count(self, name: str) -> int:
-        found = self._fields.get(name)
-        if type(found) is not int or found < 0:
-            raise self.wrong(name, 'a whole number, not negative')
-        return found
-
-    def count_or_none(self, name: str) -> int | None:
-        return None if self._fields.get(name) is None else self.count(name)
-
-    def number(self, name: str) -> float:
-        found = self._fields.get(name)
-        if not isinstance(found, (int, float)) or isinstance(found, bool):
-            raise self.wrong(name, 'a number')
-        return float(found)
-
-    def counts(self, name: str) -> dict[str, int]:
-        inner = _Object(self._fields.get(name), self._file, self._at(name))
-        return {key: inner.count(key) for key in inner._fields}
-
-    def object_or_none(self, name: str) -> _Object | None:
-        found = self._fields.get(name)
-        return None if found is None else _Object(found, self._file, self._at(name))
-
-    def objects(self, name: str) -> list[_Object]:
-        found = self._fields.get(name)
-        if not isinstance(found, list):
-            raise self.wrong(name, 'a list')
-        return [_Object(one, self._file, f'{self._at(name)}[{place}]') for place, one in enumerate(found)]
-
-    def wrong(self, name: str, allowed: str) -> BagDamaged:
-        found = json.dumps(self._fields[name])[:80] if name in self._fields else 'nothing'
-        return BagDamaged(
-            f'{self._file}: {self._at(name)} is {found} and must be {allowed}', path=self._file, field=self._at(name)
-        )
-
-    def _at(self, name: str) -> str:
-        return f'{self._place}.{name}' if self._place else name
-
-
-def _missing(one: _Object) -> Missing:
+def read_missing(one: JsonObject) -> Missing:
+    """Raises BagDamaged, as those below."""
     return Missing(one.text('file'), one.text('what'), one.count_or_none('messages'), one.text_or_none('topic'),
                    one.text_or_none('reason'))  # fmt: skip
 
 
-def _mission(one: _Object) -> MissionOf:
-    return MissionOf(one.text('type'), one.text_or_none('mission_id'), one.text_or_none('run_id'))
+def read_mission(one: JsonObject) -> MissionOf:
+    """Whatever an agent calls a mission."""
+    return MissionOf(one.text('type', is_any=True), one.text_or_none('mission_id'), one.text_or_none('run_id'))
 
 
-def _event(one: _Object) -> EventOf:
+def read_event(one: JsonObject) -> EventOf:
+    """Whatever an agent calls an event."""
     triggers = tuple(
-        TriggerOf(each.text('name'), each.text('by'), each.count('at_ns'), each.text_or_none('detail'))
+        TriggerOf(each.text('name', is_any=True), each.text('by'), each.count('at_ns'), each.text_or_none('detail'))
         for each in one.objects('triggers')
     )
     return EventOf(one.text('name'), one.number('pre_s'), one.number('held_s'), one.number('post_s'), triggers)
 
 
-def _slice(one: _Object) -> SliceEntry:
+def read_clock(one: JsonObject) -> ClockOf:
+    """Of a bag that has one."""
+    return ClockOf(one.text('known'), one.text('boot_id'), one.count('boot_ns'), one.count('wall_ns'),
+                   one.count_or_none('offset_ns'))  # fmt: skip
+
+
+def _slice(one: JsonObject) -> SliceEntry:
     sha256 = one.text('sha256')
     if not _SHA256.fullmatch(sha256):
         raise one.wrong('sha256', 'a SHA-256 in hex')

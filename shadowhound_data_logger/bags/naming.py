@@ -6,28 +6,40 @@ from collections.abc import Callable
 from itertools import count
 from typing import Final
 
-from shadowhound_data_logger.clock import utc
-from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.missions.folder import safe_type
 
 BUCKET: Final = 'sensor-data'
 FOLDER: Final = 'bags'
 """Of what is being recorded, in SHADOWHOUND_HOME."""
 RECORDING: Final = 'recording'
 """What a bag of no mission is called by."""
+UNSYNCED: Final = '_unsynced_'
+"""Stands in the name of a bag that has no date, or none yet."""
 METADATA, MANIFEST = 'metadata.yaml', 'manifest.json'
 
 
 def bag_name(what: str, now_ns: int, is_taken: Callable[[str], bool]) -> str:
     """``patrol_20251018_120000``, in UTC; ``_1``, ``_2``, ... when it is taken: two bags may begin in a second.
 
-    ``what`` is a mission's type; one that cannot be part of a key is left out, as is an empty one.
+    ``what`` is a mission's type, as it stands in the mission's own name where it cannot be part of a key.
     """
-    try:
-        check_name(what, 'the mission type')
-    except NameRefused:
-        what = RECORDING
-    wanted = f'{what}_{utc(now_ns):%Y%m%d_%H%M%S}'
+    return _free(f'{_safe(what)}_{utc(now_ns):%Y%m%d_%H%M%S}', is_taken)
+
+
+def unsynced_name(what: str, boot_id: str, boot_ns: int, is_taken: Callable[[str], bool]) -> str:
+    """``patrol_unsynced_<boot id>_00000012``: of a bag whose time is known by the boot clock alone, seconds since boot.
+
+    The same is told of an object without a date (``keys.unsynced``); no other boot has the id.
+    """
+    return _free(f'{_safe(what)}{UNSYNCED}{boot_id}_{boot_ns // SECOND:08d}', is_taken)
+
+
+def _safe(what: str) -> str:
+    return safe_type(what) if what else RECORDING
+
+
+def _free(wanted: str, is_taken: Callable[[str], bool]) -> str:
     names = (f'{wanted}_{number}' if number else wanted for number in count())
     return next(name for name in names if not is_taken(name))
 

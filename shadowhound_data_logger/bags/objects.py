@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, RECOVERED, Manifest, SliceEntry, topics_of
+from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, RECOVERED, Manifest, Missing, SliceEntry, topics_of
 from shadowhound_data_logger.bags.metadata import metadata_yaml
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, slice_number
 from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.slice_info import SliceInfo
-from shadowhound_data_logger.model import DataObject, FileBody
+from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.spool.retention import NO_ROOM
 
 SENSOR: Final = 'bag'
 ENDING_PRIORITY: Final = 1
 """Metadata and manifest are small, and without them the bag seems to grow still."""
+EVICTED: Final = 'the whole slice: the spool was full'
 EVENT_PRIORITY: Final = 1
 """Of an event's slices: before whatever the sensors keep, and like the ending never evicted."""
 
@@ -28,30 +32,49 @@ def ros_distro() -> str:
 def slice_object(notes: Notes, info: SliceInfo, priority: int) -> DataObject:
     """A closed slice; its messages count in the accounts of the bags, or of the events, whose own priority goes first."""
     is_event = notes.event is not None
+    file, (start_ns, end_ns) = notes.final(info.path.name), _times(notes, info.t_start_ns, info.t_end_ns)
     metadata = {
-        **_marks(notes), 'slice': str(slice_number(notes.bag, info.path.name)), 'messages': str(info.messages),
-        't_start_ns': str(info.t_start_ns), 't_end_ns': str(info.t_end_ns),
+        **_marks(notes), 'slice': str(slice_number(notes.bag, file)), 'messages': str(info.messages),
+        **({'t_start_ns': str(start_ns), 't_end_ns': str(end_ns)} if _is_dated(notes) else {}),
+        **_clock_marks(notes, info.t_start_ns, info.t_end_ns),
     }  # fmt: skip
     return DataObject(
-        bucket=BUCKET, key=key_of(notes.robot, notes.bag, info.path.name), body=FileBody(info.path, info.bytes, info.sha256),
+        bucket=BUCKET, key=key_of(notes.robot, notes.bag, file), body=FileBody(info.path, info.bytes, info.sha256),
         content_type='application/octet-stream', sensor=SENSOR, topic=None, type='', samples=info.messages,
-        t_start_ns=info.t_start_ns, t_end_ns=info.t_end_ns, priority=EVENT_PRIORITY if is_event else priority,
+        t_start_ns=start_ns, t_end_ns=end_ns, priority=EVENT_PRIORITY if is_event else priority,
         protected=is_event, metadata=metadata,
         counts={f'{notes.sink}{topic}': count for topic, count in info.counts.items() if count},
     )  # fmt: skip
 
 
+def note_evicted(notes: Notes, states: Mapping[str, State]) -> None:
+    """Before the ending: slices that the full spool gave up are missing. Raises OSError.
+
+    ``states`` are those of all that is or was of the bag in the spool. What is given up after the manifest was made is not in it.
+    """
+    if key_of(notes.robot, notes.bag, MANIFEST) in states:
+        return
+    known = _evicted(notes)
+    gone = [info for file, info in notes.slices.items()
+            if file not in known and states.get(key_of(notes.robot, notes.bag, notes.final(file))) is State.EVICTED]  # fmt: skip
+    notes.add_missing(*(Missing(info.path.name, EVICTED, info.messages, None, NO_ROOM) for info in gone))
+
+
 def ending_objects(notes: Notes) -> Iterator[DataObject]:
     """What makes the bag whole; ``notes`` know all slices. The same notes give the same bytes."""
-    slices = [notes.slices[file] for file in sorted(notes.slices, key=lambda file: slice_number(notes.bag, file) or 0)]
+    gone = _evicted(notes)
+    found = [replace(info, path=Path(notes.final(file))) for file, info in notes.slices.items() if file not in gone]
+    slices = sorted(found, key=lambda info: slice_number(notes.bag, info.path.name) or 0)
     entries = tuple(SliceEntry.of(info, key_of(notes.robot, notes.bag, info.path.name)) for info in slices)
     state = RECOVERED if not notes.ended else GAPS if notes.missing else COMPLETE
     manifest = Manifest(
-        bag=notes.bag, robot=notes.robot, mission=notes.mission, state=state, missing=tuple(notes.missing),
-        topics=topics_of(slices), slices=entries, event=notes.event,
+        bag=notes.bag, robot=notes.robot, mission=notes.mission, state=state,
+        missing=tuple(replace(one, file=notes.final(one.file)) for one in notes.missing),
+        topics=topics_of(slices), slices=entries, event=notes.event, clock=notes.clock,
     )  # fmt: skip
-    span = min((one.t_start_ns for one in slices), default=0), max((one.t_end_ns for one in slices), default=0)
-    yield _small(notes, METADATA, metadata_yaml(slices, ros_distro=ros_distro()), 'application/yaml', span)
+    span = _times(notes, min((one.t_start_ns for one in slices), default=0), max((one.t_end_ns for one in slices), default=0))
+    said = metadata_yaml(slices, ros_distro=ros_distro(), custom_data=_clock_marks(notes))
+    yield _small(notes, METADATA, said, 'application/yaml', span)
     yield _small(notes, MANIFEST, manifest.to_json(), 'application/json', span)
 
 
@@ -59,7 +82,7 @@ def _small(notes: Notes, file: str, body: bytes, content_type: str, span: tuple[
     return DataObject(
         bucket=BUCKET, key=key_of(notes.robot, notes.bag, file), body=body, content_type=content_type, sensor=SENSOR, topic=None,
         type='', samples=0, t_start_ns=span[0], t_end_ns=span[1], priority=ENDING_PRIORITY, protected=True,
-        metadata=_marks(notes),
+        metadata={**_marks(notes), **_clock_marks(notes)},
     )  # fmt: skip
 
 
@@ -70,3 +93,32 @@ def _marks(notes: Notes) -> dict[str, str]:
     if notes.mission is not None:
         marks |= {name: value for name in ('mission_id', 'run_id') if (value := getattr(notes.mission, name))}
     return marks
+
+
+def _evicted(notes: Notes) -> set[str]:
+    return {one.file for one in notes.missing if one.what == EVICTED}
+
+
+def _is_dated(notes: Notes) -> bool:
+    return notes.clock is None or notes.clock.offset_ns is not None
+
+
+def _times(notes: Notes, start_ns: int, end_ns: int) -> tuple[int, int]:
+    """Log times as UTC; where nobody knows that, by the boot clock, as those of objects are (``clock.stamp_of``)."""
+    clock = notes.clock
+    if clock is None:
+        return start_ns, end_ns
+    step_ns = clock.boot_ns - clock.wall_ns if clock.offset_ns is None else clock.offset_ns
+    return max(0, start_ns + step_ns), max(0, end_ns + step_ns)
+
+
+def _clock_marks(notes: Notes, *times_ns: int) -> dict[str, str]:
+    """How the date of a bag is known whose clock was not set, as spool/redating.py tells it of objects; log times since boot."""
+    clock = notes.clock
+    if clock is None:
+        return {}
+    marks = {'clock': clock.known, 'boot_id': clock.boot_id}
+    if clock.offset_ns is not None:
+        marks['clock_offset_ns'] = str(clock.offset_ns)
+    boot = (str(max(0, time_ns - clock.wall_ns + clock.boot_ns)) for time_ns in times_ns)
+    return {**marks, **dict(zip(('boot_start_ns', 'boot_end_ns'), boot, strict=False))}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.description import of_metadata
-from shadowhound_data_logger.bags.local import LocalFile, local_files
+from shadowhound_data_logger.bags.local import LocalFile, given_up, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.remote import (
@@ -87,10 +87,11 @@ def overview(store: Listing, robot: str, home: Path, *, since_ns: int = 0) -> li
     local: dict[str, list[LocalFile]] = {}
     for file in local_files(home, robot).values():
         local.setdefault(file.bag, []).append(file)
+    lost = given_up(home, robot)
     names = [name for name in sorted({*remote, *local}) if (named_ns(name) or since_ns) >= since_ns - SECOND]
 
     def row(name: str) -> BagRow:
-        return _row(store, remote.get(name) or RemoteBag(robot, name, ()), local.get(name, []))
+        return _row(store, remote.get(name) or RemoteBag(robot, name, ()), local.get(name, []), lost[name])
 
     with ThreadPoolExecutor(THREADS, 'bag-list') as pool:
         rows = [each for each in pool.map(row, names) if each.t_start_ns is None or each.t_start_ns >= since_ns]
@@ -107,7 +108,7 @@ def named_ns(bag: str) -> int | None:
     return int(when.timestamp()) * SECOND
 
 
-def _row(store: Listing, bag: RemoteBag, local: list[LocalFile]) -> BagRow:
+def _row(store: Listing, bag: RemoteBag, local: list[LocalFile], given_up: int) -> BagRow:
     kept = [file for file in local if bag.file(file.name) is None]  # delivered already: the spool is about to let go of it
     files = RemoteBag(bag.robot, bag.name, (*bag.files, *(RemoteFile(file.name, '', file.size) for file in kept)))
     finding = '; '.join(f'{file.name} is refused by the store' for file in kept if file.where == 'quarantine')
@@ -121,7 +122,8 @@ def _row(store: Listing, bag: RemoteBag, local: list[LocalFile]) -> BagRow:
         finding = str(error)
     state = state_of(files, manifest, next(iter(tags.values()), {}))
     if manifest is not None and (missing := missing_of(files, manifest)):
-        finding = finding or f'{len(missing)} of {len(manifest.slices)} slices are not here yet'
+        why = f'; {given_up} were given up by the full spool of this machine' if given_up else ' yet'
+        finding = finding or f'{len(missing)} of {len(manifest.slices)} slices are not here{why}'
     places: dict[str, int] = {STORE: len(bag.files)} if bag.files else {}
     for file in kept:
         places[file.where] = places.get(file.where, 0) + 1
@@ -154,8 +156,11 @@ def _tags(store: Listing, bag: RemoteBag, local: Iterable[LocalFile]) -> dict[st
 def _facts(store: Listing, bag: RemoteBag, manifest: Manifest | None, tags: Iterable[Mapping[str, str]]) -> _Facts:
     if manifest is not None:
         filled = [each for each in manifest.slices if each.messages]
-        topics = {topic for each in manifest.slices for topic in each.counts}
-        return _span(sum(each.messages for each in filled), len(topics), [(each.t_start_ns, each.t_end_ns) for each in filled])
+        topics, messages = {topic for each in manifest.slices for topic in each.counts}, sum(each.messages for each in filled)
+        step_ns = manifest.clock.offset_ns if manifest.clock is not None else 0
+        if step_ns is None:
+            return _Facts(messages, len(topics))
+        return _span(messages, len(topics), [(each.t_start_ns + step_ns, each.t_end_ns + step_ns) for each in filled])
     if file := bag.file(METADATA):
         told = of_metadata(store.get(BUCKET, file.key), file.key)
         return _span(told.messages, len({topic.name for topic in told.topics}), [(told.t_start_ns, told.t_end_ns)])

@@ -21,7 +21,7 @@ from shadowhound_data_logger.bags.ranges import LocalFile
 from shadowhound_data_logger.bags.remote import ARCHIVE, natural
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import BagDamaged, BagError
-from shadowhound_data_logger.keys import check_key, check_name
+from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_key, check_name
 
 CONTENT_TYPES: Final = {'.yaml': 'application/yaml', '.json': 'application/json', '.gz': 'application/gzip'}
 _NUMBER: Final = re.compile(r'_(\d+)\.', re.ASCII)
@@ -89,7 +89,7 @@ def finished(folder: Path) -> Description:
 def parcel_of(folder: Path, robot: str, bag: str, work: Path) -> Parcel:
     """Its files as they are; the manifest is made in the folder ``work``. Raises BagError, BagDamaged, NameRefused, OSError."""
     described = finished(folder)
-    check_name(bag, 'the bag')
+    check_name(bag, 'the bag', MAX_BAG_BYTES)
     parts = {part.name: part for part in described.parts}
     paths = sorted((path for path in folder.rglob('*') if path.is_file()), key=lambda path: natural(str(path)))
     files = [_outgoing(path, str(path.relative_to(folder)), robot, bag) for path in paths if path != folder / MANIFEST]
@@ -104,7 +104,7 @@ def parcel_of(folder: Path, robot: str, bag: str, work: Path) -> Parcel:
 def archive_of(folder: Path, robot: str, bag: str, work: Path) -> Parcel:
     """One ``<bag>.tar.gz`` with the bag's folder in it, made in ``work``; the same bag gives the same bytes."""
     described = finished(folder)
-    name = f'{check_name(bag, "the bag")}{ARCHIVE}'
+    name = f'{check_name(bag, "the bag", MAX_BAG_BYTES)}{ARCHIVE}'
     path = work / name
     with (
         path.open('wb') as raw,

@@ -11,16 +11,14 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.manifest import MissionOf
-from shadowhound_data_logger.bags.naming import bag_name
 from shadowhound_data_logger.bags.notes import Notes
+from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
 from shadowhound_data_logger.bags.recording import Outlet, Recording
 from shadowhound_data_logger.bags.salvage import Salvage
-from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.options import BagSettings
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.worker import Worker
@@ -56,18 +54,6 @@ class BagStatus:
     queue_bytes: int = 0
     refused: str = ''
     """Why the disk takes nothing now."""
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Where bags begin, and what they are named by."""
-
-    root: Path
-    """The robot's folder of bags."""
-    robot: str
-    clock: Clock
-    is_known: Callable[[str], bool]
-    """Whether a bag's name is taken in the spool."""
 
 
 @dataclass(slots=True)
@@ -144,7 +130,7 @@ class Recorder:
         with self._control:
             if self._current is not None:
                 return False, f'{self._current.recording.notes.bag} is recorded already'
-            return self._start(SERVICE)
+            return self._start(SERVICE, self._mission)
 
     def stop(self, deadline_s: float = STOP_S) -> Answer:
         """End the bag; it is whole in the spool then."""
@@ -192,6 +178,19 @@ class Recorder:
             elif self._settings.record != SERVICE and (current is None or current.by != SERVICE):
                 self._turn(mission)
 
+    def look(self) -> None:
+        """Every second or so: what began before the clock was set ends when it is, and another bag follows without a pause."""
+        if not self._control.acquire(blocking=False):
+            return  # somebody begins or ends one now
+        try:
+            current = self._current
+            if current is not None and self._place.is_due(current.recording.notes):
+                self._end_after(current.recording, STOP_S)
+                self._current = None
+                self._start(current.by, current.recording.notes.mission, listening=True)
+        finally:
+            self._control.release()
+
     # -- starts and stops, under the lock --------------------------------------------------------------------------
 
     def _turn(self, mission: MissionOf | None) -> None:
@@ -206,19 +205,18 @@ class Recorder:
         if current is not None:
             self._end_after(current.recording, STOP_S)
             self._current = None
-        self._start(ALWAYS if mission is None else MISSION, listening=current is not None)
+        self._start(ALWAYS if mission is None else MISSION, mission, listening=current is not None)
 
     def _begin_by(self, by: str) -> None:
         with self._control:
-            self._start(by)
+            self._start(by, self._mission)
 
-    def _start(self, by: str, *, listening: bool = False) -> Answer:
-        mission = self._mission
-        what = mission.type if mission is not None else ''
+    def _start(self, by: str, mission: MissionOf | None, *, listening: bool = False) -> Answer:
         place = self._place
-        name = bag_name(what, place.clock.wall_ns(), lambda bag: (place.root / bag).exists() or place.is_known(bag))
+        unset = place.unset()
+        name = place.name(mission.type if mission is not None else '', unset)
         try:
-            notes = Notes.begin(place.root / name, place.robot, mission)
+            notes = Notes.begin(place.root / name, place.robot, mission, clock=unset)
         except OSError as error:
             log.error('no bag is recorded: %s', error)  # noqa: TRY400 - an operator's matter
             if listening:
@@ -227,7 +225,7 @@ class Recorder:
         goes_on = by == ALWAYS or listening or (mission is not None and mission.mission_id in self._salvage.missions)
         if not goes_on:
             self._outlet.accounts.rebase_all(BAG)
-        recording = Recording(notes, self._settings, self._outlet)
+        recording = Recording(notes, self._settings, self._outlet, place)
         self._current = _Current(recording, by, time.monotonic(), self._queue.dropped)
         self._queue.paused = self._queue.paused and listening
         if not listening:
@@ -236,7 +234,7 @@ class Recorder:
             self._started = True
             self._worker.start()
         self._queue.mark(lambda: self._write_to(recording))
-        if not listening and not self._listen(True, STOP_S):
+        if not self._listen(True, STOP_S):
             log.warning('the intake did not begin to record within %.0f s; it does as soon as it can', STOP_S)
         log.info('bag %s is recorded', name)
         return True, name
@@ -252,6 +250,8 @@ class Recorder:
         if not done.wait(max(0.0, end_s - time.monotonic())):
             return False, f'{recording.notes.bag} is not whole within {deadline_s:g} s; it is as soon as that is possible'
         text = f'{recording.notes.bag}: {recording.messages:,} messages in {len(recording.notes.slices)} slices'
+        if not recording.notes.is_named:
+            text += '; it waits for the clock of this machine to be set'
         log.info('%s', text)
         return True, text
 

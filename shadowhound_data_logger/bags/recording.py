@@ -5,6 +5,7 @@ A disk that takes nothing costs the messages of that time, which are counted as 
 
 from __future__ import annotations
 
+import errno
 import logging
 import time
 from collections import Counter
@@ -16,14 +17,15 @@ from typing import Final
 from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.definitions import describe
 from shadowhound_data_logger.bags.manifest import Missing, MissionOf
-from shadowhound_data_logger.bags.naming import slice_file
+from shadowhound_data_logger.bags.naming import prefix_of, slice_file
 from shadowhound_data_logger.bags.notes import Notes
-from shadowhound_data_logger.bags.objects import ending_objects, ros_distro, slice_object
+from shadowhound_data_logger.bags.objects import ending_objects, note_evicted, ros_distro, slice_object
+from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.recovery import recover
 from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.bags.slice_writer import OPEN, SliceWriter
-from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.model import DataObject, State
 from shadowhound_data_logger.options import BagSettings
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.retention import NO_ROOM
@@ -33,7 +35,8 @@ log = logging.getLogger(__name__)
 RETRY_S: Final = 5.0
 """Between two tries to write to a disk that took nothing."""
 UNWRITABLE: Final = 'unwritable'
-"""Why messages are dropped that the disk refuses."""
+"""Why messages are dropped that the disk refuses, unless it is full (NO_ROOM)."""
+_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +50,20 @@ class Outlet:
     """Whether all of it became durable within so many seconds."""
     has_room: Callable[[], bool]
     """Whether the disk has space to record into."""
+    states: Callable[[str], Mapping[str, State]] = lambda _: {}
+    """What became in the spool of all whose key begins so."""
+    wait: Callable[[Path], None] = lambda _: None
+    """Have the bag of a folder, whole but for its name, shipped once that is known."""
 
 
 class Recording:
     """New; ``write``, ``tick`` and ``split`` any number of times; ``close`` once. Owned by the thread that writes bags."""
 
     def __init__(
-        self, notes: Notes, settings: BagSettings, outlet: Outlet, monotonic: Callable[[], float] = time.monotonic
+        self, notes: Notes, settings: BagSettings, outlet: Outlet, place: Place, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
         self.notes = notes
+        self._place = place
         self.number = -1
         """Of the newest slice."""
         self.messages = self.dropped = 0
@@ -68,7 +76,8 @@ class Recording:
         self._channels: dict[tuple[str, str], Channel] = {}
         self._written = Counter[str]()  # into the open slice
         self._lost = Counter[tuple[str, str]]()  # by topic and reason, not noted yet
-        self._broken: list[tuple[Path, Counter[str]]] = []
+        self._broken: list[tuple[Path, Counter[str], str]] = []
+        """Slices that the disk refused to go on with, what was written into them, and why it refused."""
         self._closed_bytes = 0
         self._began_s = self._again_s = 0.0
 
@@ -89,7 +98,7 @@ class Recording:
         self.messages += len(lot.messages)
         channel, count = self._channel(lot), self._written[lot.topic]
         try:
-            for cdr, source_ns, _, number, received_ns in lot.messages:
+            for cdr, source_ns, _, number, received_ns in self._place.by_clock_of(self.notes, lot).messages:
                 writer.write(channel, received_ns, source_ns, count if number is None else number, cdr)
         except OSError as error:
             self._break(error)
@@ -132,7 +141,7 @@ class Recording:
             self._note_lost()
 
     def close(self, deadline_s: float) -> bool:
-        """End the bag; False when it is left to the next start to make it whole."""
+        """End the bag; False when it is left to the next start to make it whole. One without a date waits for it (``outlet``)."""
         self.split()
         self._again_s = 0.0
         if not self._mend():
@@ -142,6 +151,11 @@ class Recording:
         try:
             if notes.slices or notes.missing:
                 notes.end()
+                if not self._name():
+                    return True
+                if not self._outlet.flush(deadline_s):
+                    return False
+                note_evicted(notes, self._outlet.states(prefix_of(notes.robot, notes.bag)))
                 for item in ending_objects(notes):
                     self._outlet.put(item)
                 if not self._outlet.flush(deadline_s):
@@ -179,14 +193,14 @@ class Recording:
             return False
         if not self._mend():
             return False
-        path = self.notes.folder / slice_file(self.notes.bag, self.number + 1)
+        path = self.notes.folder / slice_file(self.notes.folder.name, self.number + 1)
         try:
             path.with_name(path.name + OPEN).unlink(missing_ok=True)  # what a try that failed has left
             self._writer = SliceWriter(
                 path, compression=self._settings.compression, chunk_bytes=self._settings.chunk_bytes, ros_distro=ros_distro()
             )
         except OSError as error:
-            self._refuse(UNWRITABLE, str(error))
+            self._refuse(_reason(error), str(error))
             return False
         self._note_lost()
         self.number += 1
@@ -201,25 +215,25 @@ class Recording:
         writer, self._writer = self._writer, None
         assert writer is not None
         writer.abort()
-        self._broken.append((writer.path.with_name(writer.path.name + OPEN), self._written))
+        self._broken.append((writer.path.with_name(writer.path.name + OPEN), self._written, _reason(error)))
         self._written = Counter()
-        self._refuse(UNWRITABLE, str(error))
+        self._refuse(_reason(error), str(error))
 
     def _mend(self) -> bool:
         """Make whole slices of those that broke; what is not in them is dropped. False where the disk still refuses."""
         while self._broken:
-            path, written = self._broken[0]
+            path, written, reason = self._broken[0]
             try:
                 final = path.with_name(path.name.removesuffix(OPEN))
                 info = recover(path, ros_distro=ros_distro()) if path.exists() else None
             except OSError as error:
-                self._refuse(UNWRITABLE, str(error))
+                self._refuse(_reason(error), str(error))
                 return False
             self._broken.pop(0)
             lost = written - Counter(info.counts if info else {})
             for topic, count in lost.items():
-                self._count(topic, UNWRITABLE, count)
-                self._note(Missing(final.name, 'the disk did not take it', count, topic, UNWRITABLE))
+                self._count(topic, reason, count)
+                self._note(Missing(final.name, 'the disk did not take it', count, topic, reason))
             if info is not None and info.messages:
                 self._hand_over(replace(info, damage=None))
             elif info is not None:
@@ -233,12 +247,25 @@ class Recording:
             self.notes.add_slice(info)
         except OSError as error:
             log.warning('bag %s: %s', self.notes.bag, error)
-        self._outlet.put(slice_object(self.notes, info, self._settings.priority))
+        if self.notes.is_named:
+            self._outlet.put(slice_object(self.notes, info, self._settings.priority))
+
+    def _name(self) -> bool:
+        """Whether the bag has a name to leave by; one that gets it now lets go of its slices. Raises OSError."""
+        notes = self.notes
+        if notes.is_named:
+            return True
+        if not self._place.settle(notes):
+            self._outlet.wait(notes.folder)
+            return False
+        for info in notes.slices.values():
+            self._outlet.put(slice_object(notes, info, self._settings.priority))
+        return True
 
     def _note_lost(self) -> None:
         """The manifest names what was dropped since the slice before, all of it in or after the newest slice."""
         lost, self._lost = self._lost, Counter()
-        file = slice_file(self.notes.bag, max(0, self.number))
+        file = slice_file(self.notes.folder.name, max(0, self.number))
         found = sorted(lost.items())
         self._note(*(Missing(file, f'dropped: {reason}', count, topic, reason) for (topic, reason), count in found))
 
@@ -262,3 +289,7 @@ class Recording:
         if not self.refused:
             log.error('bag %s: nothing is recorded while the disk takes nothing: %s', self.notes.bag, text)
         self.refused = reason
+
+
+def _reason(error: OSError) -> str:
+    return NO_ROOM if error.errno in _FULL else UNWRITABLE

@@ -1,7 +1,8 @@
 """The last seconds of some topics, serialized as they came: bounded in bytes, filled by the intake, which never waits for it.
 
 It holds references to what was taken, never a copy. An event claims what is in it and what comes, and takes it out piece by
-piece: what an event has taken is in the ring no more, so that no message is in two events' bags.
+piece: what an event has taken is in the ring no more, so that no message is in two events' bags. But for what is latched: the
+last message of each publisher stays, however long ago it came, and each event begins with it.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ class Held(NamedTuple):
     at_s: float
     """When it was drained, by the monotonic clock."""
     size: int
+    latched: int = 0
+    """How many of the topic's publishers send what they sent last to whoever comes."""
+    again: bool = False
+    """Whether it is latched and came before all that is in the ring; it may have been in an event already."""
 
 
 class Ring:
@@ -40,6 +45,10 @@ class Ring:
         """For how long what nobody claimed stays, as far as its bytes have room."""
         self._lock = threading.Lock()
         self._items: deque[Held] = deque()
+        self._latched: dict[str, deque[Held]] = {}
+        """Topic -> what left the ring last of it, a message each, the oldest first; with the bytes of ``bytes``."""
+        self._first: deque[Held] = deque()
+        """What is latched, for the event that goes on."""
         self._claimed = False
         self.bytes = 0
         """Of the messages in it, with what Python needs for them."""
@@ -55,37 +64,50 @@ class Ring:
         with self._lock:
             return self._items[-1].at_s - self._items[0].at_s if self._items else 0.0
 
-    def put(self, lot: Lot, lost: int | None, now_s: float) -> list[Held]:
+    def put(self, lot: Lot, lost: int | None, now_s: float, latched: int = 0) -> list[Held]:
         """Take in messages; whatever is too old or too much goes, the oldest first. What an event asked for of that."""
-        pieces = list(_pieces(lot, lost, now_s))
+        pieces = [piece._replace(latched=latched) for piece in _pieces(lot, lost, now_s)]
         with self._lock:
             for piece in pieces:
                 self._items.append(piece)
                 self.bytes += piece.size
             gone = []
-            while self.bytes > self.max_bytes:
+            while self.bytes > self.max_bytes and self._items:
                 gone.append(self._pop())
             if self._claimed:
                 return gone
             self._age(now_s - self.keep_s)
             return []
 
-    def claim(self, since_s: float) -> float | None:
-        """All of ``since_s`` and after is asked for now; returns the time of the oldest, None for an empty ring."""
+    def claim(self, since_s: float, now_ns: int = 0) -> float | None:
+        """All of ``since_s`` and after is asked for now; returns the time of the oldest, None for an empty ring.
+
+        What is latched comes first, as if it had been received with the oldest, or now (``now_ns``).
+        """
         with self._lock:
             self._age(since_s)
             self._claimed = True
-            return self._items[0].at_s if self._items else None
+            oldest = self._items[0] if self._items else None
+            start_ns, at_s = (oldest.lot.messages[0].received_ns, oldest.at_s) if oldest else (now_ns, since_s)
+            self._first = deque(
+                held._replace(at_s=at_s, again=True, lot=held.lot._replace(
+                    messages=[message._replace(received_ns=start_ns) for message in held.lot.messages]))
+                for kept in self._latched.values() for held in kept
+            )  # fmt: skip
+            return oldest.at_s if oldest else None
 
     def next(self, until_s: float) -> Held | None:
         """Take out the oldest piece; None when there is none that was drained until then."""
         with self._lock:
+            if self._first:
+                return self._first.popleft()
             return self._pop() if self._items and self._items[0].at_s <= until_s else None
 
     def release(self) -> None:
         """Nobody asks for what is left in it."""
         with self._lock:
             self._claimed = False
+            self._first.clear()
 
     def _age(self, since_s: float) -> None:
         while self._items and self._items[0].at_s < since_s:
@@ -94,7 +116,30 @@ class Ring:
     def _pop(self) -> Held:
         held = self._items.popleft()
         self.bytes -= held.size
+        if held.latched:
+            self._keep(held)
         return held
+
+    def _keep(self, held: Held) -> None:
+        """The last message of each publisher; where nobody knows who sent what, as many as there are publishers.
+
+        All of them take half of the ring at most, whose oldest messages go for them as for others.
+        """
+        kept = self._latched.setdefault(held.lot.topic, deque())
+        for message in held.lot.messages:
+            before = [each for each in kept if _is_of(message, each.lot.messages[0])]
+            if not before and not message.publisher and len(kept) >= held.latched:
+                before = [kept[0]]
+            for each in before:
+                kept.remove(each)
+                self.bytes -= each.size
+            size = len(message.cdr) + MESSAGE_BYTES
+            if self._latched_bytes() + size <= self.max_bytes // 2:
+                kept.append(held._replace(lot=held.lot._replace(messages=[message]), size=size))
+                self.bytes += size
+
+    def _latched_bytes(self) -> int:
+        return sum(held.size for kept in self._latched.values() for held in kept)
 
 
 def _pieces(lot: Lot, lost: int | None, now_s: float) -> Iterator[Held]:
@@ -110,3 +155,8 @@ def _pieces(lot: Lot, lost: int | None, now_s: float) -> Iterator[Held]:
         size += cost
     if part:
         yield Held(lot._replace(messages=part), lost, now_s, size)
+
+
+def _is_of(message: Taken, kept: Taken) -> bool:
+    """Whether a message takes the place of an earlier one: of the same sender, or the very same again."""
+    return message.publisher == kept.publisher if message.publisher else message.cdr == kept.cdr

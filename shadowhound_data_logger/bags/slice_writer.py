@@ -44,8 +44,10 @@ class SliceWriter:
     """
 
     def __init__(
-        self, path: Path, *, compression: str = 'zstd', chunk_bytes: int = DEFAULT_CHUNK_BYTES, ros_distro: str = ''
-    ) -> None:
+        self, path: Path, *, compression: str = 'zstd', chunk_bytes: int = DEFAULT_CHUNK_BYTES, ros_distro: str = '',
+        mode: int = 0o600,
+    ) -> None:  # fmt: skip
+        """``mode``: who may read it, less what the umask takes away."""
         self.path = path
         self._ros_distro = ros_distro
         if compression not in _COMPRESSORS:
@@ -64,7 +66,7 @@ class SliceWriter:
         if path.exists():
             raise FileExistsError(f'{path} is there already')
         self._open_path = path.with_name(path.name + OPEN)
-        self._file = os.open(self._open_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        self._file = os.open(self._open_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
         self._written = 0
         try:
             self._append(head())

@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
@@ -35,6 +35,7 @@ SENDING: Final = 'sending'
 PRIORITY: Final = 8
 """As slices that the node records: after all that is smaller."""
 FACTS_PRIORITY: Final = 4
+SMALL_BYTES: Final = 1 << 20
 POLL_S: Final = 0.2
 CLOSE_S: Final = 5.0
 THREADS: Final = 4
@@ -199,11 +200,15 @@ def _object(file: Outgoing, path: Path) -> DataObject:
 
 
 def _link_or_copy(source: Path, target: Path) -> None:
-    """A second name where that works, so that the spool takes it without reading it."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
+    """A second name where that works, so that the spool takes a large file without reading it.
+
+    A small one is copied: `ros2 bag reindex`, say, writes metadata.yaml anew in its place.
+    """
+    if source.stat().st_size > SMALL_BYTES:
+        with suppress(OSError):
+            os.link(source, target)
+            return
+    shutil.copyfile(source, target)
 
 
 def _taken(bag: str, key: str) -> BagError:

@@ -14,21 +14,25 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.fetch import on_disk
 from shadowhound_data_logger.bags.naming import METADATA
 from shadowhound_data_logger.bags.parcel import Outgoing, Parcel, finished
+from shadowhound_data_logger.bags.remote import SLICES
 from shadowhound_data_logger.bags.upload import deliver, is_confirmed, opened_spool, parcel, spool_parcel
-from shadowhound_data_logger.clock import Clock, iso
+from shadowhound_data_logger.clock import SECOND, Clock, iso
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import BagError, DataLoggerError
 from shadowhound_data_logger.stores import open_store
 
 MARKS: Final = '.shadowhound-bags.json'
+UNFINISHED_S: Final = 600.0
+"""A bag without metadata.yaml of which nothing has changed for so long is told: its recorder may have died."""
 SPOOLED: Final = 'spooled'
 STORED: Final = 'stored'
 REMOVED: Final = 'removed'
@@ -65,6 +69,8 @@ class Watch:
         self._looks: dict[str, tuple[Look, float]] = {}
         self._told: dict[str, str] = {}
         self._again_s: dict[str, float] = {}
+        self._left: set[str] = set()
+        """Bags that nobody seems to finish."""
 
     @contextmanager
     def alone(self) -> Iterator[None]:
@@ -80,12 +86,14 @@ class Watch:
         """Ship what is finished, confirm what was shipped. Raises BagError where the folder itself cannot be used."""
         with on_disk(self._folder):
             marks = self._marks()
-            bags = [path for path in sorted(self._folder.iterdir()) if path.is_dir() and (path / METADATA).exists()]
-            return [step for path in bags for step in self._step(path, marks)]
+            folders = [path for path in sorted(self._folder.iterdir()) if path.is_dir()]
+            bags = [path for path in folders if (path / METADATA).exists()]
+            steps = [step for path in bags for step in self._step(path, marks)]
+            return [*steps, *(step for path in folders if path not in bags for step in self._unfinished(path))]
 
     def is_owing(self) -> bool:
         """Whether the store does not have a bag of this folder yet, for whatever reason."""
-        return bool(self._looks) or any(mark['state'] == SPOOLED for mark in self._marks().values())
+        return bool(self._looks or self._left) or any(mark['state'] == SPOOLED for mark in self._marks().values())
 
     def _step(self, path: Path, marks: dict[str, Any]) -> Iterator[Step]:
         mark = marks.get(path.name)
@@ -107,6 +115,16 @@ class Watch:
             if self._told.get(path.name) != str(error):
                 self._told[path.name] = str(error)
                 yield Step(path.name, 'refused', str(error))
+
+    def _unfinished(self, path: Path) -> Iterator[Step]:
+        """A bag that nobody seems to write any more, once."""
+        times = [changed_ns for name, _, changed_ns in _look(path) if name.endswith(SLICES)]
+        if not times or self._clock.wall_ns() - max(times) < UNFINISHED_S * SECOND:
+            self._left.discard(path.name)
+        elif path.name not in self._left:
+            self._left.add(path.name)
+            reason = f'it has no {METADATA}, and nothing in it has changed for {UNFINISHED_S / 60:.0f} min'
+            yield Step(path.name, 'refused', f'{reason} (if nobody records into it: `ros2 bag reindex` makes it)')
 
     def _is_settled(self, path: Path) -> bool:
         look = _look(path)
@@ -173,5 +191,10 @@ class Watch:
 
 
 def _look(folder: Path) -> Look:
-    found = ((path, path.stat()) for path in sorted(folder.rglob('*')) if path.is_file())
-    return [[str(path.relative_to(folder)), stat.st_size, stat.st_mtime_ns] for path, stat in found]
+    found: Look = []
+    for path in sorted(folder.rglob('*')):
+        with suppress(FileNotFoundError):  # its recorder is at work
+            stat = path.stat()
+            if S_ISREG(stat.st_mode):
+                found.append([str(path.relative_to(folder)), stat.st_size, stat.st_mtime_ns])
+    return found

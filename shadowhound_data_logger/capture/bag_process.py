@@ -27,8 +27,9 @@ from rclpy.signals import SignalHandlerOptions
 from shadowhound_data_logger.bags.local import RECORDS, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, key_of, slice_file
+from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import BagQueue
-from shadowhound_data_logger.bags.recorder import Place, Recorder
+from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.capture.bag_tap import BagTap
@@ -143,8 +144,9 @@ def _open_recorder(opened: ExitStack, node: Node, settings: Settings, spool: Spo
     place = Place(settings.home / RECORDS / settings.robot, settings.robot, clock,
                   lambda bag: spool.has(BUCKET, key_of(settings.robot, bag, slice_file(bag, 0))))  # fmt: skip
     outlet = Outlet(spool.accounts, stages.put, writer.flush,
-                    lambda: spool.free_bytes() >= settings.spool.min_free_bytes // 2)  # fmt: skip
-    salvage = Salvage(place.root, settings.robot, settings.bag.priority, outlet, spool.knows)
+                    lambda: spool.free_bytes() >= settings.spool.min_free_bytes // 2,
+                    lambda prefix: spool.states(BUCKET, prefix))  # fmt: skip
+    salvage = Salvage(place, settings.bag.priority, outlet, spool.knows)
     recorder = Recorder(settings.bag, place, queue, outlet, salvage,
                         lambda on, deadline_s: intake.record(deadline_s, on=on))  # fmt: skip
     writer.open()

@@ -37,23 +37,30 @@ class BagSources:
         """Those of topics that no sensor takes."""
         return self._own.values()
 
-    def refresh(self, sensors: Mapping[str, bool], now_s: float, *, paused: bool) -> None:
-        """Follow the graph and the topics that sensors take now (True: latched); a topic changes hands without a loss.
+    def refresh(self, taken: Mapping[str, bool], sensors: Collection[str], now_s: float, *, paused: bool) -> None:
+        """Follow the graph and the topics that are taken by others now (True: latched); a topic changes hands without a loss.
 
-        A latched topic is subscribed to anew, so that a bag begins with what was sent before it.
+        ``sensors`` are those among them that a bag has unless its settings name some. A latched topic is subscribed to anew,
+        so that a bag begins with what was sent before it.
         """
         graph = [name for name, _ in self._node.get_topic_names_and_types()] if self._choice.asks_graph else []
         wanted = self._choice.wanted(sensors, graph)
-        shared = {topic for topic, is_latched in sensors.items() if not is_latched}
+        shared = {topic for topic, is_latched in taken.items() if not is_latched}
         for topic in wanted.difference(shared, self._own):
             sensor = SensorSettings(name='bag', topics=(topic,))
             source = self._own[topic] = Source(self._node, sensor, self._settings, self._group, self._shared, BagStream)
             source.pause(now_s, paused=paused)
         for source in self._own.values():
             source.refresh(now_s)
-        self._tap.topics = wanted.union(self._own) - (sensors.keys() - shared)
+        self._tap.topics = wanted.union(self._own) - (taken.keys() - shared)
         for topic in shared.intersection(self._own):
             self._own.pop(topic).close(now_s)
+
+    def renew(self, now_s: float) -> None:
+        """Before a ``refresh``: another recording follows without a pause, and is to begin with what is latched as well."""
+        for topic in [topic for topic, source in self._own.items() if source.has_latched]:
+            self._own.pop(topic).close(now_s)
+        self._tap.topics = frozenset()
 
     def end(self, now_s: float) -> None:
         """Take what still waits; what comes from now on is recorded by nobody."""

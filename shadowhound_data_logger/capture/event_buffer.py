@@ -10,7 +10,7 @@ from typing import Any
 from rclpy.node import Node
 
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
-from shadowhound_data_logger.bags.recorder import Place
+from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.ring import Ring
 from shadowhound_data_logger.capture.event_control import EventControl

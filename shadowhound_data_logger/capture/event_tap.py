@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy
 
 from shadowhound_data_logger.bags.claims import Claims
 from shadowhound_data_logger.bags.queue import Lot
@@ -27,6 +28,8 @@ SEEN: Final = 10
 """Messages of one drain that conditions look at, evenly chosen: 50 a second."""
 LARGE_BYTES: Final = 64 << 10
 """Of a topic with larger messages they look at the newest alone."""
+LATCHED: Final = f'durability: {int(DurabilityPolicy.TRANSIENT_LOCAL)}\n'
+"""In what rosbag2 writes of a topic with such a publisher (``bags.metadata``)."""
 
 
 class Inbox:
@@ -86,7 +89,7 @@ class EventTap:
             return
         lot = Lot(topic, type_name, self._qos_of(topic, type_name, taken[-1].publisher), taken)
         if not paused:
-            if gone := self._ring.put(lot, lost, now_s):
+            if gone := self._ring.put(lot, lost, now_s, self._latched(topic, type_name, lot.qos)):
                 self._claims.lose(gone)
         elif self._ring.claimed:
             self._claims.lose([Held(lot, lost, now_s, 0)], PAUSED)
@@ -97,6 +100,14 @@ class EventTap:
         if key not in self._qos:
             self._qos[key] = qos_offered(self._node, topic, type_name)
         return self._qos[key]
+
+    def _latched(self, topic: str, type_name: str, qos: str) -> int:
+        """How many publishers of the topic are latched; asked again with each of their few messages."""
+        if LATCHED not in qos:
+            return 0
+        found = self._node.get_publishers_info_by_topic(topic)
+        durabilities = [int(info.qos_profile.durability) for info in found if info.topic_type == type_name]
+        return max(1, durabilities.count(int(DurabilityPolicy.TRANSIENT_LOCAL)))
 
 
 class Taps:

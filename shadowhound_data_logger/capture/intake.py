@@ -105,7 +105,10 @@ class Intake:
         return self._ask(partial(self._set_idle, idle=idle), deadline_s)
 
     def record(self, deadline_s: float, *, on: bool) -> bool:
-        """From now on hand all that comes of the bag's topics to the bag, or no more; False if that failed or took too long."""
+        """From now on hand all that comes of the bag's topics to the bag, or no more; False if that failed or took too long.
+
+        ``on`` while it is done already: another bag begins here.
+        """
         return self._ask(partial(self._record, on=on), deadline_s)
 
     def update(self, sensors: Iterable[SensorSettings]) -> None:
@@ -156,6 +159,8 @@ class Intake:
         """What came before is drained first: it is not of this recording, or the last of it."""
         now_s = time.monotonic()
         _each([partial(source.drain, now_s) for source in (*self._sources, *self._unsampled)])
+        if on and self._records:
+            self._bag.renew(now_s)
         self._records = on
         if on:
             self._follow(now_s)
@@ -163,12 +168,13 @@ class Intake:
             self._bag.end(now_s)
 
     def _follow(self, now_s: float) -> None:
-        sensors = {source.topic: source.is_latched for source in self._sources if source.sensor.enabled}
+        sensors = {source.topic: source.has_latched for source in self._sources if source.sensor.enabled}
+        ring: dict[str, bool] = {}
         if self._ring is not None:
-            self._ring.refresh(dict.fromkeys(sensors, False), now_s, paused=self.paused)
-            sensors |= {source.topic: source.is_latched for source in self._ring.own}
+            self._ring.refresh(dict.fromkeys(sensors, False), sensors, now_s, paused=self.paused)
+            ring = {source.topic: source.has_latched for source in self._ring.own}
         if self._records:
-            self._bag.refresh(sensors, now_s, paused=self.paused)
+            self._bag.refresh(sensors | ring, sensors, now_s, paused=self.paused)
         self._taps.look()
 
     def _finish(self) -> None:

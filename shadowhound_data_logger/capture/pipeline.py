@@ -14,8 +14,9 @@ from typing import Any
 from rclpy.node import Node
 
 from shadowhound_data_logger.bags.naming import BUCKET, FOLDER, key_of, slice_file
+from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import BagQueue
-from shadowhound_data_logger.bags.recorder import Place, Recorder
+from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.capture.bag_control import BagControl
@@ -62,8 +63,8 @@ class Pipeline:
 
     def __init__(self, node: Node, settings: Settings) -> None:
         self._settings = settings
-        system_clock, record = SystemClock.of_this_machine(), ClockRecord(settings.spool_path, settings.robot)
-        self._clock = ClockWatch(system_clock, settings.clock.hold_s, record.steps)
+        self._record = record = ClockRecord(settings.spool_path, settings.robot)
+        self._clock = ClockWatch(SystemClock.of_this_machine(), settings.clock.hold_s, record.steps)
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
         self._catalogue = Catalogue(settings.spool_path, settings.catalogue, settings.robot, self._clock)
         self._redating = Redating(self.spool, self._clock, record, settings.robot)
@@ -76,11 +77,13 @@ class Pipeline:
     def open(self) -> None:
         """Raises SpoolError or SettingError; nothing is left open then."""
         with ExitStack() as opened:
-            self._open(opened)
+            self._open_disk(opened)
+            self._make_stages()
+            self._open_stages(opened)
             self._opened = opened.pop_all()
 
-    def _open(self, opened: ExitStack) -> None:
-        """Open the stages; ``opened`` closes them in the opposite order, each whatever happens to the others."""
+    def _open_disk(self, opened: ExitStack) -> None:
+        """The store and the spool, which nobody else may be filling; ``opened`` closes them."""
         settings = self._settings
         self._store = open_store(settings.store, settings.upload)
         opened.callback(self._store.close)
@@ -91,6 +94,10 @@ class Pipeline:
                              remedy='stop it, or give this one a robot name or SHADOWHOUND_HOME of its own')  # fmt: skip
         for sink in SINKS:
             self.spool.carry(sink)
+
+    def _make_stages(self) -> None:
+        """Each with what it hands its work to; none runs yet."""
+        settings = self._settings
         self.uploader = Uploader(self.spool, self._store, settings.upload, self._settle)
         self.writer = SpoolWriter(self.spool, settings.spool.commit_s, spooled=self.uploader.wake,
                                   settled=self.uploader.settled)  # fmt: skip
@@ -104,13 +111,17 @@ class Pipeline:
                         BagTap(self._node, self.spool.accounts, bag_queue := BagQueue(settings.bag.queue_bytes)))  # fmt: skip
         self._make_intake(sensors, shared, bag_queue)
         tap = MissionTap(settings.mission, sensors, settings.robot, types, self._node.resolve_topic_name, self._track.marks)
-        self._mission_topic = topic = MissionTopic(self._node)
+        self._mission_topic = MissionTopic(self._node)
         self.mission = MissionWatch(settings, self.intake, queue, tap, self._tell_mission)
         self.pool.observe = self.mission.observe
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
                                        self.recorder, self.event_buffer)  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
         self._diagnostics = Diagnostics(self._node)
+        self.control = Control(self._node, self.intake, queue, self.writer)
+
+    def _open_stages(self, opened: ExitStack) -> None:
+        """Start them, who is handed work before who hands it on; ``opened`` closes them in the opposite order, come what may."""
         opened.callback(self._tell, ended=True)
         self.writer.open()
         opened.callback(self.writer.close, 1.0)
@@ -119,14 +130,13 @@ class Pipeline:
         opened.callback(self.uploader.close, 0.5)
         opened.callback(self.mission.close)
         opened.callback(self._finish)
-        topic.open()
-        opened.callback(topic.close)
+        self._mission_topic.open()
+        opened.callback(self._mission_topic.close)
         self.mission.open()
         opened.callback(self.mission.stop)
         self.intake.open()
         self.recorder.open()
         self.event_buffer.open()
-        self.control = Control(self._node, self.intake, queue, self.writer)
         for answering in (self._diagnostics, self.control, BagControl(self._node, self.recorder), self.event_buffer.control):
             answering.open()
             opened.callback(answering.close)
@@ -179,6 +189,7 @@ class Pipeline:
             return
         self._due_s = now_s + PERIOD_S
         self._name_held()
+        self.recorder.look()
         self._spool_parts(self._catalogue.due)
         self._tell()
         day = self._today()
@@ -207,12 +218,15 @@ class Pipeline:
         """The intake with what takes all messages of it, for bags and for events."""
         settings, spool, writer = self._settings, self.spool, self.writer
         place = Place(settings.home / FOLDER / settings.robot, settings.robot, self._clock,
-                      lambda bag: spool.has(BUCKET, key_of(settings.robot, bag, slice_file(bag, 0))))  # fmt: skip
+                      lambda bag: spool.has(BUCKET, key_of(settings.robot, bag, slice_file(bag, 0))), settings.clock.hold_s,
+                      lambda: self._record.offsets)  # fmt: skip
         outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush,
-                        lambda: spool.free_bytes() >= settings.spool.min_free_bytes // 2)  # fmt: skip
+                        lambda: spool.free_bytes() >= settings.spool.min_free_bytes // 2,
+                        lambda prefix: spool.states(BUCKET, prefix),
+                        lambda folder: salvage.add(folder))  # fmt: skip  # noqa: PLW0108 - made below
         self.event_buffer = EventBuffer(self._node, settings, place, outlet, shared.types)
         self.intake = Intake(self._node, sensors, settings.intake, shared, settings.bag, self.event_buffer.tap)
-        salvage = Salvage(place.root, settings.robot, settings.bag.priority, outlet, spool.knows)
+        salvage = Salvage(place, settings.bag.priority, outlet, spool.knows)
         self.recorder = Recorder(settings.bag, place, queue, outlet, salvage,
                                  lambda on, deadline_s: self.intake.record(deadline_s, on=on))  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from importlib import import_module
@@ -14,6 +15,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.type_support import NoTypeSupportImportedException, check_for_type_support
 
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan
+from shadowhound_data_logger.clock import MAX_AGE_NS
 from shadowhound_data_logger.model import Taken
 
 try:
@@ -123,7 +125,7 @@ class Reader:
                 cdr, info = taken
                 yield Taken(
                     cdr, info['source_timestamp'], self._publisher(info), info.get('publication_sequence_number'),
-                    info['received_timestamp'],
+                    info['received_timestamp'] or _came_ns(info['source_timestamp']),
                 )  # fmt: skip
             self._overrun = True
 
@@ -161,6 +163,15 @@ class Reader:
         if name is None:
             name = self._names[data] = bytes(data).hex()
         return name
+
+
+def _came_ns(sent_ns: int) -> int:
+    """When a message came whose middleware does not say (Humble's Cyclone DDS): when it was sent, if that was just now.
+
+    Source: rmw_cyclonedds_cpp, rmw_node.cpp; received_timestamp is 0 before its version 2.2.1 (Jazzy).
+    """
+    now_ns = time.time_ns()
+    return sent_ns if 0 <= now_ns - sent_ns <= MAX_AGE_NS else now_ns
 
 
 def _never_called(_: bytes) -> None:

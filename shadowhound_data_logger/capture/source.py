@@ -64,6 +64,8 @@ class Source:
         self._publishers = self._matched = 0
         self.is_latched = False
         """Whether all publishers send what they sent before to whoever comes; as it was while there were any."""
+        self.has_latched = False
+        """Whether one of them does."""
         self._type = ''
         self._readers: list[Reader] = []
         self._retiring: dict[Reader, float] = {}
@@ -96,6 +98,7 @@ class Source:
         self._matched = max((reader.matched() for reader in self._readers), default=0)
         if publishers:
             self.is_latched = all(publisher.transient_local for publisher in publishers)
+            self.has_latched = any(publisher.transient_local for publisher in publishers)
         self._senders.look([publisher.gid for publisher in publishers])
         wanted = plans(self._chosen, publishers, self._types_expected.get(self._chosen), self._settings, self._type)
         self._warn_of_types(publishers, wanted)

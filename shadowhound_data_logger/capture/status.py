@@ -102,7 +102,7 @@ class Status:
             'paused': self._stages.intake.paused, 'ended': ended,
             'mission': self._stages.mission.status(), 'bag': self._bag(), 'events': self._events(), 'topics': self._topics(now_s),
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
-            'spool': {'path': str(self._stages.spool.root), **asdict(piles), 'max_bytes': self._settings.spool.max_bytes},
+            'spool': {'path': str(self._stages.spool.root), **asdict(piles), **asdict(self._settings.spool)},
             'store': self._store(upload, now_s), 'clock': asdict(self._clock.state()),
             'workers': {worker.name: asdict(worker.status()) for worker in self._stages.workers},
         }  # fmt: skip

@@ -18,6 +18,16 @@ ENCODE_S: Final = 10.0
 """Batches wait, and none was finished for so long."""
 DELIVERY_S: Final = 30.0
 """Objects wait, and nothing moved for so long on top of what a single request may take."""
+_UNWRITTEN: Final = 'nothing more is written to its bag for {s}: does the disk answer?'
+_HANGS_ENCODING: Final = 'one batch has taken {s} so far; others go on meanwhile if there are more encoder threads'
+_HANGING: Final[Mapping[str, str]] = {
+    'intake': 'it takes no messages for {s} and they are being lost; start the node again if that lasts',
+    'spool-writer': 'a commit to the spool has taken {s}: its disk does not answer; look at dmesg and at its cable or card',
+    'mission': 'missions are not followed for {s}, neither their begin and end nor their logs; does the disk answer?',
+    'bag-writer': _UNWRITTEN,
+    'event-writer': _UNWRITTEN,
+    'event-watch': 'neither conditions nor what an agent logs is looked at for {s}; does the disk answer?',
+}
 Stalls = Mapping[str, str]
 
 
@@ -101,13 +111,7 @@ def _hanging(name: str, row: Mapping[str, Any]) -> str:
     busy_s = row['busy_s']
     if row['patience_s'] is None or busy_s <= row['patience_s']:
         return ''
-    if name == 'intake':
-        return f'it takes no messages for {busy_s:.0f} s and they are being lost; start the node again if that lasts'
-    if name == 'spool-writer':
-        return f'a commit to the spool has taken {busy_s:.0f} s: its disk does not answer; look at dmesg and at its cable or card'
-    if name == 'mission':
-        return f'missions are not followed for {busy_s:.0f} s, neither their begin and end nor their logs; does the disk answer?'
-    return f'one batch has taken {busy_s:.0f} s so far; others go on meanwhile if there are more encoder threads'
+    return _HANGING.get(name, _HANGS_ENCODING).format(s=f'{busy_s:.0f} s')
 
 
 def _why_undelivered(status: Mapping[str, Any]) -> str:

@@ -20,7 +20,7 @@ from shadowhound_data_logger.cli.tables import plain
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings, home, store_settings
 from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -43,7 +43,7 @@ def _bag(_: click.Context, __: click.Parameter, name: str) -> str | Path:
             raise click.BadParameter(f'there is no folder {name}')
         return path.absolute()
     try:
-        return check_name(name, 'the bag')
+        return check_name(name, 'the bag', MAX_BAG_BYTES)
     except NameRefused as error:
         raise click.BadParameter(str(error)) from error
 

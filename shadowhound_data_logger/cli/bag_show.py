@@ -13,7 +13,7 @@ from rich.console import Console, RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.bags.info import BagInfo, info_folder, info_of
-from shadowhound_data_logger.bags.manifest import Missing
+from shadowhound_data_logger.bags.manifest import ClockOf, Missing
 from shadowhound_data_logger.bags.overview import BagRow, NoStore, overview
 from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
 from shadowhound_data_logger.bags.span import since as since_ns
@@ -152,6 +152,7 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
         'robot': found.robot or (manifest.robot if manifest else ''),
         'mission': f'{mission.type}, run {mission.run_id or "-"}, id {mission.mission_id or "-"}' if mission else '',
         'event': ', '.join(f'{each.name} by {each.by}' for each in event.triggers) if event else '',
+        'clock': _clock(manifest.clock, told.t_start_ns) if manifest and manifest.clock else '',
         'began': f'{moment(told.t_start_ns)} UTC' if told.messages else '-',
         'ended': f'{moment(told.t_end_ns)} UTC' if told.messages else '-',
         'duration': duration(told.duration_s), 'messages': f'{number(told.messages)} on {len(told.topics)} topics',
@@ -172,6 +173,14 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
     if found.missing:
         yield plain(f'Not here yet: {", ".join(found.missing)}', 'yellow')
     yield from _lost(manifest.missing if manifest else ())
+
+
+def _clock(clock: ClockOf, start_ns: int) -> str:
+    """What the times of a bag are worth whose clock was not set."""
+    if clock.offset_ns is None:
+        return f'was never set in boot {clock.boot_id}: nobody knows the date, and the times below are by that clock'
+    began = f'the bag began {moment(start_ns + clock.offset_ns)} UTC'
+    return f'was not set yet: {began}, and {clock.offset_ns / 1e9:.3f} s are to be added to the times below'
 
 
 def _lost(missing: Sequence[Missing]) -> Iterator[RenderableType]:

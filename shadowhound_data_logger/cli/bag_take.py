@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 import click
+from rich.text import Text
 
-from shadowhound_data_logger.bags.cut import Choice, Cut, cut_folder, cut_remote
+from shadowhound_data_logger.bags.cut import COMES, Choice, Cut, cut_folder, cut_remote
 from shadowhound_data_logger.bags.fetch import THREADS
 from shadowhound_data_logger.bags.fetch import fetch as fetch_bag
 from shadowhound_data_logger.bags.remote import find_bag
@@ -37,6 +39,8 @@ def fetch(*, bag: str, to: Path, threads: int, robot: str, as_json: bool) -> int
     lines = [plain(f'{found.folder}: {number(found.files)} files, {volume(found.bytes)}; downloaded {volume(found.downloaded)}')]
     if found.unverified:
         lines.append(plain(f'No checksum is known of {", ".join(found.unverified)}: only the size was compared.', 'yellow'))
+    elif found.missing:
+        lines.append(plain(f'Not in the store yet: {", ".join(found.missing)}. Fetch it again for the rest.', 'cyan'))
     elif not found.is_complete:
         lines.append(plain('The bag is still growing: fetch it again for the rest.', 'cyan'))
     say(*lines)
@@ -62,7 +66,7 @@ def cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str, a
            1760788805.5            seconds since 1970
 
     It goes by the time at which messages were received, as ros2 bag play does. Of a bag in the store only the chunks that hold
-    something of it are read.
+    something of it are read. Exit code 1 when a slice of that time is not there.
     """  # noqa: D301 - click's mark for lines that stay as they are
     names = tuple(name.strip() for each in topics for name in each.split(',') if name.strip())
     choice = Choice(topics=names, **wanted)
@@ -75,12 +79,17 @@ def cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str, a
         click.echo(json.dumps(said_json({**asdict(found), 'folder': str(found.folder)}), indent=2))
     else:
         say(*_told(found))
-    return 0
+    return 1 if found.missing else 0
 
 
-def _told(found: Cut) -> tuple[str, str]:
+def _told(found: Cut) -> Iterator[str | Text]:
     length = duration((found.t_end_ns - found.t_start_ns) / 1e9)
     what = f'{number(found.messages)} messages on {number(found.topics)} topics, {volume(found.bytes)}'
     share = f'{100 * found.read_bytes / max(found.bag_bytes, 1):.1f} %'
     read = f'Read {volume(found.read_bytes)} of {volume(found.bag_bytes)} ({share}) in {number(found.read_requests)} requests.'
-    return f'{found.folder}: {what}, {moment(found.t_start_ns)} to {moment(found.t_end_ns)} UTC ({length})', read
+    yield f'{found.folder}: {what}, {moment(found.t_start_ns)} to {moment(found.t_end_ns)} UTC ({length})'
+    yield read
+    if found.absent:
+        yield plain(f'The bag has no topic {", ".join(found.absent)}.', 'yellow')
+    if found.missing:
+        yield plain(f'Not all of that time: {", ".join(found.missing)} is not there; {COMES}', 'yellow')

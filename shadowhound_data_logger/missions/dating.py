@@ -46,13 +46,13 @@ class Dating:
         if not waits(folder):
             return True
         start = journal.first(folder.journal)
-        offset_ns = self._offset_ns(str(start.get('boot_id')), int(start['t']))
+        offset_ns = self.offset_ns(str(start.get('boot_id')), int(start['t']))
         if offset_ns is not None:
             folder.set_clock_offset_ns(offset_ns)
         return offset_ns is not None
 
-    def _offset_ns(self, boot_id: str, start_ns: int) -> int | None:
-        """0 where it will never be known, None where it may be yet."""
+    def offset_ns(self, boot_id: str, start_ns: int) -> int | None:
+        """What makes UTC of the boot clock for what began at ``start_ns``; 0 where it will never be known, None where it may."""
         if boot_id != self.clock.boot_id:
             return self.offsets().get(boot_id, 0)
         wall_ns, boot_ns = self.clock.wall_ns(), self.clock.boot_ns()

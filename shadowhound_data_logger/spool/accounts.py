@@ -74,8 +74,11 @@ class TopicAccount:
         self.received += 1
         return True
 
-    def receive_again(self, publisher: str) -> None:
-        """Count a message that was counted before, and that is wanted once more."""
+    def receive_again(self, publisher: str | None, *, reported: bool = False) -> None:
+        """Count a message that was counted before, and that is wanted once more; arguments as above."""
+        if publisher is None or self.accounting != EXACT:
+            self.receive(None, None, reported=reported)
+            return
         self._span(publisher).count()
         self.received += 1
 

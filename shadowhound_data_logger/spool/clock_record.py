@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,6 +48,11 @@ class ClockRecord:
     @property
     def steps(self) -> int:
         return int(self._said['steps'])
+
+    @property
+    def offsets(self) -> Mapping[str, int]:
+        """UTC less boot clock by boot id, of the boots whose clock was set; the others are missing."""
+        return dict(self._offsets)
 
     def offset_ns(self, boot_id: str) -> int | None:
         """UTC less boot clock of a boot whose clock was set."""

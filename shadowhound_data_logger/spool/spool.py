@@ -39,6 +39,8 @@ log = logging.getLogger(__name__)
 CLOSE_S: Final = 10.0
 """For a commit that is under way when the spool is closed."""
 DAY_NS: Final = 24 * 3600 * SECOND
+LAST: Final = '\x7f'
+"""After everything that a key has."""
 _LEFT: Final = frozenset({State.DELIVERED, State.DEDUPLICATED, State.EVICTED})
 
 
@@ -147,6 +149,11 @@ class Spool:
         """Whether the name is taken. Waits for no commit; raises sqlite3.Error."""
         return self._view.has(bucket, key)
 
+    def states(self, bucket: str, prefix: str) -> dict[str, State]:
+        """What became of every object whose key begins so, by key. Waits for no commit; raises sqlite3.Error."""
+        rows = self._view.rows('bucket = ? AND key >= ? AND key < ?', (bucket, prefix, prefix + LAST))
+        return {row['key']: State(row['state']) for row in rows}
+
     def free_bytes(self) -> int:
         """What this user may still write to the spool's file system. Raises OSError."""
         return self._tree.free_bytes()
@@ -247,10 +254,19 @@ class Spool:
         for outcome in outcomes:
             item = outcome.item
             if outcome.state is State.QUARANTINED:
-                source = self._tree.waiting(item.id, item.bucket, item.key)
-                self._tree.place(source, self._tree.path(outcome.state, outcome.reason, item.bucket, item.key))
+                self._set_apart(item, outcome.reason)
             elif outcome.state in _LEFT and not self._tree.remove(item.path):
                 self._tree.remove(self._tree.waiting(item.id, item.bucket, item.key))
+
+    def _set_apart(self, item: SpooledObject, reason: str | None) -> None:
+        """Unless a retry, or another process's start, lets it wait again by now; where one is at it, the next start does it."""
+        try:
+            with flock(self.root / 'recovery.lock', wait=False) as mine:
+                if mine and self._view.rows("id = ? AND state = 'quarantined'", (item.id,)):
+                    source = self._tree.waiting(item.id, item.bucket, item.key)
+                    self._tree.place(source, self._tree.path(State.QUARANTINED, reason, item.bucket, item.key))
+        except (OSError, sqlite3.Error) as error:
+            log.warning('cannot move %s to the quarantine: %s', item.path, error)
 
     def _forget(self, now_ns: int) -> None:
         """Once an hour, drop rows of deliveries that nobody will ask for any more."""

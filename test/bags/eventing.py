@@ -14,8 +14,8 @@ from clocks import Clocks
 
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
 from shadowhound_data_logger.bags.naming import BUCKET, key_of, slice_file
+from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import Lot
-from shadowhound_data_logger.bags.recorder import Place
 from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.ring import Ring
 from shadowhound_data_logger.bags.salvage import Salvage
@@ -99,11 +99,13 @@ def buffer(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator
     writer = SpoolWriter(spool, 0.01)
     writer.open()
     now_s, made = [1000.0], list[Buffer]()
-    outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush, lambda: made[0].room[0])
-    place = Place(home / 'bags' / ROBOT, ROBOT, clocks, lambda name: spool.has(BUCKET, key_of(ROBOT, name, slice_file(name, 0))))
+    outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush, lambda: made[0].room[0],
+                    lambda prefix: spool.states(BUCKET, prefix), lambda folder: salvage.add(folder))  # fmt: skip  # noqa: PLW0108 - made below
+    place = Place(home / 'bags' / ROBOT, ROBOT, clocks, lambda name: spool.has(BUCKET, key_of(ROBOT, name, slice_file(name, 0))),
+                  600.0)  # fmt: skip
     ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
     events = Events(options, bag, place, ring, outlet, POLL_S, lambda: now_s[0])
-    salvage = Salvage(place.root, ROBOT, 8, outlet, spool.knows)
+    salvage = Salvage(place, 8, outlet, spool.knows)
     made.append(Buffer(spool, writer, ring, events, home, now_s))
     try:
         salvage.open()

@@ -14,8 +14,9 @@ from clocks import Clocks
 from mcap.reader import make_reader
 
 from shadowhound_data_logger.bags.naming import BUCKET, key_of, slice_file
+from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
-from shadowhound_data_logger.bags.recorder import Place, Recorder
+from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.config import SpoolSettings
@@ -30,6 +31,7 @@ NOON_NS = 1_760_788_800 * 10**9
 STRING = 'std_msgs/msg/String'
 ROBOT = 'thor'
 WAIT_S = 20.0
+HOLD_S = 600.0
 
 
 def messages(numbers: range, size: int = 0) -> list[Taken]:
@@ -86,20 +88,21 @@ class Desk:
 
 
 @contextmanager
-def desk(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator[Desk]:
-    """An open one; closed as the node does it, unless it was before."""
+def desk(home: Path, clock: Clocks | None = None, *, offsets: Mapping[str, int] | None = None, **settings: Any) -> Iterator[Desk]:
+    """An open one; closed as the node does it, unless it was before. ``offsets`` is what is known of other boots' clocks."""
     time = clock or Clocks()
     if clock is None:
         time.set()
+    spool = Spool(home / 'spool', SpoolSettings(min_free_bytes=0, **settings.pop('spool', {})), time, ROBOT)
     bag = BagSettings(**{'compression': 'none', **settings})
-    spool = Spool(home / 'spool', SpoolSettings(min_free_bytes=0), time, ROBOT)
     spool.open()
     spool.carry(BAG)
     writer = SpoolWriter(spool, 0.01)
     writer.open()
     root, queue = home / 'bags' / ROBOT, BagQueue(bag.queue_bytes)
     made: list[Desk] = []
-    outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush, lambda: made[0].room[0])
+    outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush, lambda: made[0].room[0],
+                    lambda prefix: spool.states(BUCKET, prefix), lambda folder: salvage.add(folder))  # fmt: skip  # noqa: PLW0108 - made below
 
     def listen(on: bool, deadline_s: float) -> bool:
         made[0].listening.append(on)
@@ -108,8 +111,9 @@ def desk(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator[D
     def is_known(name: str) -> bool:
         return spool.has(BUCKET, key_of(ROBOT, name, slice_file(name, 0)))
 
-    salvage = Salvage(root, ROBOT, bag.priority, outlet, spool.knows)
-    recorder = Recorder(bag, Place(root, ROBOT, time, is_known), queue, outlet, salvage, listen)
+    place = Place(root, ROBOT, time, is_known, HOLD_S, lambda: offsets or {})
+    salvage = Salvage(place, bag.priority, outlet, spool.knows)
+    recorder = Recorder(bag, place, queue, outlet, salvage, listen)
     made.append(Desk(spool, writer, queue, recorder, home))
     try:
         recorder.open()

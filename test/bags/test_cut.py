@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -109,7 +110,9 @@ def test_bags_of_others(tmp_path: Path, plugin: StoragePlugin, mode: Compression
 
 
 @pytest.mark.parametrize(('choice', 'error', 'text'), [
-    (Choice(topics=('/imv',)), BagError, 'it has /imu'),
+    (Choice(topics=('/imv',)), BagError, 'is it /imu?'),
+    (Choice(topics=('/nothing/of/it',)), BagError, 'it has /camera/blob, /imu'),
+    (Choice('1000'), BagError, 'from 2025-10-18T12:16:40.000000Z on .the bag goes from'),
     (Choice(regex='nothing'), BagError, 'no topic of the bag matches'),
     (Choice('100', '101'), BagError, 'the bag goes from 2025-10-18T12:00:00.000000Z'),
     (Choice('5', '4'), SettingError, 'a time after --start'),
@@ -123,6 +126,41 @@ def test_a_cut_of_nothing_leaves_nothing(
     with pytest.raises(error, match=text):
         cut_remote(store, find_bag(store, 'thor', NAME), tmp_path / 'piece', choice)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_others_may_read_a_piece_as_they_may_any_file(origin: Path, tmp_path: Path) -> None:
+    """Its slice is no private file of a spool: the umask alone decides."""
+    before = os.umask(0o027)
+    try:
+        found = cut_folder(origin, tmp_path / 'piece', Choice('1', '2'))
+    finally:
+        os.umask(before)
+    assert {path.name: oct(path.stat().st_mode & 0o777) for path in found.folder.iterdir()} == {
+        'piece_0.mcap': '0o640', 'metadata.yaml': '0o640'
+    }  # fmt: skip
+
+
+def test_what_is_not_there_is_told(origin: Path, tmp_path: Path) -> None:
+    """A topic that the bag does not have; a slice that has not arrived: of its time nothing is made up, nor called nothing."""
+    store = MemoryStore()
+    stored(store, origin, without='_1.mcap')
+    bag = find_bag(store, 'thor', NAME)
+    found = cut_remote(store, bag, tmp_path / 'piece', Choice('4', '6', topics=('/imu', '/nowhere')))
+    assert (found.absent, found.missing) == (('/nowhere',), (f'{NAME}_1.mcap',))
+    assert found.messages == 100
+    assert cut_remote(store, bag, tmp_path / 'first', Choice('1', '2')).missing == ()
+    with pytest.raises(BagError, match=f'is in {NAME}_1.mcap, which is not there'):
+        cut_remote(store, bag, tmp_path / 'gone', Choice('6', '7'))
+    assert not (tmp_path / 'gone').exists()
+
+
+def test_a_piece_does_not_become_a_part_of_its_bag(origin: Path) -> None:
+    """Its folder is refused there, and nothing is made."""
+    before = sorted(origin.rglob('*'))
+    for out in (origin / 'piece', origin / 'a' / 'b', origin / '..' / NAME / 'c'):
+        with pytest.raises(BagError, match='within the bag'):
+            cut_folder(origin, out, Choice())
+    assert sorted(origin.rglob('*')) == before
 
 
 def test_an_existing_folder_is_left_alone(store: MemoryStore, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from bags.eventing import Buffer, buffer, until
-from bags.recording import ROBOT, WAIT_S, manifest, mission, numbers
+from bags.recording import ROBOT, STRING, WAIT_S, manifest, messages, mission, numbers
 from bags.test_recorder import kill
 from clocks import Clocks
 
@@ -151,6 +151,21 @@ def test_repeats_are_in_it_once(tmp_path: Path) -> None:
         it.pass_s(5.0)
         it.written()
         assert in_bag(it, only_bag(it)) == list(range(8))
+
+
+def test_what_is_latched_is_in_each_event(tmp_path: Path) -> None:
+    """Though it came long before; each time it counts as received, and nothing of it is missed."""
+    with buffer(tmp_path) as it:
+        it.ring.put(Lot('/tf_static', STRING, '', messages(range(40, 42))), None, it.now_s[0], 1)
+        it.pass_s(60.0)
+        for number, name in enumerate(('one', 'two'), 1):
+            it.hear(range(number, number + 1))
+            it.events.trigger(name, 'service')
+            it.pass_s(5.0)
+            it.written(number)
+        assert [in_bag(it, bag) for bag in it.bags()] == [[41, 1], [41, 2]]
+        row = it.rows()['/tf_static']
+        assert (row['received'], row['stored'], row['missed'], row['published']) == (2, 2, 0, 2)
 
 
 def test_it_ships_first_and_is_never_evicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -136,6 +136,23 @@ def test_a_growing_bag_can_be_opened_and_completed(tmp_path: Path) -> None:
     assert files(found.folder) == files(origin)
 
 
+def test_a_bag_of_which_a_slice_is_missing_can_be_opened_and_completed(tmp_path: Path) -> None:
+    """Though its metadata.yaml was faster, and names what is not there: what is missing is told, and fetched once it is there."""
+    folder = tmp_path / 'robot' / NAME
+    write_ours(folder)
+    store = MemoryStore()
+    stored(store, folder, without='_1.mcap')
+    for _ in range(2):
+        found = fetch(store, find_bag(store, 'thor', NAME), tmp_path)
+        assert (found.is_complete, found.missing) == (False, (f'{NAME}_1.mcap',))
+        assert len(by_rosbags(tmp_path / NAME)) == 2 * 550
+    path = folder / f'{NAME}_1.mcap'
+    store.put(put_item(path, f'thor/rosbags/{NAME}/{path.name}', NAME, 1))
+    found = fetch(store, find_bag(store, 'thor', NAME), tmp_path)
+    assert (found.is_complete, found.missing) == (True, ())
+    assert files(tmp_path / NAME) == files(folder)
+
+
 def test_a_foreign_bag_is_fetched_as_it_is(tmp_path: Path) -> None:
     """What another program put there without a checksum is told so."""
     write_rosbags(tmp_path / 'store' / BUCKET / 'thor' / 'rosbags' / 'theirs', StoragePlugin.SQLITE3, CompressionMode.NONE)

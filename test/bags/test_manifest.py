@@ -41,7 +41,8 @@ def test_read_as_written(manifest: Manifest) -> None:
 def test_the_fields_that_others_read() -> None:
     """Names and places are a contract with every reader of the store."""
     found = json.loads(WHOLE.to_json())
-    assert list(found) == ['version', 'bag', 'robot', 'mission', 'state', 'missing', 'topics', 'slices', 'event']
+    assert list(found) == ['version', 'bag', 'robot', 'mission', 'state', 'missing', 'topics', 'slices', 'event',
+                           'clock']  # fmt: skip
     assert found['version'] == 1
     assert list(found['slices'][0]) == ['file', 'key', 'bytes', 'sha256', 'messages', 't_start_ns', 't_end_ns', 'counts']
     assert found['mission'] == {'type': 'patrol', 'mission_id': 'm1', 'run_id': None}

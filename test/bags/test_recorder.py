@@ -113,7 +113,7 @@ def test_a_bag_follows_its_mission(tmp_path: Path) -> None:
 
 
 def test_one_bag_follows_the_other_without_a_gap(tmp_path: Path) -> None:
-    """Recording always, a mission has a bag of its own; the intake listens all the time."""
+    """Recording always, a mission has a bag of its own; the intake listens all the time, and is told of each that begins."""
     with desk(tmp_path, record='always') as it:
         names = [it.recorder.status().bag]
         for number, told in enumerate(({}, mission(), mission(number=2), {})):
@@ -127,7 +127,7 @@ def test_one_bag_follows_the_other_without_a_gap(tmp_path: Path) -> None:
         assert [numbers(found[f'{bag}/{bag}_0.mcap']) for bag in bags] == [
             list(range(10 * number, 10 * number + 10)) for number in range(4)
         ]
-        assert it.listening == [True, False]
+        assert it.listening == [True] * 4 + [False]
 
 
 def test_what_somebody_started_outlives_missions(tmp_path: Path) -> None:

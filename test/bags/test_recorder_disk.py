@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import threading
 from collections import Counter
 from pathlib import Path
@@ -9,7 +11,10 @@ from pathlib import Path
 import pytest
 from bags.recording import ROBOT, Desk, desk, manifest, numbers, start, write_out
 
+from shadowhound_data_logger.bags.naming import BUCKET
+from shadowhound_data_logger.bags.overview import NoStore, overview
 from shadowhound_data_logger.bags.slice_writer import SliceWriter
+from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.spool import ledger
 
 
@@ -45,16 +50,21 @@ def _retry(it: Desk) -> None:
     assert done.wait(10.0)
 
 
-@pytest.mark.parametrize('where', ['write', 'sync', 'close'])
-def test_a_disk_that_refuses_costs_what_it_did_not_take(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
-    """The broken slice is saved as far as it goes, the rest is dropped as unwritable, and the bag goes on."""
+@pytest.mark.parametrize(('where', 'number', 'reason'), [
+    ('write', errno.ENOSPC, 'no_room'), ('sync', errno.EIO, 'unwritable'), ('sync', errno.EDQUOT, 'no_room'),
+    ('close', errno.EROFS, 'unwritable'),
+])  # fmt: skip
+def test_a_disk_that_refuses_costs_what_it_did_not_take(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, number: int, reason: str
+) -> None:
+    """The broken slice is saved as far as it goes, the rest is dropped with the disk's reason, and the bag goes on."""
     with desk(tmp_path) as it:
         name = start(it.recorder)
         it.hear(range(5))
         write_out(it)
 
         def refuse(*_: object) -> None:
-            raise OSError(28, 'No space left on device')
+            raise OSError(number, os.strerror(number))
 
         with monkeypatch.context() as broken:
             broken.setattr(SliceWriter, where, refuse)
@@ -70,12 +80,12 @@ def test_a_disk_that_refuses_costs_what_it_did_not_take(tmp_path: Path, monkeypa
         kept = [each for number in range(2) for each in numbers(found[f'{name}/{name}_{number}.mcap'])]
         row = it.row()
         assert (row['received'], row['stored'], row['open']) == (20, len(kept), 0)
-        assert set(row['dropped']) == {'unwritable'}
+        assert set(row['dropped']) == {reason}
         assert kept[:5] + kept[-5:] == [*range(5), *range(15, 20)]
         said = manifest(found, name)
         assert said['state'] == ('gaps' if said['missing'] else 'complete')
         assert sum(each['messages'] for each in said['missing']) == 20 - len(kept)
-        assert all((each['topic'], each['reason']) == ('/talk', 'unwritable') for each in said['missing'])
+        assert all((each['topic'], each['reason']) == ('/talk', reason) for each in said['missing'])
         assert ledger.imbalances(ledger.read(it.spool.root, ROBOT)) == []
 
 
@@ -104,3 +114,43 @@ def test_what_did_not_get_in_is_in_the_manifest(tmp_path: Path) -> None:
         it.recorder.stop()
         said = manifest(it.objects(), name)
         assert (said['state'], said['missing']) == ('complete', [])
+
+
+def test_slices_that_the_full_spool_gave_up_are_in_the_manifest(tmp_path: Path) -> None:
+    """As missing, with their messages and the reason, and not among the slices: nobody waits for them."""
+    with desk(tmp_path, slice_bytes=1 << 20, spool={'max_bytes': 4 << 20}) as it:
+        name = start(it.recorder)
+        for first in range(0, 80, 10):
+            it.hear(range(first, first + 10), size=100_000)
+            write_out(it)
+        it.recorder.stop()
+        found = it.objects()
+        said = manifest(found, name)
+        lost = {each['file']: (each['messages'], each['topic'], each['reason']) for each in said['missing']}
+        kept = {each['file'] for each in said['slices']}
+        assert lost
+        assert f'{name}_0.mcap' in lost
+        assert kept == {key.partition('/')[2] for key in found if key.endswith('.mcap')}
+        assert not kept & lost.keys()
+        assert {(topic, reason) for _, topic, reason in lost.values()} == {(None, 'no_room')}
+        assert sum(each['messages'] for each in said['slices']) + sum(count for count, *_ in lost.values()) == 80
+        assert said['state'] == 'gaps'
+        assert f'{name}_0.mcap' not in found[f'{name}/metadata.yaml'].read_text()
+        row = it.row()
+        assert (row['stored'], row['stored_in']['evicted']) == (80, sum(count for count, *_ in lost.values()))
+
+
+def test_slices_that_are_given_up_after_the_end_are_told_on_the_robot(tmp_path: Path) -> None:
+    """Their manifest was made already: the list says why they never come."""
+    with desk(tmp_path, slice_bytes=1 << 20, spool={'max_bytes': 4 << 20}) as it:
+        start(it.recorder)
+        it.hear(range(20), size=100_000)
+        it.recorder.stop()
+        (row,) = overview(NoStore(), ROBOT, it.home)
+        assert (row.state, row.finding) == ('complete', '')
+        more = DataObject(bucket=BUCKET, key='more', body=bytes(3 << 20), content_type='', sensor='imu', topic=None, type='',
+                          samples=0, t_start_ns=0, t_end_ns=0, priority=1)  # fmt: skip
+        it.spool.commit([more])
+        (row,) = overview(NoStore(), ROBOT, it.home)
+        assert row.state == 'growing'
+        assert row.finding == '1 of 1 slices are not here; 1 were given up by the full spool of this machine'

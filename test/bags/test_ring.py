@@ -119,3 +119,70 @@ def test_memory_is_bounded_by_the_limit_of_bytes(size: int) -> None:
     grown, used = map(float, ran.stdout.split())
     assert 0.9 < used <= 1.0
     assert grown <= 1.1
+
+
+def latched(*numbers: int, publisher: str | None = 'p', size: int = 0) -> Lot:
+    found = lot(range(min(numbers), max(numbers) + 1), '/tf_static', size)
+    return found._replace(messages=[each._replace(publisher=publisher) for each in found.messages])
+
+
+def of_event(ring: Ring) -> list[tuple[str, str | None, list[int], bool]]:
+    """What an event gets: topic, publisher, numbers, and whether it is there once more."""
+    found = list(iter(lambda: ring.next(float('inf')), None))
+    return [(held.lot.topic, held.lot.messages[0].publisher, told(held), held.again) for held in found]
+
+
+def test_what_is_latched_is_at_the_start_of_each_event() -> None:
+    """The last message of each publisher, however long ago it left the ring, with the time of the oldest that is there."""
+    ring = Ring(1 << 20, KEEP_S)
+    ring.put(latched(1, 2), None, 0.0, 2)
+    ring.put(latched(5, publisher='q'), None, 0.0, 2)
+    ring.put(lot(range(7, 8)), None, 50.0)
+    for _ in range(2):
+        ring.put(lot(range(8, 9)), None, 100.0)
+        ring.claim(95.0)
+        first = ring.next(100.0)
+        assert first is not None
+        assert (first.lot.messages[0].number, first.again) == (2, True)
+        assert first.lot.messages[0].received_ns == messages(range(8, 9))[0].received_ns
+        assert first.lot.messages[0].source_ns == messages(range(2, 3))[0].source_ns
+        assert of_event(ring) == [('/tf_static', 'q', [5], True), ('/talk', 'p', [8], False)]
+        ring.release()
+    ring.put(latched(3), None, 100.0, 2)
+    ring.claim(95.0)
+    assert of_event(ring) == [('/tf_static', 'p', [2], True), ('/tf_static', 'q', [5], True), ('/tf_static', 'p', [3], False)]
+    ring.claim(95.0)
+    assert of_event(ring) == [('/tf_static', 'q', [5], True), ('/tf_static', 'p', [3], True)]
+
+
+def test_without_senders_as_many_are_latched_as_there_are() -> None:
+    """Where the middleware does not say who sent what (Humble), the last ones stay, as many as there are publishers."""
+    ring = Ring(1 << 20, KEEP_S)
+    ring.put(latched(1, 2, 3, publisher=None), None, 0.0, 2)
+    ring.put(latched(3, publisher=None), None, 0.0, 2)
+    ring.claim(50.0)
+    assert of_event(ring) == [('/tf_static', None, [2], True), ('/tf_static', None, [3], True)]
+
+
+def test_an_event_without_anything_else_begins_with_what_is_latched() -> None:
+    """Now; and one that is over leaves nothing for the next."""
+    ring = Ring(1 << 20, KEEP_S)
+    ring.put(latched(1), None, 0.0, 1)
+    for now_ns in (77, 78):
+        assert ring.claim(50.0, now_ns) is None
+        ring.release()
+    ring.claim(50.0, 79)
+    (held,) = iter(lambda: ring.next(60.0), None)
+    assert held.lot.messages[0].received_ns == 79
+
+
+def test_what_is_latched_counts_as_bytes() -> None:
+    """At most half of the ring is for it, and what no room is left for is not kept."""
+    ring = Ring(1 << 20, KEEP_S)
+    for number in range(12):
+        ring.put(latched(number, publisher=str(number), size=100_000), None, 0.0, 12)
+        assert ring.bytes <= ring.max_bytes
+    ring.put(lot(range(3)), None, 50.0)
+    assert 500_000 < ring.bytes < 600_000
+    ring.claim(0.0)
+    assert [numbers for topic, _, numbers, _ in of_event(ring) if topic == '/tf_static'] == [[0], [1], [2], [3], [4]]

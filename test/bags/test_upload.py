@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import os
 import shutil
 import tarfile
+import time
 from contextlib import closing
 from pathlib import Path
 
@@ -158,6 +160,24 @@ def test_an_unfinished_bag_is_refused(settings: Settings, tmp_path: Path, what: 
     assert not settings.home.exists()
 
 
+def test_a_bag_that_is_changed_after_it_was_spooled(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
+    """What small files were is sent; a slice that is not what it was is refused, and never sent under its name."""
+    write_ours(tmp_path / NAME, slices=2, each=1500)
+    before = contents(tmp_path / NAME)
+    with parcel(tmp_path / NAME, 'thor', NAME, settings.home, is_archive=False) as sent, opened_spool(settings, CLOCK) as spool:
+        spool_parcel(sent, spool)
+        for name in ('metadata.yaml', f'{NAME}_0.mcap'):
+            with (tmp_path / NAME / name).open('ab') as file:
+                file.write(b'# more')
+        with pytest.raises(BagError, match=f'{NAME}_0.mcap is quarantined .damaged'):
+            deliver(settings, spool, sent, deadline_s=DEADLINE_S)
+    there = {file.name: store.get(BUCKET, file.key) for file in find_bag(store, 'thor', NAME).files}
+    assert f'{NAME}_0.mcap' not in there
+    assert {name: there[name] for name in before if name in there and name != MANIFEST} == {
+        name: before[name] for name in there if name != MANIFEST
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize('is_archive', [False, True])
 def test_a_link_out_of_the_bag_is_refused(settings: Settings, tmp_path: Path, is_archive: bool) -> None:
     """Neither is what it names sent, nor an archive in which it names something else."""
@@ -218,6 +238,28 @@ def test_a_watched_bag_is_shipped_once_it_is_finished(settings: Settings, store:
     assert steps(again) == []
     assert (folder / NAME / 'notes.txt').exists()
     assert len(find_bag(store, 'thor', NAME).files) == 6
+
+
+def test_a_bag_that_nobody_finishes_is_told_once(settings: Settings, tmp_path: Path) -> None:
+    """After ten minutes without a change; it is not sent, it is owed, and once somebody goes on with it all is as before."""
+    folder = tmp_path / 'recordings'
+    write_ours(folder / NAME, is_ended=False)
+    (folder / 'empty').mkdir()
+    watching = watch(settings, folder, Hand())
+    assert steps(watching) == []
+    assert not watching.is_owing()
+    long_ago = time.time() - 700
+    for path in (folder / NAME).iterdir():
+        os.utime(path, (long_ago, long_ago))
+    (step,) = watching.round()
+    assert (step.bag, step.what) == (NAME, 'refused')
+    assert 'no metadata.yaml, and nothing in it has changed for 10 min' in step.reason
+    assert steps(watching) == []
+    assert watching.is_owing()
+    (folder / NAME / f'{NAME}_3.mcap').write_bytes(b'more')
+    assert steps(watching) == []
+    assert not watching.is_owing()
+    assert not settings.home.exists()
 
 
 def test_a_bag_is_removed_only_when_the_store_has_it(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:

@@ -12,13 +12,16 @@ pytest.importorskip('rclpy')
 from capture.test_stream import NOON_NS, TOPIC, TYPE
 
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
+from shadowhound_data_logger.bags.topics import Choice
+from shadowhound_data_logger.capture.bag_sources import BagSources
 from shadowhound_data_logger.capture.bag_tap import BagStream, BagTap
 from shadowhound_data_logger.capture.endpoints import Senders
 from shadowhound_data_logger.capture.stream import Shared, Stream
 from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, Taken
+from shadowhound_data_logger.options import BagSettings
 from shadowhound_data_logger.spool.accounts import BAG, Accounts, TopicAccount
 
 
@@ -153,3 +156,15 @@ def test_what_is_latched_is_in_each_bag() -> None:
     assert ear.heard() == [1, 2, 3]
     assert (ear.account.received, ear.account.missed) == (5, 0)
     assert ear.account.publishers['p'].published == 5
+
+
+@pytest.mark.parametrize(('named', 'expected'), [((), {'/imu', '/odom'}), (('/rosout',), {'/rosout'})])
+def test_what_only_the_ring_takes_is_in_a_bag_where_it_is_named_alone(named: tuple[str, ...], expected: set[str]) -> None:
+    """Without settings a bag has what the sensors take, whatever events keep; what is named needs no subscription more."""
+    tap = SimpleNamespace(topics=frozenset())
+    choice, graph, nothing = Choice(BagSettings(), named), Any, Any
+    sources = BagSources(graph, choice, tap, IntakeSettings(), nothing, nothing)  # type: ignore[arg-type]
+    sensors = dict.fromkeys(('/imu', '/odom'), False)
+    sources.refresh(sensors | {'/rosout': False}, sensors, 0.0, paused=False)
+    assert tap.topics == expected
+    assert not sources.own

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from shadowhound_data_logger.bags import events, recorder
 from shadowhound_data_logger.capture.watchdog import Watchdog
 
 REQUEST_S = 35.0
@@ -17,8 +18,8 @@ STATUS: dict[str, Any] = {
     'topics': {'/imu': TOPIC}, 'queue': {'batches': 0, 'finished': 0}, 'spool': {'pending': 0},
     'store': {'state': 'idle', 'delivered': 0, 'quarantined': 0, 'mbps': 0.0, 'in_flight': 0, 'deferred': 0, 'last_error': ''},
     'workers': {name: {**WORKER, 'patience_s': patience_s} for name, patience_s in
-                {'intake': 5.0, 'encode-0': 60.0, 'spool-writer': 12.0, 'mission': 30.0, 'upload-lock': None,
-                 'upload-0': None}.items()},
+                {'intake': 5.0, 'encode-0': 60.0, 'spool-writer': 12.0, 'mission': 30.0, 'event-writer': 30.0,
+                 'upload-lock': None, 'upload-0': None}.items()},
 }  # fmt: skip
 
 
@@ -155,7 +156,8 @@ def test_an_intake_that_takes_nothing_is_the_one_cause(watch: Watch, trouble: di
 @pytest.mark.parametrize(
     ('name', 'busy_s', 'words'),
     [('intake', 5.1, 'takes no messages for 5 s'), ('spool-writer', 12.1, 'its disk does not answer'),
-     ('encode-0', 61.0, 'one batch has taken 61 s'), ('mission', 31.0, 'missions are not followed for 31 s')],
+     ('encode-0', 61.0, 'one batch has taken 61 s'), ('mission', 31.0, 'missions are not followed for 31 s'),
+     ('event-writer', 31.0, 'nothing more is written to its bag for 31 s')],
 )  # fmt: skip
 def test_a_round_that_hangs(stages: Watch, name: str, busy_s: float, words: str) -> None:
     """Each thread has its own patience; for the one that holds the drain lock any length is fine."""
@@ -218,3 +220,9 @@ def test_a_disk_that_fails_is_the_one_cause(stages: Watch, trouble: dict[str, An
     stages.workers['spool-writer'] |= trouble
     for _ in range(100):
         assert set(stages.look()) <= {'spool-writer'}
+
+
+@pytest.mark.parametrize(('idle_s', 'patience_s'), [(events.IDLE_S, events.PATIENCE_S), (recorder.IDLE_S, recorder.PATIENCE_S)])
+def test_a_writer_without_anything_to_write_does_not_seem_to_hang(idle_s: float, patience_s: float) -> None:
+    """Its rounds are far shorter than what is held for a hang: a machine under load may wake it late."""
+    assert idle_s <= patience_s / 2

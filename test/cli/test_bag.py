@@ -121,7 +121,7 @@ def test_an_away_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(('arguments', 'error', 'text'), [
     (('info', 'patrol_2025'), BagError, f'there is {NAME}'),
-    (('cut', NAME, '--topic', '/imv', '-o', 'new'), BagError, 'it has /imu'),
+    (('cut', NAME, '--topic', '/imv', '-o', 'new'), BagError, 'is it /imu?'),
     (('cut', NAME, '--start', 'noon', '-o', 'new'), SettingError, 'seconds since the start'),
     (('list', '--since', 'yesterday'), SettingError, '12h'),
     (('upload', '/nowhere'), BagError, 'is no folder'),

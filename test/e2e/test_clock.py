@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import calendar
 import json
 import os
 import shutil
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from e2e.bag_reading import bags
 from e2e.processes import HERE, Node, Processes, until
 from e2e.reading import STRING, Objects, texts
 
@@ -114,6 +116,38 @@ def test_a_clock_that_is_set_later(robot: Robot) -> None:
     assert not [key for key in keys if '1970' in key or '_unsynced' in key]
     check_dates(robot, robot.objects())
     assert 'set_later' in robot.clocks_of('_ledger'), 'that of the stop in 1970'
+
+
+def test_bags_of_a_clock_that_is_set_later(robot: Robot, tmp_path: Path) -> None:
+    """Each has the date at which it began, also one that ended before anybody knew it; none spans the moment, nothing is lost."""
+    robot.node.stop()
+    began_ns = [time.time_ns()]
+    robot.start(**{'bag.record': 'always'})
+    robot.publish()
+    first = robot.node.stop()['bags']['/talk']
+    assert (first['stored'], first['open']) == (0, GROUP)
+    began_ns.append(time.time_ns())
+    robot.start(**{'bag.record': 'always'})
+    robot.publish()
+    robot.set_clock()
+    began_ns.append(time.time_ns())
+    until(lambda: 'the clock was set' in robot.node.log, 'the node knows')
+    robot.publish()
+    ledger = robot.node.stop()
+    assert {row['open'] for row in ledger['bags'].values()} == {0}
+    assert ledger['bags']['/talk']['stored'] == ledger['bags']['/slow']['stored'] == 3 * GROUP
+    with closing(DirectoryStore(robot.node.home / 'store')) as store:
+        store.open()
+        found = bags(store, robot.node.robot, tmp_path / 'bags')
+    assert [bag.check() for bag in found] == [{'/talk': GROUP, '/slow': GROUP}] * 3
+    for bag, early_ns, span in zip(found, began_ns, robot.spans, strict=True):
+        clock = bag.manifest['clock']
+        assert (clock is None) == (bag is found[-1])
+        named_ns = calendar.timegm(time.strptime(bag.folder.name, 'recording_%Y%m%d_%H%M%S')) * SECOND
+        assert early_ns - 2 * SECOND <= named_ns <= span[0]
+        for message in bag.messages():
+            assert span[0] - RIGHT_NS <= message.log_ns + (clock['offset_ns'] if clock else 0) <= span[1] + RIGHT_NS
+    assert not list((robot.node.home / 'bags' / robot.node.robot).iterdir())
 
 
 def check_dates(robot: Robot, objects: Objects) -> None:

@@ -1,20 +1,20 @@
 """Gives the node another wall clock: copied as sitecustomize.py to where a Python finds it at its start.
 
-While there is a file WRONG_CLOCK the clock is as many nanoseconds behind as it says, and so are the publishers' source
-timestamps, as those of a driver on the same machine are.
+While there is a file WRONG_CLOCK the clock is as many nanoseconds behind as it says, and so are the times at which messages
+were sent, by a driver on the same machine, and received.
 """
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from shadowhound_data_logger.capture.stream import Stream, Taken
+from shadowhound_data_logger.capture.reader import Reader
 from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.model import Taken
 
 behind = Path(os.environ['WRONG_CLOCK'])
-add = Stream.add
+drain = Reader.drain
 
 
 def behind_ns() -> int:
@@ -24,10 +24,11 @@ def behind_ns() -> int:
         return 0
 
 
-def add_behind(stream: Stream, taken: Sequence[Taken], *arguments: Any, **named: Any) -> None:
+def drain_behind(reader: Reader) -> Iterator[Taken]:
     shift_ns = behind_ns()
-    add(stream, [one._replace(source_ns=one.source_ns - shift_ns) for one in taken], *arguments, **named)
+    for one in drain(reader):
+        yield one._replace(source_ns=one.source_ns - shift_ns, received_ns=one.received_ns - shift_ns)
 
 
 SystemClock.wall_ns = lambda _: time.time_ns() - behind_ns()  # type: ignore[method-assign]
-Stream.add = add_behind  # type: ignore[method-assign]
+Reader.drain = drain_behind  # type: ignore[method-assign]

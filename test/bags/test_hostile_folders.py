@@ -1,0 +1,154 @@
+"""Whatever lies in the folder of a bag at a start: nothing outside is touched, the node starts, the other bags are made whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bags.recording import ROBOT, desk, manifest
+from bags.slices import closed, fill, messages
+
+from shadowhound_data_logger.bags.notes import FILE, MOST_BYTES, Notes
+from shadowhound_data_logger.bags.slice_writer import SliceWriter
+
+BAG = 'patrol_20251018_120000'
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Of a bag that was cut off: a slice that is whole, and one that is open, each with ten messages."""
+    made = tmp_path / 'home' / 'bags' / ROBOT / BAG
+    notes = Notes.begin(made, ROBOT, None)
+    notes.add_slice(closed(made / f'{BAG}_0.mcap', 10)[0])
+    writer = SliceWriter(made / f'{BAG}_1.mcap')
+    fill(writer, messages(10))
+    writer.sync()
+    writer.abort()
+    return made
+
+
+def recovered(home: Path) -> dict[str, Path]:
+    """What is in the spool after a start."""
+    with desk(home) as it:
+        it.recorder._salvage.worker.join(20.0)
+        assert it.recorder._salvage.worker.failures == 0
+        return dict(it.objects())
+
+
+def counts(found: dict[str, Path], home: Path) -> dict[str, int]:
+    """Slice -> messages, as the manifest tells it."""
+    (path,) = home.glob(f'spool/ready/*/{ROBOT}/rosbags/{BAG}/manifest.json')
+    return {entry['file'].removeprefix(f'{BAG}_'): entry['messages'] for entry in json.loads(path.read_bytes())['slices']}
+
+
+WHOLE = {'0.mcap': 10, '1.mcap': 10}
+
+
+def test_links_are_not_followed(folder: Path, tmp_path: Path) -> None:
+    """A slice, an open one, a bag: what a link leads to stays as it is, and the link is set aside."""
+    home, precious = tmp_path / 'home', tmp_path / 'precious.mcap.open'
+    closed(tmp_path / 'other.mcap', 5)
+    precious.write_bytes(b'precious')
+    before = {path: path.read_bytes() for path in (precious, tmp_path / 'other.mcap')}
+    (folder / f'{BAG}_2.mcap.open').symlink_to(precious)
+    (folder / f'{BAG}_3.mcap').symlink_to(tmp_path / 'other.mcap')
+    (folder.parent / 'linked_20251018_120000').symlink_to(tmp_path)
+    assert counts(recovered(home), home) == WHOLE
+    assert {path: path.read_bytes() for path in before} == before
+    aside = home / 'bags' / f'{ROBOT}.damaged' / BAG
+    assert sorted(path.name for path in aside.iterdir()) == [f'{BAG}_2.mcap.open', f'{BAG}_3.mcap']
+    assert all(path.is_symlink() for path in aside.iterdir())
+
+
+def test_notes_that_are_a_link_are_not_followed(folder: Path, tmp_path: Path) -> None:
+    """Nothing is written where they lead to, and the slices tell of themselves."""
+    precious = tmp_path / 'precious'
+    precious.write_text('precious')
+    (folder / FILE).unlink()
+    (folder / FILE).symlink_to(precious)
+    assert counts(recovered(tmp_path / 'home'), tmp_path / 'home') == WHOLE
+    assert precious.read_text() == 'precious'
+
+
+def test_what_is_no_slice_is_set_aside(folder: Path, tmp_path: Path) -> None:
+    """A folder, a slice of another bag, a name without a number; twice of one name as well."""
+    home = tmp_path / 'home'
+    (folder / f'{BAG}_5.mcap').mkdir()
+    (folder / 'other_20251018_120000_0.mcap').write_bytes(b'')
+    (folder / 'x.mcap.open').write_bytes(b'x')
+    aside = home / 'bags' / f'{ROBOT}.damaged' / BAG
+    aside.mkdir(parents=True)
+    (aside / 'x.mcap.open').write_bytes(b'before')
+    assert counts(recovered(home), home) == WHOLE
+    assert sorted(path.name for path in aside.iterdir()) == [
+        'other_20251018_120000_0.mcap', f'{BAG}_5.mcap', 'x.mcap.open', 'x.mcap.open.1',
+    ]  # fmt: skip
+    assert (aside / 'x.mcap.open').read_bytes() == b'before'
+
+
+SLICE: dict[str, Any] = {'file': f'{BAG}_0.mcap', 'bytes': 1, 'sha256': 'ab' * 32, 't_start_ns': 1, 't_end_ns': 2, 'messages': 3,
+                         'counts': {'/talk': 3}, 'channels': []}  # fmt: skip
+
+
+@pytest.mark.parametrize('content', [
+    b'', b'\0' * 5000, os.urandom(5000), b'{"slice": ', b'[' * 100_000, b'{"a":' * 100_000, b'[1]\n7\n"x"\nnull\n',
+    b'{"slice": {"file": "../../../precious", "bytes": 1}}',
+    json.dumps({'slice': {**SLICE, 'file': '../../../precious'}}).encode(),
+    json.dumps({'slice': {**SLICE, 'messages': '3'}}).encode(), json.dumps({'slice': {**SLICE, 't_end_ns': 1 << 80}}).encode(),
+    json.dumps({'slice': {**SLICE, 'channels': [{'topic': 7}]}}).encode(), b'{"missing": {"file": 1}}\n{"mission": "patrol"}',
+    b'{"event": {"name": "x", "triggers": 5}}', b'{"named": {"bag": "../../x", "clock": null}}', b'{"clock": {"boot_id": 1}}',
+])  # fmt: skip
+def test_notes_that_make_no_sense(folder: Path, tmp_path: Path, content: bytes) -> None:
+    """They cost what they would have told: what is in the folder is recovered by what it is."""
+    precious = tmp_path / 'home' / 'precious'
+    precious.write_text('precious')
+    (folder / FILE).write_bytes(content)
+    home = tmp_path / 'home'
+    found = recovered(home)
+    assert counts(found, home) == WHOLE
+    assert manifest({f'{BAG}/manifest.json': found[f'{BAG}/manifest.json']}, BAG)['state'] == 'recovered'
+    assert precious.read_text() == 'precious'
+    assert not folder.exists()
+
+
+def test_what_follows_a_line_that_makes_no_sense_counts(folder: Path) -> None:
+    """Also after one that is longer than any line may be."""
+    with (folder / FILE).open('ab') as file:
+        file.write(b'{"slice": "' + b'x' * (5 << 20) + b'"}\n\xff\xfe\n{"ended": true}\n')
+    notes = Notes.read(folder, ROBOT)
+    assert (list(notes.slices), notes.ended) == ([f'{BAG}_0.mcap'], True)
+
+
+def test_notes_of_any_size_take_little_memory(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A file that has grown to gigabytes, in one line or none."""
+    os.truncate(folder / FILE, 4 * MOST_BYTES)
+    tracemalloc.start()
+    notes = Notes.read(folder, ROBOT)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert list(notes.slices) == [f'{BAG}_0.mcap']
+    assert peak < 20 << 20
+    assert 'the rest of it is not read' in caplog.text
+
+
+def test_a_bag_that_cannot_be_made_whole_keeps_none_of_the_others(folder: Path, tmp_path: Path) -> None:
+    """It is tried again; those after it are whole meanwhile, and the node records."""
+    later = folder.with_name('patrol_20251018_130000')
+    Notes.begin(later, ROBOT, None).add_slice(closed(later / f'{later.name}_0.mcap', 7)[0])
+    (folder / f'{BAG}_1.mcap').write_bytes(b'in the way of the open slice')
+    with desk(tmp_path / 'home') as it:
+        for _ in range(200):
+            if f'{later.name}/manifest.json' in it.objects():
+                break
+            it.recorder._salvage.worker.join(0.05)
+        assert numbers_of(it.objects(), later.name) == 7
+        assert it.recorder._salvage.is_busy
+        assert it.recorder.start()[0]
+
+
+def numbers_of(found: dict[str, Path], bag: str) -> int:
+    return sum(entry['messages'] for entry in manifest(found, bag)['slices'])

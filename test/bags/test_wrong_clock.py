@@ -1,0 +1,246 @@
+"""A bag that begins before the clock is set gets the date at which it began, or a name that says that nobody knows it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from bags.eventing import buffer, until
+from bags.recording import ROBOT, STRING, Desk, desk, manifest, mission, numbers, start
+from bags.test_recorder import kill
+from clocks import NOON_NS, Clocks
+from mcap.reader import make_reader
+
+from shadowhound_data_logger.bags.naming import slice_number
+from shadowhound_data_logger.bags.notes import Notes
+from shadowhound_data_logger.bags.overview import NoStore, overview
+from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.keys import unsynced
+from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.spool.accounts import BAG
+
+UNSET = 'recording_unsynced_this-boot_00000060'
+
+
+def hear(it: Desk, clock: Clocks, numbers: range) -> None:
+    """Messages that came just now, as this machine's clock has it."""
+    came_ns = clock.wall_ns()
+    heard = [Taken(b'\0\1\0\0%08d' % number, came_ns, 'p', number, came_ns + number * 1000) for number in numbers]
+    with it.spool.accounts.entry(f'{BAG}/talk') as account:
+        for message in heard:
+            assert account.receive(message.publisher, message.number)
+    it.queue.put(Lot('/talk', STRING, '', heard))
+
+
+def log_times(path: Path) -> list[int]:
+    with path.open('rb') as file:
+        return [message.log_time for *_, message in make_reader(file).iter_messages()]
+
+
+def bags_of(found: dict[str, Path]) -> dict[str, list[int]]:
+    """Bag -> the numbers of its messages, in the order of its slices."""
+    names = sorted({key.partition('/')[0] for key in found})
+    slices = {bag: [key for key in found if key.startswith(f'{bag}/') and key.endswith('.mcap')] for bag in names}
+    order = {bag: sorted(keys, key=lambda key: slice_number(bag, key.partition('/')[2]) or 0) for bag, keys in slices.items()}
+    return {bag: [number for key in keys for number in numbers(found[key])] for bag, keys in order.items()}
+
+
+def is_whole(it: Desk) -> None:
+    it.recorder._salvage.worker.join(20.0)
+    assert not it.recorder._salvage.is_busy
+
+
+def test_a_bag_never_spans_the_moment_in_which_the_clock_is_set(tmp_path: Path) -> None:
+    """It ends then and leaves under the date at which it began; another follows without a message between them."""
+    clock = Clocks()
+    with desk(tmp_path, clock, record='always') as it:
+        assert it.recorder.status().bag == UNSET
+        hear(it, clock, range(5))
+        it.recorder.split()
+        it.recorder.look()
+        hear(it, clock, range(5, 10))
+        assert it.objects() == {}
+        clock.wait(30.0)
+        clock.set(NOON_NS)
+        hear(it, clock, range(10, 12))
+        it.recorder.look()
+        it.recorder.look()
+        hear(it, clock, range(12, 15))
+        it.recorder.stop()
+        found = it.objects()
+        first, second = 'recording_20251018_115930', 'recording_20251018_120000'
+        assert bags_of(found) == {first: [*range(12)], second: [12, 13, 14]}
+        said = manifest(found, first)
+        assert (said['bag'], said['state'], said['missing']) == (first, 'complete', [])
+        offset_ns = NOON_NS - 30 * SECOND - 70 * SECOND
+        assert said['clock'] == {
+            'known': 'set_later', 'boot_id': 'this-boot', 'boot_ns': 60 * SECOND, 'wall_ns': 70 * SECOND, 'offset_ns': offset_ns,
+        }  # fmt: skip
+        assert [entry['file'] for entry in said['slices']] == [f'{first}_0.mcap', f'{first}_1.mcap']
+        assert manifest(found, second)['clock'] is None
+        assert f'{first}_1.mcap' in found[f'{first}/metadata.yaml'].read_text()
+        assert f'clock_offset_ns: "{offset_ns}"' in found[f'{first}/metadata.yaml'].read_text()
+        times = [time for file in (0, 1) for time in log_times(found[f'{first}/{first}_{file}.mcap'])]
+        assert times[-1] - times[0] == pytest.approx(30 * SECOND, abs=SECOND)
+        assert times[-1] + offset_ns == pytest.approx(NOON_NS, abs=SECOND)
+        assert (it.row()['stored'], it.row()['open'], it.row()['dropped']) == (15, 0, {})
+
+
+def test_what_came_before_the_clock_was_set_has_a_right_time_in_a_later_bag(tmp_path: Path) -> None:
+    """It waited in the queue meanwhile: its time is told by the clock of the bag that it is in."""
+    clock = Clocks()
+    with desk(tmp_path, clock) as it:
+        early = Clocks()
+        clock.set(NOON_NS)
+        name = start(it.recorder)
+        hear(it, early, range(1))
+        hear(it, clock, range(1, 2))
+        it.recorder.stop()
+        assert log_times(it.objects()[f'{name}/{name}_0.mcap']) == [NOON_NS, NOON_NS + 1000]
+
+
+def test_a_bag_that_ends_before_the_clock_is_set_waits_for_it(tmp_path: Path) -> None:
+    """In its folder, as the stop says; it is whole in the spool under its date as soon as that is known."""
+    clock = Clocks()
+    with desk(tmp_path, clock) as it:
+        it.recorder.on_mission(mission())
+        name = start(it.recorder)
+        hear(it, clock, range(3))
+        done, text = it.recorder.stop()
+        assert (done, text) == (True, f'{name}: 3 messages in 1 slices; it waits for the clock of this machine to be set')
+        assert it.recorder._salvage.is_busy
+        assert it.objects() == {}
+        assert it.row()['open'] == 3
+        (row,) = overview(NoStore(), ROBOT, it.home)
+        assert (row.bag, row.where) == (name, {'recording': 1})
+        clock.set(NOON_NS)
+        is_whole(it)
+        found = it.objects()
+        assert bags_of(found) == {'patrol_20251018_120000': [0, 1, 2]}
+        assert manifest(found, 'patrol_20251018_120000')['state'] == 'complete'
+        (row,) = overview(NoStore(), ROBOT, it.home)
+        assert row.t_start_ns == pytest.approx(NOON_NS, abs=SECOND)
+        assert (it.row()['stored'], it.row()['received'], it.row()['open']) == (3, 3, 0)
+        assert not list(it.root.iterdir())
+
+
+def test_a_clock_that_is_not_set_for_too_long(tmp_path: Path) -> None:
+    """What began before leaves under the name of its boot, as objects do, and says that its date is not known."""
+    clock = Clocks()
+    with desk(tmp_path, clock, record='always') as it:
+        hear(it, clock, range(3))
+        clock.wait(601.0)
+        it.recorder.look()
+        hear(it, clock, range(3, 5))
+        assert it.recorder.status().bag == 'recording_unsynced_this-boot_00000661'
+        it.recorder.split()
+        found = it.objects()
+        assert bags_of(found) == {UNSET: [0, 1, 2]}
+        said = manifest(found, UNSET)['clock']
+        assert (said['known'], said['offset_ns']) == ('unset', None)
+        (row,) = [row for row in overview(NoStore(), ROBOT, it.home) if row.bag == UNSET]
+        assert (row.state, row.messages, row.t_start_ns) == ('complete', 3, None)
+        item = next(item for item in it.spool.pending(10) if item.key.endswith('.mcap'))
+        assert {name: item.metadata[name] for name in ('clock', 'boot_id', 'boot_start_ns', 'boot_end_ns')} == {
+            'clock': 'unset', 'boot_id': 'this-boot', 'boot_start_ns': str(60 * SECOND), 'boot_end_ns': str(60 * SECOND + 2000),
+        }  # fmt: skip
+        assert 't_start_ns' not in item.metadata
+        boot, seconds = unsynced(ROBOT, 'this-boot', 'camera', 60 * SECOND, 'x.jpg').split('/')[2:5:2]
+        assert f'recording_unsynced_{boot}_{seconds.partition("_")[0]}' == UNSET
+
+
+def left_in_1970(home: Path, boot_id: str = 'this-boot') -> Path:
+    """A home whose node died while it recorded, before the clock was set."""
+    clock = Clocks(boot_id=boot_id)
+    with desk(home, clock, record='always') as it:
+        hear(it, clock, range(5))
+        it.recorder.split()
+        assert it.row()['open'] == 5
+        return kill(home)
+
+
+def test_a_start_in_the_same_boot_waits_as_well(tmp_path: Path) -> None:
+    """What a dead node left is dated once the clock is set, and says that it was cut off."""
+    left = left_in_1970(tmp_path / 'home')
+    clock = Clocks()
+    with desk(left, clock) as it:
+        assert it.recorder._salvage.is_busy
+        assert it.objects() == {}
+        clock.set(NOON_NS)
+        is_whole(it)
+        found = it.objects()
+        assert bags_of(found) == {'recording_20251018_120000': [*range(5)]}
+        said = manifest(found, 'recording_20251018_120000')
+        assert (said['state'], said['clock']['known']) == ('recovered', 'set_later')
+        assert said['missing'][0]['file'] == 'recording_20251018_120000_0.mcap'
+        assert (it.row()['stored'], it.row()['open'], it.row()['dropped']) == (5, 0, {})
+
+
+@pytest.mark.parametrize('offset_ns', [None, NOON_NS - 60 * SECOND])
+def test_a_start_in_another_boot(tmp_path: Path, offset_ns: int | None) -> None:
+    """It ships at once: under the date if that boot's clock was set after all, else under the name of that boot."""
+    left = left_in_1970(tmp_path / 'home')
+    clock = Clocks(boot_id='next-boot')
+    with desk(left, clock, offsets={'this-boot': offset_ns} if offset_ns else {}, record='always') as it:
+        is_whole(it)
+        (bag,) = bags_of(it.objects())
+        assert bag == (UNSET if offset_ns is None else 'recording_20251018_120000')
+        assert it.recorder.status().bag == 'recording_unsynced_next-boot_00000060'
+
+
+def test_a_name_that_was_decided_stays(tmp_path: Path) -> None:
+    """Whatever becomes of the clock after a death between two slices: a bag has one name."""
+    left = left_in_1970(tmp_path / 'home')
+    (folder,) = (left / 'bags' / ROBOT).iterdir()
+    for hour in range(2):
+        clock = Clocks()
+        clock.set(NOON_NS + hour * 3600 * SECOND)
+        notes = Notes.read(folder, ROBOT)
+        assert notes.is_named is bool(hour)
+        assert Place(folder.parent, ROBOT, clock, lambda _: False).settle(notes)
+        assert notes.bag == 'recording_20251018_120000'
+
+
+def test_an_event_before_the_clock_is_set(tmp_path: Path) -> None:
+    """As any bag; the seconds before the trigger, and its time, are by the clock of the event."""
+    clock = Clocks()
+    with buffer(tmp_path, clock) as it:
+        came_ns = clock.wall_ns()
+        it.ring.put(Lot('/talk', STRING, '', [Taken(b'\0\1\0\0%08d' % 1, came_ns, 'p', 1, came_ns)]), None, it.now_s[0])
+        text = it.events.trigger('fall', 'service')[1]
+        assert text == 'event_fall_unsynced_this-boot_00000060 begins'
+        it.taken()
+        clock.set(NOON_NS)
+        clock.wait(1.0)
+        it.ring.put(Lot('/talk', STRING, '', [Taken(b'\0\1\0\0%08d' % 2, 0, 'p', 2, clock.wall_ns())]), None, it.now_s[0])
+        it.events.trigger('again', 'service')
+        it.pass_s(5.0)
+        it.written()
+        (bag,) = it.bags()
+        assert bag == 'event_fall_20251018_120000'
+        said = manifest(it.objects(), bag)
+        times = log_times(it.objects()[f'{bag}/{bag}_0.mcap'])
+        assert times == [70 * SECOND, 71 * SECOND]
+        assert [trigger['at_ns'] for trigger in said['event']['triggers']] == [70 * SECOND, 71 * SECOND]
+        assert said['clock']['offset_ns'] == NOON_NS - 70 * SECOND
+        row = it.rows()['/talk']
+        assert (row['received'], row['stored'], row['open']) == (2, 2, 0)
+
+
+def test_two_events_wait_at_the_same_time(tmp_path: Path) -> None:
+    """Both leave, each under its own date."""
+    clock = Clocks()
+    with buffer(tmp_path, clock) as it:
+        for number, name in enumerate(('one', 'two'), 1):
+            it.ring.put(Lot('/talk', STRING, '', [Taken(b'\0\1\0\0%08d' % number, 0, 'p', number, clock.wall_ns())]), None,
+                        it.now_s[0])  # fmt: skip
+            it.events.trigger(name, 'service')
+            it.pass_s(5.0)
+            clock.wait(5.0)
+            it.written(number)
+        assert it.bags() == []
+        clock.set(NOON_NS)
+        until(lambda: len(it.bags()) == 2, 'both leave')
+        assert it.bags() == ['event_one_20251018_115950', 'event_two_20251018_115955']

@@ -1,0 +1,92 @@
+"""Each bag of the node begins with what is latched, as if it were the only one: events and bags that follow others as well."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import pytest
+from e2e.bag_reading import Bag, bags
+from e2e.processes import Processes, until
+from e2e.reading import STRING, decode, texts
+from e2e.station import Station
+
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.spool.status import file
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.s3 import S3Store
+
+STATIC, TALK = '/l_static', '/l_talk'
+PARAMETERS = {
+    'sensors': ['map'], 'map.topics': ['/l_map'], 'map.rate_hz': 0.0, 'bag.record': 'always', 'bag.regex': '^/l_',
+    'events.regex': '^/l_', 'events.pre_s': 1.0, 'events.post_s': 0.5,
+}  # fmt: skip
+
+
+@pytest.fixture
+def station(processes: Processes) -> Iterator[Station]:
+    made = Station(processes.environ)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def store(seaweed: Tower) -> Iterator[ObjectStore]:
+    opened = S3Store(seaweed.store_settings(), UploadSettings())
+    opened.open()
+    yield opened
+    opened.close()
+
+
+def latched(bag: Bag) -> list[tuple[str, str]]:
+    return sorted((each.topic, decode(STRING, each.cdr).data) for each in bag.messages() if each.topic != TALK)
+
+
+def test_what_is_latched_is_at_the_start_of_every_bag(
+    processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
+) -> None:
+    """The last message of both publishers of a topic, and of one that a sensor takes too; nothing of it counts as missed."""
+    node = processes.node(seaweed.environment(), PARAMETERS)
+    for name in ('left', 'right'):
+        publisher = processes.publisher()
+        publisher.create(STATIC, STRING, latched=True, depth=1)
+        publisher.matched(STATIC)
+        publisher.publish(STATIC, texts([f'{name} before', name]))
+    publisher.create('/l_map', STRING, latched=True, depth=1)
+    publisher.create(TALK, STRING)
+    publisher.matched(TALK)
+    publisher.publish('/l_map', texts(['map']))
+
+    def recorded(topic: str) -> int:
+        return int(node.ledger()['bags'].get(topic, {}).get('received', 0))
+
+    until(lambda: (recorded(STATIC), recorded('/l_map')) == (4, 1), 'all is recorded')
+    publisher.publish(TALK, texts(range(20)), 0.1)
+    assert station.event()[0]
+    publisher.publish(TALK, texts(range(20, 30)), 0.1)
+    path = file(node.home / 'spool', node.robot)
+    until(lambda: json.loads(path.read_text())['events']['written'] == 1, 'the event is written')
+    logger = MissionDataLogger(home=node.home, robot=processes.robot, replay=False, start_timeout_s=0.0)
+    try:
+        logger.start_mission('patrol', 'go round')
+        until(lambda: (recorded(STATIC), recorded('/l_map')) == (6, 2), 'the bag of the mission has what is latched')
+        publisher.publish(TALK, texts(range(30, 40)))
+        logger.end_mission(True, 0.0, 0.0)
+        until(lambda: (recorded(STATIC), recorded('/l_map')) == (8, 3), 'the bag after it has it')
+    finally:
+        logger.close()
+    ledger = node.stop()
+    event, mission, first, last = bags(store, processes.robot, processes.folder / 'bags')
+    static = [('/l_map', 'map'), (STATIC, 'left'), (STATIC, 'right')]
+    assert latched(event) == latched(mission) == latched(last) == static
+    assert latched(first) == sorted([*static, (STATIC, 'left before'), (STATIC, 'right before')])
+    for bag in (event, mission, first, last):
+        bag.check()
+    began_ns = min(each.log_ns for each in event.messages())
+    assert {each.log_ns for each in event.messages() if each.topic != TALK} == {began_ns}
+    talked = [each for bag in (first, mission, last) for each in bag.messages() if each.topic == TALK]
+    assert [int(decode(STRING, each.cdr).data) for each in talked] == list(range(40))
+    for row in (*ledger['bags'].values(), *ledger['events'].values()):
+        assert (row['missed'], row['open'], row['received']) == (0, 0, row['stored'])
