@@ -44,7 +44,7 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
         store = settings()
         begun_s = time.monotonic()
         rows = [] if prefix is not None else _asked(flags, limit)
-        wishes = [lake.Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows]
+        wishes = list(dict.fromkeys(lake.Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows))
         if prefix is not None:
             wishes = lake.under(open_source(store, bucket), prefix)
     with _progress() as bar:
@@ -58,7 +58,8 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
                 'unverified': found.unverified, 'failed': found.failed, 'took_s': round(took_s, 3)}  # fmt: skip
         click.echo(json.dumps(told, indent=2))
     else:
-        _show(found, len(wishes), took_s, to)
+        where = f'{"" if prefix is None else f"under {prefix} "}in {open_source(store, bucket).describe()}'
+        _show(found, len(wishes), took_s, to, where)
     return 1 if found.failed else 0
 
 
@@ -84,10 +85,10 @@ def _advance(bar: Progress, task: TaskID, size: int, objects: int) -> None:
     bar.update(task, advance=size, objects=bar.tasks[0].fields['objects'] + objects)
 
 
-def _show(found: Any, asked: int, took_s: float, to: Path) -> None:
+def _show(found: Any, asked: int, took_s: float, to: Path, where: str) -> None:
     console = Console(highlight=False, soft_wrap=True)
     if not asked:
-        console.print('There is nothing to fetch.')
+        console.print(plain(f'There is nothing to fetch {where}.'))
         return
     rate = f', {volume(found.bytes / took_s)}/s' if found.moved and took_s else ''
     console.print(plain(f'{number(found.moved)} objects ({volume(found.bytes)}) moved to {to} in {duration(took_s)}{rate}; '

@@ -41,7 +41,8 @@ def status(*, robot: str | None, as_json: bool) -> int:
         from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
         from shadowhound_data_logger.lake.state import state  # noqa: PLC0415
 
-    found = state(default_source(settings()), robot)
+    source = default_source(settings())
+    found = state(source, robot)
     if as_json:
         click.echo(json.dumps([asdict(row) for row in found], indent=2))
         return 0
@@ -51,7 +52,7 @@ def status(*, robot: str | None, as_json: bool) -> int:
         counts = (row.files, row.size, row.compacted, row.open_days, row.covered)
         table.add_row(plain(row.robot), number(row.days), row.first, row.last, number(counts[0]), volume(counts[1]),
                       *map(number, counts[2:]))  # fmt: skip
-    show_whole([table] if found else ['There is no catalogue yet.'], Console(highlight=False))
+    show_whole([table] if found else [plain(f'There is no catalogue yet in {source.describe()}.')], Console(highlight=False))
     return 0
 
 

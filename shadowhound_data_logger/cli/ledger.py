@@ -46,7 +46,9 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
         return verify(folder, deep=deep, again=again, as_json=as_json)
     if again:
         raise click.UsageError('--again is for --verify or --deep')
-    found = read(folder, os.environ.get('SHADOWHOUND_ROBOT') or next(iter(robots(folder)), 'thor'))
+    names = robots(folder)
+    found = read(folder, os.environ.get('SHADOWHOUND_ROBOT') or next(iter(names), 'thor'))
+    found['robots'] = names if len(names) > 1 else [found['robot']]  # a spool that several share has one ledger of them all
     if as_json:
         click.echo(json.dumps(found, indent=2))
     else:
@@ -57,7 +59,7 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
 def show(found: Mapping[str, Any], console: Console) -> None:
     """The ledger as tables, what there is to say about single topics, and a verdict."""
     titles = {'bags': 'Messages recorded into bags of', 'events': 'Messages that events asked for of'}
-    tables = [_table(f'{title} {found["robot"]}', found[sink]) for sink, title in titles.items() if found.get(sink)]
+    tables = [_table(f'{title} {_whose(found)}', found[sink]) for sink, title in titles.items() if found.get(sink)]
     files = [part for table in tables for part in (table, '')]
     show_whole([topics_table(found), '', *files, objects_table(found), *_section(notes(found)), '', verdict(found)], console)
 
@@ -65,8 +67,12 @@ def show(found: Mapping[str, Any], console: Console) -> None:
 def topics_table(found: Mapping[str, Any]) -> RenderableType:
     """One row a topic; a dash is a figure that the middleware does not tell."""
     if not found['topics']:
-        return Text(f'No message of {found["robot"]} has been received yet.')
-    return _table(f'Messages of {found["robot"]}', found['topics'])
+        return Text(f'No message of {_whose(found)} has been received yet.')
+    return _table(f'Messages of {_whose(found)}', found['topics'])
+
+
+def _whose(found: Mapping[str, Any]) -> str:
+    return ' and '.join(found.get('robots') or [found['robot']])
 
 
 def _table(title: str, topics: Mapping[str, Any]) -> RenderableType:

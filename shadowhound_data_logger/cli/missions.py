@@ -21,6 +21,7 @@ from shadowhound_data_logger.config import home
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder
 from shadowhound_data_logger.missions.overview import ACTIVE, export, find, overview, overviews
+from shadowhound_data_logger.missions.report import is_sending
 
 POLL_S: Final = 0.5
 STYLES: Final = {'FINISHED': 'green', ACTIVE: 'cyan'}
@@ -57,7 +58,7 @@ def list_(*, as_json: bool) -> int:
     elif not found:
         click.echo(f'No mission has been logged in {where / FOLDER} yet. SHADOWHOUND_HOME names the folder above it.')
     else:
-        show_whole([_table(found), *_verdict(found)], Console(highlight=False))
+        show_whole([_table(found), *_verdict(found, is_sending=is_sending(where / FOLDER))], Console(highlight=False))
     return 1 if _late(found) else 0
 
 
@@ -150,11 +151,12 @@ def _table(found: list[dict[str, Any]]) -> RenderableType:
     return table
 
 
-def _verdict(found: list[dict[str, Any]]) -> Iterator[RenderableType]:
+def _verdict(found: list[dict[str, Any]], *, is_sending: bool) -> Iterator[RenderableType]:
     late = _late(found)
     if late:
+        how = 'being sent' if is_sending else 'shadowhound-data missions resume sends it'
         yield ''
-        yield Text(f'{number(len(late))} not sent whole: shadowhound-data missions resume sends it', 'yellow')
+        yield Text(f'{number(len(late))} not sent whole: {how}', 'yellow')
         yield from _reason(late[-1])
 
 

@@ -54,7 +54,7 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
     with asking():
         if sheet or ground:
             _pictures(source, found.to_pylist(), flags, sheet, ground)
-    _print(found, 'json' if as_json else kind, is_objects=not sql, is_limited=limit is not None)
+    _print(found, 'json' if as_json else kind, source.describe(), is_objects=not sql, is_limited=limit is not None)
     return 0
 
 
@@ -67,7 +67,7 @@ def _ordered(frame: Any, order: str | None) -> Any:
     return frame.sort([words_[0] for words_ in columns], desc=[words_[-1].lower() == 'desc' for words_ in columns])
 
 
-def _print(found: Any, kind: str, *, is_objects: bool, is_limited: bool) -> None:
+def _print(found: Any, kind: str, where: str, *, is_objects: bool, is_limited: bool) -> None:
     if kind == 'keys':
         for bucket, key in zip(found['bucket'].to_pylist(), found['key'].to_pylist(), strict=True):
             click.echo(f'{bucket}/{key}')
@@ -78,10 +78,10 @@ def _print(found: Any, kind: str, *, is_objects: bool, is_limited: bool) -> None
         writer.writerow(found.column_names)
         writer.writerows(_told(row).values() for row in found.to_pylist())
     else:
-        show_whole(list(_table(found, is_objects=is_objects, is_limited=is_limited)), Console(highlight=False))
+        show_whole(list(_table(found, where, is_objects=is_objects, is_limited=is_limited)), Console(highlight=False))
 
 
-def _table(found: Any, *, is_objects: bool, is_limited: bool) -> Iterator[RenderableType]:
+def _table(found: Any, where: str, *, is_objects: bool, is_limited: bool) -> Iterator[RenderableType]:
     columns = [name for name in COLUMNS if name in found.column_names] if is_objects else found.column_names
     rows = found.select(columns).slice(0, len(found) if is_limited else SHOWN).to_pylist()
     left = {name for name in columns if any(isinstance(row[name], (str, datetime)) for row in rows)}
@@ -92,13 +92,13 @@ def _table(found: Any, *, is_objects: bool, is_limited: bool) -> Iterator[Render
     if rows:
         yield table
         yield ''
-    yield plain(_verdict(found, len(rows), is_objects=is_objects))
+    yield plain(_verdict(found, len(rows), where, is_objects=is_objects))
 
 
-def _verdict(found: Any, shown: int, *, is_objects: bool) -> str:
+def _verdict(found: Any, shown: int, where: str, *, is_objects: bool) -> str:
     what = 'objects' if is_objects else 'rows'
     if not len(found):
-        return f'No {what}.'
+        return f'No {what} in {where}.'
     text = f'{number(len(found))} {what}'
     if is_objects:
         text += f', {volume(sum(found["bytes"].to_pylist()))}'

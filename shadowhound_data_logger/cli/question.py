@@ -14,7 +14,7 @@ from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.options import StoreSettings
 
-EXTRA: Final = {'daft', 'pyarrow', 'obstore'}
+EXTRA: Final = {'daft', 'matplotlib', 'obstore', 'pyarrow'}
 _FLAGS: Final = (
     click.option('--robot', metavar='NAME', help='Of this robot.'),
     click.option('--sensor', metavar='NAME', help='Of this sensor: camera, lidar, odom, ...'),

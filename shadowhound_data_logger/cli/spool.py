@@ -70,14 +70,14 @@ def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, l
 
 @spool.command()
 @click.option('--patience', type=click.FloatRange(1.0, 1e6), default=60.0, show_default=True,
-              help='Seconds without a delivery after which it gives up.')  # fmt: skip
+              help='Seconds in which nothing gets on after which it gives up.')  # fmt: skip
 @_as_json
 @click.pass_obj
 def drain(folder: Path, *, patience: float, as_json: bool) -> int:
     """Deliver all that waits, where no node runs to do it: before a robot is put away, or from the disk of one that is broken.
 
     The store is the one that the environment names. Each object is verified as by the node, and gets its row in the catalogue.
-    Exit code 1 when something is left. Ctrl-C loses nothing.
+    Exit code 1 when something of that is left or refused. Ctrl-C loses nothing.
     """
     from shadowhound_data_logger.cli.spool_drain import drain_all  # noqa: PLC0415 - the other verbs need no store
 

@@ -22,6 +22,7 @@ from shadowhound_data_logger.lake.catalogue import Catalogue
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
 from shadowhound_data_logger.spool.delivering import delivering
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.status import limits
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 LOOK_S: Final = 0.2
@@ -34,7 +35,7 @@ def drain_all(folder: Path, *, patience_s: float, as_json: bool) -> int:
     """The exit code."""
     settings, clock = Settings.load({}, os.environ), SystemClock.of_this_machine()
     # A robot of its own: its session is none of the node's, and what that left open is not for it to settle.
-    spool = Spool(folder, settings.spool, clock, f'{settings.robot} drain')
+    spool = Spool(folder, limits(folder, settings.spool), clock, f'{settings.robot} drain')
     spool.open()
     catalogue = Catalogue(folder, settings.catalogue, settings.robot, clock)
     try:
@@ -52,12 +53,15 @@ def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalogue: Cata
           shown: tuple[Progress, TaskID]) -> None:  # fmt: skip
     """Until nothing waits that can be delivered, the catalogue's parts of it included; or nothing moves for so long."""
     bar, task = shown
-    done, moved_s = -1, time.monotonic()
+    done, sent, retries, moved_s = -1, 0, 0, time.monotonic()
     while time.monotonic() - moved_s < patience_s:
         is_drained = uploader.drain(LOOK_S)
         status = uploader.status()
         if status.delivered + status.quarantined > done:
-            done, moved_s = status.delivered + status.quarantined, time.monotonic()
+            done, retries, moved_s = status.delivered + status.quarantined, status.retries, time.monotonic()
+        elif status.sent_bytes > sent and status.retries == retries:  # a large one is under way, and none is sent in vain
+            moved_s = time.monotonic()
+        sent = status.sent_bytes
         what = 'delivered' if status.state in {'idle', 'shipping'} else status.state.replace('_', ' ')
         bar.update(task, completed=status.delivered, total=status.delivered + spool.pending_count(), description=what)
         if not is_drained:

@@ -18,7 +18,7 @@ import numpy as np
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.lake import shards
 from shadowhound_data_logger.lake.bodies import Bodies
-from shadowhound_data_logger.lake.samples import Near, Sample, Samples, Window, is_complete
+from shadowhound_data_logger.lake.samples import POSE_GAP_NS, Near, Sample, Samples, Window, is_complete
 from shadowhound_data_logger.lake.track import Object, Track
 
 if TYPE_CHECKING:
@@ -77,12 +77,16 @@ class MissionDataset:
 
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
         """Several at once, whose objects are read at the same time; torch's DataLoader asks for whole batches so."""
-        references = [self._reference(index) for index in indices]
+        wanted = [self._at(self._reference(index)) for index in indices]
+        objects = [each for track, number, _ in wanted for each in self._selection.needed(track, number)]
         samples = self._samples()
         assert self._reading is not None
-        for reference in references:
-            self._reading[1].ahead(self._selection.needed(*self._at(reference)[:2]))
-        return [samples.sample(*self._at(reference)) for reference in references]
+        bodies = self._reading[1]
+        bodies.ahead(objects)
+        try:
+            return [samples.sample(*each) for each in wanted]
+        finally:
+            bodies.settle(objects)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, '_reading': None}
@@ -102,9 +106,14 @@ class MissionDataset:
 
     @property
     def poses(self) -> NDArray[np.float64]:
-        """(samples, 3): x y yaw of each by the catalogue, in an archive that of its middle; NaN where it is not known."""
-        found = [np.repeat(track.pose[chosen], track.count[chosen], axis=0)
-                 for track, chosen in zip(self._selection.anchors, self._chosen, strict=True)]  # fmt: skip
+        """(samples, 3): x y yaw of each by the catalogue, at the times of ``stamps_ns``; NaN where it is not known."""
+        found: list[NDArray[np.float64]] = []
+        for track, chosen in zip(self._selection.anchors, self._chosen, strict=True):
+            if (track.count[chosen] == 1).all():
+                found.append(track.pose[chosen])
+            else:
+                found += [track.pose_at(int(number), int(stamp_ns), POSE_GAP_NS)[None]
+                          for number in chosen for stamp_ns in track.stamps_ns(int(number))]  # fmt: skip
         return np.concatenate([np.empty((0, 3)), *found])
 
     def stream(self, *, shuffle: bool = False, seed: int = 0, rank: int = 0, ranks: int = 1) -> MissionStream:

@@ -126,7 +126,7 @@ class _Fetch:
     def _wanting(self, wishes: Sequence[Wish]) -> Iterator[Wish]:
         """Those that are not known to be there."""
         seen: set[str] = set()
-        for wish in wishes:
+        for wish in dict.fromkeys(wishes):  # the rows of repeats name one object
             if (refusal := _refusal(wish.key)) or wish.key in seen:
                 self._fail(wish, refusal or 'another bucket has the same key: fetch it elsewhere')
                 continue

@@ -8,9 +8,10 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.errors import LakeError, NameRefused
+from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.lake import parts
 from shadowhound_data_logger.lake.fetched import PARTS
 from shadowhound_data_logger.lake.schema import COLUMNS
@@ -18,12 +19,15 @@ from shadowhound_data_logger.lake.standing import mended_key
 
 
 def keep(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """One part for each robot and date among rows as Daft gives them. Raises LakeError where it cannot be written."""
+    """One part for each robot and date among rows as Daft gives them. Raises LakeError where it cannot be written.
+
+    A row whose robot is no name is left out: anybody may have written it, and the name becomes a folder's.
+    """
     plain = [
         {**{name: row[name] for name in COLUMNS}, **{name: _micros(row, name) for name in ('t_start', 't_end')}} for row in rows
     ]
     for robot, date, found in parts.by_folder(enumerate(plain)):
-        if robot is None:
+        if not _is_name(robot):
             continue
         ours = [row for _, row in found]
         path = folder / mended_key(robot, date, [f'{row["bucket"]}/{row["key"]} {row["t_start_ns"]}' for row in ours])
@@ -37,6 +41,13 @@ def keep(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             part.replace(path)
         except OSError as error:
             raise LakeError(f'{path} cannot be written: {error.strerror}', folder=str(folder)) from error
+
+
+def _is_name(robot: str | None) -> TypeGuard[str]:
+    try:
+        return bool(check_name(robot or '', 'the robot name'))
+    except NameRefused:
+        return False
 
 
 def _micros(row: Mapping[str, Any], name: str) -> int | None:

@@ -50,7 +50,7 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Source
         frames = [frame for frame in pool.map(save, chosen) if frame is not None]
         try:
             contact_sheet(frames, title, min((frame.time_ns for frame in frames), default=0), target)
-        except ValueError as error:
+        except (OSError, ValueError) as error:
             raise LakeError(f'{target} cannot be made: {error}') from error
 
 
@@ -95,4 +95,7 @@ def ground(
         (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
         figure.set_size_inches(plots.WIDTH_IN, min(max(0.8 * plots.WIDTH_IN * (y1 - y0) / (x1 - x0), 2.5), 12.0) + 1.3)
         figure.legend(loc='outside lower center', ncols=3)
-        figure.savefig(target, format='png')
+        try:
+            figure.savefig(target, format='png')
+        except OSError as error:
+            raise LakeError(f'{target} cannot be made: {error}') from error

@@ -19,6 +19,7 @@ from typing import Any, Final
 
 import pyarrow as pa
 
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake import schema
@@ -31,6 +32,8 @@ import daft  # isort: skip - after scan, which turns its telemetry off
 from daft import DataFrame, Expression, col, lit  # isort: skip
 
 _MISSIONS: Final = re.compile(r'\bmissions\b', re.IGNORECASE)
+LONGEST_NS: Final = 24 * 3600 * SECOND
+"""For so long after a time that is asked for a mission may go on before one of its objects knows its run."""
 _SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
     'command': ('mission_command', pa.string()),
     'started': ('start', pa.string()),
@@ -94,6 +97,10 @@ def _objects(source: Source, asked: Wanted) -> DataFrame:
     rows = Catalogue(source, asked).read()
     with answering():
         conditions = list(_conditions(asked))
+        if asked.mission is not None:
+            runs = {} if '_' in asked.mission else _runs(source, asked)  # no id of a run has one, every one of a mission
+            of_run = [mission for mission, run in runs.items() if run.startswith(asked.mission)]
+            conditions.append(col('mission_id').startswith(asked.mission) | col('mission_id').is_in(of_run or ['']))
         if asked.success is not None:
             ended = _missions(source, replace(asked, success=None)).where(col('success') == lit(asked.success))
             ids = ended.select('mission_id').to_pydict()['mission_id']
@@ -111,8 +118,6 @@ def _conditions(asked: Wanted) -> Iterator[Expression]:
         yield col('t_start_ns') >= lit(asked.since_ns)
     if asked.until_ns is not None:
         yield col('t_start_ns') < lit(asked.until_ns)
-    if asked.mission is not None:
-        yield col('mission_id').startswith(asked.mission) | col('run_id').startswith(asked.mission)
     if asked.near is not None:
         x, y, radius = asked.near
         for name, middle in (('x', x), ('y', y)):  # a box first: statistics can rule parts of a file out by it
@@ -139,15 +144,29 @@ def _missions(source: Source, asked: Wanted) -> DataFrame:
             col('run_id').max(), col('mission_type').max(), col('key').count().alias('objects'),
             col('bytes').sum().alias('bytes'), col('t_start').min().alias('first'), col('t_end').max().alias('last'),
         ).sort('first').to_arrow()  # fmt: skip
-    ids = zip(found['robot'].to_pylist(), found['run_id'].to_pylist(), strict=True)
+    runs = found['run_id'].to_pylist()
+    if None in runs:
+        known = _runs(source, asked)
+        runs = [run or known.get(mission) for mission, run in zip(found['mission_id'].to_pylist(), runs, strict=True)]
+        found = found.set_column(found.column_names.index('run_id'), 'run_id', pa.array(runs, pa.string()))
     with ThreadPoolExecutor(THREADS) as pool:
-        told = list(pool.map(lambda pair: _summary(source, *pair), ids))
+        told = list(pool.map(lambda pair: _summary(source, *pair), zip(found['robot'].to_pylist(), runs, strict=True)))
     types = found['mission_type'].to_pylist()
     kinds = [kind or one.get('mission_type') for kind, one in zip(types, told, strict=True)]
     found = found.set_column(found.column_names.index('mission_type'), 'mission_type', pa.array(kinds, pa.string()))
     for column, (name, kind) in _SUMMARY.items():
         found = found.append_column(column, pa.array([_value(one.get(name), kind) for one in told], kind))
     return daft.from_arrow(found)
+
+
+def _runs(source: Source, asked: Wanted) -> dict[str, str]:
+    """The run of each mission of that time, by whichever object knows it: one that came before there was a run does not."""
+    until_ns = None if asked.until_ns is None else asked.until_ns + LONGEST_NS
+    rows = Catalogue(source, Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns)).read()
+    with answering():
+        known = rows.where(col('mission_id').not_null() & col('run_id').not_null())
+        found = known.groupby('mission_id').agg(col('run_id').max()).to_pydict()
+    return dict(zip(found['mission_id'], found['run_id'], strict=True))
 
 
 def _summary(source: Source, robot: str, run_id: str | None) -> dict[str, Any]:

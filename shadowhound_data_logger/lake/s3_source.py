@@ -144,10 +144,8 @@ def _client(settings: StoreSettings, bucket: str) -> S3Store:
     given: dict[str, Any] = {'access_key_id': settings.access_key_id, 'secret_access_key': settings.secret_access_key}
     if settings.session_token:
         given['session_token'] = settings.session_token
-    if not settings.access_key_id:
-        from obstore.auth.boto3 import Boto3CredentialProvider  # noqa: PLC0415 - half a second that few need
-
-        given = {'credential_provider': Boto3CredentialProvider()}
+    if not (settings.access_key_id and settings.secret_access_key):
+        given = {'credential_provider': _provider(settings)}
     options: Any = {'allow_http': True, 'connect_timeout': _CONNECT, 'read_timeout': _SILENCE, 'timeout': _WHOLE}
     if (trusted := authorities(settings)) is not None:
         options['root_certificate'] = trusted
@@ -155,6 +153,19 @@ def _client(settings: StoreSettings, bucket: str) -> S3Store:
         bucket, endpoint=settings.endpoint_url, region=settings.region, virtual_hosted_style_request=False, **given,
         client_options=options, retry_config={'max_retries': _TRIES, 'retry_timeout': _PATIENCE},
     )  # fmt: skip
+
+
+def _provider(settings: StoreSettings) -> Any:
+    """What finds the keys of this machine. Raises SettingError for half a pair of keys, CredentialsRejected without any."""
+    from obstore.auth.boto3 import Boto3CredentialProvider  # noqa: PLC0415 - half a second that few need
+
+    from shadowhound_data_logger.stores.credentials import has_keys  # noqa: PLC0415
+
+    if not has_keys(settings):
+        text = f'there are no credentials for Tower at {settings.endpoint_url}'
+        remedy = 'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SHARED_CREDENTIALS_FILE to a file with them'
+        raise CredentialsRejected(text, remedy=remedy, endpoint=settings.endpoint_url or '')
+    return Boto3CredentialProvider()
 
 
 def _entry(found: Any) -> Entry:

@@ -73,6 +73,12 @@ class Selection:
     size: tuple[int, int] | None
     """(height, width) of images; None: as they are."""
 
+    def like(self, robot: str, sensor: str) -> Track | None:
+        """What says how many numbers a sensor has: the robot's own, or another robot's where it stored nothing."""
+        own = self.sides.get((robot, sensor))
+        others = (track for (_, name), track in self.sides.items() if name == sensor)
+        return own or next((track for track in others if len(track)), None)
+
     def needed(self, track: Track, number: int) -> Iterator[Object]:
         """The objects that the samples of this object of an anchor are made of, the object itself among them."""
         yield track.object(number)
@@ -120,8 +126,7 @@ class Samples:
             'battery_pct': np.float64(track.battery_pct[number]),
         }
         for sensor, how in self._selection.aligned.items():
-            side = self._selection.sides.get((track.robot, sensor))
-            sample |= self._aligned(sensor, how, side, stamp_ns)
+            sample |= self._aligned(sensor, how, track.robot, stamp_ns)
         return sample
 
     def _anchor(self, track: Track, number: int, member: int, wanted: Object) -> tuple[str, NDArray[Any], int]:
@@ -145,18 +150,22 @@ class Samples:
         found: list[Member] = self._once(('members', wanted.bucket, wanted.key), wanted, read)
         return found
 
-    def _aligned(self, sensor: str, how: Near | Window, side: Track | None, stamp_ns: int) -> Sample:
+    def _aligned(self, sensor: str, how: Near | Window, robot: str, stamp_ns: int) -> Sample:
+        like = self._selection.like(robot, sensor)
+        side = like if like is not None and like.robot == robot else None
         if isinstance(how, Window):
-            values, present = self._window(how, side, stamp_ns)
+            values, present = self._window(how, side, self._width(like, how.fields), stamp_ns)
             return {sensor: values, f'{sensor}_ok': present}
-        if side is not None and _is_cloud(side):
+        if like is not None and _is_cloud(like):
             points, away_ns = self._nearest_cloud(how, side, stamp_ns)
             return {sensor: points, f'{sensor}_ok': np.bool_(away_ns is not None), f'{sensor}_dt_s': _seconds(away_ns)}
         row, away_ns = self._nearest(how, side, stamp_ns)
+        if row is None:
+            row = np.full(self._width(like, how.fields), np.nan)
         return {sensor: row, f'{sensor}_ok': np.bool_(away_ns is not None), f'{sensor}_dt_s': _seconds(away_ns)}
 
-    def _nearest(self, how: Near, side: Track | None, stamp_ns: int) -> tuple[NDArray[np.float64], int | None]:
-        """Its numbers, and how much later it is than the anchor; NaN and None where there is none."""
+    def _nearest(self, how: Near, side: Track | None, stamp_ns: int) -> tuple[NDArray[np.float64] | None, int | None]:
+        """Its numbers, and how much later it is than the anchor; None where there is none."""
         best: tuple[int, NDArray[np.float64]] | None = None
         if side is not None:
             tolerance = how.reach_ns[0]
@@ -169,12 +178,12 @@ class Samples:
                     away = int(found.stamps[place]) - stamp_ns
                     if abs(away) <= tolerance and (best is None or abs(away) < abs(best[0])):
                         best = away, found.values[place]
-        if best is None:
-            return np.full(self._width(side, how.fields), np.nan), None
-        return best[1].copy(), best[0]
+        return (None, None) if best is None else (best[1].copy(), best[0])
 
-    def _nearest_cloud(self, how: Near, side: Track, stamp_ns: int) -> tuple[NDArray[np.float32], int | None]:
+    def _nearest_cloud(self, how: Near, side: Track | None, stamp_ns: int) -> tuple[NDArray[np.float32], int | None]:
         best: tuple[int, Object, Member | None] | None = None
+        if side is None:
+            return np.empty((0, 4), np.float32), None
         for least, number in side.nearest(stamp_ns, how.reach_ns[0]):
             if best is not None and abs(best[0]) <= least:
                 break
@@ -191,8 +200,8 @@ class Samples:
         with _naming(wanted):
             return decode.cloud(self._bodies.get(wanted) if one is None else one.body), away
 
-    def _window(self, how: Window, side: Track | None, stamp_ns: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        width = self._width(side, how.fields)
+    def _window(self, how: Window, side: Track | None, width: int,
+                stamp_ns: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
         values, present = np.full((how.rows, width), np.nan), np.zeros(how.rows, np.bool_)
         if side is None:
             return values, present
@@ -206,9 +215,9 @@ class Samples:
             present[-len(last) :] = True
         return values, present
 
-    def _width(self, side: Track | None, fields: tuple[str, ...]) -> int:
-        """Columns of a sensor, those of its first object; none of one that stored nothing."""
-        return 0 if side is None or not len(side) else int(self._table(side, 0, fields).values.shape[1])
+    def _width(self, like: Track | None, fields: tuple[str, ...]) -> int:
+        """Columns of a sensor, those of the first object; none of one that nobody has."""
+        return 0 if like is None else int(self._table(like, 0, fields).values.shape[1])
 
     def _table(self, side: Track, number: int, fields: tuple[str, ...]) -> Table:
         wanted = side.object(number)

@@ -13,6 +13,7 @@ from shadowhound_data_logger.lake.bodies import Place
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES, extension_of
 from shadowhound_data_logger.lake.folder_source import FolderSource
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
+from shadowhound_data_logger.lake.schema import SENSOR
 from shadowhound_data_logger.lake.source import Source
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.options import StoreSettings
@@ -23,8 +24,13 @@ Row = dict[str, Any]
 
 
 def place(source: Source | Path | str | None) -> tuple[Place, Source]:
-    """Where contents come from, and where the catalogue is."""
+    """Where contents come from, and where the catalogue is. Raises LakeError for a folder without one."""
     if isinstance(source, (str, Path)):
+        if not any(Path(source).glob(f'*/{SENSOR}')):
+            raise LakeError(
+                f'{source} has no catalogue',
+                remedy='fetch by a question, such as --since yesterday: a prefix alone brings no rows',
+            )
         return Place(StoreSettings(), Path(source).absolute()), fetched(Path(source))
     found = source or query.default_source()
     return Place(found.settings), found
@@ -38,7 +44,7 @@ def fetched(folder: Path) -> Source:
 
 def select(source: Source, anchor: str, aligned: Mapping[str, Near | Window], size: tuple[int, int] | None,
            flags: Mapping[str, Any]) -> Selection:  # fmt: skip
-    """Raises SettingError for what is no question, LakeError where an aligned sensor is in no catalogue at all, StoreError."""
+    """Raises SettingError for what is no question, LakeError where nothing is known of an aligned sensor, StoreError."""
     for name, how in aligned.items():
         if min(how.reach_ns) < 0 or not sum(how.reach_ns):
             raise SettingError(f'align[{name!r}]', how, 'a time of more than 0 s')
@@ -58,7 +64,11 @@ def _sides(source: Source, anchors: list[Track], aligned: Mapping[str, Near | Wi
     rows = query.objects(source, since=since, until=until).where(col('sensor').is_in(list(aligned)))
     found = _rows(rows)
     for name in aligned:
-        if len(kinds := {row['type'] for row in found if row['sensor'] == name}) > 1:
+        kinds = {row['type'] for row in found if row['sensor'] == name}
+        if not kinds:
+            raise LakeError(f'{name} has no object about the time of the {anchors[0].sensor}',
+                            remedy='is it fetched too, is it the name of a sensor? Else leave it out of align')  # fmt: skip
+        if len(kinds) > 1:
             raise LakeError(f'{name} has messages of {" and of ".join(sorted(map(str, kinds)))}', remedy='restrict the time')
     return {key: _near(track, anchors, reach) for key, track in _tracks(found).items()}
 

@@ -110,7 +110,7 @@ class Track:
             yield int(away[place]), int(found[place])
 
     def pose_at(self, number: int, stamp_ns: int, gap_ns: int) -> NDArray[np.float64]:
-        """X y yaw at a moment in the object: its own, of a single message; else straight on between those of its neighbours."""
+        """X y yaw at a moment in the object: its own, of a single message; else straight on between it and its neighbour's."""
         own: NDArray[np.float64] = self.pose[number]
         if self.count[number] == 1:
             return own
@@ -118,7 +118,7 @@ class Track:
         if not 0 <= other < len(self):
             return own
         here, there = ((int(self.start_ns[each]) + int(self.end_ns[each])) // 2 for each in (number, other))
-        if abs(there - here) > gap_ns or here == there:
+        if abs(there - here) > gap_ns or here == there or np.isnan(self.pose[other]).any():
             return own
         turn = (self.pose[other, 2] - own[2] + np.pi) % (2 * np.pi) - np.pi
         change = np.array([*(self.pose[other, :2] - own[:2]), turn])

@@ -104,6 +104,16 @@ class Keys(Credentials):
         return found
 
 
+def has_keys(settings: StoreSettings) -> bool:
+    """Whether there are keys for this store, here or given. Raises SettingError for half a pair."""
+    keys = Keys(settings)
+    try:
+        keys.get_frozen_credentials()
+    except BotoCoreError:
+        return False
+    return True
+
+
 class _Provider:
     """In the place of botocore's own: it knows the keys already."""
 

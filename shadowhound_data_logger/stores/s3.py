@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import logging
+import os
 import threading
 import time
 import zlib
@@ -28,7 +29,7 @@ from shadowhound_data_logger.errors import (
     StoreUnavailable,
 )
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.stores.content import check_target, chunks, identical_or_foreign
+from shadowhound_data_logger.stores.content import check_target, chunks, identical_or_foreign, opened
 from shadowhound_data_logger.stores.pace import Pace
 from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES, Multipart
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
@@ -247,7 +248,7 @@ def _verified(item: SpooledObject) -> Iterator[tuple[bytes | IO[bytes], str]]:
     crc32 = 0
     for chunk in chunks(item):
         crc32 = zlib.crc32(chunk, crc32)
-    with item.path.open('rb') as file:
+    with opened(item) as descriptor, os.fdopen(descriptor, 'rb', closefd=False) as file:
         yield file, _base64(crc32)
 
 

@@ -14,6 +14,7 @@ from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, 
 from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.lake import query, selecting
 from shadowhound_data_logger.stores import open_store
 
 TIMES = [NOON_NS + second * SECOND for second in range(5)]
@@ -57,7 +58,8 @@ def test_by_question(home: Path) -> None:
     told = json.loads(run(home, '--sensor', 'odom', '--since', '2026-10-28T12:00:01', '--limit', '2', '--json').output)
     assert (told['asked'], told['moved']) == (2, 2)
     assert files(home) == sorted(row('odom', stamp_ns)['key'] for stamp_ns in TIMES[1:3])
-    assert 'nothing to fetch' in run(home, '--sensor', 'lidar').output
+    assert 'nothing to fetch in the bucket sensor-data' in run(home, '--sensor', 'lidar').output
+    assert 'nothing to fetch under thor/lidar/ in the bucket x' in run(home, 'thor/lidar/', '--bucket', 'x').output
 
 
 def test_what_cannot_be_fetched_is_a_finding(home: Path) -> None:
@@ -69,6 +71,18 @@ def test_what_cannot_be_fetched_is_a_finding(home: Path) -> None:
     assert gone in found.output
     assert '1 could not be fetched' in found.output
     assert len(files(home)) == 4
+
+
+def test_a_repeat_asks_for_nothing_of_its_own(home: Path) -> None:
+    """What was stored once and seen again has two rows of one key: it is one object, which is fetched, and both rows are kept."""
+    again = {**row('odom', TIMES[0]), **dict.fromkeys(('t_start_ns', 't_end_ns'), TIMES[4] + SECOND)}
+    again |= {name: again[f'{name}_ns'] // 1000 for name in ('t_start', 't_end')}
+    with closing(open_store(folder_store(home), UploadSettings())) as store:
+        add_part(store, [again], 'later', home / 'tmp')
+    told = json.loads(run(home, '--sensor', 'odom', '--json').output)
+    assert (told['asked'], told['moved'], told['failed']) == (5, 5, {})
+    rows = query.objects(selecting.fetched(home / 'data')).to_pydict()['t_start_ns']
+    assert sorted(rows) == sorted([*TIMES, again['t_start_ns']])
 
 
 def test_bad_usage(home: Path) -> None:

@@ -42,7 +42,7 @@ def test_status_compact_status(home: Path) -> None:
 
 def test_an_empty_store_is_no_error(tmp_path: Path) -> None:
     """There is nothing to say and nothing to do."""
-    assert 'no catalogue yet' in run(tmp_path, 'status').output
+    assert 'no catalogue yet in the bucket sensor-data' in run(tmp_path, 'status').output
     assert run(tmp_path, 'compact').exit_code == 0
 
 

@@ -56,8 +56,21 @@ def test_the_robot_is_the_one_whose_node_ran(tmp_path: Path, monkeypatch: pytest
     (tmp_path / 'status-tachi.json').write_text('{}')
     for robot in ('tachi', 'other'):
         answer = CliRunner().invoke(ledger, ['--spool', str(tmp_path), '--json'], standalone_mode=False)
-        assert json.loads(answer.stdout)['robot'] == robot
+        found = json.loads(answer.stdout)
+        assert (found['robot'], found['robots']) == (robot, [robot])
         monkeypatch.setenv('SHADOWHOUND_ROBOT', 'other')
+    abandon(spool)
+
+
+def test_robots_that_share_a_spool_are_all_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ledger is of the whole spool: it is not called that of one of them."""
+    monkeypatch.delenv('SHADOWHOUND_ROBOT', raising=False)
+    spool = new_spool(tmp_path)
+    spool.open()
+    for robot in ('tachi', 'thor'):
+        (tmp_path / f'status-{robot}.json').write_text('{}')
+    answer = CliRunner().invoke(ledger, ['--spool', str(tmp_path)], standalone_mode=False)
+    assert 'No message of tachi and thor has been received yet.' in answer.stdout
     abandon(spool)
 
 

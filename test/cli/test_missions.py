@@ -20,6 +20,8 @@ from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, write_json
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.missions.overview import BRIEF, overview, overviews
+from shadowhound_data_logger.missions.report import LOCK
+from shadowhound_data_logger.spool.files import flock
 
 
 def run(home: Path, *arguments: str) -> Result:
@@ -76,6 +78,15 @@ def test_the_list_tells_what_is_not_sent(tmp_path: Path) -> None:
         found = run(tmp_path, 'list', '--json')
         assert found.return_value == 0
         assert [each['result'] for each in json.loads(found.output)] == ['FINISHED', 'active']
+
+
+def test_what_somebody_sends_already_needs_no_resume(tmp_path: Path) -> None:
+    """While an agent's sender is at it the list says so, and asks for nothing."""
+    fly(tmp_path)
+    with flock(tmp_path / FOLDER / LOCK):
+        text = run(tmp_path, 'list').output
+    assert '1 not sent whole: being sent' in text
+    assert 'resume' not in text
 
 
 def test_a_list_does_not_read_what_is_sent(tmp_path: Path) -> None:

@@ -46,7 +46,9 @@ def test_a_table_is_for_reading(home: Path) -> None:
     assert '2026-10-28 12:00:00  odom' in found.output
     assert '48 objects' in found.output
     assert 'the first 30 are shown' in found.output
-    assert 'No objects.' in run(home, '--sensor', 'lidar').output
+    assert f'No objects in the bucket sensor-data in the folder {home}' in run(home, '--sensor', 'lidar').output.replace(
+        '\n', ' '
+    )
 
 
 def test_json_and_csv_are_whole(home: Path) -> None:
@@ -88,6 +90,9 @@ def test_pictures_of_the_answer(home: Path, tmp_path: Path) -> None:
     with Image.open(ground) as image:
         assert image.width == 800
     assert 'no image' in run(home, '--sensor', 'odom', '--sheet', str(sheet)).output
+    for flag in ('--sheet', '--map'):
+        refused = run(home, *asked, flag, str(tmp_path / 'nowhere' / 'x.png'))
+        assert (refused.exit_code, 'x.png cannot be made: ' in refused.output) == (2, True)
 
 
 @pytest.mark.parametrize(

@@ -5,17 +5,21 @@ from __future__ import annotations
 import json
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
-from spool.making import BUCKET, make, new_spool, put, rows, settle
+from spool.making import BUCKET, assert_whole, make, new_spool, put, rows, settle
 
+from shadowhound_data_logger.cli import spool_drain
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.model import Outcome, State
+from shadowhound_data_logger.ship.uploader import UploadStatus
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.files import flock
@@ -160,6 +164,29 @@ def test_a_death_in_the_middle_of_a_retry(home: Path, monkeypatch: pytest.Monkey
     assert states(home)['d.jpg'] == 'pending'
 
 
+@pytest.mark.parametrize('reopens', [False, True])
+def test_what_waits_again_before_its_file_was_set_apart(home: Path, *, reopens: bool) -> None:
+    """A retry, or another process's start, between the row and the file: the file stays where the object waits."""
+
+    def meanwhile(_: object) -> None:
+        if reopens:
+            other = new_spool(home / 'spool')
+            other.open()
+            other.close()
+        else:
+            retry(home / 'spool', names={f'{BUCKET}/thor/camera/x.jpg'})
+
+    spool = new_spool(home / 'spool')
+    spool.open()
+    (item,) = put(spool, make('thor/camera/x.jpg', b'x'))
+    spool.commit(outcomes=[Outcome(item, State.QUARANTINED, 'access_denied')], durable=meanwhile)
+    assert states(home)['x.jpg'] == 'pending'
+    assert_whole(home / 'spool')
+    settle(spool, item, State.QUARANTINED, 'access_denied')
+    assert_whole(home / 'spool')
+    spool.close()
+
+
 def test_all_is_delivered_without_a_node(home: Path, seaweed: Tower, monkeypatch: pytest.MonkeyPatch) -> None:
     """To a real server, each object with a row in the catalogue; what is held or refused stays, and is told."""
     for name, value in seaweed.environment().items():
@@ -196,3 +223,26 @@ def test_a_node_delivers_already(home: Path) -> None:
     assert answer.return_value == 1
     assert 'another process delivers from this spool' in answer.stdout
     assert states(home)['a.jpg'] == 'pending'
+
+
+@pytest.mark.parametrize(('retries', 'rounds'), [(0, 1000), (1, 0)])
+def test_patience_is_for_what_stands_still(home: Path, monkeypatch: pytest.MonkeyPatch, retries: int, rounds: int) -> None:
+    """A slice that takes minutes to send is waited for; a store that takes the bytes and refuses each time is not."""
+    time = SimpleNamespace(now_s=0.0)
+    time.monotonic = lambda: time.now_s
+    sent = UploadStatus('shipping', '', 0, 1, 0, 0, 0)
+
+    def drain(seconds: float) -> bool:
+        nonlocal sent
+        time.now_s += seconds
+        sent = replace(sent, sent_bytes=sent.sent_bytes + 1, retries=sent.retries + retries)
+        if sent.sent_bytes > 1000:
+            sent = replace(sent, delivered=1)
+        return sent.delivered == 1
+
+    time.sleep = lambda _: None
+    monkeypatch.setattr(spool_drain, 'time', time)
+    nothing = SimpleNamespace(parts=list, update=lambda *_, **__: None, pending_count=lambda: 1)
+    spool_drain._wait(nothing, SimpleNamespace(drain=drain, status=lambda: sent), nothing, nothing, 1.0, (nothing, 0))  # type: ignore[arg-type]
+    assert sent.sent_bytes > rounds
+    assert (sent.delivered == 1) is not bool(retries)

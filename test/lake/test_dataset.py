@@ -112,13 +112,59 @@ def test_repeats_are_samples_of_their_own(tmp_path: Path) -> None:
 
 def test_what_is_too_far_away_is_missing(tmp_path: Path) -> None:
     """Numbers are NaN, a cloud has no point, the mask says so; all samples keep one shape."""
-    source = drive(tmp_path, without=['imu'])
-    dataset = MissionDataset(source, align={'odom': Near(0.02), 'lowstate': 0.1, 'imu': Window(0.5, rows=3)})
+    settings = folder_store(tmp_path)
+    partly = Drive(settings, tmp_path)
+    partly.record(4, without=['imu'])
+    partly.record(1, first=9)
+    dataset = MissionDataset(
+        open_source(settings, BUCKET), align={'odom': Near(0.02), 'lowstate': 0.1, 'imu': Window(0.5, rows=3)}
+    )
     sample = dataset[3]
     assert np.isnan(sample['odom']).all()
     assert sample['odom'].shape == (13,)
     assert (bool(sample['odom_ok']), bool(sample['lowstate_ok']), sample['imu_ok'].any()) == (False, True, False)
     assert sample['imu'].shape[0] == 3
+
+
+def test_robots_differ_in_what_they_have(tmp_path: Path) -> None:
+    """One that stored nothing of a sensor has samples of the same shape as the others, all of it missing."""
+    settings = folder_store(tmp_path)
+    Drive(settings, tmp_path).record(1)
+    Drive(settings, tmp_path, 'tachi').record(1, without=['imu', 'joints', 'lidar'])
+    dataset = MissionDataset(open_source(settings, BUCKET), align={'joints': 0.1, 'imu': Window(0.5, rows=3), 'lidar': 0.1})
+    bare, full = dataset.__getitems__(range(2))
+    assert {name: value.dtype for name, value in bare.items()} == {name: value.dtype for name, value in full.items()}
+    assert [bare[name].shape for name in ('joints', 'imu', 'lidar')] == [(12,), (3, 10), (0, 4)]
+    assert not any(bare[f'{name}_ok'].any() for name in ('joints', 'imu', 'lidar'))
+
+
+def test_what_was_read_ahead_for_a_batch_does_not_stay(tmp_path: Path) -> None:
+    """Of the neighbours of a whole archive one frame needs few: the others would fill the memory, batch by batch."""
+    dataset = MissionDataset(drive(tmp_path, frames='tar'), align={'imu': 1.0, 'odom': 1.0})
+    for number in (0, 5, 9):
+        dataset.__getitems__([number])
+        assert dataset._reading is not None
+        assert dataset._reading[1].waiting_bytes == 0
+    dataset.close()
+
+
+def test_a_pose_that_is_known_is_not_lost_at_the_side_of_one_that_is_not(tmp_path: Path) -> None:
+    """Odometry ends within an archive: its own pose counts for the frames whose next archive has none."""
+    settings = folder_store(tmp_path)
+    still = Drive(settings, tmp_path)
+    for second, more in ((0, {}), (1, {'pose': ''})):
+        stamps = [NOON_NS + second * SECOND + number * SECOND // 4 for number in range(4)]
+        kind, how = 'sensor_msgs/msg/CompressedImage', {'format': 'tar', 'batch_s': 1.0}
+        still.store([still.one(kind, stamps, [still.frame(number) for number in range(4)], **how)], **more)
+    dataset = MissionDataset(open_source(settings, BUCKET))
+    assert [dataset[number]['pose'][0] for number in range(4)] == pytest.approx([0.375] * 4)
+    assert all(np.isnan(dataset[number]['pose']).all() for number in range(4, 8))
+
+
+def test_the_poses_of_all_samples_are_those_of_each(tmp_path: Path) -> None:
+    """Also of the frames of an archive, between which the robot walked."""
+    dataset = MissionDataset(drive(tmp_path, frames='tar'))
+    assert dataset.poses == pytest.approx(np.array([dataset[number]['pose'] for number in range(len(dataset))]))
 
 
 def test_incomplete_samples_can_be_left_out(tmp_path: Path) -> None:
@@ -160,6 +206,22 @@ def test_a_fetched_folder_gives_the_same(tmp_path: Path, frames: str) -> None:
     assert len(store) == len(folder) > 0
     assert all(map(same, store.stream(), folder.stream()))
     assert len(query.objects(selecting.fetched(to)).to_pylist()) == len(query.objects(source).to_pylist())
+
+
+def test_a_folder_without_rows_is_no_data_set(tmp_path: Path) -> None:
+    """It is not there, or its files were fetched by prefix: an empty data set would say that there are no frames."""
+    (tmp_path / 'data' / 'thor' / 'camera').mkdir(parents=True)
+    for folder in ('nowhere', 'data'):
+        with pytest.raises(LakeError, match=f'{folder} has no catalogue'):
+            MissionDataset(tmp_path / folder)
+
+
+def test_a_sensor_of_which_nothing_is_known_is_no_neighbour(tmp_path: Path) -> None:
+    """Misspelt, or not fetched with the frames: an error, not a column of NaN."""
+    source = drive(tmp_path, without=['imu'])
+    for name in ('odometer', 'imu'):
+        with pytest.raises(LakeError, match=f'{name} has no object about the time of the camera'):
+            MissionDataset(source, align={'odom': 0.5, name: 0.5})
 
 
 def test_repeats_survive_compaction(tmp_path: Path) -> None:

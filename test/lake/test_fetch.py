@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from lake.making import Watched, add, folder_store, watched
+from lake.making import NOON_NS, Watched, add, folder_store, row, watched
 
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import CredentialsRejected, LakeError, StoreUnavailable
+from shadowhound_data_logger.lake import fetched_rows
 from shadowhound_data_logger.lake.fetch import Result, Wish, fetch, under
 from shadowhound_data_logger.lake.fetched import Fetched
 from shadowhound_data_logger.lake.schema import BUCKET
@@ -161,6 +162,15 @@ def test_no_key_leads_out_of_the_folder(settings: StoreSettings, tmp_path: Path,
     found = run(source, tmp_path / 'data', wishes=[Wish(BUCKET, key, 3)])
     assert list(found.failed) == [f'{BUCKET}/{key}']
     assert source.asked == []
+
+
+@pytest.mark.parametrize('robot', ['{tmp}/evil', '../../evil', '..'])
+def test_no_row_leads_out_of_the_folder(tmp_path: Path, robot: str) -> None:
+    """Nor does what a row calls its robot: such a row is not kept, the others are."""
+    to, named = tmp_path / 'a' / 'data', robot.format(tmp=tmp_path)
+    fetched_rows.keep(to, [row('camera', NOON_NS), {**row('camera', NOON_NS), 'robot': named}])
+    kept = [path for path in tmp_path.rglob('*') if path.is_file()]
+    assert [path.parents[2] for path in kept] == [to / 'thor']
 
 
 def test_one_that_cannot_be_fetched_stops_no_other(settings: StoreSettings, tmp_path: Path) -> None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from faults.front import Front
-from lake.making import DAY_NS, FAILED, FINISHED, NOON_NS, Watched, add, fill, folder_store, keys, minutes, watched
+from lake.making import DAY_NS, FAILED, FINISHED, NOON_NS, Watched, add, add_part, fill, folder_store, keys, minutes, watched
 
 from shadowhound_data_logger import lake
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import CredentialsRejected, LakeError
+from shadowhound_data_logger.errors import CredentialsRejected, LakeError, SettingError
 from shadowhound_data_logger.lake import schema
 from shadowhound_data_logger.lake.query import answering
 from shadowhound_data_logger.lake.source import open_source
@@ -136,6 +138,22 @@ def test_a_mission_without_a_summary_is_told_without_an_end(tmp_path: Path) -> N
     assert found(source, success=False) == []
 
 
+def test_what_was_delivered_before_its_mission_had_a_run_belongs_to_it(tmp_path: Path) -> None:
+    """How the mission ended, and its run, are known from others of its objects, which the question need not ask for."""
+    settings = folder_store(tmp_path)
+    rows = [each for _, few in minutes(days=(0,), hours=(11,)) for each in few]
+    early = [{**each, 'run_id': None} if each['sensor'] == 'camera' else each for each in rows]
+    fill(settings, tmp_path / 'tmp', days=(), hours=())
+    with closing(open_store(settings, UploadSettings())) as store:
+        add_part(store, early, 'early', tmp_path / 'tmp')
+    source = open_source(settings, schema.BUCKET)
+    frames = sorted(each['key'] for each in rows if each['sensor'] == 'camera' and each['mission_id'] == FAILED)
+    assert found(source, sensor='camera', success=False) == frames
+    assert found(source, sensor='camera', mission='run-mfail', **DAY) == found(source, sensor='camera', mission=FAILED) == frames
+    told = lake.missions(source, sensor='camera', **DAY).sort('mission_id').to_pydict()
+    assert (told['run_id'], told['success']) == ([f'run-{FAILED}', f'run-{FINISHED}'], [False, True])
+
+
 @pytest.mark.parametrize(
     'ask',
     [
@@ -212,6 +230,23 @@ def test_wrong_credentials_are_told_without_showing_them(seaweed: Tower) -> None
     assert plain.access_key_id not in str(caught.value)
     assert 'not the secret' not in str(caught.value)
     assert 'AWS_SECRET_ACCESS_KEY' in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('keys', 'error', 'says'),
+    [({}, CredentialsRejected, 'there are no credentials for Tower'),
+     ({'access_key_id': 'k'}, SettingError, 'AWS_SECRET_ACCESS_KEY'),
+     ({'secret_access_key': 's'}, SettingError, 'AWS_ACCESS_KEY_ID')],
+)  # fmt: skip
+def test_credentials_that_are_not_there_are_told(
+    keys: dict[str, str], error: type[Exception], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """None of them, or half a pair: what is missing, before anything is asked for."""
+    for name in [name for name in os.environ if name.startswith('AWS_')]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv('HOME', str(tmp_path))
+    with pytest.raises(error, match=says):
+        open_source(StoreSettings(endpoint_url='http://127.0.0.1:9', **keys), schema.BUCKET).folders('')
 
 
 def test_a_source_can_be_sent_to_another_process(world: tuple[StoreSettings, list[schema.Row]]) -> None:

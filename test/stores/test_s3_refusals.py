@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -21,9 +21,10 @@ from shadowhound_data_logger.errors import (
     SettingError,
     StoreUnavailable,
 )
-from shadowhound_data_logger.model import Put
+from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store, s3
+from shadowhound_data_logger.stores.content import chunks
 from shadowhound_data_logger.stores.s3 import S3Store
 
 
@@ -38,6 +39,22 @@ def test_a_wrong_secret(opened: Callable[..., S3Store], seaweed: Tower, spool: S
         assert words in error_of(CredentialsRejected, store.probe)
         assert words in error_of(CredentialsRejected, lambda s=store: s.head('allowed', 'a'))  # type: ignore[misc]
         assert words in error_of(CredentialsRejected, lambda s=store: s.get('allowed', 'a'))  # type: ignore[misc]
+
+
+def test_a_file_that_goes_between_its_check_and_its_sending(
+    opened: Callable[..., S3Store], spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Evicted in that instant, say: it is refused as gone, and nothing but a store's error leaves the store."""
+    item = spool('a', bytes(s3.STREAM_BYTES + 1))
+
+    def gone(given: SpooledObject) -> Iterator[bytes]:
+        yield from chunks(given)
+        given.path.unlink()
+
+    monkeypatch.setattr(s3, 'chunks', gone)
+    with served(FakeS3()) as server:
+        store = opened(StoreSettings(endpoint_url=server.url, access_key_id='KEYID', secret_access_key=SECRET))
+        assert 'it is gone' in error_of(ObjectRefused, lambda: store.put(item))
 
 
 def test_no_credentials_at_all(
