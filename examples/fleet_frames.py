@@ -3,8 +3,9 @@
     python examples/fleet_frames.py --since yesterday --near=-0.6,3.1,2 --workers 4
     python examples/fleet_frames.py --since yesterday --runner ray --address ray://HEAD:10001 --workers 64
 
-The question and the code are the same on a laptop (Daft's own runner, processes) and on a Ray cluster. A frame never comes to
-this process: workers send back two numbers for each. Sharpness is the variance of the Laplacian: blurred frames have little.
+The question and the code are the same on a laptop (Daft's own runner, processes) and on a Ray cluster (``pip install
+'daft[ray]'``). A frame never comes to this process: workers send back two numbers for each. Sharpness is the variance of the
+Laplacian: blurred frames have little.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
 """The integration guide's training script: a small network learns from camera frames how the robot went on.
 
+    pip install '.[lake,train]'
     python examples/train_navigation_policy.py --mission-type patrol --since yesterday --epochs 5
 
 Frames come from the store that AWS_ENDPOINT_URL names (or from ``--folder``, what ``shadowhound-data fetch --to`` brought), the

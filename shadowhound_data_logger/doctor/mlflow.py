@@ -35,7 +35,7 @@ def check(context: Context) -> Iterator[Result]:
     """See the module."""
     service = services.mlflow(context)
     if service is None:
-        uri = context.environ.get('MLFLOW_TRACKING_URI', '')
+        uri = services.shown(context.environ.get('MLFLOW_TRACKING_URI', ''))
         yield info(NAME, f'no MLflow server is set: missions are logged to {uri or context.settings.home / "mlflow.db"}')
         return
     if failed := context.failed('network.mlflow'):
@@ -155,7 +155,7 @@ def _proxied(rest: MlflowRest, folder: str) -> Result:
             'mlflow.artifacts',
             f'MLflow takes no artifact: {problem}',
             S3_OF_SERVER,
-            f'{LOGS} ; docker exec mlflow env | grep -E "AWS_|MLFLOW_S3"',
+            f'{LOGS} ; docker exec mlflow env | grep -E "AWS_|MLFLOW_S3" | cut -d= -f1  # the names alone',
         )
     except TrackingUnavailable as problem:
         return error(

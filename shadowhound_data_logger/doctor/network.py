@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import ssl
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from shadowhound_data_logger.doctor import services
@@ -37,7 +37,7 @@ def _check(service: Service | None, check: str, context: Context) -> Iterator[Re
     if service is None:
         return
     try:
-        address = _resolve(service)
+        addresses = _resolve(service)
     except (OSError, UnicodeError) as problem:
         yield error(
             f'{check}.dns',
@@ -47,12 +47,11 @@ def _check(service: Service | None, check: str, context: Context) -> Iterator[Re
             f'export {service.variable}=http{"s" * service.tls}://TOWER_IP:{service.port}',
         )
         return
-    yield ok(f'{check}.dns', f'{service.host} is {address}')
+    yield ok(f'{check}.dns', f'{service.host} is {" and ".join(addresses)}')
     began_s = time.monotonic()
-    try:
-        socket.create_connection((address, service.port), timeout=CONNECT_S).close()
-    except OSError as problem:
-        yield _unreachable(service, address, f'{check}.tcp', problem)
+    address, refusal = _reach(addresses, service.port)
+    if refusal is not None:
+        yield _unreachable(service, address, f'{check}.tcp', refusal)
         return
     took_ms = 1000 * (time.monotonic() - began_s)
     yield ok(f'{check}.tcp', f'{service.title} at {service.host}:{service.port} accepts connections ({took_ms:.1f} ms)')
@@ -67,10 +66,23 @@ def _check(service: Service | None, check: str, context: Context) -> Iterator[Re
         )
 
 
-def _resolve(service: Service) -> str:
-    """The first address; a server that listens is reached at any."""
+def _resolve(service: Service) -> list[str]:
+    """Its addresses, the preferred one first."""
     found = socket.getaddrinfo(service.host, service.port, type=socket.SOCK_STREAM)
-    return str(found[0][4][0])
+    return list(dict.fromkeys(str(each[4][0]) for each in found))
+
+
+def _reach(addresses: Sequence[str], port: int) -> tuple[str, OSError | None]:
+    """The first that takes a connection, as clients try them: a server may listen at one alone. Else the first, and why not."""
+    problems: list[OSError] = []
+    for address in addresses:
+        try:
+            socket.create_connection((address, port), timeout=CONNECT_S / len(addresses)).close()
+        except OSError as problem:
+            problems.append(problem)
+        else:
+            return address, None
+    return addresses[0], problems[0]
 
 
 def _unreachable(service: Service, address: str, check: str, problem: OSError) -> Result:

@@ -7,8 +7,8 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
-from urllib.parse import urlsplit
 
+from shadowhound_data_logger.doctor import services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.model import Context, Result, info, ok, warning
 
@@ -19,7 +19,7 @@ WELL_KNOWN: Final = frozenset({'minioadmin', 'minio', 'minio123', 'password', 'a
 URLS: Final = ('AWS_ENDPOINT_URL', 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL')
 MOST_BYTES: Final = 1 << 20
 _SECRET: Final = re.compile(
-    r'(?im)^[^#\n]*(aws_secret_access_key|mlflow_tracking_password|secret_?key|postgres_password)\b\s*[:=]\s*\S'
+    r'(?im)^[^#\n]*(aws_secret_access_key|mlflow_tracking_password|secret_?key|postgres_password)\b"?\s*[:=]\s*\S'
 )
 
 
@@ -33,7 +33,7 @@ def check(context: Context) -> Iterator[Result]:
 
 def _urls(context: Context) -> Iterator[Result]:
     for name in URLS:
-        if '@' in urlsplit(context.environ.get(name, '')).netloc:
+        if services.shown(url := context.environ.get(name, '')) != url:
             yield warning(
                 'secrets.url',
                 f'{name} holds a user and a password',
@@ -92,9 +92,9 @@ def _candidates(context: Context) -> list[Path]:
     paths = [
         Path(environ.get('AWS_SHARED_CREDENTIALS_FILE') or home / '.aws/credentials').expanduser(),
         Path(environ.get('AWS_CONFIG_FILE') or home / '.aws/config').expanduser(),
-        context.root / 'etc/shadowhound/logger.env',
-        *(Path(name) for name in ('tower/.env', '.env', 'thor.env', 'spark.env')),
-        *sorted(Path('tower/secrets').glob('*.env')),
+        *(context.root / 'etc/shadowhound' / name for name in ('logger.env', 'credentials')),
+        *(Path(name) for name in ('tower/.env', '.env', 'thor.env', 'spark.env', 'thor.credentials')),
+        *sorted(Path('tower/secrets').glob('*.*')),
         home / '.mlflow/credentials',
         *(home / name for name in ('.bashrc', '.profile', '.bash_profile', '.zshrc', '.bash_history', '.shadowhound.env')),
         *([context.parameter_file] if context.parameter_file else []),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Final
 from urllib.parse import urlsplit
@@ -50,6 +51,11 @@ def mlflow(context: Context) -> Service | None:
     return _service('mlflow', 'MLflow', 'MLFLOW_TRACKING_URI', context.environ.get('MLFLOW_TRACKING_URI', ''), (5001, 5000))
 
 
+def shown(url: str) -> str:
+    """A URL, which may be none, without user and password."""
+    return re.sub('//.*@', '//', url)
+
+
 def _service(name: str, title: str, variable: str, given: str, usual: tuple[int, ...]) -> Service | None:
     try:
         url = urlsplit(given)
@@ -58,5 +64,4 @@ def _service(name: str, title: str, variable: str, given: str, usual: tuple[int,
         port = url.port or (443 if url.scheme == 'https' else 80)
     except ValueError:
         return None
-    shown = url._replace(netloc=url.netloc.rpartition('@')[2]).geturl().rstrip('/')
-    return Service(name, title, variable, shown, url.hostname, port, url.scheme == 'https', usual)
+    return Service(name, title, variable, shown(given).rstrip('/'), url.hostname, port, url.scheme == 'https', usual)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -93,8 +93,7 @@ def _cyclone(context: Context) -> Iterator[Result]:
 def _profile(context: Context) -> Result:
     """Fast DDS of this shell."""
     name, file = next(((name, path) for name in PROFILES if (path := context.environ.get(name))), ('', ''))
-    variable = PROFILES[1] if context.environ.get('ROS_DISTRO') in {'humble', 'jazzy'} else PROFILES[0]
-    remedy = f'export {variable}={PROFILE_FILE}  # for the driver, and here'
+    remedy = f'export {_variable(context.environ)}={PROFILE_FILE}  # for the driver, and here'
     if not file:
         return warning(
             'sockets.profile',
@@ -154,5 +153,10 @@ def _driver_profile(context: Context, driver: list[Process]) -> Iterator[Result]
             'sockets.driver',
             f'the driver (process {without[0].pid}) was started without the shared-memory profile',
             "the memory is the publisher's: here alone it changes nothing",
-            f'start the driver again with: export {PROFILES[1]}={PROFILE_FILE}',
+            f'start the driver again with: export {_variable(without[0].environ)}={PROFILE_FILE}',
         )
+
+
+def _variable(environ: Mapping[str, str]) -> str:
+    """What names the profile for the Fast DDS of this environment."""
+    return PROFILES[environ.get('ROS_DISTRO') in {'humble', 'iron', 'jazzy'}]

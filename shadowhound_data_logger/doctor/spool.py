@@ -52,7 +52,7 @@ def check(context: Context) -> Iterator[Result]:
         )
         return
     yield ok('spool.index', 'the index is whole')
-    yield _ledger(accounts)
+    yield _ledger(accounts, path)
     yield _backlog(piles, context, runs=found['running'])
     yield from _quarantine(quarantined)
     yield from _lock(folder, found, context.root)
@@ -107,9 +107,9 @@ def _node(found: Mapping[str, Any], folder: Path) -> Iterator[Result]:
 
 def _status_remedy(text: str) -> str:
     remedies = {
-        'missed': 'shadowhound-data doctor --only sockets --only ros  # lost before the logger',
+        'missed': 'shadowhound-data ledger  # by restart: no node ran; by transport: doctor --only sockets --only ros',
         'dropped': 'top -H -p $(pgrep -f sensor_logger_node)  # the encoders do not follow: log less, or set encode.threads',
-        'the node is paused': 'ros2 service call /sensor_logger_node/resume std_srvs/srv/Trigger',
+        'the node is paused': 'ros2 service call /sensor_logger_node/pause std_srvs/srv/SetBool "{data: false}"',
         'bucket': 'shadowhound-data doctor --only s3',
         'the clock': 'timedatectl  # docs/thor.md, Wrong clock',
         'quarantined': 'shadowhound-data spool list --state quarantined',
@@ -117,7 +117,7 @@ def _status_remedy(text: str) -> str:
     return next((remedy for start, remedy in remedies.items() if text.startswith(start)), 'shadowhound-data status')
 
 
-def _ledger(accounts: Mapping[str, Any]) -> Result:
+def _ledger(accounts: Mapping[str, Any], index: Path) -> Result:
     wrong = ledger.imbalances(accounts)
     if not wrong:
         return ok(
@@ -128,7 +128,7 @@ def _ledger(accounts: Mapping[str, Any]) -> Result:
         'spool.ledger',
         f'the ledger does not close: {wrong[0]}' + (f'; and {len(wrong) - 1} more' if wrong[1:] else ''),
         'the index was written by something else, or this is a fault of ours',
-        'cp -r ~/.shadowhound/spool /tmp/spool && shadowhound-data ledger --json > /tmp/ledger.json  # and send us both',
+        f'shadowhound-data ledger --json > /tmp/ledger.json ; cp {index}* /tmp/  # and send us these files',
         imbalances=wrong,
     )
 
@@ -196,5 +196,5 @@ def _lock(folder: Path, found: Mapping[str, Any], root: Path) -> Iterator[Result
         'spool.lock',
         f'process {holder} has the right to deliver: {who[:120]}',
         'another node, a program that rescues the spool, or one that hangs; until it ends, no node delivers',
-        f'ps -fp {holder} ; kill {holder}  # if it is not wanted',
+        f'ps -fp {holder}  # and if it is not wanted: kill {holder}',
     )

@@ -17,10 +17,12 @@ if TYPE_CHECKING:
 
 _ROWS: Final = 8
 _COLUMNS: Final = 9
+_CONTRAST: Final = 4.0
+"""Grey levels between the darkest cell and the brightest: below it noise sets the bits, or none is set, of black as of white."""
 
 
 def difference_hash(jpeg: bytes) -> int | None:
-    """64 bits, the top left one the highest; None of what is no JPEG that can be decoded, or has fewer pixels than that."""
+    """64 bits, the top left one the highest; None of what is no JPEG, too small, or without contrast."""
     try:
         grey = simplejpeg.decode_jpeg(
             jpeg, 'GRAY', fastdct=True, min_height=_ROWS, min_width=_COLUMNS, min_factor=8, strict=False
@@ -31,6 +33,8 @@ def difference_hash(jpeg: bytes) -> int | None:
     if height < _ROWS or width < _COLUMNS:
         return None
     cells = _means(_means(grey[:, :, 0].astype(np.float32), _ROWS, 0), _COLUMNS, 1)
+    if np.ptp(cells) < _CONTRAST:
+        return None
     return int.from_bytes(np.packbits(cells[:, :-1] < cells[:, 1:]).tobytes(), 'big')
 
 

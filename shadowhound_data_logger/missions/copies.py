@@ -61,6 +61,12 @@ class Spares:
                 os.close(descriptor)
                 target.unlink(missing_ok=True)
 
+    def forget(self) -> None:
+        """In a forked child: let go of what the parent made."""
+        self._lock, self._is_open = threading.Lock(), False
+        while self._ready:
+            os.close(self._ready.popleft()[1])
+
     def _new(self) -> tuple[Path, int]:
         target = self._folder / f'{next(self._numbers):08d}.jpg'
         return target, _create(target)

@@ -14,10 +14,10 @@ import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.config import home as home_of
 from shadowhound_data_logger.errors import NameRefused, SettingError
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.missions.beginning import Beginning
@@ -26,6 +26,7 @@ from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.recorder import Mission
 from shadowhound_data_logger.missions.report import Report, has_arrived, report, sizes
 from shadowhound_data_logger.missions.story import FAILED, KILLED
+from shadowhound_data_logger.missions.values import text
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -42,7 +43,7 @@ class MissionDataLogger:
 
     The constructor starts the process that sends (it takes seconds to load MLflow, and a mission's start should not wait for
     that) and the thread ``missions``, which syncs journals. All methods may be called from any thread. ``_lock`` guards the
-    active mission. Raises SettingError for a robot's name that cannot be in a key, and nothing else, ever.
+    active mission. Raises SettingError for a robot's name that cannot be in a key or a home of nobody's, and nothing else, ever.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class MissionDataLogger:
         """
         environ = dict(os.environ) | ({'MLFLOW_TRACKING_URI': tracking_uri} if tracking_uri else {})
         self.robot = _robot(robot or environ.get('SHADOWHOUND_ROBOT') or 'thor')
-        self.home = Path(home or environ.get('SHADOWHOUND_HOME') or '~/.shadowhound').expanduser().absolute()
+        self.home = home_of({'SHADOWHOUND_HOME': os.fspath(home)} if home else environ)
         self._environ = environ | {'SHADOWHOUND_ROBOT': self.robot}
         self._start_timeout_s = start_timeout_s
         self._beginning = Beginning(self.home, self.robot, frame_artifact_every_s, SystemClock.of_this_machine())
@@ -97,8 +98,9 @@ class MissionDataLogger:
         try:
             yield mission
         except BaseException as error:
-            mission.log_event('exception', type=type(error).__name__, text=str(error))
-            mission.end(success=False, status=FAILED, error=f'{type(error).__name__}: {error}')
+            said = text(error)
+            mission.log_event('exception', type=type(error).__name__, text=said)
+            mission.end(success=False, status=FAILED, error=f'{type(error).__name__}: {said}')
             raise
         else:
             mission.end(success=True)
@@ -230,7 +232,9 @@ class MissionDataLogger:
     def _forget_all(self) -> None:
         """In a forked child: threads, journal and replayer are the parent's."""
         self._lock = threading.RLock()
-        self._mission = None
+        for mission in (*self._ended, *((self._mission,) if self._mission else ())):
+            mission.forget()
+        self._mission, self._ended = None, []
         if self._replayer:
             self._replayer.forget()
             self._replayer = None

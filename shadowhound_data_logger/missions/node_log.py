@@ -117,14 +117,12 @@ class NodeLog:
                 else:
                     self._append('metrics', fact.stamp_ns, m={fact.key: fact.value}, s=self._step(fact.stamp_ns))
             self._move(all_of_it=all_of_it)
-            if all_of_it:
-                self._floor.save(self.mission.folder.floor)
             if facts:
                 self._journal.sync()
+            if all_of_it:
+                self._floor.save(self.mission.folder.floor)
         except OSError as error:
-            if not self._told:
-                self._told = True
-                log.warning('mission %s loses what the node logs while the disk takes nothing: %s', self.mission.id, error)
+            self._lose(error)
 
     def close(self, mission: Active | None = None) -> None:
         """Write the rest, of ``mission`` that has its end now, and let go of the journal: the sender waits for that."""
@@ -163,10 +161,19 @@ class NodeLog:
         number = FIRST_FRAME + self._frames
         name = f'{number:08d}.jpg'
         path = self._folder.files / name
-        path.unlink(missing_ok=True)  # of a node that was killed before it journalled the frame
-        copies.write(path, memoryview(frame.body))
+        try:
+            path.unlink(missing_ok=True)  # of a node that was killed before it journalled the frame
+            copies.write(path, memoryview(frame.body))
+        except OSError as error:  # the journal has room when frames have none any more
+            self._lose(error)
+            return
         self._append('frame', frame.stamp_ns, id=number, file=name, artifact=True, marks=dict(frame.marks))
         self._frames += 1
+
+    def _lose(self, error: OSError) -> None:
+        if not self._told:
+            self._told = True
+            log.warning('mission %s loses what the node logs while the disk takes nothing: %s', self.mission.id, error)
 
     def _step(self, stamp_ns: int) -> int:
         """Whole seconds since the start: what MLflow draws the points over."""

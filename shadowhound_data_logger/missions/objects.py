@@ -25,6 +25,7 @@ from shadowhound_data_logger.spool.delivering import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.status import limits
 
 FRAME_PRIORITY: Final = 6
 """As the camera's own images."""
@@ -182,7 +183,8 @@ class Shelf:
     def _opened(self) -> Spool:
         self._used_s = self._monotonic()
         if self._spool is None:
-            spool = Spool(self._settings.spool_path, self._settings.spool, self._clock, self._settings.robot)
+            path = self._settings.spool_path
+            spool = Spool(path, limits(path, self._settings.spool), self._clock, self._settings.robot)
             spool.open()
             self._spool = spool
         return self._spool

@@ -75,6 +75,8 @@ class Mission:
         try:
             number = values.whole(frame_id, 'frame_id')
             data = values.content(frame_data, f'frame {number}')
+            if self._is_over():
+                return
             self._append('frame', id=number, file=self._frames.write(data), artifact=self._is_sampled())
         except Rejected as error:
             self._refuse(error)
@@ -137,6 +139,11 @@ class Mission:
         self._frames.close()
         self._journal.close()
 
+    def forget(self) -> None:
+        """In a forked child: the parent alone logs, and the files that were made ahead are its own."""
+        self._lock, self._ended = threading.Lock(), True
+        self._frames.forget()
+
     def sync(self) -> None:
         """Make durable what was logged before. Called by the logger's thread; never raises OSError."""
         with self._lock:
@@ -174,6 +181,8 @@ class Mission:
                 self._lose(error)
 
     def _log_file(self, kind: str, path: str | os.PathLike[str], more: Mapping[str, str]) -> None:
+        if self._is_over():
+            return
         name = f'{next(self._numbers):08d}'
         try:
             copies.copy(path, self.folder.files / name)
@@ -194,7 +203,13 @@ class Mission:
                 if 'file' in fields:
                     self._unsynced.append(self.folder.files / fields['file'])
         if ended:
+            self._is_over()
+
+    def _is_over(self) -> bool:
+        """Whether it has ended, which is said: no file of what comes now may be left."""
+        if self._ended:
             self._warn('ended', 'mission %s has ended: what is logged to it now is left out', self.id)
+        return self._ended
 
     def _is_sampled(self) -> bool:
         """Whether this frame becomes an artifact of the run as well."""

@@ -28,10 +28,10 @@ from shadowhound_data_logger.missions.dating import Dating
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.drawing import Drawing
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missions, write_json
+from shadowhound_data_logger.missions.gate import Gate
 from shadowhound_data_logger.missions.objects import Shelf
-from shadowhound_data_logger.missions.report import STATE
+from shadowhound_data_logger.missions.report import LOCK, STATE
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
-from shadowhound_data_logger.ship.retry import backoff
 from shadowhound_data_logger.spool import clock_record
 from shadowhound_data_logger.spool.files import flock
 
@@ -43,37 +43,9 @@ LINGER_S: Final = 600.0
 """How long it tries on after the agent ended and nothing gets through."""
 KEEP_S: Final = 30 * 86_400.0
 """How long a mission that has arrived stays on the robot; looked at when a sender starts."""
-LONGEST_PAUSE_S: Final = 60.0
 NICE: Final = 5
 SLICE_S: Final = 0.5
 TRACKING, ARTIFACTS, OBJECTS, STORE = 'tracking', 'artifacts', 'objects', 'store'
-
-
-class Gate:
-    """One receiver's outage: when to try it next (exponential backoff, full jitter, up to a minute)."""
-
-    def __init__(self, monotonic: Callable[[], float], rng: random.Random) -> None:
-        self._monotonic = monotonic
-        self._rng = rng
-        self._failures = 0
-        self._next_s = float('-inf')
-        self.error: Exception | None = None
-
-    @property
-    def is_open(self) -> bool:
-        return self._monotonic() >= self._next_s
-
-    def failed(self, error: Exception) -> None:
-        self._failures += 1
-        self.error = error
-        self._next_s = self._monotonic() + backoff(self._failures, LONGEST_PAUSE_S, self._rng)
-
-    def worked(self) -> None:
-        self._failures, self.error, self._next_s = 0, None, float('-inf')
-
-    def hurry(self) -> None:
-        """Try at once: somebody waits for it."""
-        self._next_s = float('-inf')
 
 
 class Replay:
@@ -93,7 +65,8 @@ class Replay:
         self.gates = {name: Gate(monotonic, rng) for name in (TRACKING, ARTIFACTS, OBJECTS, STORE)}
         self._deliveries: dict[str, Delivery] = {}
         self._settle = settle
-        self._undated: set[str] = set()
+        self._stuck: set[tuple[str, str]] = set()  # (gate, mission) that failed when it was tried last
+        self._waiting: set[str] = set()  # without a date yet, or not readable now
         self._settled: set[str] = set()  # complete, or beyond help until the next start
         self._told: dict[str, object] = {}
         self._logged: set[str] = set()
@@ -104,8 +77,7 @@ class Replay:
         self._look()
         self._progress = False
         tried = [gate for gate in self.gates.values() if gate.is_open]
-        newest_first = sorted(self._deliveries.values(), key=lambda delivery: _age(delivery.folder.mission_id), reverse=True)
-        for delivery in newest_first:
+        for delivery in self._newest_first():
             if self._work(delivery):
                 self._settled.add(delivery.folder.mission_id)
                 del self._deliveries[delivery.folder.mission_id]
@@ -123,9 +95,10 @@ class Replay:
     def _work(self, delivery: Delivery) -> bool:
         """One piece for each receiver; whether nothing is left to do for this mission."""
         try:
-            self._try(TRACKING, delivery.track)
-            self._try(ARTIFACTS, delivery.attach)
-            self._try(OBJECTS, lambda: delivery.shelve(hold=self.gates[TRACKING].error is not None))
+            mission_id = delivery.folder.mission_id
+            self._try(TRACKING, delivery.track, mission_id)
+            self._try(ARTIFACTS, delivery.attach, mission_id)
+            self._try(OBJECTS, lambda: delivery.shelve(hold=self.gates[TRACKING].error is not None), mission_id)
             return delivery.complete()
         except TrackingRefused as error:
             log.error('mission %s is not sent on: %s', delivery.folder.mission_id, error)  # noqa: TRY400 - no defect
@@ -137,7 +110,7 @@ class Replay:
     @property
     def owes(self) -> bool:
         """Whether something could not be sent yet."""
-        return any(gate.error for gate in self.gates.values()) or self._shelf.owes or self._drawing.busy or bool(self._undated)
+        return any(gate.error for gate in self.gates.values()) or self._shelf.owes or self._drawing.busy or bool(self._waiting)
 
     def hurry(self) -> None:
         for gate in self.gates.values():
@@ -152,18 +125,31 @@ class Replay:
         """Take up missions that are new here."""
         for folder in missions(self._home):
             if folder.mission_id not in self._deliveries and folder.mission_id not in self._settled and folder.journal.exists():
-                if folder.sent().complete:
-                    self._settled.add(folder.mission_id)
-                    if folder.age_s() > KEEP_S:
-                        shutil.rmtree(folder.path, ignore_errors=True)
-                elif self._settle(folder):
-                    self._undated.discard(folder.mission_id)
-                    self._deliveries[folder.mission_id] = Delivery(folder, self._tracking, self._shelf, self._drawing.of)
-                    self.gates[TRACKING].hurry()  # its agent waits for the run's id
-                else:
-                    self._undated.add(folder.mission_id)
+                try:
+                    self._take_up(folder)
+                except OSError as error:
+                    self._waiting.add(folder.mission_id)
+                    self._say(folder.mission_id, error)
 
-    def _try(self, name: str, work: Callable[[], bool]) -> None:
+    def _take_up(self, folder: MissionFolder) -> None:
+        if folder.sent().complete:
+            self._settled.add(folder.mission_id)
+            if folder.age_s() > KEEP_S:
+                shutil.rmtree(folder.path, ignore_errors=True)
+        elif self._settle(folder):
+            self._deliveries[folder.mission_id] = Delivery(folder, self._tracking, self._shelf, self._drawing.of)
+            self._waiting.discard(folder.mission_id)
+            self.gates[TRACKING].hurry()  # its agent waits for the run's id
+        else:
+            self._waiting.add(folder.mission_id)
+
+    def _newest_first(self) -> list[Delivery]:
+        """Those that something holds up come last: the others would wait for them whenever it is tried again."""
+        stuck = {mission_id for _, mission_id in self._stuck}
+        found = sorted(self._deliveries.items(), key=lambda item: (item[0] not in stuck, _age(item[0])), reverse=True)
+        return [delivery for _, delivery in found]
+
+    def _try(self, name: str, work: Callable[[], bool], mission_id: str = '') -> None:
         gate = self.gates[name]
         if not gate.is_open:
             return
@@ -173,13 +159,19 @@ class Replay:
             raise
         except (DataLoggerError, OSError, sqlite3.Error) as error:
             gate.failed(error)
-            if str(error) not in self._logged:
-                self._logged.add(str(error))
-                log.warning('%s: %s', name, error)
+            self._stuck.add((name, mission_id))
+            self._say(name, error)
         else:
             if worked:
                 gate.worked()
+                self._stuck.discard((name, mission_id))
             self._progress = self._progress or worked
+
+    def _say(self, who: str, error: Exception) -> None:
+        """Once."""
+        if str(error) not in self._logged:
+            self._logged.add(str(error))
+            log.warning('%s: %s', who, error)
 
     def _drain(self) -> bool:
         """True while there is more to deliver."""
@@ -195,8 +187,12 @@ class Replay:
         }  # fmt: skip
         state: dict[str, object] = {'pid': 0 if ended else os.getpid(), 'errors': errors}
         if state != self._told:
-            self._told = state
-            write_json(self._home / FOLDER / STATE, state)
+            try:
+                write_json(self._home / FOLDER / STATE, state)
+            except OSError as error:
+                self._say(STATE, error)
+            else:
+                self._told = state
 
 
 def _age(mission_id: str) -> list[str]:
@@ -252,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format='%(asctime)s %(levelname)s %(message)s')
     parent = Parent(sys.stdin.fileno())
     with ExitStack() as opened:
-        while not opened.enter_context(flock(options.home / FOLDER / 'replay.lock', wait=False)):
+        while not opened.enter_context(flock(options.home / FOLDER / LOCK, wait=False)):
             opened.close()
             parent.wait(LOOK_EVERY_S)
             if parent.gone or asked:

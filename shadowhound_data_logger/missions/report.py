@@ -12,6 +12,8 @@ from shadowhound_data_logger.missions.folder import MissionFolder, Sent, read_js
 
 STATE: Final = 'replay.json'
 """Beside the missions: what the replayer says of itself."""
+LOCK: Final = 'replay.lock'
+"""Beside the missions: who holds it sends them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +74,14 @@ def _size(path: Path) -> int:
         return path.stat().st_size
     except FileNotFoundError:
         return 0
+
+
+def is_sending(missions: Path) -> bool:
+    """Whether a replayer of this folder runs."""
+    try:
+        return journal.is_locked(missions / LOCK)
+    except OSError:
+        return False
 
 
 def errors(missions: Path) -> dict[str, tuple[str, str]]:

@@ -40,10 +40,12 @@ REFUSALS: Final = frozenset({
     'RESOURCE_CONFLICT', 'NOT_IMPLEMENTED',
 })  # fmt: skip
 """MLflow's error codes after which trying the same again is no use."""
+TOO_LARGE: Final = 413
+"""The HTTP status of a proxy that will never take this file, whatever it takes besides."""
 RUN_GONE: Final = 'RUN_GONE'
 """``data['code']`` of the refusal of everything that belongs to a run that somebody deleted."""
 S3_REMEDY: Final = 'set MLFLOW_S3_ENDPOINT_URL to the S3 server of Tower, such as http://TOWER_IP:9000'
-_USER: Final = re.compile(r'//[^/@]*@')
+_USER: Final = re.compile(r'//[^/\s]*@')
 
 
 class Tracking(Protocol):
@@ -133,14 +135,11 @@ class MlflowTracking:
                 f'artifacts of run {run.run_id} lie in {run.artifact_uri}, and MLFLOW_S3_ENDPOINT_URL does not say where that is'
             )
             raise TrackingUnavailable(text, remedy=S3_REMEDY)
-        try:
-            with self._translated(f'took no artifact of run {run.run_id}'):
-                self._client.log_artifact(run.run_id, str(path), folder or None)
-        except (TrackingUnavailable, TrackingRefused):
-            raise
-        except Exception as error:  # each kind of artifact store (S3, Azure, SFTP, ...) raises what it likes
-            text = f'the artifact {path.name} did not reach {run.artifact_uri}: {type(error).__name__}: {error}'
-            raise TrackingUnavailable(text, remedy=S3_REMEDY if run.artifact_uri.startswith('s3:') else '') from error
+        what, remedy = f'took no artifact of run {run.run_id}', ''
+        if run.artifact_uri.startswith('s3:'):
+            what, remedy = f'{what} for {run.artifact_uri}', S3_REMEDY
+        with self._translated(what, remedy):
+            self._client.log_artifact(run.run_id, str(path), folder or None)
 
     def finish(self, run_id: str, mission_id: str, status: str, end_ms: int) -> None:
         self.open()
@@ -187,7 +186,8 @@ class MlflowTracking:
         return sorted(found, key=lambda run: (run.info.start_time, run.info.run_id))
 
     @contextmanager
-    def _translated(self, what: str) -> Iterator[None]:
+    def _translated(self, what: str, remedy: str = '') -> Iterator[None]:
+        """``remedy`` is that of a failure without an answer of MLflow's."""
         from mlflow.exceptions import MlflowException, RestException  # noqa: PLC0415 - see open
 
         try:
@@ -199,10 +199,12 @@ class MlflowTracking:
                 raise TrackingRefused(text, code=code) from error
             self._raise_distrust(error)
             raise TrackingUnavailable(text, remedy=remedy_for(code), code=code) from error
-        except Exception as error:  # whatever else a client raises (a captive portal's page is no JSON) is no mission's fault
+        except Exception as error:  # what a client, or a store of artifacts, raises besides (a portal's page is no JSON)
             self._raise_distrust(error)
             text = f'{self.where} {what}: {type(error).__name__}: {_USER.sub("//", str(error))[:500]}'
-            raise TrackingUnavailable(text, remedy=remedy_for('')) from error
+            if getattr(getattr(error, 'response', None), 'status_code', 0) == TOO_LARGE:
+                raise TrackingRefused(text, remedy='let the proxy before MLflow take larger files', code='TOO_LARGE') from error
+            raise TrackingUnavailable(text, remedy=remedy or remedy_for('')) from error
 
     def _raise_distrust(self, error: Exception) -> None:
         """Raises TrackingUnavailable where the certificate of the server is not believed, or of the store of artifacts."""

@@ -23,13 +23,15 @@ MAX_TAG: Final = 5000
 MAX_TEXT: Final = 1 << 20
 """Of anything that is journalled: a mission's command is no film."""
 MAX_STEP: Final = (1 << 63) - 1
+MAX_BITS: Final = 1024
+"""Of a number in an event: far larger ones Python does not even write."""
 _KEY: Final = re.compile(r'[/\w.\- ]+')
 
 
 def metric_key(key: object) -> str:
     """The key unchanged; raises Rejected for one that MLflow would refuse."""
     if not isinstance(key, str) or not _KEY.fullmatch(key) or len(key) > MAX_KEY or not _is_plain(key):
-        raise Rejected('bad_name', f'{str(key)[:80]!r} cannot name a metric: letters, digits, "_-./ ", at most {MAX_KEY}')
+        raise Rejected('bad_name', f'{text(key, 80)!r} cannot name a metric: letters, digits, "_-./ ", at most {MAX_KEY}')
     return key
 
 
@@ -40,7 +42,7 @@ def number(value: Any, what: str) -> float:
     except (TypeError, ValueError, OverflowError, RuntimeError):
         found = math.nan
     if not math.isfinite(found):
-        raise Rejected('not_a_number', f'{what} = {str(value)[:80]!r}')
+        raise Rejected('not_a_number', f'{what} = {text(value, 80)!r}')
     return found
 
 
@@ -49,9 +51,9 @@ def whole(value: Any, what: str) -> int:
     try:
         found = int(value)
     except (TypeError, ValueError, OverflowError, RuntimeError):
-        raise Rejected('not_a_number', f'{what} = {str(value)[:80]!r}') from None
+        raise Rejected('not_a_number', f'{what} = {text(value, 80)!r}') from None
     if not -MAX_STEP <= found <= MAX_STEP:
-        raise Rejected('not_a_number', f'{what} = {found} has more than 64 bits')
+        raise Rejected('not_a_number', f'{what} = {text(found, 80)} has more than 64 bits')
     return found
 
 
@@ -68,7 +70,11 @@ def content(value: Any, what: str) -> memoryview:
 
 def text(value: object, limit: int = MAX_TEXT) -> str:
     """Any value as text that every database takes: no NUL (PostgreSQL), no lone surrogates, at most ``limit`` characters."""
-    return str(value).replace('\0', '\N{REPLACEMENT CHARACTER}').encode('utf-8', 'replace').decode('utf-8')[:limit]
+    try:
+        found = str(value)
+    except Exception:  # noqa: BLE001 - an agent's own class raises what it likes, and Python for a number of 5,000 digits
+        found = f'<{type(value).__name__}>'
+    return found.replace('\0', '\N{REPLACEMENT CHARACTER}').encode('utf-8', 'replace').decode('utf-8')[:limit]
 
 
 def artifact_folder(path: object) -> str:
@@ -76,18 +82,19 @@ def artifact_folder(path: object) -> str:
     if path is None or path == '':
         return ''
     if not isinstance(path, str) or not _is_plain(path) or '\0' in path or len(path) > MAX_KEY:
-        raise Rejected('bad_name', f'{str(path)[:80]!r} is no folder below the artifacts of a run')
+        raise Rejected('bad_name', f'{text(path, 80)!r} is no folder below the artifacts of a run')
     return path
 
 
 def plain(value: Any, depth: int = 4) -> Any:
     """The value as JSON can hold it: what it cannot becomes text."""
-    if value is None or isinstance(value, (bool, int)):
+    if value is None or (isinstance(value, int) and value.bit_length() <= MAX_BITS):
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     if isinstance(value, dict) and depth:
-        return {text(key, MAX_KEY): plain(inner, depth - 1) for key, inner in value.items()}
+        copy = dict(value)  # in one step: another thread of the agent may change it meanwhile
+        return {text(key, MAX_KEY): plain(inner, depth - 1) for key, inner in copy.items()}
     if isinstance(value, (list, tuple)) and depth:
         return [plain(inner, depth - 1) for inner in value]
     return text(value, MAX_PARAM)

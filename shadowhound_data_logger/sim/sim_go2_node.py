@@ -129,7 +129,7 @@ def main(args: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if args is None else args)
     rest = remove_ros_args(argv)
     if rest:
-        _complain(f'{rest[0]!r} is no argument of it; parameters are given as --ros-args -p name:=value')
+        _say(f'{rest[0]!r} is no argument of it; parameters are given as --ros-args -p name:=value')
         return 2
     rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     # Nothing is spun, so no services; parameters are judged here and not by rclpy, which would ignore unknown ones.
@@ -138,11 +138,12 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         settings = SimSettings.load({name: parameter.value for name, parameter in node.get_parameters_by_prefix('').items()})
         robot = SimulatedGo2(node, _sources(settings))
+        _say(f'the robot walks and publishes {" ".join(sorted(robot.published))}; Ctrl-C ends it')
         run(robot, settings, lambda: bool(caught))
         robot.linger(LINGER_S)
         print(json.dumps({'published': robot.published}), flush=True)
     except SettingError as error:
-        _complain(str(error))
+        _say(str(error))
         return 2
     finally:
         node.destroy_node()
@@ -150,7 +151,7 @@ def main(args: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _complain(text: str) -> None:
+def _say(text: str) -> None:
     print(f'sim_go2_node: {text}', file=sys.stderr, flush=True)
 
 
@@ -161,7 +162,7 @@ def _sources(settings: SimSettings) -> list[Source]:
     try:
         from shadowhound_data_logger.sim.go2_messages import go2_sources  # noqa: PLC0415  # it may be missing
     except ImportError as error:
-        _complain(f'runs without imu, go2_states and lowstate, for want of go2_interfaces ({error})')
+        _say(f'runs without imu, go2_states and lowstate, for want of go2_interfaces ({error})')
         return common
     return [*go2_sources(world), *common]
 

@@ -42,7 +42,7 @@ class Listed:
     bytes: int
     created_ns: int
     path: str
-    """Of its file, within the spool's folder; it may be ``incoming/<id>.part`` for a moment yet."""
+    """Of its file, within the spool's folder; it may be ``incoming/<id>.part`` for a moment yet. One that is missing has none."""
 
 
 @dataclass(frozen=True, slots=True)

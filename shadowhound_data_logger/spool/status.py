@@ -10,11 +10,12 @@ import json
 import os
 import sqlite3
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import SECOND, Clock, iso
+from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.piles import look
@@ -35,7 +36,7 @@ _TOPIC: Final[dict[str, Any]] = {
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
     'spool': {'path': '', 'pending': 0, 'held': 0, 'quarantined': 0, 'bytes': 0, 'max_bytes': None, 'free_bytes': None,
-              'oldest_age_s': None},
+              'oldest_age_s': None, 'min_free_bytes': None, 'remember_days': None},
     'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
               'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
     'clock': {'is_set': True, 'gave_up': False, 'unset_s': 0.0, 'steps': 0, 'last_step_s': None, 'last_step_age_s': None},
@@ -63,6 +64,20 @@ def targets(spool: Path) -> list[str]:
     """The stores that the nodes of this spool delivered to when they last wrote a status, as a store describes itself."""
     written = (_load(file(spool, robot)) for robot in robots(spool))
     return sorted({one['store']['target'] for one in written if one} - {''})
+
+
+def limits(spool: Path, own: SpoolSettings) -> SpoolSettings:
+    """What the nodes of this spool keep to, the widest of it, or ``own`` where none has run.
+
+    Their parameters are unknown to other processes, which would evict, or forget, by their own defaults what a node may keep.
+    """
+    said = [one['spool'] for one in (_load(file(spool, robot)) for robot in robots(spool)) if one]
+    most, least, days = (
+        [one[name] for one in said if isinstance(one[name], (int, float))]
+        for name in ('max_bytes', 'min_free_bytes', 'remember_days')
+    )
+    return replace(own, max_bytes=max(most, default=own.max_bytes), min_free_bytes=min(least, default=own.min_free_bytes),
+                   remember_days=max(days, default=own.remember_days))  # fmt: skip
 
 
 def read(spool: Path, robot: str, clock: Clock) -> dict[str, Any]:
@@ -116,7 +131,7 @@ def _lives(pid: int, boot_ns: int) -> bool:
 
 
 def _of_index(spool: Path, robot: str, now_ns: int, written: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What the spool itself tells: what lies in it, and its last session."""
+    """What the spool itself tells: what lies in it, and the node's last session."""
     path = spool / 'index.db'
     if not path.is_file():
         text = f'there is no spool in {spool}: has the node run here? SHADOWHOUND_HOME names its folder'
@@ -126,17 +141,20 @@ def _of_index(spool: Path, robot: str, now_ns: int, written: Mapping[str, Any] |
         index.open()
         limit = written['spool']['max_bytes'] if written else None
         piles = {'path': str(spool), **asdict(look(index, spool, now_ns)), 'max_bytes': limit}
-        return {'spool': piles, 'session': _session(index, robot)}
+        return {'spool': piles, 'session': _session(index, robot, written['pid'] if written else 0)}
     except (OSError, sqlite3.Error, SpoolError) as error:
         return {'spool': None, 'session': None, 'problem': f'the spool index {path} cannot be read: {error}'}
     finally:
         index.close()
 
 
-def _session(index: Index, robot: str) -> dict[str, Any] | None:
-    """The last session: when it began and ended by the wall clock; ``ended`` is None where it was cut off."""
-    query = 'SELECT started_ns, ended_ns FROM sessions WHERE robot = ? ORDER BY id DESC LIMIT 1'
-    row = index.db.execute(query, (robot,)).fetchone()
+def _session(index: Index, robot: str, pid: int) -> dict[str, Any] | None:
+    """The node's last session: when it began and ended by the wall clock; ``ended`` is None where it was cut off.
+
+    Who sends missions or bags has sessions as well: the node's is that of the process that wrote the status, where one did.
+    """
+    query = 'SELECT started_ns, ended_ns FROM sessions WHERE robot = ? ORDER BY pid = ? DESC, id DESC LIMIT 1'
+    row = index.db.execute(query, (robot, pid)).fetchone()
     return {'started': iso(row[0]), 'ended': iso(row[1]) if row[1] is not None else None} if row else None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import sqlite3
 import subprocess
@@ -16,6 +17,8 @@ from doctor.scene import Scene, expect
 from spool.making import make, put, settle
 
 from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.doctor import disk
+from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.model import Result, Role
 from shadowhound_data_logger.model import State
 
@@ -51,6 +54,12 @@ def readable_by_all(scene: Scene) -> None:
     path.chmod(0o644)
 
 
+def keys_readable_by_all(scene: Scene) -> None:
+    path = scene.root / 'etc/shadowhound/credentials'
+    path.write_text(f'[default]\n{SECRET.lower()}')
+    path.chmod(0o644)
+
+
 def small_buffers(scene: Scene) -> None:
     scene.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
     scene.environ['CYCLONEDDS_URI'] = '<CycloneDDS><SocketReceiveBufferSize min="10MB"/></CycloneDDS>'
@@ -62,8 +71,8 @@ def driver_elsewhere(scene: Scene) -> None:
     scene.process(77, 'python3', '/opt/go2_driver_node', ROS_DOMAIN_ID='5', FASTRTPS_DEFAULT_PROFILES_FILE='x')
 
 
-def driver_with_small_memory(scene: Scene) -> None:
-    scene.process(77, 'python3', '/opt/go2_driver_node', HOME='/root')
+def driver_with_small_memory(**environ: str) -> Inject:
+    return lambda scene: scene.process(77, 'python3', '/opt/go2_driver_node', HOME='/root', **environ)
 
 
 def backlog(scene: Scene) -> None:
@@ -162,6 +171,7 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
     'secret for all to read': (readable_by_all, 'secrets', 'secrets.mode', ('chmod 600', 'logger.env')),
     'password in a URL': (wrong('MLFLOW_TRACKING_URI', 'http://me:word@tower:5001'), 'secrets', 'secrets.url',
                           ('MLFLOW_TRACKING_USERNAME',)),
+    'keys of a file for all to read': (keys_readable_by_all, 'secrets', 'secrets.mode', ('chmod 600', 'credentials')),
     'default secret': (wrong('AWS_SECRET_ACCESS_KEY', 'minioadmin'), 'secrets', 'secrets.default', ('make tower-secrets',)),
     'wrong domain': (wrong('ROS_DOMAIN_ID', '300'), 'ros.environment', 'ros.domain_id', ('export ROS_DOMAIN_ID=',)),
     'discovery off': (wrong('ROS_AUTOMATIC_DISCOVERY_RANGE', 'OFF'), 'ros.environment', 'ros.discovery', ('=SUBNET',)),
@@ -170,14 +180,20 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
     'driver in another domain': (driver_elsewhere, 'ros.environment', 'ros.driver', ('export ROS_DOMAIN_ID=5',)),
     'small socket buffers': (small_buffers, 'sockets', 'sockets.buffer', ('net.core.rmem_max', 'sysctl')),
     'small shared memory': (without('FASTDDS_DEFAULT_PROFILES_FILE'), 'sockets', 'sockets.profile', ('fastdds_shm.xml',)),
-    'small shared memory of the driver': (driver_with_small_memory, 'sockets', 'sockets.driver', ('start the driver again',)),
+    'small shared memory of the driver': (driver_with_small_memory(), 'sockets', 'sockets.driver',
+                                          ('start the driver again', 'export FASTDDS_DEFAULT')),
+    'small shared memory of a driver with Fast DDS 2': (driver_with_small_memory(ROS_DISTRO='humble'), 'sockets',
+                                                        'sockets.driver', ('export FASTRTPS_DEFAULT',)),
     'node not running': (not_running, 'spool', 'node.running', ('sensor_logger_node',)),
+    'node that is paused': (lambda scene: scene.run_node(paused=True), 'spool', 'node.status', ('/pause ', '{data: false}')),
     'node that does not deliver': (no_delivery, 'spool', 'node.delivery', ('doctor --only s3',)),
     'node of another version': (lambda scene: scene.run_node(version='0.0.1'), 'versions', 'versions.node', ('restart',)),
     'clock that was never set': (patched('clock.EARLIEST_SANE_NS', 1 << 62), 'clock', 'clock.set', ('timedatectl',)),
     'mission that is not sent': (patched('missions.overviews', stuck_mission), 'missions', 'missions.sent',
                                  ('MLFLOW_TRACKING_URI',)),
     'backlog': (backlog, 'spool', 'spool.backlog', ('doctor --only s3',)),
+    'no address': (wrong('MLFLOW_TRACKING_URI', 'http://[tower'), 'environment', 'environment.tracking',
+                   ('export MLFLOW_TRACKING_URI=http://',)),
     'quarantine': (quarantined, 'spool', 'spool.quarantine', ('quarantine',)),
     'unbalanced ledger': (unbalanced, 'spool', 'spool.ledger', ('shadowhound-data ledger --json',)),
     'damaged index': (damaged, 'spool', 'spool.index', ('start the node',)),
@@ -207,6 +223,44 @@ def test_a_healthy_robot_gives_no_finding(robot: Scene) -> None:
 def but_speed(results: list[Result]) -> list[Result]:
     """The findings; how fast the disk under the tests is now is not theirs to judge."""
     return [result for result in results if result.is_finding and result.check not in {'disk.speed', 'disk.sync'}]
+
+
+def test_the_default_domain_is_that_of_a_shell_without_one(robot: Scene) -> None:
+    """A node that was told domain 0 is where a shell is that was told none."""
+    robot.process(os.getpid(), 'sensor_logger_node', **{**robot.environ, 'ROS_DOMAIN_ID': '0'})
+    assert robot.findings('environment') == []
+
+
+@pytest.mark.parametrize(('name', 'url'), [
+    ('MLFLOW_TRACKING_URI', 'postgresql://me:hunter2@tower/mlflow'), ('MLFLOW_TRACKING_URI', 'http://me:hunter2@tower:99999'),
+    ('MLFLOW_TRACKING_URI', 'http://[me:hunter2@tower'), ('MLFLOW_TRACKING_URI', 'http://me:hun/ter2@127.0.0.1:1'),
+    ('MLFLOW_S3_ENDPOINT_URL', 'http://me:hunter2@tower:9000'), ('AWS_ENDPOINT_URL', 'http://me:hunter2@127.0.0.1:1'),
+])  # fmt: skip
+def test_no_password_is_shown(robot: Scene, name: str, url: str) -> None:
+    """That of a URL: not of a database, and not of one that is mistyped."""
+    robot.environ[name] = url
+    told = json.dumps(
+        [result.as_dict() for result in robot.ask('environment', 'secrets', 'network.s3', 'network.mlflow', 'mlflow')]
+    )
+    assert 'ter2' not in told
+    assert 'crash' not in told
+    assert f'{name} holds a user and a password' in told
+
+
+def test_a_slow_disk_is_named_in_time(robot: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An SD card that takes a second for a sync and another for each megabyte: found, and not given up on."""
+    now_s, waiting = [0.0], [0]
+
+    def sync(number: int) -> None:
+        size = os.fstat(number).st_size
+        now_s[0] += 1.0 + (size - waiting[0]) / MEBI
+        waiting[0] = size
+
+    monkeypatch.setattr(disk.os, 'fsync', sync)
+    monkeypatch.setattr(disk.time, 'perf_counter', lambda: now_s[0])
+    found = [result.check for result in disk.check(robot.context()) if result.is_finding]
+    assert found == ['disk.sync', 'disk.speed']
+    assert now_s[0] < next(check.deadline_s for check in CHECKS if check.name == 'disk')
 
 
 def test_an_index_of_an_older_version_is_not_damaged(robot: Scene) -> None:

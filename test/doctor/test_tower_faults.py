@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -197,6 +198,22 @@ def test_the_usual_port_is_proposed(robot: Scene, monkeypatch: pytest.MonkeyPatc
     nobody_there('AWS_ENDPOINT_URL')(robot)
     monkeypatch.setattr(network, '_answers', lambda _, port: port == 9000)
     expect(robot.findings('network.s3'), 'network.s3.tcp', 'export AWS_ENDPOINT_URL=http://127.0.0.1:9000')
+
+
+def test_a_name_with_several_addresses(robot: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server may listen at the second alone, as one of 127.0.0.1 where ``localhost`` is ::1 first: clients get there."""
+    told = [
+        (socket.AF_INET6, socket.SOCK_STREAM, 6, '', ('::1', 0, 0, 0)),
+        (socket.AF_INET, socket.SOCK_STREAM, 6, '', ('127.0.0.1', 0)),
+    ]
+    asked = socket.getaddrinfo
+    monkeypatch.setattr(
+        network.socket, 'getaddrinfo', lambda host, *rest, **how: told if host == 'localhost' else asked(host, *rest, **how)
+    )
+    robot.environ['AWS_ENDPOINT_URL'] = robot.environ['AWS_ENDPOINT_URL'].replace('127.0.0.1', 'localhost')
+    assert robot.findings('network.s3') == []
+    robot.environ['AWS_ENDPOINT_URL'] = 'http://localhost:1'
+    expect(robot.findings('network.s3'), 'network.s3.tcp', 'ss -ltnp')
 
 
 def test_a_server_that_verifies_nothing(robot: Scene) -> None:

@@ -51,9 +51,12 @@ def test_the_bits_are_where_the_brightness_grows() -> None:
     assert difference_hash(jpeg(ramp[:, ::-1])) == 0
 
 
-@pytest.mark.parametrize('body', [b'', b'no picture', jpeg(np.zeros((7, 640))), jpeg(np.zeros((480, 8)))])
+@pytest.mark.parametrize('body', [
+    b'', b'no picture', jpeg(np.zeros((7, 640))), jpeg(np.zeros((480, 8))), jpeg(np.zeros((480, 640))),
+    jpeg(np.full((480, 640), 255.0)),
+])  # fmt: skip
 def test_what_cannot_be_told_is_none(body: bytes) -> None:
-    """No picture, or too few pixels."""
+    """No picture, too few pixels, or nothing in it: a lens that is covered must not look like one that is dazzled."""
     assert difference_hash(body) is None
 
 

@@ -16,6 +16,7 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.missions.copies import SPARES
 from shadowhound_data_logger.missions.folder import FOLDER, missions
+from shadowhound_data_logger.missions.recorder import Mission
 
 JPEG = b'\xff\xd8 a picture \xff\xd9'
 
@@ -38,6 +39,37 @@ def test_a_fork_has_no_mission(tmp_path: Path) -> None:
     assert [record['k'] for record in journal(tmp_path)] == ['start', 'metrics', 'end']
 
 
+def _frame_in_a_fork(mission: Mission, path: Path) -> None:
+    mission.log_camera_frame(b'of the child', 7)
+    mission.log_artifact(path)
+
+
+@pytest.mark.filterwarnings('ignore:This process .* is multi-threaded')
+def test_a_fork_touches_no_file_of_the_mission(tmp_path: Path) -> None:
+    """A child that has the mission itself in hand: neither the files made ahead nor new ones are written."""
+    with journalling(tmp_path) as logger, logger.mission('patrol', '') as mission:
+        files = mission.folder.files
+        until(lambda: len(list(files.iterdir())) == SPARES, 'files are made ahead')
+        child = multiprocessing.get_context('fork').Process(target=_frame_in_a_fork, args=(mission, Path(__file__)))
+        child.start()
+        child.join(30)
+        assert child.exitcode == 0
+        assert {path.stat().st_size for path in files.iterdir()} == {0}
+        mission.log_camera_frame(JPEG, 0)
+    assert [path.read_bytes() for path in files.iterdir()] == [JPEG]
+
+
+def test_what_comes_after_the_end_leaves_no_file(tmp_path: Path) -> None:
+    """Nobody would ever send it."""
+    with journalling(tmp_path) as logger:
+        with logger.mission('patrol', '') as mission:
+            pass
+        mission.close()
+        mission.log_camera_frame(JPEG, 0)
+        mission.log_artifact(__file__)
+        assert list(mission.folder.files.iterdir()) == []
+
+
 def test_closing_ends_the_mission_as_killed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A logger that is closed in a mission says so; closing twice is the same as once."""
     with journalling(tmp_path) as logger:
@@ -52,6 +84,13 @@ def test_a_robot_s_name_is_checked_at_once(tmp_path: Path) -> None:
     """A name that cannot lead a key is the one thing that is refused, and before any mission."""
     with pytest.raises(SettingError, match='robot'):
         MissionDataLogger(robot='../thor', home=tmp_path, replay=False)
+
+
+def test_a_home_of_nobody_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the node refuses it: a user without a home, in a container say, has to name the folder."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', '~no-such-user/x')
+    with pytest.raises(SettingError, match='SHADOWHOUND_HOME'):
+        MissionDataLogger(replay=False)
 
 
 def test_what_was_logged_reaches_the_disk_within_a_quarter_of_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

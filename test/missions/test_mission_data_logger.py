@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from missions.fakes import journal, journalling, journals
 
+from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions import copies
 from shadowhound_data_logger.missions.folder import FOLDER, missions
 from shadowhound_data_logger.missions.recorder import Mission
@@ -109,7 +110,18 @@ def test_a_second_start_ends_the_first(tmp_path: Path, caplog: pytest.LogCapture
     assert [record['k'] for record in found['2']] == ['start', 'metrics', 'end']
 
 
-@pytest.mark.parametrize('value', [math.nan, math.inf, None, 'twelve', '12', [1, 2], object(), 10**400])
+class Mute(Exception):
+    """What has no text."""
+
+    def __str__(self) -> str:
+        raise ZeroDivisionError
+
+    __repr__ = __str__
+
+
+@pytest.mark.parametrize(
+    'value', [math.nan, math.inf, None, 'twelve', '12', [1, 2], object(), 10**400, pytest.param(10**5000, id='huge'), Mute()]
+)
 def test_what_is_no_number_is_counted(tmp_path: Path, value: Any) -> None:
     """It is left out and counted, and the rest of the call stands."""
     with journalling(tmp_path) as logger:
@@ -179,6 +191,22 @@ def test_events_hold_anything_but_files(tmp_path: Path) -> None:
     }
     assert refused['reason'] == 'too_large'
     assert end['status'] == 'FINISHED'
+
+
+def test_what_has_no_text_is_named_by_its_class(tmp_path: Path) -> None:
+    """In an event, as a name, a command, or as the exception that ends a mission, which goes on as it was raised."""
+
+    def fly(logger: MissionDataLogger, mute: Any) -> None:
+        with logger.mission('patrol', mute) as mission:
+            mission.log_event('seen', what=mute, number=10**5000)
+            mission.log_metric(mute, 1.0)
+            raise mute
+
+    with journalling(tmp_path) as logger, pytest.raises(Mute):
+        fly(logger, Mute())
+    start, event, refused, exception, end = journal(tmp_path)
+    assert (start['command'], event['data'], refused['reason']) == ('<Mute>', {'what': '<Mute>', 'number': '<int>'}, 'bad_name')
+    assert (exception['data']['text'], end['error'], end['status']) == ('<Mute>', 'Mute: <Mute>', 'FAILED')
 
 
 def test_a_full_disk_does_not_reach_the_mission(

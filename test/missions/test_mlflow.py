@@ -15,7 +15,7 @@ from missions.agent import FRAME_EVERY, jpeg
 from missions.server import Server, complete, until
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.errors import TrackingUnavailable
+from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.folder import FOLDER, missions, read_json
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.tracking import MlflowTracking
@@ -163,13 +163,29 @@ def test_artifacts_in_s3(server: Server, tmp_path: Path, monkeypatch: pytest.Mon
     tracking.artifact(run, path, 'camera')
     key = f'mlflow/{run.run_id}/artifacts/camera/frame_000000.jpg'
     assert server.keys('mlflow/') == {key: 1}
+    monkeypatch.setenv('MLFLOW_S3_ENDPOINT_URL', 'http://127.0.0.1:9')
+    with pytest.raises(TrackingUnavailable, match='s3://sensor-data/mlflow') as caught:
+        MlflowTracking(server.wire.url, 'in s3').artifact(run, path, 'camera')
+    assert 'MLFLOW_S3_ENDPOINT_URL' in caught.value.remedy
+
+
+def test_a_file_that_a_proxy_never_takes_is_refused(server: Server, tmp_path: Path) -> None:
+    """Tried again for ever it would hold up all that follows it."""
+    tracking = MlflowTracking(server.wire.url, 'thor_missions')
+    run = tracking.run_of('patrol_1', 'patrol', 1, {})
+    path = tmp_path / 'map.png'
+    path.write_bytes(jpeg(0))
+    tracking.artifact(run, path, '')
+    server.wire.set((413, 'Request Entity Too Large'))
+    with pytest.raises(TrackingRefused, match='413'):
+        tracking.artifact(run, path, '')
 
 
 @pytest.mark.parametrize('mode', [REFUSE, HANG, (200, 'Portal'), (403, 'Forbidden'), (500, 'Broken'), (404, 'Elsewhere')])
 def test_a_server_that_is_none_is_tried_again(server: Server, mode: str | tuple[int, str]) -> None:
     """Whatever answers, or does not: the mission waits, and the error has a remedy and no password."""
     server.wire.set(mode)
-    tracking = MlflowTracking(server.wire.url.replace('//', '//thor:secret@'), 'thor_missions')
+    tracking = MlflowTracking(server.wire.url.replace('//', '//thor:very@secret@'), 'thor_missions')
     with pytest.raises(TrackingUnavailable) as caught:
         tracking.run_of('patrol_1', 'patrol', 0, {})
     assert 'MLFLOW_TRACKING_' in caught.value.remedy

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from missions.fakes import journalling
 
-from shadowhound_data_logger.missions import journal
+from shadowhound_data_logger.missions import copies, journal
 from shadowhound_data_logger.missions.active import Active, Lookout
 from shadowhound_data_logger.missions.floor import MOST, Floor
 from shadowhound_data_logger.missions.node_log import FIRST_FRAME, Cloud, Frame, NodeLog, Reading
@@ -136,3 +136,14 @@ def test_a_full_disk_costs_a_warning(mission: Active, monkeypatch: pytest.Monkey
         node_log.write()
     node_log.close()
     assert caplog.text.count('no space') == 1
+
+
+def test_little_room_costs_frames_alone(mission: Active, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What comes after one in the same second is journalled all the same."""
+    node_log = opened(mission)
+    monkeypatch.setattr(copies, 'MIN_FREE_BYTES', 1 << 60)
+    node_log.add(Frame(mission.start_ns + SECOND, JPEG))
+    node_log.add(Reading(mission.start_ns + 2 * SECOND, 'battery_pct', 90.0))
+    node_log.write()
+    node_log.close()
+    assert [record['k'] for record in records(mission)] == ['metrics']

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from missions.fakes import journalling
-from spool.making import rows
+from spool.making import make, new_spool, put, rows
 
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
@@ -16,6 +17,7 @@ from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.objects import Shelf, objects_of
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.spool.files import flock
+from shadowhound_data_logger.spool.status import file
 
 RUN = Run('abc', '1', 'x')
 
@@ -112,3 +114,20 @@ def test_what_an_earlier_process_left_is_delivered(tmp_path: Path, shelf: Shelf,
     finally:
         later.close()
     assert set(spooled(tmp_path).values()) == {'delivered'}
+
+
+def test_a_node_s_larger_spool_is_left_to_it(tmp_path: Path, folder: MissionFolder) -> None:
+    """The parameters of a node are not the agent's: by those that it has itself it would evict what the node keeps."""
+    root = tmp_path / 'spool'
+    node = new_spool(root, max_bytes=64 << 20)
+    node.open()
+    put(node, *(make(f'thor/lidar/{number}.pcd', bytes(100_000), priority=7) for number in range(20)))
+    file(root, 'thor').write_text(json.dumps({'spool': {'max_bytes': 64 << 20, 'min_free_bytes': 0}}))
+    settings = Settings.load({'spool.max_bytes': 1 << 20}, {'SHADOWHOUND_HOME': str(tmp_path)})
+    shelf = Shelf(settings, SystemClock('boot'))
+    try:
+        shelf.add(objects(folder, RUN))
+    finally:
+        shelf.close()
+        node.close()
+    assert set(spooled(tmp_path).values()) == {'pending'}

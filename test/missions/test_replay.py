@@ -15,8 +15,10 @@ from missions.fakes import FakeDrawing, FakeShelf, FakeTracking, journalling
 from missions.server import until
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.missions.folder import FOLDER, missions, read_json
-from shadowhound_data_logger.missions.replay import KEEP_S, LINGER_S, Gate, Parent, Replay, open_tracking, run
+from shadowhound_data_logger.errors import TrackingUnavailable
+from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, Run, missions, read_json
+from shadowhound_data_logger.missions.gate import Gate
+from shadowhound_data_logger.missions.replay import KEEP_S, LINGER_S, Parent, Replay, open_tracking, run
 from shadowhound_data_logger.missions.report import report
 from shadowhound_data_logger.spool.files import flock
 
@@ -237,3 +239,64 @@ def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert first.returncode == 1
     finally:
         logger.close()
+
+
+@pytest.mark.parametrize('what', ['journal', 'artifact'])
+def test_one_that_always_fails_holds_up_no_other(tmp_path: Path, what: str) -> None:
+    """A journal that the disk does not give back, an artifact that the server never gets: the older missions arrive."""
+    for number in range(3):
+        older = tmp_path / FOLDER / fly(tmp_path)
+        older.rename(older.with_name(f'patrol_20200101_00000{number}_00000000'))
+    stuck = tmp_path / FOLDER / fly(tmp_path, 'stuck')
+    now, tracking = Now(), FakeTracking()
+    replay = new_replay(tmp_path, tracking, now)
+    if what == 'journal':
+        (stuck / 'journal').unlink()
+        (stuck / 'journal').mkdir()
+    else:
+        send = tracking.artifact
+
+        def artifact(run: Run, path: Path, folder: str) -> None:
+            if run.run_id == tracking.runs[stuck.name].run_id:
+                raise TrackingUnavailable('too large')
+            send(run, path, folder)
+
+        tracking.artifact = artifact  # type: ignore[method-assign]
+    for _ in range(60):
+        now.seconds += 61.0
+        replay.step()
+    assert [folder.sent().complete for folder in missions(tmp_path) if folder.path != stuck] == [True] * 3
+
+
+def test_a_full_disk_does_not_end_the_sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it says of itself cannot be written: it goes on, for what it sends makes room."""
+    fly(tmp_path)
+    replay = new_replay(tmp_path, FakeTracking())
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, 'No space left on device')
+
+    with monkeypatch.context() as patched:
+        patched.setattr('shadowhound_data_logger.missions.replay.write_json', full)
+        while replay.step():
+            pass
+    assert [folder.sent().complete for folder in missions(tmp_path)] == [True]
+    replay.step()
+    assert read_json(tmp_path / FOLDER / 'replay.json')['errors'] == {}
+
+
+def test_a_mission_that_cannot_be_looked_at_stops_no_other(tmp_path: Path) -> None:
+    """Its folder's disk, or whoever removes it in that instant: the others are sent."""
+    rotten, whole = fly(tmp_path), fly(tmp_path)
+
+    def settle(folder: MissionFolder) -> bool:
+        if folder.mission_id == rotten:
+            raise OSError(5, 'Input/output error')
+        return True
+
+    (tmp_path / FOLDER).mkdir(exist_ok=True)
+    replay = Replay(tmp_path, FakeTracking(), FakeShelf(), FakeDrawing(), settle=settle)  # type: ignore[arg-type]
+    while replay.step():
+        pass
+    assert {folder.mission_id: folder.sent().complete for folder in missions(tmp_path)} == {rotten: False, whole: True}
+    assert replay.owes

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ import pytest
 from spool.making import NOON_NS, FakeClock, make, new_spool, put, settle
 
 from shadowhound_data_logger.clock import SECOND, SystemClock
+from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool.status import file, read, robots
+from shadowhound_data_logger.spool.status import file, limits, read, robots
 
 
 def written(root: Path, **changes: Any) -> None:
@@ -127,6 +130,19 @@ def test_a_session_that_was_cut_off_has_no_end(tmp_path: Path) -> None:
     assert found['session'] == {'started': '2025-10-18T12:00:00.000000Z', 'ended': None}
 
 
+def test_the_session_is_that_of_the_node(tmp_path: Path) -> None:
+    """Not of whoever sent a mission or a bag from the same spool meanwhile."""
+    for clock in (FakeClock(), FakeClock(NOON_NS + 60 * SECOND)):
+        spool = new_spool(tmp_path, clock)
+        spool.open()
+        spool.close()
+    with closing(sqlite3.connect(tmp_path / 'index.db')) as index:
+        index.execute('UPDATE sessions SET pid = pid + 1 WHERE id = 2')
+        index.commit()
+    written(tmp_path, ended=True)
+    assert read(tmp_path, 'thor', FakeClock())['session']['started'] == '2025-10-18T12:00:00.000000Z'
+
+
 def test_no_spool_and_a_damaged_one_are_answers(tmp_path: Path) -> None:
     """Both are told among the findings, and leave the spool unknown."""
     found = read(tmp_path, 'thor', FakeClock())
@@ -197,3 +213,13 @@ def test_an_age_that_nobody_knows(tmp_path: Path) -> None:
     clock.now_ns = NOON_NS
     assert spool.piles().oldest_age_s is None
     spool.close()
+
+
+def test_others_keep_to_what_the_node_was_told(tmp_path: Path) -> None:
+    """The widest of several nodes' limits; where none has run, or an old one did not say, those of one's own."""
+    own = SpoolSettings(max_bytes=20 << 20, min_free_bytes=10)
+    assert limits(tmp_path, own) == own
+    written(tmp_path, spool={'max_bytes': 9 << 20})
+    assert limits(tmp_path, own) == SpoolSettings(max_bytes=9 << 20, min_free_bytes=10)
+    written(tmp_path, robot='tachi', spool={'max_bytes': 50 << 20, 'min_free_bytes': 0, 'remember_days': 30.0})
+    assert limits(tmp_path, own) == SpoolSettings(max_bytes=50 << 20, min_free_bytes=0, remember_days=30.0)

@@ -13,7 +13,7 @@ from tower_scripts import make_secrets, prepare
 
 from shadowhound_data_logger.sim.tower import Tower
 
-PORTS: Final = (9000, 5001, 5432, 9333, 8080, 8888, 23646)
+PORTS: Final = (9000, 5001, 5432, 9333, 8080, 8888)
 
 
 @pytest.fixture(scope='module')

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import boto3
 import pytest
 import yaml
-from tower_scripts import TOWER, make_secrets
+from tower_scripts import TOWER, make_secrets, prepare
 
-from shadowhound_data_logger.sim.servers import find_program
+from shadowhound_data_logger.sim.servers import Ports, Server, find_program
 
 
 @pytest.fixture(scope='module')
@@ -61,6 +64,41 @@ def test_every_variable_is_in_the_file_that_is_made(tmp_path: Path) -> None:
     assert named
     assert all((tmp_path / name).is_file() for name in named)
     assert all(value.startswith('${') for value in re.findall(r'(?:SECRET\w*|PASSWORD): (\S+)', text))
+
+
+def test_a_running_server_sees_the_keys_that_are_changed(services: dict[str, Any]) -> None:
+    """The folder of what SIGHUP has it read again is mounted: a file is replaced there, and a mounted one stays what it was."""
+    mounts = [volume.split(':') for volume in services['s3']['volumes'] if volume.startswith('./')]
+    assert mounts == [['./secrets', '/secrets', 'ro']]
+    assert '-s3.config=/secrets/s3.json' in services['s3']['command']
+
+
+@pytest.mark.seaweedfs
+def test_a_small_disk_has_room_for_all_buckets(services: dict[str, Any], tmp_path: Path) -> None:
+    """The server as it is started there, on a disk of 2 GB: each bucket takes an object."""
+    disk = tmp_path / 'disk'
+    disk.mkdir()
+    if subprocess.run(['mount', '-t', 'tmpfs', '-o', 'size=2g', 'none', str(disk)], capture_output=True, check=False).returncode:
+        pytest.skip('this user may not mount a file system')
+    with ExitStack() as stack:
+        stack.callback(subprocess.run, ['umount', '--lazy', str(disk)], check=True)
+        (tmp_path / 's3.json').write_text(make_secrets.seaweed({'tower': [{'accessKey': 'a', 'secretKey': 'b'}]}))
+        ports = Ports('127.0.0.1')
+        stack.callback(ports.release)
+        numbers = {name: ports.take() for name in ('s3', 'master', 'volume', 'filer')}
+        ours = {'-dir': str(disk), '-ip': '127.0.0.1', '-ip.bind': '127.0.0.1', '-s3.config': str(tmp_path / 's3.json')}
+        ours |= {f'-{name}.port': str(number) for name, number in numbers.items()}
+        command = [word for word in shlex.split(services['s3']['command']) if word.partition('=')[0] not in ours]
+        command += [f'{name}={value}' for name, value in ours.items()] + ['-volume.preStopSeconds=0']
+        server = Server('s3', [find_program('weed', ''), *command], log=tmp_path / 'log', environ=os.environ)
+        stack.callback(server.stop)
+        server.start()
+        s3 = boto3.client('s3', endpoint_url=f'http://127.0.0.1:{numbers["s3"]}', aws_access_key_id='a',
+                          aws_secret_access_key='b', region_name='us-east-1')  # fmt: skip
+        prepare.wait(s3, 60.0)
+        prepare.prepare(s3, ['thor'])
+        for bucket in prepare.BUCKETS:
+            s3.put_object(Bucket=bucket, Key='thor/probe', Body=b'1')
 
 
 class _Override(yaml.SafeLoader):

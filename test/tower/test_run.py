@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -22,13 +24,15 @@ pytestmark = [
     pytest.mark.skipif('SHADOWHOUND_TEST_LONG' not in os.environ, reason='half a minute: set SHADOWHOUND_TEST_LONG=1'),
 ]
 START_S: Final = 120.0
+HOST: Final = '127.0.0.2'
+"""What stands for the address that others reach the machine at."""
 
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory: pytest.TempPathFactory, offset: int) -> Iterator[Path]:
     """Of a Tower that runs."""
     folder = tmp_path_factory.mktemp('plain')
-    command = [sys.executable, str(TOWER / 'run.py'), '--folder', str(folder), '--offset', str(offset)]
+    command = [sys.executable, str(TOWER / 'run.py'), '--folder', str(folder), '--offset', str(offset), '--bind', HOST]
     with (folder / 'log').open('w', encoding='utf-8') as log, subprocess.Popen(command, stdout=log, stderr=log) as tower:
         try:
             _until(lambda: 'credentials' in (folder / 'log').read_text() or tower.poll() is not None, START_S)
@@ -49,7 +53,7 @@ def _until(ready: Callable[[], bool], seconds: float) -> None:
 
 
 def _works(folder: Path, offset: int, key: dict[str, str]) -> bool:
-    s3 = boto3.client('s3', endpoint_url=f'http://127.0.0.1:{9000 + offset}', aws_access_key_id=key['accessKey'],
+    s3 = boto3.client('s3', endpoint_url=f'http://{HOST}:{9000 + offset}', aws_access_key_id=key['accessKey'],
                       aws_secret_access_key=key['secretKey'], region_name='us-east-1')  # fmt: skip
     try:
         s3.put_object(Bucket='sensor-data', Key='thor/probe', Body=b'1')
@@ -58,14 +62,21 @@ def _works(folder: Path, offset: int, key: dict[str, str]) -> bool:
     return True
 
 
+def test_others_reach_nothing_that_asks_for_no_key(folder: Path, offset: int) -> None:
+    """Neither the filer, which gives and deletes whatever is stored, nor the volume server, the master and the database."""
+    for port in (9333, 8080, 8888, 19333, 18080, 18888, 5432):
+        with socket.socket() as one:
+            assert one.connect_ex((HOST, port + offset)) == errno.ECONNREFUSED, port
+
+
 def test_artifacts_go_through_mlflow_to_the_store(folder: Path, offset: int) -> None:
     """What is put to MLflow's artifact service lies in the bucket mlflow; the sender needs no key for it."""
-    url = f'http://127.0.0.1:{5001 + offset}/api/2.0/mlflow-artifacts/artifacts/1/hello.txt'
+    url = f'http://{HOST}:{5001 + offset}/api/2.0/mlflow-artifacts/artifacts/1/hello.txt'
     request = urllib.request.Request(url, data=b'hello', method='PUT')
     with urllib.request.urlopen(request, timeout=60) as answer:  # noqa: S310 - http, by us
         assert answer.status == 200
     key = make_secrets.load_users(folder / 'secrets' / 'users.json')['tower'][0]
-    s3: Any = boto3.client('s3', endpoint_url=f'http://127.0.0.1:{9000 + offset}', aws_access_key_id=key['accessKey'],
+    s3: Any = boto3.client('s3', endpoint_url=f'http://{HOST}:{9000 + offset}', aws_access_key_id=key['accessKey'],
                            aws_secret_access_key=key['secretKey'], region_name='us-east-1')  # fmt: skip
     assert s3.get_object(Bucket='mlflow', Key='1/hello.txt')['Body'].read() == b'hello'
 
