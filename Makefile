@@ -8,7 +8,7 @@ BENCH_ARGS ?=
 TOWER_ARGS ?=
 
 help: ## this list
-	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 13
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 15
 
 setup: ## make the environment (.venv, go2_interfaces); PYTHON=... names the interpreter
 	@PYTHON="$(PYTHON)" scripts/setup

@@ -5,8 +5,8 @@
 
 Frames come from the store that AWS_ENDPOINT_URL names (or from ``--folder``, what ``shadowhound-data fetch --to`` brought), the
 run goes to MLFLOW_TRACKING_URI: parameters, losses, the best checkpoint. What is learnt is speed (m/s) and yaw rate (rad/s)
-from one frame to the next, by the catalogue's poses. The last fifth of each robot's time is for validation: neighbours in time
-look alike.
+from one frame to the next, by the catalogue's poses. The last fifth in the order of time is for validation: neighbours look
+alike.
 """
 
 from __future__ import annotations

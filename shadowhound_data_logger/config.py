@@ -146,11 +146,13 @@ def _robot(given: object, environ: Mapping[str, str], namespace: str) -> str:
     """The parameter, else SHADOWHOUND_ROBOT, else the node's namespace, else ``thor``."""
     if not isinstance(given, str):
         raise SettingError('robot', given, 'a string')
-    name = given or environ.get('SHADOWHOUND_ROBOT') or namespace.strip('/').replace('/', '_') or 'thor'
+    of_shell = environ.get('SHADOWHOUND_ROBOT')
+    name = given or of_shell or namespace.strip('/').replace('/', '_') or 'thor'
     try:
         return check_name(name, 'the robot name')
     except NameRefused as error:
-        raise SettingError('robot', name, error.remedy) from error
+        said = 'SHADOWHOUND_ROBOT' if of_shell and not given else 'robot'
+        raise SettingError(said, name, f'a name: {error.remedy}') from error
 
 
 def _sensors(given: dict[str, Any], robot: str) -> tuple[SensorSettings, ...]:
@@ -176,7 +178,7 @@ def _sensor(name: str, given: dict[str, Any], robot: str) -> SensorSettings:
     try:
         check_name(name, 'the sensor name')
     except NameRefused as error:
-        raise SettingError('sensors', name, error.remedy) from error
+        raise SettingError('sensors', name, f'a name: {error.remedy}') from error
     sensor: SensorSettings = _fill(SensorSettings, name, given, {'name': name, **DEFAULT_SENSORS.get(name, {})})
     if not sensor.topics or not all(sensor.topics):
         raise SettingError(f'{name}.topics', list(sensor.topics), 'at least one topic')

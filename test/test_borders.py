@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 STAGES = ('capture', 'encode', 'spool', 'ship', 'stores')
 """In the order of the data."""
 ROS = {'ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'go2_interfaces', 'nav_msgs', 'rcl_interfaces', 'rclpy',
-       'sensor_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs'}  # fmt: skip
+       'rosidl_generator_py', 'sensor_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs'}  # fmt: skip
 ALLOWED = {
     **{name: {'capture', 'sim'} for name in ROS},
     'rclpy': {'capture', 'doctor', 'sim'},

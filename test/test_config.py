@@ -56,6 +56,12 @@ def test_a_robot_name_that_is_no_word(value: object) -> None:
     assert refused(robot=value).data['value'] == value
 
 
+def test_a_robot_name_of_the_shell_is_told_as_that() -> None:
+    """Who set SHADOWHOUND_ROBOT finds no parameter ``robot`` in the file."""
+    with pytest.raises(SettingError, match="SHADOWHOUND_ROBOT = 'Thor 1' is refused; allowed is a name: use letters"):
+        load({'SHADOWHOUND_ROBOT': 'Thor 1'})
+
+
 @pytest.mark.parametrize(('name', 'value', 'allowed'), [
     ('camera.rate_hz', 'fast', 'a number'), ('camera.rate_hz', -1.0, '0 to'), ('camera.rate_hz', float('nan'), '0 to'),
     ('camera.rate_hz', True, 'a number'), ('camera.quality', 101, '1 to 100'), ('camera.quality', 80.0, 'a whole number'),

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from shadowhound_data_logger.conditions import conditions
-from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.config import FOREIGN, Settings
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.options import GROUPS
 
@@ -32,6 +32,10 @@ class Parameters:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._changed = False
+
+    def given(self) -> bool:
+        """Whether file or command line set anything of ours; to be asked before ``load`` declares the rest."""
+        return any(name.partition('.')[0] not in FOREIGN for name in self._node.get_parameters_by_prefix(''))
 
     def load(self) -> Settings:
         """The settings; every parameter is declared then, so that ``ros2 param list`` shows it. Raises SettingError."""

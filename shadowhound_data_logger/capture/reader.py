@@ -13,6 +13,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.type_support import NoTypeSupportImportedException, check_for_type_support
+from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
 
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan
 from shadowhound_data_logger.clock import MAX_AGE_NS
@@ -58,6 +59,9 @@ def message_class(type_name: str) -> type:
         check_for_type_support(found)
     except (ImportError, AttributeError, ValueError, TypeError, NoTypeSupportImportedException) as error:
         raise TypeUnavailable(f'{type_name}: {error}') from error
+    except UnsupportedTypeSupport as error:  # no ImportError, though it is about one
+        text = f'{type_name}: a library of {package} does not load: is its workspace sourced, and built for this Python?'
+        raise TypeUnavailable(text) from error
     return found
 
 

@@ -30,8 +30,9 @@ from shadowhound_data_logger.errors import DataLoggerError, SettingError
 USAGE = """\
 usage: sensor_logger_node [--ros-args [--params-file FILE] [-p NAME:=VALUE ...] [-r __ns:=/NAMESPACE] ...]
 What it is doing: shadowhound-data status. Without AWS_ENDPOINT_URL it stores to a folder, $SHADOWHOUND_HOME/store."""
-SPIN_S = 0.4
-"""How long a signal may wait to be seen."""
+UNHEARD = 'the parameter file has nothing for {name}, so the defaults hold: begin its section with /**, or with that name'
+SPIN_S = 0.5
+"""How long a signal may wait to be seen; two of them are the second that is between two statuses."""
 ARENAS, MMAP_THRESHOLD = (-8, 2), (-3, 1 << 20)
 """Options of glibc's mallopt(3) and their values: few heaps for all threads, and large blocks go back when they are freed.
 At full rate that saves 35 of 128 MB (docs/performance.md)."""
@@ -89,6 +90,8 @@ def main(args: list[str] | None = None) -> int:
     stop = StopSignals()
     node = Node('sensor_logger_node', automatically_declare_parameters_from_overrides=True)
     logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
+    if '--params-file' in arguments and not Parameters(node).given():  # which is no error to rcl
+        node.get_logger().warning(UNHEARD.format(name=node.get_fully_qualified_name()))
     try:
         run(node, stop)
     except SettingError as error:

@@ -41,12 +41,12 @@ def check(context: Context) -> Iterator[Result]:
     sensors = [sensor for sensor in context.settings.sensors if sensor.enabled]
     yield from _types(sensors)
     with ros_watch.node(namespace=context.namespace) as node:
-        names = {node.resolve_topic_name(topic): topic for sensor in sensors for topic in sensor.topics}
-        found = ros_watch.discover(node, list(names))
+        resolved = {topic: node.resolve_topic_name(topic) for sensor in sensors for topic in sensor.topics}
+        names = list(dict.fromkeys(resolved.values()))
+        found = ros_watch.discover(node, names)
         heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S)} if any(found.values()) else {}
-        resolved = {topic: name for name, topic in names.items()}
     if not heard:
-        yield from _nobody(context, list(names))
+        yield from _nobody(context, names)
         return
     for sensor in sensors:
         yield from _sensor(sensor, [heard[resolved[topic]] for topic in sensor.topics], context.rates_hz)

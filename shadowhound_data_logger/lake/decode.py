@@ -8,6 +8,7 @@ from __future__ import annotations
 import tarfile
 import warnings
 import zipfile
+import zlib
 from collections.abc import Iterator
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -30,7 +31,7 @@ _DATA: Final = b'\nDATA '
 _MOST_HEADER: Final = 1 << 16
 _MOST_PIXELS: Final = 1 << 28
 _BROKEN: Final = (ValueError, KeyError, IndexError, TypeError, OSError, EOFError, tarfile.TarError, zipfile.BadZipFile,
-                  NotImplementedError, RuntimeError)  # fmt: skip
+                  NotImplementedError, RuntimeError, zlib.error)  # fmt: skip
 """What the readers raise for content that is no such thing; RuntimeError is a zip with a password."""
 
 
@@ -77,11 +78,9 @@ def _resized(pixels: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
 
 
 def _pillow(body: bytes, size: tuple[int, int] | None) -> NDArray[Any]:
-    from PIL import Image  # noqa: PLC0415 - 0.1 s, and most cameras send JPEGs
-
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')  # of a damaged file Pillow warns before it raises
-        with Image.open(BytesIO(body)) as opened:
+        with _opened(body) as opened:
             if opened.width * opened.height > _MOST_PIXELS:
                 raise ValueError(f'{opened.width} x {opened.height} pixels')
             plain = opened.mode in {'I;16', 'I', 'F'}
@@ -94,6 +93,15 @@ def _pillow(body: bytes, size: tuple[int, int] | None) -> NDArray[Any]:
         return _resized(pixels, size)
     rows, columns = (np.arange(wish) * have // wish for wish, have in zip(size, pixels.shape[:2], strict=True))
     return np.array(pixels[rows][:, columns])  # a mean of depths lies on neither surface
+
+
+def _opened(body: bytes) -> Any:
+    from PIL import Image  # noqa: PLC0415 - 0.1 s, and most cameras send JPEGs
+
+    try:
+        return Image.open(BytesIO(body))
+    except Image.DecompressionBombError as error:  # which is nobody's ValueError
+        raise ValueError(str(error)) from None
 
 
 def cloud(body: bytes) -> NDArray[np.float32]:

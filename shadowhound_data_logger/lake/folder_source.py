@@ -41,7 +41,10 @@ class FolderSource:
                     path = Path(folder, name)
                     key = str(path.relative_to(root))
                     if key.startswith(prefix):
-                        seen = path.stat()
+                        try:
+                            seen = path.stat()
+                        except FileNotFoundError:  # deleted meanwhile
+                            continue
                         modified = datetime.fromtimestamp(seen.st_mtime, timezone.utc)
                         yield Entry(key, seen.st_size, str(seen.st_mtime_ns), modified)
 

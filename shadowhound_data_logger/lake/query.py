@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -152,7 +153,7 @@ def _missions(source: Source, asked: Wanted) -> DataFrame:
     with ThreadPoolExecutor(THREADS) as pool:
         told = list(pool.map(lambda pair: _summary(source, *pair), zip(found['robot'].to_pylist(), runs, strict=True)))
     types = found['mission_type'].to_pylist()
-    kinds = [kind or one.get('mission_type') for kind, one in zip(types, told, strict=True)]
+    kinds = [kind or _value(one.get('mission_type'), pa.string()) for kind, one in zip(types, told, strict=True)]
     found = found.set_column(found.column_names.index('mission_type'), 'mission_type', pa.array(kinds, pa.string()))
     for column, (name, kind) in _SUMMARY.items():
         found = found.append_column(column, pa.array([_value(one.get(name), kind) for one in told], kind))
@@ -175,7 +176,7 @@ def _summary(source: Source, robot: str, run_id: str | None) -> dict[str, Any]:
         return {}
     try:
         told = json.loads(source.read(f'{robot}/missions/{run_id}/summary.json'))
-    except (ObjectRefused, ValueError):
+    except (ObjectRefused, ValueError, RecursionError):
         return {}
     return told if isinstance(told, dict) else {}
 
@@ -183,5 +184,7 @@ def _summary(source: Source, robot: str, run_id: str | None) -> dict[str, Any]:
 def _value(value: Any, kind: pa.DataType) -> Any:
     """Null for what is not of its kind: a summary may be of another version."""
     if kind == pa.float64():
-        return float(value) if isinstance(value, (int, float)) else None
-    return value if isinstance(value, bool if kind == pa.bool_() else str) else None
+        return float(value) if isinstance(value, (int, float)) and abs(value) <= sys.float_info.max else None
+    if kind == pa.string():  # half a surrogate pair is no text
+        return value.encode(errors='replace').decode() if isinstance(value, str) else None
+    return value if isinstance(value, bool) else None

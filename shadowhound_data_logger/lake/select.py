@@ -91,9 +91,9 @@ def moment(name: str, given: str | datetime, now_ns: int) -> int:
         return _ns(named[text])
     try:
         if ago := _AGO.fullmatch(text):
-            return now_ns - round(float(ago[1]) * _UNITS[ago[2]] * SECOND)
+            return _ns(utc(now_ns - round(float(ago[1]) * _UNITS[ago[2]] * SECOND)))
         return _ns(datetime.fromisoformat(given.strip().replace('Z', '+00:00').replace('z', '+00:00')))
-    except (ValueError, OverflowError):
+    except (ValueError, OverflowError, OSError):
         raise SettingError(name, given, TIMES) from None
 
 

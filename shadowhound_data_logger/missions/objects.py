@@ -6,6 +6,7 @@ trajectories/<robot>/<mission type>_YYYYMMDD_HHMMSS.csv
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,7 +17,6 @@ from typing import Any, Final
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import StoreUnavailable
-from shadowhound_data_logger.keys import unique
 from shadowhound_data_logger.lake.catalogue import Catalogue
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, safe_type, stamped
 from shadowhound_data_logger.missions.story import BUCKET, TRAJECTORIES
@@ -24,7 +24,7 @@ from shadowhound_data_logger.model import Binding, DataObject
 from shadowhound_data_logger.spool.delivering import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.spool import LAST, Spool
 from shadowhound_data_logger.spool.status import limits
 
 FRAME_PRIORITY: Final = 6
@@ -191,10 +191,14 @@ class Shelf:
 
 
 def _has(index: Index, item: DataObject) -> bool:
-    """Whether the very same content was spooled under this key, or the next free one, before."""
-    sha256, attempt = content_sha256(item.body), 0
-    while rows := index.rows('bucket = ? AND key = ?', (item.bucket, unique(item.key, attempt))):
-        if rows[0]['sha256'] == sha256:
-            return True
-        attempt += 1
-    return False
+    """Whether the very same content was spooled before, under this key or one of its ``_1``, ``_2``, ... (``keys.unique``).
+
+    In one question: where all frames of an agent have one number there are very many of these.
+    """
+    folder, slash, name = item.key.rpartition('/')
+    stem, dot, extension = name.partition('.')
+    first = f'{folder}{slash}{stem}'
+    values = (item.bucket, first, f'{first}{LAST}', content_sha256(item.body))
+    found = index.rows('bucket = ? AND key >= ? AND key < ? AND sha256 = ?', values)
+    numbered = re.compile(rf'{re.escape(first)}(_[1-9][0-9]*)?{re.escape(dot + extension)}')
+    return any(numbered.fullmatch(row['key']) for row in found)

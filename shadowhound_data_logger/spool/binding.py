@@ -60,11 +60,23 @@ def renew(index: Index, number: int, path: Path) -> None:
 
 
 def free_key(index: Index, bucket: str, wanted: str, own: str | None = None) -> str:
-    """The wanted key or the first of its ``_1``, ``_2``, ... that was never given out (D7), or is the object's ``own``."""
-    attempt = 0
-    while index.has(bucket, key := unique(wanted, attempt)) and key != own:
-        attempt += 1
-    return key
+    """The wanted key or the first of its ``_1``, ``_2``, ... that was never given out (D7), or is the object's ``own``.
+
+    They are given out in turn, so few are asked for: an agent whose frames all have one number must not hold up other writers.
+    """
+
+    def is_free(attempt: int) -> bool:
+        return (key := unique(wanted, attempt)) == own or not index.has(bucket, key)
+
+    if is_free(0):
+        return wanted
+    taken, free = 0, 1
+    while not is_free(free):
+        taken, free = free, 2 * free
+    while free - taken > 1:
+        middle = (taken + free) // 2
+        taken, free = (taken, middle) if is_free(middle) else (middle, free)
+    return unique(wanted, free)
 
 
 def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bags.recording import ROBOT, STRING, WAIT_S, messages
+from bags.recording import ROBOT, STRING, WAIT_S, manifest, messages, numbers
 from clocks import Clocks
 
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
@@ -117,3 +117,22 @@ def buffer(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator
         salvage.close(WAIT_S)
         writer.close(WAIT_S)
         spool.close()
+
+
+def only_bag(it: Buffer) -> str:
+    """The one that is there."""
+    (bag,) = it.bags()
+    return bag
+
+
+def in_bag(it: Buffer, bag: str) -> list[int]:
+    """The numbers of its messages, slice by slice."""
+    found = it.objects()
+    return [number for file in manifest(found, bag)['slices'] for number in numbers(found[f'{bag}/{file["file"]}'])]
+
+
+def hear_each_second(it: Buffer, seconds: range) -> None:
+    """A message each, numbered so."""
+    for second in seconds:
+        it.hear(range(second, second + 1))
+        it.pass_s(1.0)

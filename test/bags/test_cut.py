@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from bags.real_bags import NAME, STEP_NS, T0, by_rosbags, messages_of, stored, write_ours, write_rosbags
+from bags.real_bags import IMU, NAME, STEP_NS, T0, by_rosbags, messages_of, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from ruamel.yaml import YAML
 from stores.spooled import QUICK
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
 from shadowhound_data_logger.bags.mcap_messages import Message
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
+from shadowhound_data_logger.bags.slice_writer import SliceWriter
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
@@ -107,6 +110,21 @@ def test_bags_of_others(tmp_path: Path, plugin: StoragePlugin, mode: Compression
     channel = next(messages_of([found.folder / 'piece_0.mcap'])).channel
     assert (channel.type, channel.encoding) == ('sensor_msgs/msg/Imu', 'ros2msg')
     assert 'float64[9] orientation_covariance' in channel.definition
+
+
+def test_a_piece_tells_qos_as_humble_reads_it(tmp_path: Path) -> None:
+    """Jazzy and Kilted record it in words, at which Humble's player ends."""
+    folder = tmp_path / 'kilted'
+    folder.mkdir()
+    writer = SliceWriter(folder / 'kilted_0.mcap')
+    words = '- history: unknown\n  depth: 0\n  reliability: best_effort\n  durability: volatile\n  liveliness: automatic'
+    writer.write(replace(IMU, qos=words), T0, T0, 0, b'data')
+    writer.close()
+    found = cut_folder(folder, tmp_path / 'piece', Choice())
+    numbers = '- history: 3\n  depth: 0\n  reliability: 2\n  durability: 2\n  liveliness: 1'
+    assert next(messages_of([found.folder / 'piece_0.mcap'])).channel.qos == numbers
+    told = YAML(typ='safe').load(found.folder / 'metadata.yaml')['rosbag2_bagfile_information']
+    assert told['topics_with_message_count'][0]['topic_metadata']['offered_qos_profiles'] == numbers
 
 
 @pytest.mark.parametrize(('choice', 'error', 'text'), [

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shadowhound_data_logger.bags.channel import Channel
-from shadowhound_data_logger.bags.metadata import metadata_yaml, offered_qos, to_yaml
+from shadowhound_data_logger.bags.metadata import in_numbers, metadata_yaml, offered_qos, to_yaml
 from shadowhound_data_logger.bags.slice_info import SliceInfo
 
 OTHER = Channel('/späti', 'std_msgs/msg/Empty', '', '', '', '')
@@ -95,6 +95,32 @@ def test_qos_is_in_numbers() -> None:
     }  # fmt: skip
     assert second['depth'] == 1
     assert offered_qos([]) == ''
+
+
+IN_WORDS = """- history: unknown
+  depth: 0
+  reliability: reliable
+  durability: transient_local
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: manual_by_topic
+  liveliness_lease_duration:
+    sec: 3
+    nsec: 0
+  avoid_ros_namespace_conventions: false
+- {history: keep_last, depth: 7, reliability: best_effort, durability: volatile, liveliness: automatic}"""
+"""As `ros2 bag record` of Jazzy and Kilted keeps it in an MCAP file."""
+
+
+def test_qos_in_words_becomes_numbers() -> None:
+    """Those of rmw/types.h, with all else as it was; numbers stay, and so does what is no QoS at all."""
+    first, second = yaml.safe_load(in_numbers(IN_WORDS))
+    assert first == yaml.safe_load(IN_WORDS)[0] | {'history': 3, 'reliability': 1, 'durability': 1, 'liveliness': 3}
+    assert second == {'history': 1, 'depth': 7, 'reliability': 2, 'durability': 2, 'liveliness': 1}
+    numbers = offered_qos([profile()])
+    for text in (numbers, '', 'history: of a robot', '- [', '\x00'):
+        assert in_numbers(text) == text
 
 
 @pytest.mark.ros

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -46,6 +47,20 @@ def loaded(node: Node) -> tuple[Parameters, Settings]:
 def sensor(settings: Settings | None, name: str = 'camera') -> SensorSettings:
     assert settings is not None
     return next(sensor for sensor in settings.sensors if sensor.name == name)
+
+
+@pytest.mark.parametrize(('section', 'given'), [('/**', True), ('sensor_logger_node', True), ('sensor_loger_node', False)])
+def test_a_file_for_another_node_gives_nothing(tmp_path: Path, section: str, *, given: bool) -> None:
+    """A misspelt section is no error to rcl: that nothing came is all that there is to know it by."""
+    file = tmp_path / 'mine.yaml'
+    file.write_text(f'{section}:\n  ros__parameters:\n    camera:\n      rate_hz: 2.0\n')
+    context = Context()
+    with free_domain() as domain:
+        rclpy.init(args=['--ros-args', '--params-file', str(file)], context=context, domain_id=domain)
+        node = Node('sensor_logger_node', context=context, automatically_declare_parameters_from_overrides=True)
+        assert Parameters(node).given() is given
+        node.destroy_node()
+        rclpy.shutdown(context=context)
 
 
 def test_every_setting_is_a_parameter(node: Node, loaded: tuple[Parameters, Settings]) -> None:

@@ -7,14 +7,16 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from doctor.scene import Scene, expect
 from domains import free_domain
 
+from shadowhound_data_logger.doctor.context import make
 from shadowhound_data_logger.doctor.model import Result, Severity
 
 pytest.importorskip('rclpy')
@@ -38,7 +40,6 @@ class Examined:
 def examine(scene: Scene, namespace: str = '/') -> list[Result]:
     """In this process, whose ROS is loaded once; the check itself is what a child of the doctor runs."""
     from shadowhound_data_logger.doctor import ros
-    from shadowhound_data_logger.doctor.context import make
 
     context = make(scene.environ, role=scene.role, parameters=SENSORS, namespace=namespace, rates_hz=RATES, root=scene.root)
     return list(ros.check(context))
@@ -66,6 +67,19 @@ def examined(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Examined]:
         lines = ['head', f'   1: 00000000:{7400 + 250 * domain:04X} 00000000:0000 07']
         (scene.root / 'proc/net/udp').write_text('\n'.join(lines) + '\n')
         yield Examined(domain, found, examine(scene, '/well'), nowhere)
+
+
+def test_two_names_of_one_topic(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With and without a slash they are the same in the root namespace: two sensors of it are both judged."""
+    from shadowhound_data_logger.doctor import ros, ros_watch
+
+    here = SimpleNamespace(resolve_topic_name=lambda topic: '/' + topic.lstrip('/'))
+    monkeypatch.setattr(ros_watch, 'node', lambda **_: nullcontext(here))
+    monkeypatch.setattr(ros_watch, 'discover', lambda _, names: {name: ['somebody'] for name in names})
+    monkeypatch.setattr(ros_watch, 'listen', lambda _, found, __: [ros_watch.Heard(name, []) for name in found])
+    own = {'sensors': ['imu', 'again'], 'again.topics': ['/imu'], 'again.types': ['sensor_msgs/msg/Imu']}
+    context = make(scene.environ, role=scene.role, parameters=own, root=scene.root)
+    assert [result.check for result in ros.check(context) if result.is_finding].count('ros.topic') == 2
 
 
 def findings(results: list[Result]) -> list[Result]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import struct
 import tarfile
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +97,7 @@ def test_rubbish_is_an_error_of_ours(body: bytes, magic: str) -> None:
 
 
 def test_archives_that_are_broken() -> None:
-    """A tar that ends in a file, a member without its content, and a PCD that is shorter than it says."""
+    """A tar that ends in a file, a member without its content, and a PCD that is too short, a picture of 400 megapixels."""
     file = io.BytesIO()
     with tarfile.open(fileobj=file, mode='w') as made:
         entry = tarfile.TarInfo('1.json')
@@ -108,6 +110,14 @@ def test_archives_that_are_broken() -> None:
         packed_.writestr('1.json', '{"stamp_ns": 1}')
     with pytest.raises(LakeError):
         decode.members(file.getvalue(), 'zip')
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as packed_:
+        packed_.writestr('1.jpg', bytes(range(256)) * 4)
+    with pytest.raises(LakeError):
+        decode.members(file.getvalue().replace(file.getvalue()[35:60], 25 * b'\xff', 1), 'zip')
+    head = b'IHDR' + struct.pack('>IIBBBBB', 20_000, 20_000, 8, 2, 0, 0, 0)
+    with pytest.raises(LakeError):
+        decode.image(b'\x89PNG\r\n\x1a\n' + struct.pack('>I', 13) + head + struct.pack('>I', zlib.crc32(head)))
     short = b'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nPOINTS 9\nDATA binary\n1234'
     with pytest.raises(LakeError):
         decode.cloud(short)

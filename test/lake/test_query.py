@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from faults.front import Front
-from lake.making import DAY_NS, FAILED, FINISHED, NOON_NS, Watched, add, add_part, fill, folder_store, keys, minutes, watched
+from lake.making import DAY_NS, FAILED, FINISHED, NOON_NS, Watched, add, add_part, fill, folder_store, keys, minutes, row, watched
 
 from shadowhound_data_logger import lake
 from shadowhound_data_logger.config import UploadSettings
@@ -121,6 +121,31 @@ def test_sql_over_the_views(world: tuple[StoreSettings, list[schema.Row]]) -> No
         'WHERE NOT m.success GROUP BY m.result', source, **DAY,
     ).to_pydict()  # fmt: skip
     assert failed == {'result': ['FAILED'], 'n': [sum(row['mission_id'] == FAILED for row in day)]}
+
+
+@pytest.mark.parametrize(
+    'told', ['{"distance_m": 1%s}' % (400 * '0'), '{"result": "\\ud800"}', 10_000 * '[', '{"mission_type": 5}'], ids=range(4)
+)
+def test_a_senseless_summary_costs_its_own_figures_alone(tmp_path: Path, told: str) -> None:
+    """Anybody may have written it: the mission has no end then, and the others are told."""
+    settings = folder_store(tmp_path)
+    fill(settings, tmp_path / 'tmp', days=(0,), hours=(12,))
+    untyped = {**row('camera', NOON_NS), 'mission_id': 'odd', 'run_id': 'run-odd', 'mission_type': None}
+    with closing(open_store(settings, UploadSettings())) as store:
+        add(store, tmp_path / 'tmp', 'thor/missions/run-odd/summary.json', told.encode())
+        add_part(store, [untyped], 'odd', tmp_path / 'tmp')
+    every = {one['mission_id']: one for one in lake.missions(open_source(settings, schema.BUCKET)).to_pylist()}
+    assert (every[FAILED]['success'], every[FINISHED]['success']) == (False, True)
+    assert (every['odd']['distance_m'], every['odd']['success'], every['odd']['mission_type']) == (None, None, None)
+
+
+def test_a_file_that_goes_while_a_folder_is_listed_is_no_error(tmp_path: Path) -> None:
+    """As those do that a compacted one stands for."""
+    settings = folder_store(tmp_path)
+    rows = fill(settings, tmp_path / 'tmp', days=(0,), hours=(12,))
+    gone = settings.directory / schema.BUCKET / 'thor/_catalog/date=2026-10-28/gone.parquet'
+    gone.symlink_to(tmp_path / 'nowhere')
+    assert lake.objects(open_source(settings, schema.BUCKET)).count_rows() == len(rows)
 
 
 def test_a_mission_without_a_summary_is_told_without_an_end(tmp_path: Path) -> None:

@@ -64,6 +64,13 @@ def test_what_is_handed_over_twice_is_spooled_once(tmp_path: Path, shelf: Shelf,
     }  # fmt: skip
 
 
+def test_a_frame_of_a_longer_number_is_another_one(tmp_path: Path, shelf: Shelf) -> None:
+    """Though its picture is the same, and its name begins as the other's."""
+    for number in (100_000, 1_000_000):
+        shelf.add([make(f'thor/missions/abc/camera/frame_{number:06d}.jpg', topic=None)])
+    assert len(spooled(tmp_path)) == 2
+
+
 def test_what_is_held_gets_the_run_s_name(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
     """Under the run's id, with it in the metadata; handed over again afterwards it is still there once."""
     shelf.add(objects(folder, None))
