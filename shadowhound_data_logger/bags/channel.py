@@ -11,7 +11,8 @@ class Channel:
 
     ``type`` is the ROS name (``sensor_msgs/msg/Imu``). ``encoding`` says how ``definition`` is written: ``ros2msg`` or
     ``ros2idl``; both are empty where nobody knows the type. ``type_hash`` is ``RIHS01_...``, empty where the distribution
-    knows none (Humble). ``qos`` is the YAML that rosbag2 calls offered_qos_profiles, empty when it is not known.
+    knows none (Humble). ``qos`` is the YAML that rosbag2 calls offered_qos_profiles, its policies in
+    numbers as Humble reads them, empty when it is not known.
     """
 
     topic: str

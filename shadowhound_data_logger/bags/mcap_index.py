@@ -12,6 +12,7 @@ from typing import Final
 
 from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.mcap_format import MAGIC, RECORD, Op
+from shadowhound_data_logger.bags.metadata import in_numbers
 from shadowhound_data_logger.bags.ranges import Ranged
 from shadowhound_data_logger.errors import BagDamaged
 
@@ -77,7 +78,7 @@ class Schemas:
         topic, _, metadata = fields.text(), fields.text(), fields.texts()
         self.channels[number] = Channel(
             topic=topic, type=name, encoding=encoding, definition=definition,
-            type_hash=metadata.get('topic_type_hash', ''), qos=metadata.get('offered_qos_profiles', ''),
+            type_hash=metadata.get('topic_type_hash', ''), qos=in_numbers(metadata.get('offered_qos_profiles', '')),
         )  # fmt: skip
 
 

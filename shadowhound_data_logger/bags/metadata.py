@@ -21,6 +21,15 @@ _INFINITE_NS: Final = (1 << 63) - 1
 _PLAIN: Final = re.compile(r'(?!(true|false|null|yes|no|on|off|y|n)$)[a-z_]+')
 """Keys that need no quotes: YAML 1.1 reads the others as something else, or may."""
 
+_POLICIES: Final = {
+    'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
+    'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
+    'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
+    'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown', 'best_available'),
+}
+"""The words of version 9, each in the place of its number (rmw/types.h)."""
+_POLICY: Final = re.compile(rf'\b({"|".join(_POLICIES)}): ([a-z_]+)')
+
 
 def metadata_yaml(slices: Sequence[SliceInfo], *, ros_distro: str, custom_data: Mapping[str, str] | None = None) -> bytes:
     """The whole file for a bag of these slices, in their order; ``ros_distro`` is empty where it is not known."""
@@ -62,6 +71,16 @@ def offered_qos(profiles: Iterable[Any]) -> str:
     """The QoS of a topic's publishers (rclpy's QoSProfile, or what looks like one) as rosbag2 keeps it with the topic."""
     described = [_profile(profile) for profile in profiles]
     return '\n'.join(_sequence(described)) if described else ''
+
+
+def in_numbers(qos: str) -> str:
+    """A topic's offered QoS profiles, which bags of Jazzy and Kilted keep in words, as version 8 does; all else stays."""
+
+    def number(found: re.Match[str]) -> str:
+        words = _POLICIES[found[1]]
+        return f'{found[1]}: {words.index(found[2])}' if found[2] in words else found[0]
+
+    return _POLICY.sub(number, qos)
 
 
 def to_yaml(value: Mapping[str, Any]) -> str:

@@ -329,14 +329,3 @@ def test_the_live_view_leaves_the_terminal_as_it_was(tmp_path: Path) -> None:
     assert text.index('\x1b[?1049h') < text.index('\x1b[?1049l')
     assert 'thor' in text.partition('\x1b[?1049l')[2]
     assert text.count('\x1b[?25h') >= text.count('\x1b[?25l') > 0
-
-
-def test_a_reader_that_has_enough_is_no_error(tmp_path: Path) -> None:
-    """As ``head`` has: the command ends by SIGPIPE's exit code and without a word."""
-    read, write = os.pipe()
-    os.close(read)
-    command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'status', '--json']
-    environ = {**os.environ, 'SHADOWHOUND_HOME': str(tmp_path)}
-    found = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, env=environ, check=False)
-    os.close(write)
-    assert (found.returncode, found.stderr) == (128 + signal.SIGPIPE, b'')
