@@ -28,6 +28,7 @@ from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.delivering import delivering
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.status import limits
 from shadowhound_data_logger.stores.base import ObjectStore
 
 SENDING: Final = 'sending'
@@ -127,7 +128,7 @@ def spool_parcel(sent: Parcel, spool: Spool) -> None:
 @contextmanager
 def opened_spool(settings: Settings, clock: Clock) -> Iterator[Spool]:
     """Raises SpoolError."""
-    spool = Spool(settings.spool_path, settings.spool, clock, settings.robot)
+    spool = Spool(settings.spool_path, limits(settings.spool_path, settings.spool), clock, settings.robot)
     spool.open()
     with closing(spool):
         yield spool

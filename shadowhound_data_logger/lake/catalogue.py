@@ -37,7 +37,8 @@ class Catalogue:
         self._clock = clock
         self._monotonic = monotonic
         self._due_s = monotonic()
-        self._handed: set[int] = set()
+        self._handed: dict[int, frozenset[int]] = {}
+        """Id -> the ids of all the rows of its part, which is on its way."""
 
     def due(self) -> list[DataObject]:
         """The parts of a period that is over, at first of what an earlier process left.
@@ -58,11 +59,13 @@ class Catalogue:
             uncatalogued.clear(self._spool)
             return []
         listed = uncatalogued.waiting(self._spool, MOST_ROWS)
-        self._handed.intersection_update(item.id for item in listed)
+        there = {item.id for item in listed}
+        # A part takes all its rows at once: where one has gone without the others, another process's part has it, not ours.
+        self._handed = {number: rows for number, rows in self._handed.items() if rows <= there}
         new = [item for item in listed if item.id not in self._handed]
         rows = [(item.id, row_of(item.bucket, item.key, item.size, item.content_type, item.metadata)) for item in new]
         made = [self._part(robot, date, found) for robot, date, found in parts.by_folder(rows)]
-        self._handed.update(item.id for item in new)
+        self._handed.update((number, frozenset(part.catalogues)) for part in made for number in part.catalogues)
         return made
 
     def _part(self, robot: str | None, date: str, found: list[tuple[int, Row]]) -> DataObject:

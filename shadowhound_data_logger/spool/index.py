@@ -155,6 +155,10 @@ class Index:
         cursor.row_factory = sqlite3.Row
         return cursor.fetchall()
 
+    def protect(self, bucket: str, key: str) -> None:
+        """Never evict this object from now on."""
+        self.db.execute('UPDATE objects SET protected = 1 WHERE bucket = ? AND key = ?', (bucket, key))
+
     def evictable(self, limit: int) -> list[sqlite3.Row]:
         """What a full disk costs first: lowest priority, then oldest; never a protected object."""
         return self.rows("state IN ('pending', 'held') AND NOT protected ORDER BY priority DESC, id LIMIT ?", (limit,))

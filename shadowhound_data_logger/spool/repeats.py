@@ -4,7 +4,7 @@ Equal are the same bytes or, where a sensor asks for it, pictures that look alik
 stored, not with its neighbour, so that what changes slowly is stored again. A repeat is a row of the index in state
 deduplicated, with its own time, and ``content_key`` in its metadata names the object that holds the content; so does its
 row in the catalogue. No file of it is written and nothing of it is sent. What was sent cannot be changed, so the first
-object with another content tells, as metadata, how many repeats there were before it.
+object with another content tells, as metadata, how many repeats there were before it. What has repeats is never evicted.
 """
 
 from __future__ import annotations
@@ -72,7 +72,8 @@ class Repeats:
             return None
         rows = index.rows('bucket = ? AND key = ?', (item.bucket, last.key))
         if not rows or rows[0]['state'] not in _HOLDS or rows[0]['sha256'] != last.sha256:
-            return None  # evicted, say: a repeat of it would be lost with it
+            return None  # evicted, say
+        index.protect(item.bucket, last.key)  # else an outage that fills the disk would cost all its repeats as well
         self._next[_source(item)] = replace(last, repeats=last.repeats + 1, until_ns=item.t_end_ns)
         said = {CONTENT_KEY: last.key} if last.sha256 == sha256 else {CONTENT_KEY: last.key, DISTANCE: str(distance)}
         return Holder(FileBody(Path(last.key), rows[0]['bytes'], last.sha256), said)

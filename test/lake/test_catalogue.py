@@ -174,6 +174,19 @@ def test_two_that_catalogue_one_spool(spool: Spool, root: Path, clock: FakeClock
     assert_whole(root)
 
 
+def test_what_a_part_left_out_is_in_the_next(spool: Spool, root: Path, clock: FakeClock) -> None:
+    """A part that came second for some of its rows is none; what nobody else took is handed out again, without a restart."""
+    delivered(spool, 'a')
+    theirs = made(spool, clock).parts()
+    delivered(spool, 'b')
+    catalogue = made(spool, clock)
+    ours = catalogue.parts()
+    assert [keys(part) for part in (*theirs, *ours)] == [['a'], ['a', 'b']]
+    assert len(spool.commit(theirs)) == 1
+    assert spool.commit(ours) == []
+    assert [keys(part) for part in catalogue.parts()] == [['b']]
+
+
 def test_a_repeat_has_a_row_of_its_own(spool: Spool, root: Path, catalogue: Catalogue) -> None:
     """Content that was not stored again is found at its own time, under the key that holds it."""
     first, later = (make(f'thor/camera/{second}.jpg', t_start_ns=NOON_NS + second, t_end_ns=NOON_NS + second, dedup=True,

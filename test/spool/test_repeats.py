@@ -92,6 +92,18 @@ def test_a_commit_that_fails_is_no_content(spool: Spool, root: Path, monkeypatch
     assert_whole(root)
 
 
+def test_what_has_repeats_is_never_evicted(opened: Open, root: Path) -> None:
+    """An outage that fills the spool costs what stands for itself alone."""
+    spool = opened(max_bytes=100_000)
+    put(spool, picture(0, bytes(20_000)), picture(1, bytes(20_000)))
+    for second in range(2, 12):
+        put(spool, picture(second, bytes([second]) * 20_000))
+    found = {row['key'][-12:-10]: row['state'] for row in rows(root)}
+    assert (found['00'], found['01']) == ('pending', 'deduplicated')
+    assert 'evicted' in found.values()
+    assert_whole(root)
+
+
 def test_a_restart_stores_the_picture_anew(opened: Open, root: Path) -> None:
     """What another process stored is not known: one more object, and none is lost."""
     spool = opened()
