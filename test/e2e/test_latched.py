@@ -53,13 +53,14 @@ def test_what_is_latched_is_at_the_start_of_every_bag(
     def recorded(topic: str) -> int:
         return int(node.ledger()['bags'].get(topic, {}).get('received', 0))
 
-    # One after the other: of a depth of 1, the next message replaces one that is not delivered yet.
-    for count, text in enumerate(['left before', 'left', 'right before', 'right'], 1):
-        if count % 2:
-            publisher = processes.publisher()
-            publisher.create(STATIC, STRING, latched=True, depth=1)
-            publisher.matched(STATIC)
-        publisher.publish(STATIC, texts([text]))
+    publishers = {name: processes.publisher() for name in ('left', 'right')}
+    for publisher in publishers.values():
+        publisher.create(STATIC, STRING, latched=True, depth=1)
+        publisher.matched(STATIC)
+    # One after the other: of a depth of 1, the next message replaces one that is not delivered yet. And in turns: a middleware
+    # that does not name publishers leaves the ring of the events the last two messages, whoever sent them.
+    for count, text in enumerate(['left before', 'right before', 'left', 'right'], 1):
+        publishers[text.split()[0]].publish(STATIC, texts([text]))
         until(lambda count=count: recorded(STATIC) == count, f'{text!r} is recorded')
     publisher.create('/l_map', STRING, latched=True, depth=1)
     publisher.create(TALK, STRING)
@@ -92,4 +93,5 @@ def test_what_is_latched_is_at_the_start_of_every_bag(
     talked = [each for bag in (first, mission, last) for each in bag.messages() if each.topic == TALK]
     assert [int(decode(STRING, each.cdr).data) for each in talked] == list(range(40))
     for row in (*ledger['bags'].values(), *ledger['events'].values()):
-        assert (row['missed'], row['open'], row['received']) == (0, 0, row['stored'])
+        assert not row['missed']  # not known where publishers have no names
+        assert (row['open'], row['received']) == (0, row['stored'])
