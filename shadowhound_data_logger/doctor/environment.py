@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
@@ -20,12 +21,21 @@ SHARED: Final = ('AWS_ENDPOINT_URL', *KEYS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_EN
 """Where the node and this shell should agree; AWS's keys among them are compared, never shown."""
 PLACEHOLDERS: Final = ('<', 'TOWER_IP', 'from Tower', '...')
 """What is in the variables of somebody who pasted the guide as it is."""
+_BARE: Final = re.compile(r'[\w.-]+:\d{2,5}/?')
+"""A host and its port, which are no URL."""
 
 
 def check(context: Context) -> Iterator[Result]:
     """See the module."""
     for problem in context.refused:
         yield of_error('environment.settings', problem, 'the node would not start with it')
+    if context.parameter_file and not context.parameters:
+        yield warning(
+            'environment.parameters',
+            f'{context.parameter_file} sets nothing for the node',
+            'its section is for another node, or misspelt: the defaults hold, and ROS says nothing',
+            "begin the section with '/**:'  # launch_configs/go2.yaml shows how",
+        )
     yield from _store(context)
     yield from _tracking(context)
     yield from _proxies(context)
@@ -112,6 +122,13 @@ def _tracking(context: Context) -> Iterator[Result]:
             f'MLFLOW_TRACKING_URI is {services.shown(uri)}, which is no address',
             'its host or its port is none',
             'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
+        )
+    elif _BARE.fullmatch(uri):
+        yield error(
+            'environment.tracking',
+            f'MLFLOW_TRACKING_URI is {uri}, without http://',
+            'MLflow takes it for a folder on this machine',
+            f'export MLFLOW_TRACKING_URI=http://{uri}',
         )
     elif uri:
         yield ok('environment.tracking', f'MLFLOW_TRACKING_URI is {services.shown(uri)}')

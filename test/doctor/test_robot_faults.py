@@ -17,8 +17,9 @@ from doctor.scene import Scene, expect
 from spool.making import make, put, settle
 
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.doctor import disk
+from shadowhound_data_logger.doctor import disk, environment
 from shadowhound_data_logger.doctor.checks import CHECKS
+from shadowhound_data_logger.doctor.context import make as make_context
 from shadowhound_data_logger.doctor.model import Result, Role
 from shadowhound_data_logger.model import State
 
@@ -160,6 +161,8 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
                 ('export AWS_ACCESS_KEY_ID=', 'aws configure')),
     'half a pair': (without('AWS_SECRET_ACCESS_KEY'), 'environment', 'environment.credentials', ('AWS_SECRET_ACCESS_KEY=',)),
     'no MLflow': (without('MLFLOW_TRACKING_URI'), 'environment', 'environment.tracking', ('export MLFLOW_TRACKING_URI=http://',)),
+    'MLflow without http://': (wrong('MLFLOW_TRACKING_URI', 'tower:5001'), 'environment', 'environment.tracking',
+                               ('export MLFLOW_TRACKING_URI=http://tower:5001',)),
     'pasted as it was': (wrong('MLFLOW_TRACKING_URI', 'http://TOWER_IP:5001'), 'environment', 'environment.placeholder',
                          ('export MLFLOW_TRACKING_URI=',)),
     'another store for artifacts': (wrong('MLFLOW_S3_ENDPOINT_URL', 'http://old:9000'), 'environment', 'environment.artifacts',
@@ -210,6 +213,14 @@ def test_a_fault_is_found_and_named(robot: Scene, inject: Inject, asked: str, na
     if name == 'tower.listen':
         found = found[:1]  # both addresses are of one port here
     expect(found, name, *words)
+
+
+def test_a_parameter_file_for_another_node(robot: Scene, tmp_path: Path) -> None:
+    """A misspelt section is no error to ROS: the node runs with its defaults, and only here somebody says so."""
+    path = tmp_path / 'mine.yaml'
+    path.write_text('sensor_loger_node:\n  ros__parameters: {camera: {rate_hz: 2.0}}\n')
+    context = make_context(robot.environ, role=robot.role, parameter_file=path, root=robot.root)
+    expect([each for each in environment.check(context) if each.is_finding], 'environment.parameters', '/**:')
 
 
 def test_a_healthy_robot_gives_no_finding(robot: Scene) -> None:
