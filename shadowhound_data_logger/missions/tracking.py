@@ -97,8 +97,12 @@ class MlflowTracking:
         except ImportError as error:
             remedy = 'install mlflow-skinny for a server, mlflow for sqlite: and file: stores'
             raise TrackingUnavailable(f'MLflow cannot be imported: {error}', remedy=remedy) from error
-        with self._translated('cannot be used'):  # SQLite's tables are made here
-            self._client = MlflowClient(tracking_uri=self._uri)
+        try:
+            with self._translated('cannot be used'):  # SQLite's tables are made here
+                self._client = MlflowClient(tracking_uri=self._uri)
+        except TrackingRefused as error:  # nothing was sent yet: it is the address that this MLflow cannot do with
+            remedy = 'set MLFLOW_TRACKING_URI to a server, http://TOWER_IP:5001; for sqlite: install mlflow beside mlflow-skinny'
+            raise TrackingUnavailable(f'{error}', remedy=remedy) from error
 
     def run_of(self, mission_id: str, name: str, start_ms: int, tags: Mapping[str, str]) -> Run:
         self.open()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from shadowhound_data_logger.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.folder import Run
 from shadowhound_data_logger.missions.story import Point
 from shadowhound_data_logger.missions.tracking import MISSION_TAG, MlflowTracking
@@ -45,6 +46,13 @@ def test_a_mission_sent_twice_is_there_once(tracking: MlflowTracking, tmp_path: 
     assert str(tmp_path / 'artifacts') in run.artifact_uri
     times = 1 if tracking.where.startswith('sqlite') else 2
     assert len(client.get_metric_history(run.run_id, 'battery_pct')) == times * len(POINTS)
+
+
+@pytest.mark.parametrize('uri', ['nosuch://tower', 'tower:5001'])
+def test_an_address_that_this_mlflow_cannot_do_with_is_waited_for(uri: str) -> None:
+    """As sqlite: is for mlflow-skinny. It is no refusal of a mission: the sender lives, and says what is to be set."""
+    with pytest.raises(TrackingUnavailable, match='set MLFLOW_TRACKING_URI to a server'):
+        MlflowTracking(uri, 'thor_missions').open()
 
 
 @pytest.mark.filterwarnings('ignore')
