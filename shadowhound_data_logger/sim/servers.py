@@ -25,10 +25,17 @@ PORTS: Final = range(11_000, 22_700)
 """Below Linux's ephemeral ports (32768 up), as are the same plus 10,000: no outgoing connection takes one meanwhile."""
 GRPC: Final = 10_000
 """SeaweedFS serves gRPC on the HTTP port plus this; some of it cannot be told another."""
+SOCKETS: Final = Path('/tmp')  # noqa: S108 - where SeaweedFS leaves its sockets is fixed; we only remove them
 
 
 class ServerFailed(DataLoggerError):
     """A server did not start or is not installed; ``data`` has its log."""
+
+
+def seaweed_sockets(ports: Mapping[str, int]) -> list[Path]:
+    """What a SeaweedFS whose parts listen on these ports leaves behind."""
+    names = ((f'{name}-{port}', f'{name}-grpc-{port + GRPC}') for name, port in ports.items())
+    return [SOCKETS / f'seaweedfs-{name}.sock' for both in names for name in both]
 
 
 class Server:

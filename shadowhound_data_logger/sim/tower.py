@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import DataLoggerError, StoreError
-from shadowhound_data_logger.sim.servers import GRPC, Ports, Server, find_program
+from shadowhound_data_logger.sim.servers import GRPC, Ports, Server, find_program, seaweed_sockets
 from shadowhound_data_logger.stores.s3 import S3Store
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ S3_READY_S: Final = 30.0
 MLFLOW_READY_S: Final = 120.0
 """It takes some 8 s on an idle machine, most of it imports and the schema of a new database."""
 SECRET_BYTES: Final = 24
-SOCKETS: Final = Path('/tmp')  # noqa: S108 - where SeaweedFS leaves its sockets is fixed; we only remove them
 
 
 class Tower:
@@ -136,9 +135,9 @@ class Tower:
             f'-s3.config={self._identities()}', '-s3.iam=false', '-s3.autoCreateBucket=false', '-s3.port.iceberg=0',
             '-s3.port.lance=0', '-webdav=false', '-admin.ui=false', '-master.telemetry=false', '-volume.preStopSeconds=0',
         ]  # fmt: skip
-        sockets = [SOCKETS / f'seaweedfs-{name}-{port}.sock' for name, port in ports.items()]
-        sockets += [SOCKETS / f'seaweedfs-{name}-grpc-{port + GRPC}.sock' for name, port in ports.items()]
-        return Server('SeaweedFS', command, log=self._folder / 's3.log', environ=self._environ(), leftovers=sockets)
+        return Server(
+            'SeaweedFS', command, log=self._folder / 's3.log', environ=self._environ(), leftovers=seaweed_sockets(ports)
+        )
 
     def _identities(self) -> Path:
         """SeaweedFS's S3 configuration with fresh credentials, readable by this user only."""

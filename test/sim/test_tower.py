@@ -23,8 +23,8 @@ from e2e.processes import LONG
 from shadowhound_data_logger.config import StoreSettings, UploadSettings, store_settings
 from shadowhound_data_logger.errors import CredentialsRejected, StoreUnavailable
 from shadowhound_data_logger.sim import servers
-from shadowhound_data_logger.sim.servers import GRPC, Ports, Server, ServerFailed, find_program
-from shadowhound_data_logger.sim.tower import SOCKETS, Tower
+from shadowhound_data_logger.sim.servers import GRPC, SOCKETS, Ports, Server, ServerFailed, find_program
+from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 

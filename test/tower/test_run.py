@@ -43,6 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, offset: int) -> Iterator[Pa
             assert tower.wait(60) == 0
             remove_database(folder, offset)
     _until(lambda: not processes_of(folder), 10)
+    assert list(Path('/tmp').glob(f'seaweedfs-s3-*{9000 + offset}.sock')) == []  # noqa: S108 - that is where they would be
 
 
 def _until(ready: Callable[[], bool], seconds: float) -> None:
