@@ -14,6 +14,8 @@ import pytest
 from domains import free_domain
 
 if TYPE_CHECKING:
+    from stores.certificates import Authority
+
     from shadowhound_data_logger.sim.tower import Tower
 
 
@@ -114,3 +116,12 @@ def domain() -> Iterator[int]:
     """A ROS domain that nobody uses, and no other test takes meanwhile."""
     with free_domain() as number:
         yield number
+
+
+@pytest.fixture(scope='module')
+def authorities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Authority]:
+    """One that is trusted, and one that nobody knows."""
+    from stores.certificates import Authority
+
+    folder = tmp_path_factory.mktemp('tls')
+    return {name: Authority(folder, name) for name in ('authority', 'stranger')}

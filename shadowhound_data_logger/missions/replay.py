@@ -17,7 +17,7 @@ import sqlite3
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final
 
@@ -94,17 +94,20 @@ class Replay:
 
     def _work(self, delivery: Delivery) -> bool:
         """One piece for each receiver; whether nothing is left to do for this mission."""
+        mission_id = delivery.folder.mission_id
         try:
-            mission_id = delivery.folder.mission_id
             self._try(TRACKING, delivery.track, mission_id)
             self._try(ARTIFACTS, delivery.attach, mission_id)
             self._try(OBJECTS, lambda: delivery.shelve(hold=self.gates[TRACKING].error is not None), mission_id)
             return delivery.complete()
         except TrackingRefused as error:
-            log.error('mission %s is not sent on: %s', delivery.folder.mission_id, error)  # noqa: TRY400 - no defect
-            delivery.give_up(str(error))
+            log.error('mission %s is not sent on: %s', mission_id, error)  # noqa: TRY400 - no defect
+            said = str(error)
         except Exception as error:  # the supervised catch-all (D14): one rotten journal must not stop the others
-            log.error('mission %s cannot be sent', delivery.folder.mission_id, exc_info=error)  # noqa: TRY400
+            log.error('mission %s cannot be sent', mission_id, exc_info=error)  # noqa: TRY400
+            said = f'{type(error).__name__}: {error}'
+        with suppress(OSError):  # the log has it as well
+            delivery.give_up(said)
         return True
 
     @property

@@ -11,6 +11,7 @@ import pytest
 from domains import free_domain
 from e2e.processes import Processes
 from e2e.reading import Objects
+from e2e.station import Station
 
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.sim.tower import Tower
@@ -50,6 +51,23 @@ def running(folder: Path) -> Iterator[Processes]:
         finally:
             LIVE.remove(processes)
             processes.end()
+
+
+@pytest.fixture(scope='module')
+def store(seaweed: Tower) -> Iterator[S3Store]:
+    """The server as our own programs read it."""
+    opened = S3Store(seaweed.store_settings(), UploadSettings())
+    opened.open()
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def station(processes: Processes) -> Iterator[Station]:
+    """Another node of the robot, which calls services and hears topics."""
+    made = Station(processes.environ)
+    yield made
+    made.close()
 
 
 @pytest.fixture

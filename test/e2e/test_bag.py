@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import sqlite3
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -14,10 +13,8 @@ from e2e.reading import STRING, TYPES, decode, texts
 from e2e.station import Station
 from e2e.witness import recorded
 
-from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.s3 import S3Store
 
 DURATION_S = 60.0 if LONG else 6.0
 SLICE_S = 2.0
@@ -26,14 +23,6 @@ SOON_NS = 10 * 10**9
 BEST_EFFORT = {'/point_cloud2', '/camera/camera_info'}
 
 pytestmark = pytest.mark.timeout(120 + 2 * DURATION_S)
-
-
-@pytest.fixture(scope='module')
-def store(seaweed: Tower) -> Iterator[ObjectStore]:
-    opened = S3Store(seaweed.store_settings(), UploadSettings())
-    opened.open()
-    yield opened
-    opened.close()
 
 
 class Session:
@@ -103,13 +92,6 @@ def _row(processes: Processes, key: str) -> dict[str, Any]:
     with sqlite3.connect(processes.folder / 'home' / 'spool' / 'index.db') as db:
         db.row_factory = sqlite3.Row
         return dict(db.execute('SELECT * FROM objects WHERE key = ?', (key,)).fetchone())
-
-
-@pytest.fixture
-def station(processes: Processes) -> Iterator[Station]:
-    made = Station(processes.environ)
-    yield made
-    made.close()
 
 
 def test_the_services_begin_pause_split_and_end_a_bag(

@@ -7,16 +7,13 @@ import json
 import math
 import signal
 from collections import Counter
-from collections.abc import Iterator
 from typing import Any
 
 import pyarrow
 import pyarrow.parquet
-import pytest
 from e2e.processes import Processes, until
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.lake import schema
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.sim.tower import Tower
@@ -36,14 +33,6 @@ HEARD_NS = 1_200_000_000
 WITH_HEADER = {'camera', 'camera_info', 'joints', 'lidar', 'odom'}
 """The time of the others is that of sending: a simulator that is late sends them with a newer one than its odometry has."""
 FAST = {'catalogue.period_s': 2.0, 'lowstate.batch_s': 2.0}
-
-
-@pytest.fixture
-def store(seaweed: Tower) -> Iterator[S3Store]:
-    opened = S3Store(seaweed.store_settings(), UploadSettings())
-    opened.open()
-    yield opened
-    opened.close()
 
 
 def listed(store: S3Store, robot: str) -> dict[tuple[str, str], ObjectInfo]:

@@ -5,40 +5,21 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
 from e2e.bag_reading import Bag, bags
 from e2e.processes import Node, Processes, Publisher, until
 from e2e.reading import STRING, TYPES, decode, texts
 from e2e.station import Station
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool.status import file
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.s3 import S3Store
 
 TOPIC, OTHER = '/e_one', '/e_two'
 SETTINGS = {'events.regex': '^/e_', 'events.pre_s': 60.0, 'events.post_s': 1.0, 'sensors': ['odom']}
-
-
-@pytest.fixture
-def station(processes: Processes) -> Iterator[Station]:
-    made = Station(processes.environ)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def store(seaweed: Tower) -> Iterator[ObjectStore]:
-    opened = S3Store(seaweed.store_settings(), UploadSettings())
-    opened.open()
-    yield opened
-    opened.close()
 
 
 def publisher_of(processes: Processes, topic: str = TOPIC) -> Publisher:

@@ -3,41 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 
-import pytest
 from e2e.bag_reading import Bag, bags
 from e2e.processes import Processes, until
 from e2e.reading import STRING, decode, texts
 from e2e.station import Station
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool.status import file
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.s3 import S3Store
 
 STATIC, TALK = '/l_static', '/l_talk'
 PARAMETERS = {
     'sensors': ['map'], 'map.topics': ['/l_map'], 'map.rate_hz': 0.0, 'bag.record': 'always', 'bag.regex': '^/l_',
     'events.regex': '^/l_', 'events.pre_s': 1.0, 'events.post_s': 0.5,
 }  # fmt: skip
-
-
-@pytest.fixture
-def station(processes: Processes) -> Iterator[Station]:
-    made = Station(processes.environ)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def store(seaweed: Tower) -> Iterator[ObjectStore]:
-    opened = S3Store(seaweed.store_settings(), UploadSettings())
-    opened.open()
-    yield opened
-    opened.close()
 
 
 def latched(bag: Bag) -> list[tuple[str, str]]:

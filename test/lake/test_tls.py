@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 from lake.training import Drive
-from stores.certificates import DAY, Authority
+from stores.certificates import WRONG, Authority
 from stores.tls_front import Secured, behind_tls
 
 from shadowhound_data_logger import lake
@@ -31,19 +30,6 @@ SECONDS = 3
 OBJECTS = 6 * SECONDS
 HANDSHAKE = 22
 """Content type of the TLS record that begins a connection (RFC 8446, 5.1)."""
-WRONG: dict[str, tuple[str, dict[str, Any], str, str]] = {
-    'unknown': ('stranger', {}, 'is not trusted', 'AWS_CA_BUNDLE'),
-    'expired': ('authority', {'begins': -2 * DAY, 'ends': timedelta(hours=-1)}, 'has expired', 'renew it'),
-    'early': ('authority', {'begins': timedelta(hours=1)}, 'is not valid yet', 'timedatectl'),
-    'host': ('authority', {'host': '10.0.0.1'}, 'is for another name', 'AWS_ENDPOINT_URL'),
-}
-
-
-@pytest.fixture(scope='module')
-def authorities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Authority]:
-    """One that is trusted, and one that nobody knows."""
-    folder = tmp_path_factory.mktemp('tls')
-    return {name: Authority(folder, name) for name in ('authority', 'stranger')}
 
 
 @pytest.fixture(scope='module')

@@ -16,6 +16,7 @@ from missions.server import until
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.errors import TrackingUnavailable
+from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, Run, missions, read_json
 from shadowhound_data_logger.missions.gate import Gate
 from shadowhound_data_logger.missions.replay import KEEP_S, LINGER_S, Parent, Replay, open_tracking, run
@@ -266,6 +267,15 @@ def test_one_that_always_fails_holds_up_no_other(tmp_path: Path, what: str) -> N
         now.seconds += 61.0
         replay.step()
     assert [folder.sent().complete for folder in missions(tmp_path) if folder.path != stuck] == [True] * 3
+
+
+def test_a_mission_that_is_beyond_help_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`missions list` tells the cause, not the log alone."""
+    broken = MissionFolder(tmp_path / FOLDER / fly(tmp_path))
+    monkeypatch.setattr(Delivery, 'track', lambda _: 1 / 0)
+    replay = new_replay(tmp_path, FakeTracking(), Now())
+    replay.step()
+    assert broken.sent().error == 'ZeroDivisionError: division by zero'
 
 
 def test_a_full_disk_does_not_end_the_sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

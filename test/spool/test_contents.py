@@ -61,6 +61,13 @@ def die(spool: Spool, root: Path) -> Path:
     return copy
 
 
+def killed(spool: Spool, root: Path) -> Path:
+    """What a session leaves that recorded ten messages and died before it spooled a slice."""
+    receive(spool, 10, IMU)
+    spool.commit()
+    return die(spool, root)
+
+
 def test_a_slice_counts_for_each_of_its_topics(spool: Spool, root: Path) -> None:
     """Its messages are stored in the bags' accounts, none in the sensors', and follow the object from state to state."""
     receive(spool, 3, IMU)
@@ -110,16 +117,11 @@ def test_what_a_dead_session_left_open_is_settled_by_what_its_files_hold(
     opened: Open, root: Path, clock: FakeClock, recorded: int, expected: tuple[object, ...]
 ) -> None:
     """Found again it is stored, else lost by the restart; what the accounts had not known yet is received as well."""
-    spool = opened()
-    receive(spool, 10, IMU)
-    spool.commit()
-    left = die(spool, root)
+    left = killed(opened(), root)
     after = started(left, clock)
     assert bags(left) == {'/imu': (10, 0, {}, 10)}
     if recorded:
-        item = a_slice(0, imu=recorded)
-        after.accounts.find(item.counts)
-        after.commit([item])
+        find(after, a_slice(0, imu=recorded))
     assert after.accounts.drop_carried('restart') == max(0, 10 - recorded)
     after.close()
     assert bags(left) == {'/imu': expected}
@@ -147,10 +149,7 @@ def test_each_settles_its_own(opened: Open, root: Path, clock: FakeClock) -> Non
 
 def test_a_death_in_the_middle_of_settling_costs_nothing(opened: Open, root: Path, clock: FakeClock) -> None:
     """What one session carried and did not settle is carried by the next."""
-    spool = opened()
-    receive(spool, 10, IMU)
-    spool.commit()
-    first = die(spool, root)
+    first = killed(opened(), root)
     after = started(first, clock)
     find(after, a_slice(0, imu=4))
     second = die(after, first)
@@ -177,10 +176,7 @@ def test_what_is_open_at_a_stop_waits_for_the_next_start(opened: Open, root: Pat
 
 def test_what_is_found_is_counted_once_whatever_dies_next(opened: Open, root: Path, clock: FakeClock) -> None:
     """A session that found messages and dies before the next one comes leaves no gap for them to the session after it."""
-    spool = opened()
-    receive(spool, 10, IMU)
-    spool.commit()
-    first = die(spool, root)
+    first = killed(opened(), root)
     second = started(first, clock)
     find(second, a_slice(0, imu=14))
     left = die(second, first)
@@ -195,10 +191,7 @@ def test_what_is_found_is_counted_once_whatever_dies_next(opened: Open, root: Pa
 @pytest.mark.parametrize('found_first', [True, False])
 def test_a_recorded_message_is_not_missed_as_well(opened: Open, root: Path, clock: FakeClock, found_first: bool) -> None:
     """Numbers that the accounts of the dead session did not reach are in its file: the gap before the next one is shorter."""
-    spool = opened()
-    receive(spool, 10, IMU)
-    spool.commit()
-    left = die(spool, root)
+    left = killed(opened(), root)
     after = started(left, clock)
     item = a_slice(0, imu=14)
     if found_first:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import ipaddress
 from pathlib import Path
+from typing import Any
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -12,6 +13,13 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 DAY = datetime.timedelta(days=1)
 HERE = '127.0.0.1'
+WRONG: dict[str, tuple[str, dict[str, Any], str, str]] = {
+    'unknown': ('stranger', {}, 'is not trusted', 'AWS_CA_BUNDLE'),
+    'expired': ('authority', {'begins': -2 * DAY, 'ends': datetime.timedelta(hours=-1)}, 'has expired', 'renew it'),
+    'early': ('authority', {'begins': datetime.timedelta(hours=1)}, 'is not valid yet', 'timedatectl'),
+    'host': ('authority', {'host': '10.0.0.1'}, 'is for another name', 'AWS_ENDPOINT_URL'),
+}
+"""What can be wrong with a certificate: who signed it and how, and words of the message and of its remedy."""
 
 
 class Authority:

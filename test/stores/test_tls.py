@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 from stores.asking import error_of
-from stores.certificates import DAY, Authority
+from stores.certificates import DAY, WRONG, Authority
 from stores.fake_s3 import FakeS3, served
 from stores.spooled import Spool
 from stores.tls_front import Secured, behind_tls
@@ -27,19 +26,6 @@ from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES
 BODY = b'what the robot saw, which is nobody else to read; ' * 100
 RECORDS = {20, 21, 22, 23}
 """Content types of TLS records: change_cipher_spec, alert, handshake, application_data (RFC 8446, 5.1)."""
-WRONG: dict[str, tuple[str, dict[str, Any], str, str]] = {
-    'unknown': ('stranger', {}, 'is not trusted', 'AWS_CA_BUNDLE'),
-    'expired': ('authority', {'begins': -2 * DAY, 'ends': timedelta(hours=-1)}, 'has expired', 'renew it'),
-    'early': ('authority', {'begins': timedelta(hours=1)}, 'is not valid yet', 'timedatectl'),
-    'host': ('authority', {'host': '10.0.0.1'}, 'is for another name', 'AWS_ENDPOINT_URL'),
-}
-
-
-@pytest.fixture(scope='module')
-def authorities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Authority]:
-    """One that is trusted, and one that nobody knows."""
-    folder = tmp_path_factory.mktemp('tls')
-    return {name: Authority(folder, name) for name in ('authority', 'stranger')}
 
 
 @pytest.fixture(params=['AWS_CA_BUNDLE', 'REQUESTS_CA_BUNDLE'])
