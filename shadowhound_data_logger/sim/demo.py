@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -23,7 +23,7 @@ from rich.console import Console
 
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import DataLoggerError
-from shadowhound_data_logger.sim import demo_audit, demo_processes, demo_report, demo_run
+from shadowhound_data_logger.sim import demo_audit, demo_mission, demo_processes, demo_report, demo_run
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 
@@ -74,8 +74,9 @@ def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, m
     with Tower(folder / 'tower', mlflow=mlflow) as tower:
         console.print(f'  S3 server  {tower.endpoint_url}')
         if mlflow:
-            console.print(f'  MLflow     {tower.tracking_uri}  (empty: this patrol is no mission)')
-        record = _patrol(folder, tower, duration_s, outage_s, console)
+            console.print(f'  MLflow     {tower.tracking_uri}')
+        record, run_id = _patrol(folder, tower, duration_s, outage_s, console, with_mission=mlflow)
+        drawn = [demo_mission.picture(tower.tracking_uri, run_id, folder / 'mission.png')] if run_id else []
         console.print('\nReading everything back from the S3 server ...\n')
         store = open_store(tower.store_settings(), UploadSettings())
         try:
@@ -84,15 +85,18 @@ def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, m
             store.close()
     (folder / 'ledger.json').write_text(json.dumps(audit.ledger, indent=2), encoding='utf-8')
     demo_report.show_result(audit, record, console)
+    if run_id:
+        demo_report.show_mission(demo_mission.summary(audit.bodies, run_id), console)
     from shadowhound_data_logger.sim import demo_pictures  # noqa: PLC0415 - matplotlib takes a second to load
 
     pictures = demo_pictures.draw(folder, audit.bodies, record)
-    demo_report.show_where(folder, pictures, os.environ, console)
+    demo_report.show_where(folder, [*pictures, *drawn], os.environ, console)
     return 1 if audit.problems else 0
 
 
-def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, console: Console) -> demo_run.Record:
-    """The minute itself; afterwards all processes but the Tower have ended."""
+def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, console: Console, *,
+            with_mission: bool) -> tuple[demo_run.Record, str]:  # fmt: skip
+    """The minute itself, and its mission's run, if it is one; afterwards all processes but the Tower have ended."""
     environ = demo_processes.environment(folder / 'home', tower.environment(), demo_processes.free_domain())
     console.print(f'Starting the node and the robot (ROS_DOMAIN_ID={environ["ROS_DOMAIN_ID"]}, this machine only) ...')
     with (
@@ -101,13 +105,17 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
     ):
         if outage_s:
             console.print(f'In the middle the S3 server goes away for {outage_s:g} s.\n')
-        with demo_report.progress(console, duration_s) as show:
-            record = demo_run.patrol(folder, node, outage, environ, duration_s, show)
+        with ExitStack() as agents:
+            if with_mission:
+                agent = agents.enter_context(demo_mission.start(folder, environ))
+            with demo_report.progress(console, duration_s) as show:
+                record = demo_run.patrol(folder, node, outage, environ, duration_s, show)
+            run_id = demo_mission.end(agent) if with_mission else ''
         began = time.monotonic()
         node.stop(demo_processes.STOP_S)
         node.check()
         console.print(f'The robot has stopped. Asked to end (SIGINT), the node did so in {time.monotonic() - began:.1f} s.')
-    return record
+    return record, run_id
 
 
 @contextmanager

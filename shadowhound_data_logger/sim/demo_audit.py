@@ -68,7 +68,7 @@ class Audit:
     samples: int
     """Messages counted in them."""
     bodies: Mapping[str, bytes]
-    """What was read, by key."""
+    """What was read, by key; no two buckets have the same."""
     rows: int
     """Of the catalogue, as it lies in the server."""
     problems: tuple[str, ...]
@@ -90,8 +90,9 @@ def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectSt
         before[publisher.topic] += max((publisher.first or 1) - 1, 0)
     accounts = found['topics']
     messages = {topic: _messages(number, before[topic], accounts.get(topic)) for topic, number in published.items()}
-    bodies = {info.key: store.get(BUCKET, info.key) for info in store.list(BUCKET, f'{robot}/')}
-    delivered = {row['key']: row['sha256'] for row in rows if row['state'] == State.DELIVERED.value and row['bucket'] == BUCKET}
+    buckets = sorted({BUCKET, *(row['bucket'] for row in rows)})
+    bodies = {info.key: store.get(bucket, info.key) for bucket in buckets for info in store.list(bucket, f'{robot}/')}
+    delivered = {row['key']: row['sha256'] for row in rows if row['state'] == State.DELIVERED.value}
     samples = _count(rows, bodies)
     problems = [*ledger.imbalances(found), *_unread(delivered, bodies), *_unaccounted(messages), *_undelivered(found)]
     catalogue = _catalogued(bodies)

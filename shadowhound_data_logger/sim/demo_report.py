@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -125,13 +125,22 @@ def messages_table(audit: Audit) -> Table:
 def objects_table(audit: Audit) -> Table:
     """A row a sensor: the objects that lie in the S3 server, and what they are called."""
     columns = ('objects', 'delivered', 'size', 'the latest one')
-    table = plain_table(f'What lies in the bucket {BUCKET}', columns, left=columns[-1:])
+    table = plain_table('What lies in the S3 server', columns, left=columns[-1:])
     for _, pile in sorted(audit.piles.items(), key=lambda item: item[1].latest):
         table.add_row(number(pile.objects), number(pile.delivered), volume(pile.bytes), pile.latest)
     piles = audit.piles.values()
     total = (sum(pile.objects for pile in piles), sum(pile.delivered for pile in piles), sum(pile.bytes for pile in piles))
     table.add_row(number(total[0]), number(total[1]), volume(total[2]), 'all', style='bold')
     return table
+
+
+def show_mission(summary: Mapping[str, Any], console: Console) -> None:
+    """What a mission came to, by its summary.json."""
+    counts, last = summary['counts'], summary['last']
+    walked = f'{summary["distance_m"]:.1f} m in {summary["duration_s"]:.0f} s'
+    battery = f', battery {last["battery_pct"]:.0f} %' if 'battery_pct' in last else ''
+    console.print(f'The mission {summary["run_name"]}: {walked}{battery}, {number(counts["camera_frames"])} frames.')
+    console.print('Its run in MLflow has parameters, metrics over time, trajectory, frames, three pictures and a summary.')
 
 
 def show_where(folder: Path, pictures: list[Path], environ: Mapping[str, str], console: Console) -> None:
@@ -147,6 +156,7 @@ def show_where(folder: Path, pictures: list[Path], environ: Mapping[str, str], c
     console.print(f'  {prefix}python -m shadowhound_data_logger.sim.tower --folder {place}/tower', soft_wrap=True)
     console.print('Paste the "export" lines it prints into another terminal, and use any S3 client:')
     console.print('  aws s3 ls --recursive s3://sensor-data/ --endpoint-url "$AWS_ENDPOINT_URL"', soft_wrap=True)
+    console.print('It prints where MLflow is as well: experiment thor_missions has the mission.')
     console.print('The ledger again, as on a robot:')
     console.print(f'  SHADOWHOUND_HOME={place}/home {prefix}shadowhound-data ledger', soft_wrap=True)
 

@@ -305,19 +305,20 @@ def test_times_that_make_no_sense_are_refused(arguments: list[str], tmp_path: Pa
 @pytest.mark.seaweedfs
 @pytest.mark.slow
 def test_a_short_demo_ends_well(tmp_path: Path) -> None:
-    """With a real S3 server, the real node and the simulated robot: exit code 0, a ledger that balances, and three pictures."""
+    """With a real Tower, the real node, a mission and the simulated robot: exit code 0, a ledger that balances, four pictures."""
     pytest.importorskip('rclpy')
-    command = [sys.executable, '-m', 'shadowhound_data_logger.sim.demo', '--no-mlflow']
+    command = [sys.executable, '-m', 'shadowhound_data_logger.sim.demo']
     options = ['--duration', '6', '--outage', '2', '--folder', str(tmp_path / 'demo')]
     environ = os.environ | {'COLUMNS': '80'}
-    done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=110, check=False, env=environ)
+    done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=200, check=False, env=environ)
     assert done.returncode == 0, done.stdout + done.stderr
     assert 'The ledger balances' in done.stdout
     assert 'all as spooled' in done.stdout
     assert 'AWAY' in done.stdout
+    assert 'The mission patrol_' in done.stdout
     assert done.stderr == ''
     assert json.loads((tmp_path / 'demo' / 'ledger.json').read_text())['balanced'] is True
-    for name in ('frames.png', 'patrol.png', 'delivery.png'):
+    for name in ('frames.png', 'patrol.png', 'delivery.png', 'mission.png'):
         with Image.open(tmp_path / 'demo' / name) as picture:
             assert min(picture.size) > 200
         assert str(tmp_path / 'demo' / name) in done.stdout

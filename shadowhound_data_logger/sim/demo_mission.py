@@ -1,0 +1,86 @@
+"""The demo's patrol as a mission: the agent that logs it, a process of its own, and what came of it.
+
+The agent states no distance, so that what the node measured stands (docs/missions.md). Run as a program, this is the agent.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+from urllib.error import URLError
+from urllib.parse import urlencode
+from urllib.request import urlopen
+
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.missions.folder import missions
+from shadowhound_data_logger.sim.demo_processes import READY_S, STOP_S, Child, DemoFailed
+
+COMMAND: Final = 'go through all six rooms and come back to the dock'
+SEND_S: Final = 30.0
+"""For the run to have everything: its pictures take some seconds."""
+PICTURE: Final = 'trajectory.png'
+
+
+def start(folder: Path, environ: Mapping[str, str]) -> Child:
+    """The agent, once its mission has begun. Raises DemoFailed when it does not."""
+    agent = Child(__name__, (), environ, folder / 'agent.log')
+    end_s = time.monotonic() + READY_S
+    while not any(missions(folder / 'home')):
+        if not agent.is_running or time.monotonic() > end_s:
+            agent.stop(0.0)
+            raise agent.failed('did not begin a mission')
+        time.sleep(0.1)
+    return agent
+
+
+def end(agent: Child) -> str:
+    """End the mission; the id of its run. Raises DemoFailed when not all of it has arrived there."""
+    agent.stop(STOP_S)
+    agent.check()
+    return str(json.loads(agent.output.splitlines()[-1])['run_id'])
+
+
+def picture(tracking_uri: str, run_id: str, path: Path) -> Path:
+    """The way over the floor plan, an artifact of the run, as a file. Raises DemoFailed."""
+    asked = f'{tracking_uri}/get-artifact?{urlencode({"path": PICTURE, "run_uuid": run_id})}'
+    try:
+        with urlopen(asked, timeout=READY_S) as answer:  # noqa: S310 - our own server on 127.0.0.1
+            path.write_bytes(answer.read())
+    except (URLError, TimeoutError) as error:
+        raise DemoFailed(f'the run {run_id} gives no {PICTURE}: {error}') from error
+    return path
+
+
+def summary(bodies: Mapping[str, bytes], run_id: str) -> dict[str, Any]:
+    """The mission's summary.json, of what was read from the S3 server. Raises DemoFailed where it is not there."""
+    for key, body in bodies.items():
+        if key.endswith(f'/missions/{run_id}/summary.json'):
+            found: dict[str, Any] = json.loads(body)
+            return found
+    raise DemoFailed(f'the S3 server has no summary of the run {run_id}')
+
+
+def main() -> int:
+    """Log a mission until SIGINT; exit code 0 when its run has everything."""
+    stop = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: stop.set())
+    with closing(MissionDataLogger()) as logger:
+        began_s = time.monotonic()
+        logger.start_mission('patrol', COMMAND)
+        stop.wait()
+        logger.end_mission(success=True, distance_m=0.0, duration_s=time.monotonic() - began_s)
+        found = logger.flush(SEND_S)
+    print(json.dumps(asdict(found)), flush=True)
+    return 0 if found.complete else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())
