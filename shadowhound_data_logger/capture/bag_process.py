@@ -34,7 +34,7 @@ from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.capture.bag_tap import BagTap
 from shadowhound_data_logger.capture.intake import Intake
-from shadowhound_data_logger.capture.sensor_logger_node import StopSignals
+from shadowhound_data_logger.capture.node import StopSignals
 from shadowhound_data_logger.capture.stream import Shared
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings

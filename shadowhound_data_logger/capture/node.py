@@ -1,0 +1,126 @@
+"""The node's life: its arguments, its signals, its main loop. To import this loads rclpy, and with it the middleware."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import signal
+import sys
+import time
+from types import FrameType
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from shadowhound_data_logger.capture.log_bridge import RosHandler
+from shadowhound_data_logger.capture.parameters import Parameters
+from shadowhound_data_logger.capture.pipeline import Pipeline
+from shadowhound_data_logger.capture.service import Service
+from shadowhound_data_logger.errors import DataLoggerError, SettingError
+
+USAGE = """\
+usage: sensor_logger_node [--ros-args [--params-file FILE] [-p NAME:=VALUE ...] [-r __ns:=/NAMESPACE] ...]
+What it is doing: shadowhound-data status. Without AWS_ENDPOINT_URL it stores to a folder, $SHADOWHOUND_HOME/store."""
+UNHEARD = 'the parameter file has nothing for {name}, so the defaults hold: begin its section with /**, or with that name'
+SPIN_S = 0.5
+"""How long a signal may wait to be seen; two of them are the second that is between two statuses."""
+ARENAS, MMAP_THRESHOLD = (-8, 2), (-3, 1 << 20)
+"""Options of glibc's mallopt(3) and their values: few heaps for all threads, and large blocks go back when they are freed.
+At full rate that saves 35 of 128 MB (docs/performance.md)."""
+SECOND_SIGNAL_S = 1.0
+"""A second signal later than this ends the node at once; an earlier one is the same key press."""
+
+
+class StopSignals:
+    """SIGINT and SIGTERM ask to stop; a second one, later, ends the process: what is spooled is durable already."""
+
+    def __init__(self) -> None:
+        self.first_s: float | None = None
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    @property
+    def received(self) -> bool:
+        return self.first_s is not None
+
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
+        if self.first_s is None:
+            self.first_s = time.monotonic()
+        elif time.monotonic() - self.first_s > SECOND_SIGNAL_S:
+            os._exit(128 + number)
+
+
+def bound_heap() -> None:
+    """Keep the heap small; before the first thread is started. Other C libraries than glibc know no such options."""
+    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
+    if mallopt is not None:
+        for option in (ARENAS, MMAP_THRESHOLD):
+            mallopt(*option)
+
+
+def refuse(rest: list[str]) -> int:
+    """Answer arguments that are none of ROS; the exit code."""
+    if rest[0] in {'-h', '--help'}:
+        print(USAGE)  # noqa: T201
+        return 0
+    print(f'sensor_logger_node: {rest[0]!r} is no argument of it; settings follow --ros-args\n{USAGE}', file=sys.stderr)  # noqa: T201
+    return 2
+
+
+def run(arguments: list[str]) -> int:
+    """From the start of ROS to its end; the exit code. ``arguments`` are those of ROS, without the program's name."""
+    bound_heap()
+    try:
+        if rest := remove_ros_args(arguments):  # a --params-file without --ros-args, say: rcl would ignore it
+            return refuse(rest)
+        rclpy.init(args=[sys.argv[0], *arguments], signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # a parameter file or argument that rcl cannot parse; there is no logger yet
+        print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201
+        return 2
+    stop = StopSignals()
+    node = Node('sensor_logger_node', automatically_declare_parameters_from_overrides=True)
+    logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
+    if '--params-file' in arguments and not Parameters(node).given():  # which is no error to rcl
+        node.get_logger().warning(UNHEARD.format(name=node.get_fully_qualified_name()))
+    try:
+        log_until(stop, node)
+    except SettingError as error:
+        node.get_logger().fatal(f'{error}')
+        return 2
+    except DataLoggerError as error:
+        node.get_logger().fatal(str(error))
+        return 1
+    except BaseException as error:  # the one supervised catch-all of the main loop (D14); systemd starts the node again
+        logging.getLogger(__name__).critical('the node ends: %s: %s', type(error).__name__, error, exc_info=error)
+        return 1
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def log_until(stop: StopSignals, node: Node) -> None:
+    """Until a signal comes."""
+    service = Service(os.environ)
+    parameters = Parameters(node)
+    pipeline = Pipeline(node, parameters.load())
+    pipeline.open()
+    service.ready(pipeline.describe())
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not stop.received:
+            executor.spin_once(timeout_sec=SPIN_S)
+            if settings := parameters.changed():
+                pipeline.apply(settings)
+            pipeline.tick()
+            service.alive()
+    finally:
+        service.stopping()
+        node.get_logger().info('closing: open batches are finished and delivered')
+        pipeline.close()
+        executor.shutdown()
