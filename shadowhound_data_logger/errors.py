@@ -44,6 +44,10 @@ class SpoolError(DataLoggerError):
     """The spool cannot be opened or written (another process, no space, no permission)."""
 
 
+class NodeUnavailable(DataLoggerError):
+    """No node runs here, it cannot be chosen among several, or the one that runs does not answer."""
+
+
 class StoreError(DataLoggerError):
     """Base of what a store reports about a request; the subclass decides what delivery does next."""
 

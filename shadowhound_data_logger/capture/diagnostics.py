@@ -3,7 +3,7 @@
 Levels: WARN for what needs a look (messages missed, dropped or rejected lately, whatever the watchdog finds to stand still,
 the store away, a spool that fills up, a clock that is not set or stepped lately), ERROR for what needs a hand (a thread that
 fails or failed lately, objects in quarantine lately, credentials that are refused), STALE for a topic that nobody publishes.
-Nothing is made, and nothing sent, unless somebody listens.
+Plain values; ``interface`` makes the message of them, while somebody listens.
 """
 
 from __future__ import annotations
@@ -11,48 +11,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.node import Node
-
-TOPIC: Final = '/diagnostics'
 FULL: Final = 0.8
 """Share of its limit from which on the spool is worth a look."""
 STEPPED_S: Final = 60.0
 """For how long a step of the clock is worth a look."""
-OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
-Entry = tuple[str, Any, str, Mapping[str, Any]]
+OK, WARN, ERROR, STALE = range(4)
+"""As diagnostic_msgs/msg/DiagnosticStatus has them."""
+Entry = tuple[str, int, str, Mapping[str, Any]]
 """Name, level, what is to be said, and figures."""
 
 
-class Diagnostics:
-    """New; open once; ``publish`` once a second; close once."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._prefix = f'{node.get_namespace()}/sensor_logger: '.lstrip('/')
-        self._publisher: Any = None
-
-    def open(self) -> None:
-        self._publisher = self._node.create_publisher(DiagnosticArray, TOPIC, 1)
-
-    def close(self) -> None:
-        if self._publisher is not None:
-            self._node.destroy_publisher(self._publisher)
-            self._publisher = None
-
-    def publish(self, status: Mapping[str, Any], earlier: Mapping[str, Any] | None) -> None:
-        """``earlier`` is a status of a few seconds before: what grew since then is new."""
-        if self._publisher is None or not self._publisher.get_subscription_count():
-            return
-        message = DiagnosticArray()
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        for name, level, text, figures in entries(status, earlier or status):
-            values = [KeyValue(key=key, value=_text(value)) for key, value in figures.items()]
-            entry = DiagnosticStatus(
-                name=self._prefix + name, level=level, message=text, hardware_id=status['robot'], values=values
-            )
-            message.status.append(entry)
-        self._publisher.publish(message)
+def told(status: Mapping[str, Any], earlier: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    """All entries as plain values; ``earlier`` is a status of a few seconds before: what grew since then is new."""
+    return [
+        {'name': name, 'level': level, 'message': text, 'values': {key: _text(value) for key, value in figures.items()}}
+        for name, level, text, figures in entries(status, earlier or status)
+    ]
 
 
 def entries(status: Mapping[str, Any], earlier: Mapping[str, Any]) -> Iterator[Entry]:
@@ -104,7 +78,7 @@ def _events(events: Mapping[str, Any], before: Mapping[str, Any]) -> Entry:
     return 'events', OK, f'the last {events["seconds"]:g} s are kept', figures
 
 
-def _topic(row: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> tuple[Any, str]:
+def _topic(row: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> tuple[int, str]:
     if not row['enabled']:
         return OK, 'not enabled'
     lost = {what: (row[what] or 0) - (before[what] or 0) for what in ('missed', 'dropped', 'rejected')}

@@ -13,7 +13,6 @@ from shadowhound_data_logger.bags.events import NOTICE_S, Events
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.ring import Ring
-from shadowhound_data_logger.capture.event_control import EventControl
 from shadowhound_data_logger.capture.event_tap import EventTap
 from shadowhound_data_logger.capture.event_watch import EventWatch
 from shadowhound_data_logger.config import Settings
@@ -29,7 +28,6 @@ class EventBuffer:
         options, home = settings.events, settings.home
         ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
         self.events = Events(options, settings.bag, place, ring, outlet, settings.intake.poll_s)
-        self.control = EventControl(node, self.events)
         self.tap = EventTap(node, options, ring, self.events.claims) if options.enabled else None
         self._watch = self._make_watch(options, home, place, types)
 

@@ -107,7 +107,7 @@ def log_until(stop: StopSignals, node: Node) -> None:
     """Until a signal comes."""
     service = Service(os.environ)
     parameters = Parameters(node)
-    pipeline = Pipeline(node, parameters.load())
+    pipeline = Pipeline(node, parameters.load(), parameters)
     pipeline.open()
     service.ready(pipeline.describe())
     executor = SingleThreadedExecutor()

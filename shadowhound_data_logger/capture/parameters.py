@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import Field, fields
 from typing import Any, Final
 
@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 
 from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.config import FOREIGN, Settings
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.errors import DataLoggerError, SettingError
 from shadowhound_data_logger.options import GROUPS
 
 FIXED: Final = 'Read at the start: change the parameter file and start the node again.'
@@ -55,6 +55,38 @@ class Parameters:
             return None
         self._changed = False
         return self._read()
+
+    # -- for ``commands`` -------------------------------------------------------------------------------------------
+
+    def get(self, names: Sequence[str]) -> dict[str, Any]:
+        """Values by name; raises DataLoggerError for a name that there is not."""
+        for name in names:
+            self._check_known(name)
+        return {name: _plain(self._node.get_parameter(name).value) for name in names}
+
+    def set(self, values: Mapping[str, Any]) -> tuple[bool, str]:
+        """All of them or none, as ``ros2 param set`` does it; whether that was done, and why not. Raises DataLoggerError."""
+        for name, value in values.items():
+            self._check_known(name)
+            if not _is_parameter(value):
+                raise SettingError(name, value, 'true or false, a number of 64 bits, a string, or a list of one of these')
+        result = self._node.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
+        if not result.successful:
+            is_fixed = any(self._node.describe_parameter(name).read_only for name in values)
+            return False, f'{result.reason} {FIXED}' if is_fixed else result.reason
+        return True, ', '.join(f'{name} = {value}' for name, value in values.items())
+
+    def described(self) -> list[dict[str, Any]]:
+        """Each of our own with its value and what its descriptor says; ``low`` and ``high`` are None where it has no range."""
+        names = sorted(name for name in self._node.get_parameters_by_prefix('') if name.partition('.')[0] not in FOREIGN)
+        return [_described(self._node.describe_parameter(name), self._node.get_parameter(name)) for name in names]
+
+    def _check_known(self, name: str) -> None:
+        if not self._node.has_parameter(name):
+            known = [each for each in self._node.get_parameters_by_prefix('') if each.partition('.')[0] not in FOREIGN]
+            near = [each for each in known if each.partition('.')[0] == name.partition('.')[0]]
+            there_are = ', '.join(sorted(near or {each.partition('.')[0] for each in known}))
+            raise DataLoggerError(f'there is no parameter {name!r}', remedy=f'there are {there_are}')
 
     def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
         """Whether the node could have been started with these values; they are in force after ``changed``."""
@@ -109,6 +141,23 @@ def _descriptor(spec: Field[Any]) -> ParameterDescriptor:
     constraints = [f'One of {", ".join(choices)}.'] if choices else []
     descriptor.additional_constraints = ' '.join(constraints if is_live else [*constraints, FIXED])
     return descriptor
+
+
+def _described(descriptor: ParameterDescriptor, parameter: Parameter) -> dict[str, Any]:
+    (span,) = (*descriptor.floating_point_range, *descriptor.integer_range) or (None,)
+    return {
+        'name': parameter.name, 'value': _plain(parameter.value), 'description': descriptor.description,
+        'constraints': descriptor.additional_constraints, 'read_only': descriptor.read_only,
+        'low': None if span is None else span.from_value, 'high': None if span is None else span.to_value,
+    }  # fmt: skip
+
+
+def _is_parameter(value: object) -> bool:
+    """Whether ROS has a type for it."""
+    if isinstance(value, list):
+        kinds = {type(part) for part in value}
+        return len(kinds) < 2 and list not in kinds and all(_is_parameter(part) for part in value)
+    return isinstance(value, (bool, float, str)) or (isinstance(value, int) and abs(value) <= MAX_INT)
 
 
 def _check_topics(node: Node, settings: Settings) -> None:

@@ -19,16 +19,15 @@ from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.salvage import Salvage
-from shadowhound_data_logger.capture.bag_control import BagControl
 from shadowhound_data_logger.capture.bag_tap import BagTap
-from shadowhound_data_logger.capture.control import Control
-from shadowhound_data_logger.capture.diagnostics import Diagnostics
+from shadowhound_data_logger.capture.commands import Commands
+from shadowhound_data_logger.capture.control import ControlSocket
 from shadowhound_data_logger.capture.event_buffer import EventBuffer
 from shadowhound_data_logger.capture.intake import Intake, offer_to
+from shadowhound_data_logger.capture.interface import Interface
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_tap import MissionTap
-from shadowhound_data_logger.capture.mission_topic import MissionTopic
-from shadowhound_data_logger.capture.parameters import live
+from shadowhound_data_logger.capture.parameters import Parameters, live
 from shadowhound_data_logger.capture.pose_track import RobotTrack
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.capture.stream import Shared
@@ -61,8 +60,9 @@ LEDGER_BUCKET = 'sensor-data'
 class Pipeline:
     """New; open once; close once."""
 
-    def __init__(self, node: Node, settings: Settings) -> None:
+    def __init__(self, node: Node, settings: Settings, parameters: Parameters) -> None:
         self._settings = settings
+        self._parameters = parameters
         self._record = record = ClockRecord(settings.spool_path, settings.robot)
         self._clock = ClockWatch(SystemClock.of_this_machine(), settings.clock.hold_s, record.steps)
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
@@ -111,14 +111,15 @@ class Pipeline:
                         BagTap(self._node, self.spool.accounts, bag_queue := BagQueue(settings.bag.queue_bytes)))  # fmt: skip
         self._make_intake(sensors, shared, bag_queue)
         tap = MissionTap(settings.mission, sensors, settings.robot, types, self._node.resolve_topic_name, self._track.marks)
-        self._mission_topic = MissionTopic(self._node)
         self.mission = MissionWatch(settings, self.intake, queue, tap, self._tell_mission)
         self.pool.observe = self.mission.observe
+        self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
-                                       self.recorder, self.event_buffer)  # fmt: skip
+                                       self.recorder, self.event_buffer, self._control)  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
-        self._diagnostics = Diagnostics(self._node)
-        self.control = Control(self._node, self.intake, queue, self.writer)
+        node = self._node.get_fully_qualified_name()
+        self._commands = Commands(stages, self._parameters, self._status, settings.robot, node)
+        self._interface = Interface(self._node, self._commands.answer)
 
     def _open_stages(self, opened: ExitStack) -> None:
         """Start them, who is handed work before who hands it on; ``opened`` closes them in the opposite order, come what may."""
@@ -130,16 +131,15 @@ class Pipeline:
         opened.callback(self.uploader.close, 0.5)
         opened.callback(self.mission.close)
         opened.callback(self._finish)
-        self._mission_topic.open()
-        opened.callback(self._mission_topic.close)
+        self._interface.open()
+        opened.callback(self._interface.close)
         self.mission.open()
         opened.callback(self.mission.stop)
         self.intake.open()
         self.recorder.open()
         self.event_buffer.open()
-        for answering in (self._diagnostics, self.control, BagControl(self._node, self.recorder), self.event_buffer.control):
-            answering.open()
-            opened.callback(answering.close)
+        self._control.open()
+        opened.callback(self._control.close)
         log.info(self.describe())
 
     def describe(self) -> str:
@@ -197,6 +197,10 @@ class Pipeline:
             self._day = day
             self._ship_ledger()
 
+    def _obey(self) -> None:
+        """Called by the executor when somebody asks for something at the control socket."""
+        self._control.obey(self._commands.answer)
+
     def _supervise(self) -> bool:
         """Start threads again that died; whether any thread failed since the last time."""
         for worker in self._stages.workers:
@@ -231,7 +235,7 @@ class Pipeline:
                                  lambda on, deadline_s: self.intake.record(deadline_s, on=on))  # fmt: skip
 
     def _tell_mission(self, mission: Mapping[str, Any]) -> None:
-        self._mission_topic.tell(mission)
+        self._interface.tell_mission(mission)
         self.recorder.on_mission(mission)
         self.event_buffer.on_mission(mission)
 
@@ -239,7 +243,7 @@ class Pipeline:
         status = self._status.look(ended=ended)
         if status is not None:
             self._status.write(status)
-            self._diagnostics.publish(status, self._status.earlier)
+            self._interface.publish_diagnostics()
 
     def _today(self) -> str:
         return f'{utc(self._clock.wall_ns()):%Y%m%d}'

@@ -17,6 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.recorder import Recorder
+from shadowhound_data_logger.capture.control import ControlSocket
 from shadowhound_data_logger.capture.event_buffer import EventBuffer
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.mission import MissionWatch
@@ -56,11 +57,12 @@ class Stages:
     mission: MissionWatch
     recorder: Recorder
     event_buffer: EventBuffer
+    control: ControlSocket
 
     @property
     def workers(self) -> Sequence[Worker]:
         """All threads of the node but the main one."""
-        own = self.intake.worker, self.writer.worker, self.mission.worker
+        own = self.intake.worker, self.writer.worker, self.mission.worker, self.control.worker
         return *own, *self.pool.workers, *self.uploader.workers, *self.recorder.workers, *self.event_buffer.workers
 
 
@@ -76,10 +78,15 @@ class Status:
         self._monotonic = monotonic
         self._path = file(settings.spool_path, settings.robot)
         self._began_ns = clock.boot_ns()
-        self._version = _version()
+        self.version = _version()
         self._past: deque[tuple[float, int, dict[str, Any]]] = deque()  # monotonic time, bytes sent, status
         self._complained = ''
         self._watchdog = Watchdog(settings.upload.connect_timeout_s + settings.upload.read_timeout_s)
+
+    @property
+    def latest(self) -> Mapping[str, Any] | None:
+        """The last one."""
+        return self._past[-1][2] if self._past else None
 
     @property
     def earlier(self) -> Mapping[str, Any] | None:
@@ -97,7 +104,7 @@ class Status:
             self._past.popleft()
         boot_ns, upload = self._clock.boot_ns(), self._stages.uploader.status()
         status = {
-            'robot': self._settings.robot, 'version': self._version, 'pid': os.getpid(), 'boot_id': self._clock.boot_id,
+            'robot': self._settings.robot, 'version': self.version, 'pid': os.getpid(), 'boot_id': self._clock.boot_id,
             'boot_ns': boot_ns, 'time': iso(self._clock.wall_ns()), 'uptime_s': round((boot_ns - self._began_ns) / SECOND, 1),
             'paused': self._stages.intake.paused, 'ended': ended,
             'mission': self._stages.mission.status(), 'bag': self._bag(), 'events': self._events(), 'topics': self._topics(now_s),

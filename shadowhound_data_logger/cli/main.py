@@ -12,6 +12,7 @@ from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.cli.ledger import ledger
 from shadowhound_data_logger.cli.missions import missions
+from shadowhound_data_logger.cli.node import node
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.cli.spool import spool
 from shadowhound_data_logger.cli.status import status
@@ -33,6 +34,7 @@ cli.add_command(fetch)
 cli.add_command(lake)
 cli.add_command(ledger)
 cli.add_command(missions)
+cli.add_command(node)
 cli.add_command(query)
 cli.add_command(spool)
 cli.add_command(status)

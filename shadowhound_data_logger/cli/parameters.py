@@ -29,7 +29,10 @@ or a value that is not allowed stops the start with exit code 2 and a message th
 
 **Live** ones can be changed while the node runs, and the others only at its start; a value that is not allowed changes nothing:
 
-    ros2 param set /sensor_logger_node camera.rate_hz 5.0
+    shadowhound-data node set camera.rate_hz 5.0              # on the robot
+    ros2 param set /sensor_logger_node camera.rate_hz 5.0     # with ROS, from anywhere
+
+`shadowhound-data node params` lists them as they are.
 
 ## Whose data, and which
 | parameter | default | allowed | |

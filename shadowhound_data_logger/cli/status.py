@@ -28,7 +28,8 @@ LOSSES: Final = ('dropped', 'rejected')
 HEADS: Final = {'running': ('running', 'green'), 'not_answering': ('NOT ANSWERING', 'red'), 'not_running': ('not running', 'red')}
 
 
-def _robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str | None:
+def robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str | None:
+    """What ``--robot`` names; raises BadParameter for what is no name of a robot."""
     try:
         return check_name(name, 'the robot name') if name else None
     except NameRefused as error:
@@ -41,7 +42,7 @@ def _robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str 
     '--interval', type=click.FloatRange(0.05, 3600.0), default=1.0, show_default=True, help='Seconds between two looks.'
 )
 @click.option('--json', 'as_json', is_flag=True, help='Print the status as JSON.')
-@click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=_robot_name, help='Whose node  [default: the one that runs here]')
+@click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Whose node  [default: the one that runs here]')
 @click.option('--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool  [default: $SHADOWHOUND_HOME/spool]')
 def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, spool: Path | None) -> int:
     """Rates and ages of the topics, queue, spool, store and workers of the node that runs on this machine.

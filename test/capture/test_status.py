@@ -101,7 +101,8 @@ class Setting:
         self.queue = BatchQueue(QueueSettings())
         recorder: Any = Recorders('bag-writer')
         event_buffer: Any = EventBuffers('event-writer')
-        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder, event_buffer)
+        control: Any = Threads('control')
+        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder, event_buffer, control)
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
         self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 
@@ -166,7 +167,7 @@ def test_a_failing_worker_is_told(setting: Setting) -> None:
     workers = setting.look()['workers']
     assert workers['intake'] == {'alive': False, 'failing': True, 'failures': 3, 'deaths': 1, 'last_error': 'ValueError: x',
                                  'busy_s': 0.0, 'patience_s': None}  # fmt: skip
-    others = {'encode-0', 'spool-writer', 'upload-lock', 'upload-0', 'mission', 'bag-writer', 'event-writer'}
+    others = {'encode-0', 'spool-writer', 'upload-lock', 'upload-0', 'mission', 'bag-writer', 'event-writer', 'control'}
     assert set(workers) == {'intake', *others}
 
 

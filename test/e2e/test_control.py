@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 from diagnostic_msgs.msg import DiagnosticStatus
 from e2e.processes import Node, Processes, Publisher, until
 from e2e.reading import STRING, Objects, texts
 from e2e.station import Station
 
+from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import status
+from shadowhound_data_logger.spool.control import connect
 
 COUNT = 50
 NEVER_S = 3600.0
-SENSORS = ['flushed', 'repeated', 'paused', 'switched', 'dormant', 'sampled', 'told']
+SENSORS = ['flushed', 'repeated', 'paused', 'switched', 'dormant', 'sampled', 'told', 'asked']
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +147,56 @@ def test_a_wrong_setting_changes_nothing(operated: Operated) -> None:
     assert operated.station.get('told.batch_s') == NEVER_S
 
 
+def tell(operated: Operated, *words: str) -> tuple[bool, str]:
+    """What ``shadowhound-data node`` answers; its exit code says the same."""
+    spool = str(operated.node.home / 'spool')
+    result = CliRunner().invoke(cli, ['node', *words, '--json', '--spool', spool], standalone_mode=False)
+    answer = json.loads(result.stdout)
+    assert (result.return_value, answer['robot']) == (0 if answer['ok'] else 1, operated.node.robot)
+    return answer['ok'], answer['message' if answer['ok'] else 'error']
+
+
+def test_the_command_line_does_what_the_services_do(operated: Operated) -> None:
+    """Through the socket the node answers in the same words, and what one of the two did the other one finds done."""
+    operated.publisher.matched('/asked')
+    operated.publisher.publish('/asked', texts(range(COUNT)), 0.0)
+    assert tell(operated, 'flush') == (True, f'1 object with {COUNT} messages spooled')
+    assert operated.station.flush() == '0 objects with 0 messages spooled'
+    assert tell(operated, 'pause')[1].endswith(f'delivery goes on; {operated.station.flush()}')
+    assert operated.station.pause(paused=True) == tell(operated, 'pause')[1] == 'paused already'
+    assert operated.station.pause(paused=False) == 'messages are stored again'
+    assert tell(operated, 'resume') == (True, 'not paused')
+    done, bag = tell(operated, 'bag', 'start')
+    assert done
+    assert operated.station.bag('start') == tell(operated, 'bag', 'start') == (False, f'{bag} is recorded already')
+    assert operated.station.bag('split') == tell(operated, 'bag', 'split') == (True, f'{bag} has 0 slices that are closed')
+    assert operated.station.bag_pause(paused=True) == tell(operated, 'bag', 'pause') == (True, f'{bag} is paused')
+    assert operated.station.bag_pause(paused=False) == tell(operated, 'bag', 'resume') == (True, f'{bag} is recorded')
+    assert operated.station.bag('stop') == (True, f'{bag}: 0 messages in 0 slices')
+    assert operated.station.bag('stop') == tell(operated, 'bag', 'stop') == (False, 'nothing is recorded')
+    assert operated.station.event() == tell(operated, 'event')
+    assert not operated.station.event()[0]
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [('rate_hz', 5.0), ('rate_hz', 5), ('priority', 7), ('priority', 7.5), ('rate_hz', -1.0), ('rate_hz', 1e-9),
+     ('rate_hz', 'often'), ('enabled', 1), ('priority', 10), ('quality', 101), ('batch_s', 1.0)],
+)  # fmt: skip
+def test_a_parameter_is_judged_alike(operated: Operated, name: str, value: Any) -> None:
+    """By the command line and by ROS; what is refused has the same reason, and says more where it can never be set."""
+    full = f'asked.{name}'
+    before = operated.station.get(full)
+    reason = operated.station.set(**{f'asked__{name}': value})
+    by_ros = operated.station.get(full)
+    operated.station.set(**{f'asked__{name}': before})
+    done, words = tell(operated, 'set', full, f'{value:.9f}' if isinstance(value, float) else str(value))
+    assert done is (not reason)
+    assert words == f'{full} = {value}' if done else words.startswith(reason)
+    assert ('start the node again' in words) is (name == 'batch_s')
+    assert operated.station.get(full) == by_ros == (value if done else before)
+
+
 def test_diagnostics_tell_each_part(operated: Operated) -> None:
     """There is an entry for each topic and stage, with the robot as hardware, while somebody listens."""
     operated.publisher.matched('/told')
@@ -193,6 +247,10 @@ def test_two_robots_on_one_machine(processes: Processes, seaweed: Tower, stored:
         assert (row['published'], row['received'], row['missed']) == (COUNT, COUNT, 0)
         assert row['stored_in']['delivered'] == COUNT
         assert stored(robot).numbers('talk') == list(range(COUNT))
+
+    for robot, node in zip(robots, nodes, strict=True):
+        with closing(connect(node.home / 'spool', robot)) as connection:
+            assert connection.ask('describe')['node'] == f'/{robot}/sensor_logger_node'
 
     def states() -> list[str]:
         files = [status.file(node.home / 'spool', node.robot) for node in nodes]

@@ -1,0 +1,99 @@
+"""What the node offers to ROS besides its parameters: services, ``~/mission`` and ``/diagnostics``, each by asking ``commands``.
+
+The ROS node may be the logger's own, which asks at once, or that of the front in another process, which asks through a socket.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from shadowhound_data_logger.capture.commands import SWITCHES, TRIGGERS
+
+DIAGNOSTICS: Final = '/diagnostics'
+Ask = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+"""Has a request done and returns its answer (``commands``)."""
+
+
+class Interface:
+    """New; open once; ``publish_diagnostics`` once a second; close once.
+
+    A service answers when it is done, from the thread of the executor: for up to ``commands.FLUSH_S`` others wait meanwhile.
+    ``~/mission`` says which mission is active, latched, as JSON in a std_msgs/msg/String; it is empty while there is none:
+    {"mission_id": "patrol_20251018_120000_1f2e3d4c", "run_id": null, "type": "patrol", "started": "2025-10-18T12:00:00.000000Z"}
+    """
+
+    def __init__(self, node: Node, ask: Ask) -> None:
+        self._node = node
+        self._ask = ask
+        self._prefix = f'{node.get_namespace()}/sensor_logger: '.lstrip('/')
+        self._services: list[Any] = []
+        self._mission: Any = None
+        self._diagnostics: Any = None
+
+    def open(self) -> None:
+        latched = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._mission = self._node.create_publisher(String, '~/mission', latched)
+        self.tell_mission({})
+        self._diagnostics = self._node.create_publisher(DiagnosticArray, DIAGNOSTICS, 1)
+        for name, request in TRIGGERS.items():
+            self._services.append(self._node.create_service(Trigger, name, self._triggered(request)))
+        for name, (off, on) in SWITCHES.items():
+            self._services.append(self._node.create_service(SetBool, name, self._switched(off, on)))
+
+    def close(self) -> None:
+        while self._services:
+            self._node.destroy_service(self._services.pop())
+        for publisher in (self._mission, self._diagnostics):
+            if publisher is not None:
+                self._node.destroy_publisher(publisher)
+        self._mission = self._diagnostics = None
+
+    def tell_mission(self, mission: Mapping[str, Any]) -> None:
+        """Publish what is active now. From one thread."""
+        self._mission.publish(String(data=json.dumps(mission) if mission else ''))
+
+    def publish_diagnostics(self) -> None:
+        """Nothing is made, and nothing sent, unless somebody listens."""
+        if self._diagnostics is None or not self._diagnostics.get_subscription_count():
+            return
+        answer = self._ask({'do': 'diagnostics'})
+        if not answer['ok']:
+            return
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.status = [
+            DiagnosticStatus(
+                name=self._prefix + entry['name'], level=bytes([entry['level']]), message=entry['message'],
+                hardware_id=answer['robot'], values=[KeyValue(key=key, value=value) for key, value in entry['values'].items()],
+            )
+            for entry in answer['diagnostics']
+        ]  # fmt: skip
+        self._diagnostics.publish(message)
+
+    def _triggered(self, request: Mapping[str, str]) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
+        def on_call(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            return self._say(request, response)
+
+        return on_call
+
+    def _switched(
+        self, off: Mapping[str, str], on: Mapping[str, str]
+    ) -> Callable[[SetBool.Request, SetBool.Response], SetBool.Response]:
+        def on_call(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+            return self._say(on if request.data else off, response)
+
+        return on_call
+
+    def _say(self, request: Mapping[str, str], response: Any) -> Any:
+        answer = self._ask(request)
+        response.success = answer['ok']
+        response.message = answer['message' if answer['ok'] else 'error']
+        return response

@@ -1,0 +1,155 @@
+"""``shadowhound-data node``: has the node that runs on this machine do something, whatever middleware it speaks."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import click
+from rich.console import Console, RenderableType
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from shadowhound_data_logger.cli.status import robot_name
+from shadowhound_data_logger.cli.tables import plain, plain_table, show_whole
+from shadowhound_data_logger.config import home
+from shadowhound_data_logger.spool.control import connect
+
+F = TypeVar('F', bound=Callable[..., Any])
+LIVE: Final = {True: 'at a start', False: 'yes'}
+"""When a parameter can be set, by whether it is read-only."""
+
+
+def _of_node(verb: F) -> F:
+    """The options that each verb has."""
+    where, whose = 'Its spool  [default: $SHADOWHOUND_HOME/spool]', 'Whose node  [default: the only one that runs here]'
+    for option in (
+        click.option('--json', 'as_json', is_flag=True, help='Print its answer as JSON.'),
+        click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help=whose),
+        click.option('--spool', type=click.Path(path_type=Path, file_okay=False), help=where),
+    ):
+        verb = option(verb)
+    return verb
+
+
+@click.group()
+def node() -> None:
+    """Have the node that runs here do what its services and parameters do, without ROS.
+
+    It is asked through a socket in its spool, by its own user alone. Exit code 1 when it refuses, fails, or does not run.
+    """
+
+
+@node.group()
+def bag() -> None:
+    """Record at full rate: begin a bag, end it, end a slice of it, let it rest."""
+
+
+def _add(group: click.Group, name: str, do: str, text: str) -> None:
+    @group.command(name, help=text)
+    @_of_node
+    def ask(*, robot: str | None, spool: Path | None, as_json: bool) -> int:
+        return _ask(spool, robot, do, as_json=as_json)
+
+
+_add(node, 'flush', 'flush', 'Make all durable that was taken so far, open batches included; says how much that was.')
+_add(node, 'pause', 'pause', 'Store nothing from now on; messages are still counted, and delivery goes on.')
+_add(node, 'resume', 'resume', 'Store messages again.')
+_add(bag, 'start', 'bag start', 'Begin a bag; says its name.')
+_add(bag, 'stop', 'bag stop', 'End the bag; it is whole in the spool then.')
+_add(bag, 'split', 'bag split', 'End the slice, so that it is delivered now.')
+_add(bag, 'pause', 'bag pause', 'Drop what comes, counted, until it is resumed.')
+_add(bag, 'resume', 'bag resume', 'Record again.')
+
+
+@node.command()
+@click.argument('name', default='manual')
+@click.option('--note', default='', help='What it was, for its manifest.')
+@_of_node
+def event(*, name: str, note: str, robot: str | None, spool: Path | None, as_json: bool) -> int:
+    """Make a bag of the seconds before now and after; says its name. One that goes on lasts longer instead."""
+    return _ask(spool, robot, 'event', as_json=as_json, name=name, note=note)
+
+
+@node.command('set', context_settings={'ignore_unknown_options': True})
+@click.argument('name')
+@click.argument('value')
+@_of_node
+def set_(*, name: str, value: str, robot: str | None, spool: Path | None, as_json: bool) -> int:
+    """Set a parameter while the node runs, until it ends: 5.0, true, or a word, as in a parameter file.
+
+    docs/parameters.md says which can be set; `shadowhound-data node params` as well.
+    """
+    return _ask(spool, robot, 'set', as_json=as_json, values={name: _value(value)})
+
+
+@node.command()
+@click.argument('name')
+@_of_node
+def get(*, name: str, robot: str | None, spool: Path | None, as_json: bool) -> int:
+    """Print the value of a parameter."""
+    return _ask(spool, robot, 'get', as_json=as_json, show=lambda answer: [_shown(answer['values'][name])], names=[name])
+
+
+@node.command()
+@click.argument('prefix', default='', metavar='[SENSOR|GROUP]')
+@_of_node
+def params(*, prefix: str, robot: str | None, spool: Path | None, as_json: bool) -> int:
+    """List the parameters with their values, and which can be set while it runs: all, or those of a sensor or group."""
+
+    def chosen(answer: dict[str, Any]) -> dict[str, Any]:
+        found = [each for each in answer['parameters'] if not prefix or f'{each["name"]}.'.startswith(f'{prefix}.')]
+        if found:
+            return {**answer, 'parameters': found}
+        groups = ', '.join(sorted({each['name'].partition('.')[0] for each in answer['parameters']}))
+        return {'ok': False, 'robot': answer['robot'], 'error': f'there are no parameters of {prefix!r}; there are {groups}'}
+
+    return _ask(spool, robot, 'parameters', as_json=as_json, show=_table, chosen=chosen)
+
+
+def _ask(
+    spool: Path | None, robot: str | None, do: str, *, as_json: bool, show: Callable[[dict[str, Any]], Any] | None = None,
+    chosen: Callable[[dict[str, Any]], dict[str, Any]] = lambda answer: answer, **arguments: Any,
+) -> int:  # fmt: skip
+    """Ask, print what is answered, and say by the exit code whether it was done."""
+    with closing(connect(spool or home(os.environ) / 'spool', robot)) as connection:
+        answer = connection.ask(do, **arguments)
+    if answer['ok']:
+        answer = chosen(answer)
+    if as_json:
+        click.echo(json.dumps(answer, indent=2))
+    elif not answer['ok']:
+        click.echo(f'shadowhound-data: {answer["error"]}', err=True)
+    elif show is not None:
+        show_whole(list(show(answer)), Console(highlight=False))
+    else:
+        click.echo(answer['message'])
+    return 0 if answer['ok'] else 1
+
+
+def _table(answer: dict[str, Any]) -> Iterator[RenderableType]:
+    table = plain_table('', ('parameter', 'value', 'set', ''), left=('parameter', 'value', 'set', ''))
+    for each in answer['parameters']:
+        value, text = plain(_shown(each['value'])), plain(each['description'], 'dim')
+        table.add_row(plain(each['name']), value, LIVE[each['read_only']], text)
+    yield table
+
+
+def _shown(value: object) -> str:
+    """As it is written in a parameter file."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _value(text: str) -> object:
+    """As ``ros2 param set`` reads it, which is YAML 1.1; what is none is the text itself."""
+    yaml = YAML(typ='safe', pure=True)
+    yaml.version = (1, 1)
+    try:
+        value = yaml.load(text)
+    except YAMLError:
+        return text
+    return value if isinstance(value, (bool, int, float, str, list)) else text

@@ -1,0 +1,117 @@
+"""``shadowhound-data node``: what it asks of the node that runs, what it prints, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from capture.serving import Serving
+from click.testing import CliRunner, Result
+
+from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.errors import NodeUnavailable
+
+PARAMETERS = [
+    {'name': 'camera.format', 'value': 'jpeg', 'description': 'What it is.', 'constraints': '', 'read_only': True},
+    {'name': 'camera.rate_hz', 'value': 2.0, 'description': 'How often.', 'constraints': '', 'read_only': False},
+    {'name': 'camera_info.rate_hz', 'value': 0.0, 'description': 'How often.', 'constraints': '', 'read_only': False},
+    {'name': 'robot', 'value': '', 'description': 'Who.', 'constraints': '', 'read_only': True},
+]
+
+
+def node(request: Mapping[str, Any]) -> dict[str, Any]:
+    """What a node might answer."""
+    if request['do'] == 'parameters':
+        return {'ok': True, 'robot': 'thor', 'parameters': PARAMETERS}
+    if request['do'] == 'get':
+        return {'ok': True, 'robot': 'thor', 'values': {name: [1, 'a'] for name in request['names']}}
+    if request['do'] == 'bag stop':
+        return {'ok': False, 'robot': 'thor', 'error': 'nothing is recorded'}
+    return {'ok': True, 'robot': 'thor', 'message': f'{request["do"]} is done'}
+
+
+@pytest.fixture
+def serving(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Serving]:
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.delenv('SHADOWHOUND_ROBOT', raising=False)
+    made = Serving(tmp_path / 'spool', do=node)
+    yield made
+    made.close()
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ['node', *arguments], standalone_mode=False)
+
+
+@pytest.mark.parametrize(
+    ('words', 'request_'),
+    [
+        (['flush'], {'do': 'flush'}),
+        (['pause'], {'do': 'pause'}),
+        (['resume'], {'do': 'resume'}),
+        (['bag', 'start'], {'do': 'bag start'}),
+        (['bag', 'split'], {'do': 'bag split'}),
+        (['bag', 'pause'], {'do': 'bag pause'}),
+        (['bag', 'resume'], {'do': 'bag resume'}),
+        (['event'], {'do': 'event', 'name': 'manual', 'note': ''}),
+        (['event', 'fall', '--note', 'on the stairs'], {'do': 'event', 'name': 'fall', 'note': 'on the stairs'}),
+        (['set', 'camera.rate_hz', '5.0'], {'do': 'set', 'values': {'camera.rate_hz': 5.0}}),
+        (['set', 'camera.rate_hz', '-1'], {'do': 'set', 'values': {'camera.rate_hz': -1}}),
+        (['set', 'camera.enabled', 'off'], {'do': 'set', 'values': {'camera.enabled': False}}),
+        (['set', 'events.log_event', 'fall|slip'], {'do': 'set', 'values': {'events.log_event': 'fall|slip'}}),
+        (['set', 'events.log_event', '.*'], {'do': 'set', 'values': {'events.log_event': '.*'}}),
+        (['set', 'events.log_event', '*'], {'do': 'set', 'values': {'events.log_event': '*'}}),
+        (['set', 'events.log_event', ''], {'do': 'set', 'values': {'events.log_event': ''}}),
+        (['set', 'events.log_event', '"5"'], {'do': 'set', 'values': {'events.log_event': '5'}}),
+        (['set', 'x', '2026-10-18'], {'do': 'set', 'values': {'x': '2026-10-18'}}),
+        (['set', 'x', '{a: 1}'], {'do': 'set', 'values': {'x': '{a: 1}'}}),
+        (['set', 'x', '[a, b]'], {'do': 'set', 'values': {'x': ['a', 'b']}}),
+    ],
+    ids=' '.join,
+)  # fmt: skip
+def test_a_verb_asks_for_what_it_says(serving: Serving, words: list[str], request_: dict[str, Any]) -> None:
+    """Its words are what the node answers; a value is read as ``ros2 param set`` reads it."""
+    result = run(*words)
+    assert (result.return_value, result.stdout) == (0, f'{request_["do"]} is done\n'), result.output
+    assert serving.asked[-1] == request_
+    assert json.loads(run(*words, '--json').stdout) == {'ok': True, 'robot': 'thor', 'message': f'{request_["do"]} is done'}
+
+
+def test_what_the_node_refuses_is_a_finding(serving: Serving) -> None:
+    """Exit code 1, and its words on standard error; with --json on standard output."""
+    result = run('bag', 'stop')
+    assert (result.return_value, result.stdout, result.stderr) == (1, '', 'shadowhound-data: nothing is recorded\n')
+    result = run('bag', 'stop', '--json')
+    assert (result.return_value, json.loads(result.stdout)['error']) == (1, 'nothing is recorded')
+
+
+def test_values_are_printed_as_they_are_written(serving: Serving) -> None:
+    """As in a parameter file."""
+    assert run('get', 'camera.topics').stdout == '[1, "a"]\n'
+    assert json.loads(run('get', 'camera.topics', '--json').stdout)['values'] == {'camera.topics': [1, 'a']}
+
+
+def test_the_parameters_are_listed(serving: Serving) -> None:
+    """All of them, or those of a sensor or group, with whether they can be set."""
+    assert [line.split()[:3] for line in run('params').stdout.splitlines()[1:3]] == [
+        ['camera.format', 'jpeg', 'at'], ['camera.rate_hz', '2.0', 'yes']
+    ]  # fmt: skip
+    assert [each['name'] for each in json.loads(run('params', 'camera', '--json').stdout)['parameters']] == [
+        'camera.format', 'camera.rate_hz'
+    ]  # fmt: skip
+    result = run('params', 'camra')
+    assert (result.return_value, result.stdout) == (1, '')
+    assert "no parameters of 'camra'; there are camera, camera_info, robot" in result.stderr
+
+
+def test_the_node_of_a_robot(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is named by option or environment; where several run without a name, nothing is done."""
+    assert run('flush', '--robot', 'thor').return_value == 0
+    monkeypatch.setenv('SHADOWHOUND_ROBOT', 'tachi')
+    result = run('flush')
+    assert isinstance(result.exception, NodeUnavailable)
+    assert 'no node of tachi runs here; those that run: thor' in str(result.exception)
+    assert serving.asked[-1] == {'do': 'describe'}
