@@ -1,7 +1,7 @@
 # Every target makes the environment first (see scripts/setup); with nothing to do that takes milliseconds.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-matrix torture check format demo bench docs lock tower tower-secrets clean
+.PHONY: help setup test test-long test-matrix torture check format demo bench docs lock tower tower-secrets clean
 
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
@@ -15,6 +15,9 @@ setup: ## make the environment (.venv, go2_interfaces); PYTHON=... names the int
 
 test: setup ## run all tests; PYTEST_ARGS="-k spool -x" is handed on
 	scripts/with-env pytest -n auto --no-loadscope-reorder $(PYTEST_ARGS)
+
+test-long: setup ## run the tests that take minutes: kills, full disks, the demo, Towers
+	SHADOWHOUND_TEST_LONG=1 scripts/with-env pytest -n auto --no-loadscope-reorder -m long $(PYTEST_ARGS)
 
 test-matrix: ## run all tests on other Pythons, numpys and ROS distributions; CELLS=... names some
 	@PYTEST_ARGS="$(PYTEST_ARGS)" scripts/test-matrix $(CELLS)

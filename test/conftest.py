@@ -6,9 +6,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 from domains import free_domain
@@ -68,7 +68,11 @@ def has_robot(nodeid: str) -> bool:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """The longest group first; with it a worker of its own that is not nice yet."""
+    """The longest group first; with it a worker of its own that is not nice yet. Long tests only where they are asked for."""
+    if not os.environ.get('SHADOWHOUND_TEST_LONG'):
+        for item in items:
+            if marker := item.get_closest_marker('long'):
+                item.add_marker(pytest.mark.skip(reason=f'{marker.args[0]}: set SHADOWHOUND_TEST_LONG=1'))
     if hasattr(config, 'workerinput'):
         items.sort(key=lambda item: not has_robot(item.nodeid))
 
@@ -92,23 +96,28 @@ def no_thread_is_left() -> Iterator[None]:
         time.sleep(0.01)
 
 
+def of_this_run(factory: pytest.TempPathFactory, name: str, users: Mapping[str, Sequence[str]], *, mlflow: bool = False) -> Tower:
+    """A Tower that all workers of the run share; without workers it lives as long as this process."""
+    from shared_tower import shared_tower
+
+    worker = os.environ.get('PYTEST_XDIST_WORKER')
+    base = factory.getbasetemp()
+    owner = os.getppid() if worker else os.getpid()
+    shared = shared_tower((base.parent if worker else base) / name, users, owner, mlflow=mlflow)
+    return cast('Tower', shared)  # what tests ask of it
+
+
 @pytest.fixture(scope='session')
-def seaweed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tower]:
-    """A running Tower with the S3 server only; its user ``limited`` may use the bucket ``allowed``, not create it."""
-    from shadowhound_data_logger.sim.tower import Tower
-
-    actions = ('Read:allowed', 'Write:allowed', 'List:allowed')
-    with Tower(tmp_path_factory.mktemp('seaweed'), users={'limited': actions}) as tower:
-        yield tower
+def seaweed(tmp_path_factory: pytest.TempPathFactory) -> Tower:
+    """A running Tower with the S3 server only; its user ``limited`` may use the buckets ``allowed`` and ``later``, not create them."""
+    actions = [f'{action}:{bucket}' for bucket in ('allowed', 'later') for action in ('Read', 'Write', 'List')]
+    return of_this_run(tmp_path_factory, 'seaweed', {'limited': actions})
 
 
 @pytest.fixture(scope='session')
-def tower(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tower]:
+def tower(tmp_path_factory: pytest.TempPathFactory) -> Tower:
     """A running Tower with S3 and MLflow; the latter takes some ten seconds to start."""
-    from shadowhound_data_logger.sim.tower import Tower
-
-    with Tower(tmp_path_factory.mktemp('tower'), mlflow=True) as tower:
-        yield tower
+    return of_this_run(tmp_path_factory, 'tower', {}, mlflow=True)
 
 
 @pytest.fixture

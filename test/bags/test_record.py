@@ -19,9 +19,7 @@ from shadowhound_data_logger.bags.record import record
 from shadowhound_data_logger.errors import BagError
 
 pytestmark = pytest.mark.ros
-long = pytest.mark.skipif(
-    not os.environ.get('SHADOWHOUND_TEST_LONG'), reason='starts more processes: set SHADOWHOUND_TEST_LONG=1'
-)
+long = pytest.mark.long('starts more processes')
 PUBLISHER = """
 import time, rclpy
 from nav_msgs.msg import Odometry

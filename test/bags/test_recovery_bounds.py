@@ -136,7 +136,7 @@ print(info.messages, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
 
 
 @pytest.mark.parametrize('size', [24 * MEBI, pytest.param(1 << 30, marks=[
-    pytest.mark.slow, pytest.mark.skipif(not LONG, reason='writes and reads 1 GB: set SHADOWHOUND_TEST_LONG=1'),
+    pytest.mark.slow, pytest.mark.long('writes and reads 1 GB'),
 ])])  # fmt: skip
 def test_memory_does_not_grow_with_the_slice(tmp_path: Path, size: int) -> None:
     """A torn slice of a gigabyte is recovered with the memory of a few chunks: 16 MB more than the process had."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from e2e.bag_reading import bags, in_slice
-from e2e.processes import LONG, Processes, published, until
+from e2e.processes import Processes, published, until
 
 from shadowhound_data_logger.bags.recovery import recover
 from shadowhound_data_logger.config import UploadSettings
@@ -22,7 +22,7 @@ from shadowhound_data_logger.stores.s3 import S3Store
 MEBI = 1 << 20
 FULL_S = 3.0
 
-pytestmark = pytest.mark.skipif(not LONG, reason='fills a disk for some seconds: set SHADOWHOUND_TEST_LONG=1')
+pytestmark = pytest.mark.long('fills a disk for some seconds')
 
 
 @pytest.fixture

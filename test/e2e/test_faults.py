@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import boto3
@@ -11,7 +13,9 @@ from e2e.processes import Node, Processes, Publisher, until
 from e2e.reading import STRING, Objects, texts
 from e2e.wire import HANG, PASS, REFUSE, Wire
 
+from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.s3 import S3Store
 
 TOPIC = '/talk'
 COUNT = 20
@@ -92,17 +96,17 @@ def test_a_store_that_fails_and_recovers(
     assert wired.node.ledger()['objects']['quarantined'] == 0
 
 
-def test_a_server_that_is_not_there_yet(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+def test_a_server_that_is_not_there_yet(processes: Processes, tmp_path: Path) -> None:
     """A node that is started before its server delivers once the server is started."""
-    seaweed.stop_s3()
-    try:
-        talking = talk(processes, seaweed.environment())
+    with Tower(tmp_path / 'tower') as late, closing(S3Store(late.store_settings(), UploadSettings())) as store:
+        late.stop_s3()
+        talking = talk(processes, late.environment())
         talking.publish()
         talking.node.said('refused the connection')
         assert talking.node.topic(TOPIC)['stored_in']['pending'] == COUNT
-    finally:
-        seaweed.start_s3()
-    talking.delivered(lambda: stored(processes.robot))
+        late.start_s3()
+        store.open()
+        talking.delivered(lambda: Objects.of(store, 'sensor-data', processes.robot))
 
 
 def test_a_wrong_secret(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
@@ -141,16 +145,16 @@ def owner(seaweed: Tower) -> Iterator[Any]:
 
 def test_a_bucket_that_cannot_be_made(processes: Processes, seaweed: Tower, owner: Any, stored: Callable[..., Objects]) -> None:
     """Where they do not, the error says how to create it; its objects wait and are delivered once it is there."""
-    talking = talk(processes, seaweed.environment('limited'), **{'talk.bucket': 'allowed'})
+    talking = talk(processes, seaweed.environment('limited'), **{'talk.bucket': 'later'})
     talking.publish()
-    talking.node.said('bucket allowed gets nothing')
-    assert 's3 mb s3://allowed' in talking.node.log
+    talking.node.said('bucket later gets nothing')
+    assert 's3 mb s3://later' in talking.node.log
     assert talking.node.topic(TOPIC)['stored_in']['delivered'] == 0
-    owner.create_bucket(Bucket='allowed')
+    owner.create_bucket(Bucket='later')
     try:
-        talking.delivered(lambda: stored(processes.robot, 'allowed'))
+        talking.delivered(lambda: stored(processes.robot, 'later'))
     finally:  # other tests begin without it
         processes.end()
-        for item in owner.list_objects_v2(Bucket='allowed').get('Contents', []):
-            owner.delete_object(Bucket='allowed', Key=item['Key'])
-        owner.delete_bucket(Bucket='allowed')
+        for item in owner.list_objects_v2(Bucket='later').get('Contents', []):
+            owner.delete_object(Bucket='later', Key=item['Key'])
+        owner.delete_bucket(Bucket='later')

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import simplejpeg
-from e2e.processes import LONG, Node, Processes, until
+from e2e.processes import Node, Processes, until
 from e2e.reading import Objects, cdr
 
 from shadowhound_data_logger.sim.tower import Tower
@@ -56,7 +56,7 @@ def test_raw_images_are_not_missed(processes: Processes, seaweed: Tower, stored:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not LONG, reason='a minute long: set SHADOWHOUND_TEST_LONG=1')
+@pytest.mark.long('a minute of raw images')
 def test_a_minute_of_raw_images(processes: Processes, seaweed: Tower) -> None:
     """1,800 raw images, and each of them received."""
     node = processes.node(seaweed.environment(), {'sensors': ['camera']})

@@ -30,7 +30,7 @@ READY_S: Final = 120.0
 HERE: Final = Path(sys.executable).parent
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif('SHADOWHOUND_TEST_LONG' not in os.environ, reason='half a minute each: set SHADOWHOUND_TEST_LONG=1'),
+    pytest.mark.long('half a minute each, with servers of its own'),
 ]
 needs_two = pytest.mark.skipif(not TWO, reason='SHADOWHOUND_MLFLOW2 names no environment with MLflow 2')
 needs_postgres = pytest.mark.skipif(not POSTGRES, reason='PostgreSQL is not installed: apt install postgresql')

@@ -18,7 +18,6 @@ from typing import Any
 
 import pytest
 import urllib3
-from e2e.processes import LONG
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings, store_settings
 from shadowhound_data_logger.errors import CredentialsRejected, StoreUnavailable
@@ -250,7 +249,7 @@ def test_in_the_foreground_it_prints_what_a_shell_needs(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.seaweedfs
-@pytest.mark.skipif(not LONG, reason='half a minute for a server nothing logs to yet: set SHADOWHOUND_TEST_LONG=1')
+@pytest.mark.long('half a minute for a server nothing logs to yet')
 def test_mlflow_keeps_runs_and_artifacts_in_the_folder(tower: Tower) -> None:
     """The tracking server answers, and its artifacts need neither credentials nor a path on the client's side."""
     assert tower.environment()['MLFLOW_TRACKING_URI'] == tower.tracking_uri

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import signal
 import socket
 import subprocess
@@ -21,7 +20,7 @@ from tower_scripts import TOWER, make_secrets, processes_of, reload_s3, remove_d
 
 pytestmark = [
     pytest.mark.seaweedfs,
-    pytest.mark.skipif('SHADOWHOUND_TEST_LONG' not in os.environ, reason='half a minute: set SHADOWHOUND_TEST_LONG=1'),
+    pytest.mark.long('half a minute with Towers of its own'),
 ]
 START_S: Final = 120.0
 HOST: Final = '127.0.0.2'

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -27,7 +26,7 @@ pytestmark = [
     pytest.mark.seaweedfs,
     pytest.mark.ros,
     pytest.mark.timeout(400),
-    pytest.mark.skipif('SHADOWHOUND_TEST_LONG' not in os.environ, reason='two minutes: set SHADOWHOUND_TEST_LONG=1'),
+    pytest.mark.long('a minute with a Tower of its own'),
 ]
 START_S = 120.0
 MANUAL = Path(__file__).parents[2] / 'docs' / 'tower.md'

@@ -1,0 +1,80 @@
+"""One Tower for all workers of a test run, in a process of its own that ends with the run.
+
+``python shared_tower.py FOLDER PID USERS [--mlflow]`` starts it, writes FOLDER/tower.json and stops when the process PID is gone.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import select
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.config import StoreSettings
+from shadowhound_data_logger.sim.tower import OWNER, Tower
+
+WAIT_S: Final = 180.0
+"""For both servers, on a machine on which all workers begin at the same time."""
+
+
+class SharedTower:
+    """A Tower that runs elsewhere: what its users need of it, under the names that ``Tower`` has for it."""
+
+    def __init__(self, told: Mapping[str, Any]) -> None:
+        self._environments: dict[str, dict[str, str]] = told['environments']
+        self.endpoint_url: str = told['endpoint_url']
+        self.tracking_uri: str = told['tracking_uri']
+
+    def environment(self, user: str = OWNER) -> dict[str, str]:
+        return dict(self._environments[user])
+
+    def store_settings(self, user: str = OWNER) -> StoreSettings:
+        environ = self._environments[user]
+        return StoreSettings(endpoint_url=self.endpoint_url, access_key_id=environ['AWS_ACCESS_KEY_ID'],
+                             secret_access_key=environ['AWS_SECRET_ACCESS_KEY'])  # fmt: skip
+
+
+def shared_tower(folder: Path, users: Mapping[str, Sequence[str]], owner: int, *, mlflow: bool) -> SharedTower:
+    """The Tower of this run in ``folder``, started by the first worker that asks; it lives as long as the process ``owner``."""
+    folder.mkdir(exist_ok=True)
+    with (folder / 'lock').open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        told = folder / 'tower.json'
+        if not told.exists():
+            _start(folder, [str(owner), json.dumps(users), *(['--mlflow'] if mlflow else [])])
+        return SharedTower(json.loads(told.read_text()))
+
+
+def _start(folder: Path, arguments: Sequence[str]) -> None:
+    """Returns when it is there. No Popen: the process outlives the worker that starts it."""
+    command, log = [sys.executable, __file__, str(folder), *arguments], folder / 'log'
+    pid = os.posix_spawn(sys.executable, command, os.environ, setsid=True, file_actions=[
+        (os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0),
+        (os.POSIX_SPAWN_OPEN, 1, str(log), os.O_WRONLY | os.O_CREAT, 0o600), (os.POSIX_SPAWN_DUP2, 1, 2),
+    ])  # fmt: skip
+    end = time.monotonic() + WAIT_S
+    while not (folder / 'tower.json').exists():
+        assert os.waitpid(pid, os.WNOHANG) == (0, 0), log.read_text()
+        assert time.monotonic() < end, f'no Tower within {WAIT_S:g} s: {log.read_text()}'
+        time.sleep(0.02)
+
+
+def main(folder: str, owner: str, users: str, *options: str) -> None:
+    watched = os.pidfd_open(int(owner))
+    with Tower(Path(folder) / 'data', mlflow='--mlflow' in options, users=json.loads(users)) as tower:
+        environments = {user: tower.environment(user) for user in (OWNER, *json.loads(users))}
+        told = {'endpoint_url': tower.endpoint_url, 'tracking_uri': tower.tracking_uri, 'environments': environments}
+        part = Path(folder) / 'tower.json.part'
+        part.touch(mode=0o600)
+        part.write_text(json.dumps(told))
+        part.rename(Path(folder) / 'tower.json')
+        select.select([watched], [], [])
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])
