@@ -14,10 +14,10 @@ setup: ## make the environment (.venv, go2_interfaces); PYTHON=... names the int
 	@PYTHON="$(PYTHON)" scripts/setup
 
 test: setup ## run all tests; PYTEST_ARGS="-k spool -x" is handed on
-	scripts/with-env pytest -n auto --no-loadscope-reorder $(PYTEST_ARGS)
+	PYTHONDONTWRITEBYTECODE= scripts/with-env pytest -n auto --no-loadscope-reorder $(PYTEST_ARGS)
 
 test-long: setup ## run the tests that take minutes: kills, full disks, the demo, Towers
-	SHADOWHOUND_TEST_LONG=1 scripts/with-env pytest -n auto --no-loadscope-reorder -m long $(PYTEST_ARGS)
+	PYTHONDONTWRITEBYTECODE= SHADOWHOUND_TEST_LONG=1 scripts/with-env pytest -n auto --no-loadscope-reorder -m long $(PYTEST_ARGS)
 
 test-matrix: ## run all tests on other Pythons, numpys and ROS distributions; CELLS=... names some
 	@PYTEST_ARGS="$(PYTEST_ARGS)" scripts/test-matrix $(CELLS)

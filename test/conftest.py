@@ -109,7 +109,7 @@ def of_this_run(factory: pytest.TempPathFactory, name: str, users: Mapping[str, 
 
 @pytest.fixture(scope='session')
 def seaweed(tmp_path_factory: pytest.TempPathFactory) -> Tower:
-    """A running Tower with the S3 server only; its user ``limited`` may use the buckets ``allowed`` and ``later``, not create them."""
+    """A running Tower with the S3 server only; ``limited`` may use the buckets ``allowed`` and ``later``, not create them."""
     actions = [f'{action}:{bucket}' for bucket in ('allowed', 'later') for action in ('Read', 'Write', 'List')]
     return of_this_run(tmp_path_factory, 'seaweed', {'limited': actions})
 

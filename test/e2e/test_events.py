@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
 from e2e.bag_reading import Bag, bags
 from e2e.processes import Node, Processes, Publisher, until
 from e2e.reading import STRING, TYPES, decode, texts
@@ -129,6 +130,7 @@ def test_conditions_and_what_an_agent_logs_trigger(processes: Processes, seaweed
     assert recorded.issuperset(in_event)
 
 
+@pytest.mark.long('a kill')
 def test_a_kill_in_the_middle_of_an_event(processes: Processes, seaweed: Tower, store: ObjectStore, station: Station) -> None:
     """The next start makes its bag whole with what was written; the bag and the ledger say what is missing."""
     node = processes.node(seaweed.environment(), {**SETTINGS, 'events.post_s': 60.0})

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from e2e.processes import Node, Processes, published, until
 from e2e.reading import TYPES, Objects, decode, stamp_ns
 from e2e.witness import recorded
@@ -61,6 +62,7 @@ def lost(published_ns: list[int], stored_ns: set[int]) -> list[tuple[float, floa
     return runs
 
 
+@pytest.mark.long('kills under load')
 def test_kill_and_restart_under_load(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
     """The ledger balances and knows of each message; a kill makes one gap, no longer than the restart and 1.25 s."""
     environ = seaweed.environment()

@@ -65,6 +65,7 @@ def mortal(processes: Processes, tmp_path: Path) -> Mortal:
     return Mortal(node, publisher, orders)
 
 
+@pytest.mark.long('kills threads')
 def test_each_thread_dies_and_nothing_is_lost(mortal: Mortal) -> None:
     """Twice each: of what its round raised, and of its own bookkeeping; in the end every message is delivered."""
     sent, seen_s = 0, [mortal.seen_after_s('upload-lock', 'thread', 1)]
@@ -86,6 +87,7 @@ def test_each_thread_dies_and_nothing_is_lost(mortal: Mortal) -> None:
     mortal.node.stop()
 
 
+@pytest.mark.long('kills threads')
 def test_the_main_loop_dies(mortal: Mortal) -> None:
     """The node does not go on without it: it makes all durable, says why and ends with 1, and its service starts it again."""
     mortal.publisher.publish('/talk', texts(range(GROUP)))

@@ -31,6 +31,7 @@ def test_simulated_days() -> None:
     check(simulated(range(first, first + SIMULATED)), first, SIMULATED)
 
 
+@pytest.mark.long('days over real sockets')
 @pytest.mark.seaweedfs
 @pytest.mark.timeout(1800)
 def test_live_days(seaweed: Tower) -> None:

@@ -111,6 +111,7 @@ def test_rows_that_were_being_written(tmp_path: Path, monkeypatch: pytest.Monkey
     assert left_over(tmp_path) == []
 
 
+@pytest.mark.long('kills')
 @pytest.mark.parametrize(('kills', 'asked'), [(3, [f'{ROBOT}/camera/']), (1, ['--robot', ROBOT])], ids=['prefix', 'question'])
 def test_killed_it_moves_each_object_once(filled: Tower, front: Counting, tmp_path: Path, kills: int, asked: list[str]) -> None:
     """Every file that appears is whole, at any moment; after each kill the next run asks only for what is not there."""

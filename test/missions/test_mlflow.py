@@ -112,6 +112,7 @@ def test_tower_away_for_the_whole_mission(server: Server, home: Path, tmp_path: 
     until(lambda: not read_json(home / FOLDER / 'replay.json')['pid'], 'the sender ends after its agent')
 
 
+@pytest.mark.long('a kill')
 def test_a_killed_agent_s_mission(server: Server, home: Path, tmp_path: Path) -> None:
     """One run, KILLED at its last record; each point and frame that a call had returned for is there, and once."""
     csv = tmp_path / 'trajectory.csv'

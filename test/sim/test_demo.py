@@ -301,6 +301,7 @@ def test_times_that_make_no_sense_are_refused(arguments: list[str], tmp_path: Pa
     assert not (tmp_path / 'demo').exists()
 
 
+@pytest.mark.long('a whole demo')
 @pytest.mark.ros
 @pytest.mark.seaweedfs
 @pytest.mark.slow

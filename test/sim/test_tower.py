@@ -83,6 +83,7 @@ def _content(store: ObjectStore) -> bytes:
             time.sleep(0.05)
 
 
+@pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
 def test_it_comes_back_with_the_same_data_on_the_same_port(tmp_path: Path) -> None:
     """While it is away its port refuses connections and nobody can take it; afterwards everything is there."""
@@ -103,6 +104,7 @@ def test_it_comes_back_with_the_same_data_on_the_same_port(tmp_path: Path) -> No
         assert again.environment()['AWS_SECRET_ACCESS_KEY'] != secret
 
 
+@pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
 def test_two_run_side_by_side(seaweed: Tower, tmp_path: Path) -> None:
     """Each has its own ports and credentials; neither takes the other's."""
@@ -118,6 +120,7 @@ def test_two_run_side_by_side(seaweed: Tower, tmp_path: Path) -> None:
             _probe(mixed)
 
 
+@pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
 def test_it_leaves_nothing_but_its_folder(tmp_path: Path) -> None:
     """After stop there is no process and no socket of it; stopping twice and starting twice is no error."""
@@ -144,6 +147,7 @@ def test_its_passwords_are_for_its_owner_only(tmp_path: Path) -> None:
         assert not [command for command in _processes(tmp_path) if secret in command]
 
 
+@pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
 def test_no_orphan_survives_a_killed_owner(tmp_path: Path) -> None:
     """After a kill -9 of the program that started it, SeaweedFS, MLflow and their guards are gone in seconds."""
@@ -230,6 +234,7 @@ def test_ports_are_ours_alone_and_open_to_our_server() -> None:
         other.bind(('127.0.0.1', port))
 
 
+@pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
 def test_in_the_foreground_it_prints_what_a_shell_needs(tmp_path: Path) -> None:
     """``python -m ...sim.tower`` exports its variables, and SIGTERM ends it cleanly."""

@@ -43,7 +43,7 @@ def item(spool: Spool) -> SpooledObject:
 def server(request: pytest.FixtureRequest, opened: Callable[..., S3Store]) -> S3Store:
     """A store on an S3 server."""
     found: StoreSettings | Tower = request.getfixturevalue(request.param)
-    return opened(found.store_settings() if isinstance(found, Tower) else found, QUICK)
+    return opened(found if isinstance(found, StoreSettings) else found.store_settings(), QUICK)
 
 
 def under_way(store: S3Store, bucket: str) -> list[str]:

@@ -73,6 +73,7 @@ def test_a_running_server_sees_the_keys_that_are_changed(services: dict[str, Any
     assert '-s3.config=/secrets/s3.json' in services['s3']['command']
 
 
+@pytest.mark.long('a Tower of its own')
 @pytest.mark.seaweedfs
 def test_a_small_disk_has_room_for_all_buckets(services: dict[str, Any], tmp_path: Path) -> None:
     """The server as it is started there, on a disk of 2 GB: each bucket takes an object."""
@@ -139,6 +140,7 @@ def test_the_server_knows_its_options(services: dict[str, Any], secured: dict[st
     assert f' {services["s3"]["image"].partition(":")[2]} ' in version
 
 
+@pytest.mark.long('a Tower of its own')
 def test_mlflow_knows_its_options(services: dict[str, Any]) -> None:
     """Every option of the MLflow server is one of `mlflow server`."""
     told = subprocess.run([find_program('mlflow', ''), 'server', '--help'], capture_output=True, text=True, check=True)
