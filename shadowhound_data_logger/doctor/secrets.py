@@ -19,7 +19,8 @@ WELL_KNOWN: Final = frozenset({'minioadmin', 'minio', 'minio123', 'password', 'a
 URLS: Final = ('AWS_ENDPOINT_URL', 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL')
 MOST_BYTES: Final = 1 << 20
 _SECRET: Final = re.compile(
-    r'(?im)^[^#\n]*(aws_secret_access_key|mlflow_tracking_password|secret_?key|postgres_password)\b"?\s*[:=]\s*\S'
+    r'(?im)^[^#\n]*(aws_secret_access_key|mlflow_tracking_password|secret_?key|postgres_password|weed_jwt_\w+)\b"?\s*[:=]\s*\S'
+    r'|^-----BEGIN [A-Z ]*PRIVATE KEY'
 )
 
 

@@ -12,6 +12,7 @@ import os
 import secrets
 import shlex
 import signal
+import subprocess
 import sys
 import urllib.request
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING, Final
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import DataLoggerError, StoreError
-from shadowhound_data_logger.sim.servers import GRPC, Ports, Server, find_program, seaweed_sockets
+from shadowhound_data_logger.sim.servers import GRPC, Ports, Server, ServerFailed, find_program, seaweed_sockets
 from shadowhound_data_logger.stores.s3 import S3Store
 
 if TYPE_CHECKING:
@@ -34,6 +35,9 @@ S3_READY_S: Final = 30.0
 MLFLOW_READY_S: Final = 120.0
 """It takes some 8 s on an idle machine, most of it imports and the schema of a new database."""
 SECRET_BYTES: Final = 24
+SIGNING_KEYS: Final = ('SIGNING', 'SIGNING_READ', 'FILER_SIGNING', 'FILER_SIGNING_READ')
+"""Of what SeaweedFS's parts ask one another; without them they ask nobody for a key."""
+GRPC_PARTS: Final = ('MASTER', 'VOLUME', 'FILER', 'S3', 'CLIENT', 'ADMIN', 'WORKER')
 
 
 class Tower:
@@ -122,7 +126,7 @@ class Tower:
 
     def _make_folders(self) -> None:
         for name in ('s3', 'mlflow', 'tmp'):
-            (self._folder / name).mkdir(parents=True, exist_ok=True)
+            (self._folder / name).mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def _seaweed(self) -> Server:
         """``weed mini`` with every port told: on one that is taken it would silently move to another."""
@@ -134,10 +138,27 @@ class Tower:
             weed, 'mini', f'-dir={self._folder / "s3"}', f'-ip={HOST}', f'-ip.bind={HOST}', *told,
             f'-s3.config={self._identities()}', '-s3.iam=false', '-s3.autoCreateBucket=false', '-s3.port.iceberg=0',
             '-s3.port.lance=0', '-webdav=false', '-admin.ui=false', '-master.telemetry=false', '-volume.preStopSeconds=0',
+            '-disableHttp',
         ]  # fmt: skip
-        return Server(
-            'SeaweedFS', command, log=self._folder / 's3.log', environ=self._environ(), leftovers=seaweed_sockets(ports)
-        )
+        environ = self._environ() | self._seaweed_environ()
+        return Server('SeaweedFS', command, log=self._folder / 's3.log', environ=environ, leftovers=seaweed_sockets(ports))
+
+    def _seaweed_environ(self) -> dict[str, str]:
+        """Keys and a certificate, new at each start, without which SeaweedFS's own ports serve every program on this machine.
+
+        Its servers trust this one certificate, so whoever has no copy of its key gets no gRPC connection.
+        """
+        certificate, key = self._folder / 'seaweedfs.crt', self._folder / 'seaweedfs.key'
+        command = [find_program('openssl', 'apt install openssl'), 'req', '-x509', '-newkey', 'ec', '-pkeyopt',
+                   'ec_paramgen_curve:P-256', '-nodes', '-days', '3650', '-subj', '/CN=tower', '-keyout', str(key),
+                   '-out', str(certificate)]  # fmt: skip
+        made = subprocess.run(command, check=False, capture_output=True, text=True, umask=0o077)
+        if made.returncode:
+            raise ServerFailed(f'openssl makes no certificate: {made.stderr.strip()}')
+        signing = {f'WEED_JWT_{name}_KEY': secrets.token_hex(SECRET_BYTES) for name in SIGNING_KEYS}
+        certificates = {f'WEED_GRPC_{part}_CERT': str(certificate) for part in GRPC_PARTS}
+        keys = {f'WEED_GRPC_{part}_KEY': str(key) for part in GRPC_PARTS}
+        return {**signing, 'WEED_GRPC_CA': str(certificate), **certificates, **keys}
 
     def _identities(self) -> Path:
         """SeaweedFS's S3 configuration with fresh credentials, readable by this user only."""

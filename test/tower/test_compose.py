@@ -61,7 +61,7 @@ def test_every_variable_is_in_the_file_that_is_made(tmp_path: Path) -> None:
     make_secrets.make(tmp_path, None, ['thor'])
     assert set(re.findall(r'\$\{(\w+)', text)) <= set(make_secrets.read_env(tmp_path / '.env'))
     named = re.findall(r'\./(secrets/[\w.]+)', text)
-    assert named
+    assert 'secrets/seaweedfs.env' in named
     assert all((tmp_path / name).is_file() for name in named)
     assert all(value.startswith('${') for value in re.findall(r'(?:SECRET\w*|PASSWORD): (\S+)', text))
 
@@ -71,6 +71,7 @@ def test_a_running_server_sees_the_keys_that_are_changed(services: dict[str, Any
     mounts = [volume.split(':') for volume in services['s3']['volumes'] if volume.startswith('./')]
     assert mounts == [['./secrets', '/secrets', 'ro']]
     assert '-s3.config=/secrets/s3.json' in services['s3']['command']
+    assert services['s3']['working_dir'] == '/secrets', 'seaweedfs.env names files there'
 
 
 @pytest.mark.long('a Tower of its own')

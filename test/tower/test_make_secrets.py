@@ -44,12 +44,44 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
     assert tachi['SHADOWHOUND_ROBOT'] == 'tachi'
 
 
+def test_an_older_folder_gets_what_it_lacks(tmp_path: Path) -> None:
+    """The signing keys and the certificate of SeaweedFS are added, once, beside keys and passwords that stay."""
+    make_secrets.make(tmp_path, '192.168.1.10', ['thor'])
+    for path in (tmp_path / 'secrets').glob('seaweedfs.*'):
+        path.unlink()
+    before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
+    make_secrets.make(tmp_path, None, [])
+    added = {path: path.read_bytes() for path in (tmp_path / 'secrets').glob('seaweedfs.*')}
+    assert {path.name for path in added} == {'seaweedfs.env', 'seaweedfs.crt', 'seaweedfs.key'}
+    make_secrets.make(tmp_path, None, ['thor'])
+    assert {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()} == {**before, **added}
+    assert _modes(tmp_path) == {'0o600'}
+    told = make_secrets.read_env(tmp_path / 'secrets' / 'seaweedfs.env')
+    signing = [value for name, value in told.items() if name.startswith('WEED_JWT_')]
+    assert len(set(signing)) == 4
+    assert all(len(value) == 64 for value in signing)
+    assert all((tmp_path / 'secrets' / value).is_file() for name, value in told.items() if name.startswith('WEED_GRPC_'))
+
+
+def test_a_machine_without_openssl_is_told_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing is left half made: the next run begins anew."""
+    with monkeypatch.context() as patch:
+        patch.setenv('PATH', str(tmp_path))
+        assert make_secrets.main(['--folder', str(tmp_path)]) == 2
+    assert 'apt install openssl' in capsys.readouterr().err
+    assert not list(tmp_path.rglob('seaweedfs.*'))
+    assert make_secrets.main(['--folder', str(tmp_path)]) == 0
+
+
 def test_nothing_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What the script prints holds no key and no password."""
     assert make_secrets.main(['--folder', str(tmp_path)]) == 0
     printed = ''.join(capsys.readouterr())
-    secret = {value for name, value in make_secrets.read_env(tmp_path / '.env').items() if 'SECRET' in name or 'PASSWORD' in name}
-    assert len(secret) == 3
+    settings = make_secrets.read_env(tmp_path / '.env') | make_secrets.read_env(tmp_path / 'secrets' / 'seaweedfs.env')
+    secret = {value for name, value in settings.items() if 'SECRET' in name or 'PASSWORD' in name or 'JWT' in name}
+    assert len(secret) == 7
     assert not [value for value in secret if value in printed]
 
 
