@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass
 from string import Formatter
 from typing import Final
@@ -22,6 +23,15 @@ MAX_BAG_BYTES: Final = 160
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9_.-]*')
 _SEGMENT = re.compile(r"[A-Za-z0-9!_.*'()=+@-]+")
 _FIELDS: Final = ('robot', 'sensor', 'date', 'time', 'ext')
+
+
+UNSEEN: Final = frozenset({'Cc', 'Cf', 'Cs', 'Zl', 'Zp'})
+"""Unicode categories that move the cursor, turn the direction or break lines; https://www.unicode.org/reports/tr44/"""
+
+
+def printable(text: str) -> str:
+    """Text from outside for a log, a terminal or a status: what would not be seen as a letter becomes a question mark."""
+    return ''.join('?' if unicodedata.category(letter) in UNSEEN else letter for letter in text)
 
 
 def check_name(name: str, what: str, most: int = MAX_NAME_BYTES) -> str:

@@ -38,7 +38,9 @@ class SensorSettings:
     name: str
     enabled: bool = _setting(True, 'Log this sensor.', live=True)
     topics: tuple[str, ...] = _setting((), 'Topics it can come from, the preferred one first; relative to the namespace.')
-    types: tuple[str, ...] = _setting((), 'Expected type of each topic; a publisher that exists overrides it.')
+    types: tuple[str, ...] = _setting(
+        (), 'Type of each topic, the only one that is logged; where it is empty or none, the first that is published.'
+    )
     rate_hz: float = _setting(
         1.0, 'Keep the first message of each whole period; 0 keeps every message.', low=0.0, high=1e6, live=True
     )

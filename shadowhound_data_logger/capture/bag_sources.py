@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from contextlib import ExitStack
+from typing import Final
 
 from rclpy.node import Node
 
@@ -17,19 +18,33 @@ from shadowhound_data_logger.capture.source import Source
 from shadowhound_data_logger.capture.stream import Shared, Tap
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 
+STANDARD: Final = {
+    '/rosout': 'rcl_interfaces/msg/Log',
+    '/parameter_events': 'rcl_interfaces/msg/ParameterEvent',
+    '/clock': 'rosgraph_msgs/msg/Clock',
+    '/tf': 'tf2_msgs/msg/TFMessage',
+    '/tf_static': 'tf2_msgs/msg/TFMessage',
+    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+}
+"""Types of topics that ROS itself defines, some of which this node publishes: whoever publishes another type there is wrong."""
+
 
 class BagSources:
     """New; ``refresh`` while a recording goes on, ``end`` after it."""
 
     def __init__(self, node: Node, choice: Choice, tap: Tap, settings: IntakeSettings, group: PolledGroup,
-                 shared: Shared) -> None:  # fmt: skip
-        """``tap`` is told its topics; what has a subscription of its own here goes to that of ``shared``."""
+                 shared: Shared, types: Mapping[str, str]) -> None:  # fmt: skip
+        """``tap`` is told its topics; what has a subscription of its own here goes to that of ``shared``.
+
+        ``types`` are those that sensors name for topics, also for such as they do not take now.
+        """
         self._node = node
         self._settings = settings
         self._group = group
         self._shared = shared
         self._choice = choice
         self._tap = tap
+        self._types = {**STANDARD, **types}
         self._own: dict[str, Source] = {}
 
     @property
@@ -47,7 +62,7 @@ class BagSources:
         wanted = self._choice.wanted(sensors, graph)
         shared = {topic for topic, is_latched in taken.items() if not is_latched}
         for topic in wanted.difference(shared, self._own):
-            sensor = SensorSettings(name='bag', topics=(topic,))
+            sensor = SensorSettings(name='bag', topics=(topic,), types=(self._types.get(topic, ''),))
             source = self._own[topic] = Source(self._node, sensor, self._settings, self._group, self._shared, BagStream)
             source.pause(now_s, paused=paused)
         for source in self._own.values():

@@ -85,6 +85,11 @@ def _topic(row: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> tup
     grown = [f'{count} {what}' for what, count in lost.items() if count > 0]
     if grown:
         return WARN, f'{", ".join(grown)} lately'
+    if row['other_types']:
+        return (
+            WARN,
+            f'it was published as {" and as ".join(row["other_types"])} too; only {row["type"] or "another type"} is logged',
+        )
     if not row['publishers']:
         return STALE, 'nobody publishes it'
     if stall:

@@ -36,6 +36,8 @@ class Endpoint:
     type: str
     reliable: bool
     transient_local: bool
+    node: str = ''
+    """Full name of its node, safe to print; empty where it is not known: for a program that is no ROS node, for one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,26 +56,30 @@ class Plan:
         return f'{self.topic} ({self.type}, {reliability}{", TRANSIENT_LOCAL" * self.transient_local}, depth {self.depth})'
 
 
-def plans(topic: str, publishers: Sequence[Endpoint], expected_type: str | None, settings: IntakeSettings,
-          current_type: str = '') -> tuple[Plan, ...]:  # fmt: skip
-    """The subscriptions that miss nothing of what these publishers send; none while not even the type is known.
+def logged_type(publishers: Sequence[Endpoint], named: str | None, current: str = '') -> str:
+    """The one type of a topic that is listened to: the one that the settings name, whoever publishes what.
+
+    Where they name none, ``current`` stays while it has a publisher, else it is the most common one; empty without any.
+    """
+    if named:
+        return named
+    counts = Counter(publisher.type for publisher in publishers)
+    return max(counts, key=lambda name: (name == current, counts[name], name)) if counts else ''
+
+
+def plans(topic: str, type_name: str, publishers: Sequence[Endpoint], settings: IntakeSettings) -> tuple[Plan, ...]:
+    """The subscriptions that miss nothing of what these publishers, all of this type, send.
 
     A RELIABLE subscription gets nothing from a BEST_EFFORT publisher, and a BEST_EFFORT one may lose what a RELIABLE
     publisher would have repeated; one that asks for the history of a TRANSIENT_LOCAL publisher gets nothing from the others.
     So there is one for each kind of publisher that exists. While there is none yet, two match whatever comes from its first
     message on. What two of them receive is a repeat, and dropped.
-    With several types on a topic the one already heard goes on, else the most common one is heard.
     """
-    counts = Counter(publisher.type for publisher in publishers)
-    name = max(counts, key=lambda name: (name == current_type, counts[name], name)) if counts else expected_type
-    if not name:
-        return ()
-    offered = {(publisher.reliable, publisher.reliable and publisher.transient_local)
-               for publisher in publishers if publisher.type == name}  # fmt: skip
-    size = depth(name, settings)
+    offered = {(publisher.reliable, publisher.reliable and publisher.transient_local) for publisher in publishers}
+    size = depth(type_name, settings)
     kinds = ((True, True), (True, False), (False, False))
     return tuple(
-        Plan(topic, name, reliable=kind[0], transient_local=kind[1], depth=size)
+        Plan(topic, type_name, reliable=kind[0], transient_local=kind[1], depth=size)
         for kind in kinds
         if kind in (offered or UNKNOWN)
     )  # fmt: skip

@@ -19,7 +19,7 @@ from shadowhound_data_logger.bags.topics import Choice
 from shadowhound_data_logger.capture.bag_sources import BagSources
 from shadowhound_data_logger.capture.event_tap import EventTap, Taps
 from shadowhound_data_logger.capture.reader import PolledGroup
-from shadowhound_data_logger.capture.source import Source, SourceStatus
+from shadowhound_data_logger.capture.source import OtherTypes, Source, SourceStatus
 from shadowhound_data_logger.capture.stream import Offer, Shared
 from shadowhound_data_logger.config import BagSettings, IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.queue import BatchQueue
@@ -47,14 +47,15 @@ class Intake:
         self._taps = Taps(of_bag.tap, *([events] if events is not None else []))
         if events is not None:
             shared = shared._replace(tap=self._taps)
-        self._sources = tuple(
-            Source(node, sensor, settings, group, shared) for sensor in sensors.values()
-        )  # fmt: skip
+        self._others = OtherTypes(node, shared.accounts)
+        self._sources = tuple(Source(node, sensor, settings, group, shared, others=self._others) for sensor in sensors.values())
         # The odometry comes first, so that what is taken after it finds its pose.
         self._by_turn = sorted(self._sources, key=lambda source: not (shared.robot and shared.robot.is_odometry(source.topic)))
         named = (node.resolve_topic_name(topic) for topic in bag.topics if topic)
-        self._bag = BagSources(node, Choice(bag, named), of_bag.tap, settings, group, of_bag)
-        self._ring = BagSources(node, events.choice, events, settings, group, shared) if events is not None else None
+        types = {node.resolve_topic_name(topic): type_name for sensor in sensors.values()
+                 for topic, type_name in zip(sensor.topics, sensor.types, strict=False) if type_name}  # fmt: skip
+        self._bag = BagSources(node, Choice(bag, named), of_bag.tap, settings, group, of_bag, types)
+        self._ring = BagSources(node, events.choice, events, settings, group, shared, types) if events is not None else None
         self._records = False
         self._requests: deque[Callable[[], None]] = deque()
         self._wake = threading.Event()
@@ -125,6 +126,7 @@ class Intake:
         self._next_poll_s = now_s + self._settings.poll_s
         todo: list[Callable[[], None]] = [partial(source.drain, now_s) for source in self._by_turn]
         todo += [partial(source.drain, now_s) for source in self._unsampled]
+        todo.append(self._others.drain)
         if now_s >= self._next_refresh_s:
             self._next_refresh_s = now_s + REFRESH_S
             todo = [*(partial(source.refresh, now_s) for source in self._by_turn), *todo]
@@ -181,7 +183,7 @@ class Intake:
         now_s = time.monotonic()
         ends = [partial(source.close, now_s) for source in self._sources]
         ends += [partial(each.end, now_s) for each in (self._bag, self._ring) if each is not None]
-        _each([*ends, self.worker.stop])
+        _each([*ends, self._others.close, self.worker.stop])
 
     # -- between the threads ---------------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import Any, Final
 
 from rclpy.callback_groups import CallbackGroup
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -17,6 +18,7 @@ from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
 
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan
 from shadowhound_data_logger.clock import MAX_AGE_NS
+from shadowhound_data_logger.keys import printable
 from shadowhound_data_logger.model import Taken
 
 try:
@@ -47,8 +49,16 @@ class PolledGroup(CallbackGroup):  # type: ignore[misc]  # rclpy has no types
         pass
 
 
+UNKNOWN_NODE: Final = '_NODE_NAME_UNKNOWN_'
+"""What rmw calls the node of a publisher that is no ROS node, or of which it does not know yet."""
+
+
 class TypeUnavailable(LookupError):
     """The message package of a type is not installed here."""
+
+
+class SubscriptionRefused(RuntimeError):
+    """The middleware makes no such subscription: this node has the topic under another type, or the name is none of ROS."""
 
 
 def message_class(type_name: str) -> type:
@@ -80,9 +90,10 @@ def endpoints(node: Node, topic: str) -> list[Endpoint]:
     return [
         Endpoint(
             gid=bytes(info.endpoint_gid).hex(),
-            type=info.topic_type,
+            type=printable(info.topic_type),
             reliable=info.qos_profile.reliability is ReliabilityPolicy.RELIABLE,
             transient_local=info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL,
+            node='' if info.node_name == UNKNOWN_NODE else printable(f'{info.node_namespace.rstrip("/")}/{info.node_name}'),
         )
         for info in node.get_publishers_info_by_topic(topic)
     ]
@@ -92,7 +103,7 @@ class Reader:
     """A live subscription. Created, drained and closed by the intake thread alone: a take after a destroy raises."""
 
     def __init__(self, node: Node, plan: Plan, group: PolledGroup) -> None:
-        """Raises TypeUnavailable when the message package is missing."""
+        """Raises TypeUnavailable when the message package is missing, SubscriptionRefused when the middleware does not do it."""
         self.plan = plan
         self._node = node
         self._class = message_class(plan.type)
@@ -105,10 +116,13 @@ class Reader:
             reliability=ReliabilityPolicy.RELIABLE if plan.reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if plan.transient_local else DurabilityPolicy.VOLATILE,
         )
-        self._subscription = node.create_subscription(
-            self._class, plan.topic, _never_called, profile, callback_group=group, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-        )  # fmt: skip
+        try:
+            self._subscription = node.create_subscription(
+                self._class, plan.topic, _never_called, profile, callback_group=group, raw=True,
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            )  # fmt: skip
+        except (rclpy_implementation.RCLError, InvalidTopicNameException) as error:
+            raise SubscriptionRefused(f'no subscription of type {plan.type} can be made ({error})') from error
 
     def matched(self) -> int:
         """Number of publishers it is matched with."""

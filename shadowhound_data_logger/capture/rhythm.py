@@ -40,20 +40,21 @@ class Rhythm:
         if not row['enabled'] or not row['publishers']:
             self._since_s = None
             return ''
+        received = row['received'] - row['wrong_type']
         if self._since_s is None:  # whoever publishes it from now on has a rhythm of its own
-            self._since_s, self._heard_s, self._received = now_s, None, row['received']
+            self._since_s, self._heard_s, self._received = now_s, None, received
             self._pauses.clear()
-        if row['received'] > self._received:
-            self._hear(row, now_s)
+        if received > self._received:
+            self._hear(row, received, now_s)
         if row['unavailable']:
             return f'nobody can listen to it here: {row["unavailable"]}'
         return self._unheard(row, now_s - self._since_s) if self._heard_s is None else self._stopped(row, now_s - self._heard_s)
 
-    def _hear(self, row: Mapping[str, Any], now_s: float) -> None:
+    def _hear(self, row: Mapping[str, Any], received: int, now_s: float) -> None:
         heard_s = now_s - (row['age_s'] or 0.0)
         if self._heard_s is not None:
-            self._pauses.append((heard_s - self._heard_s, row['received'] - self._received))
-        self._heard_s, self._received = heard_s, row['received']
+            self._pauses.append((heard_s - self._heard_s, received - self._received))
+        self._heard_s, self._received = heard_s, received
 
     def _unheard(self, row: Mapping[str, Any], waited_s: float) -> str:
         if not row['matched'] and waited_s > UNMATCHED_S:

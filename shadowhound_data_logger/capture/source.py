@@ -1,4 +1,8 @@
-"""One sensor's way from its topic to closed batches: which topic, and how to listen. Owned by the intake thread."""
+"""One sensor's way from its topic to closed batches: which topic, and how to listen. Owned by the intake thread.
+
+One type of a topic is logged: the one that the settings name. Where they name none it is the first one in the graph, and it
+stays while it has a publisher. Whatever else is published there is counted where that is possible, told, and never logged.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,15 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Final
 
+import rclpy
+from rclpy.context import Context
 from rclpy.node import Node
 
-from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, plans
-from shadowhound_data_logger.capture.reader import PolledGroup, Reader, endpoints, unavailable
+from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, logged_type, plans
+from shadowhound_data_logger.capture.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, unavailable
 from shadowhound_data_logger.capture.stream import AnyStream, Shared, Stream
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.spool.accounts import MAX_NODES, MAX_OTHER_TYPES, SINKS, Accounts
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +31,13 @@ FALLBACK_S: Final = 1.0
 """How long the preferred topic must be without a publisher before another one is taken."""
 OVERLAP_S: Final = 0.5
 """How long the old subscription lives beside its successor, at least until that is matched."""
+NAMELESS_S: Final = 2.0
+"""The graph shows a publisher a little before it knows its node."""
+MAX_OTHERS: Final = 4
+"""Topics of which another type is listened to in order to be counted; of further ones the count is unknown."""
+OTHER_DEPTH: Final = 10
+"""Messages of such a type that are held between two drains: whoever sends more costs no more memory, and is not all counted."""
+OTHER_NODE: Final = '_shadowhound_other_types'
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +58,87 @@ class SourceStatus:
     """Why nobody can listen to it here; empty where that is possible."""
 
 
+class OtherTypes:
+    """Counts what comes on topics of sensors under another type than theirs, and throws it away.
+
+    New; ``follow`` and ``drain`` again and again; ``close`` once. A DDS participant has one type for a topic, so this takes one
+    of its own, which is made when it is first needed and stays. There too a topic has one type: any further one is not counted.
+    """
+
+    def __init__(self, beside: Node, accounts: Accounts) -> None:
+        self._beside = beside
+        self._accounts = accounts
+        self._context: Context | None = None
+        self._node: Node | None = None
+        self._refused = False
+        self._readers: dict[str, Reader] = {}
+
+    def follow(self, topic: str, types: Sequence[str]) -> str:
+        """The one of these types, all published there now, that is listened to from now on; empty for none of them."""
+        reader = self._readers.get(topic)
+        if reader is not None and reader.plan.type not in types:
+            self._count(topic, reader)
+            self._readers.pop(topic).close()
+            reader = None
+        if reader is None and len(self._readers) < MAX_OTHERS:
+            reader = next((made for name in types if not unavailable(name) and (made := self._make(topic, name))), None)
+            if reader is not None:
+                self._readers[topic] = reader
+        return reader.plan.type if reader is not None else ''
+
+    def drain(self) -> None:
+        """Take all that waits, and count it."""
+        for topic, reader in self._readers.items():
+            self._count(topic, reader)
+
+    def close(self) -> None:
+        """Idempotent."""
+        self.drain()
+        for reader in self._readers.values():
+            reader.close()
+        self._readers.clear()
+        if self._node is not None:
+            self._node.destroy_node()
+            self._node = None
+        if self._context is not None:
+            rclpy.try_shutdown(context=self._context)
+            self._context = None
+
+    def _count(self, topic: str, reader: Reader) -> None:
+        count = sum(1 for _ in reader.drain())
+        if count:
+            self._accounts.refuse(topic, reader.plan.type, count)
+
+    def _make(self, topic: str, type_name: str) -> Reader | None:
+        """None where that cannot be done; whether it can be done at all is tried once."""
+        try:
+            node = self._open()
+            plan = Plan(topic, type_name, reliable=False, transient_local=False, depth=OTHER_DEPTH)
+            return Reader(node, plan, PolledGroup()) if node is not None else None
+        except SubscriptionRefused:
+            return None
+
+    def _open(self) -> Node | None:
+        if self._node is None and not self._refused:
+            self._context = Context()
+            try:
+                rclpy.init(args=[], context=self._context, domain_id=self._beside.context.get_domain_id())
+                self._node = Node(OTHER_NODE, context=self._context, namespace=self._beside.get_namespace(),
+                                  start_parameter_services=False, enable_rosout=False)  # fmt: skip
+            except RuntimeError as error:
+                self._refused = True
+                log.warning('messages of other types than the expected ones are not counted: %s', error)
+        return self._node
+
+
 class Source:
     """A sensor at work. ``refresh`` follows the graph, ``drain`` takes what came, ``flush`` ends the open batch as well."""
 
     def __init__(self, node: Node, sensor: SensorSettings, settings: IntakeSettings, group: PolledGroup,
-                 shared: Shared, make_stream: MakeStream = Stream) -> None:  # fmt: skip
+                 shared: Shared, make_stream: MakeStream = Stream, others: OtherTypes | None = None) -> None:  # fmt: skip
+        """Without ``others`` its topic is one that only bags have, whose other types are told in their accounts."""
         self.sensor = sensor
+        self._others = others
         self._node = node
         self._settings = settings
         self._accounts = shared.accounts
@@ -77,7 +166,8 @@ class Source:
         self._idle = False
         self._last_received_s: float | None = None
         self._unavailable = ''
-        self._unheard: set[str] = set()
+        self._told: set[str] = set()
+        self._nameless_since_s: float | None = None
 
     @property
     def topic(self) -> str:
@@ -93,23 +183,25 @@ class Source:
         """Look at the graph and subscribe as its publishers ask for it."""
         if not self.sensor.enabled:
             return
-        publishers = self._choose(now_s)
+        found = self._choose(now_s)
+        type_name = logged_type(found, self._types_expected.get(self._chosen), self._type)
+        publishers = [publisher for publisher in found if publisher.type == type_name]
         self._publishers = len(publishers)
         self._matched = max((reader.matched() for reader in self._readers), default=0)
         if publishers:
             self.is_latched = all(publisher.transient_local for publisher in publishers)
             self.has_latched = any(publisher.transient_local for publisher in publishers)
         self._senders.look([publisher.gid for publisher in publishers])
-        wanted = plans(self._chosen, publishers, self._types_expected.get(self._chosen), self._settings, self._type)
-        self._warn_of_types(publishers, wanted)
-        if not wanted or not self._is_available(wanted[0].type):
+        self._look_at_others(type_name, found, now_s)
+        if not type_name or not self._is_available(type_name):
             return
-        if wanted[0].type != self._type:
-            self._retype(wanted[0].type, now_s)
+        if type_name != self._type:
+            self._retype(type_name, now_s)
+        wanted = plans(self._chosen, type_name, publishers, self._settings)
         present = {reader.plan for reader in self._readers}
         for plan in wanted:
-            if plan not in present:
-                self._readers.append(Reader(self._node, plan, self._group))
+            if plan not in present and not self._subscribe(plan):
+                return
         if publishers and set(wanted) != self._heard:
             self._heard = set(wanted)
             log.info('%s: %s', self.sensor.name, ' and '.join(plan.describe() for plan in wanted))
@@ -158,8 +250,9 @@ class Source:
     def _choose(self, now_s: float) -> list[Endpoint]:
         """Publishers of the topic to listen to: the preferred one at once, another after a while without it."""
         found = {topic: endpoints(self._node, topic) for topic in self._topics}
-        best = next((topic for topic in self._topics if found[topic]), self._chosen)
-        if best == self._chosen or found[self._chosen]:
+        present = {topic for topic, publishers in found.items() if self._has_own(topic, publishers)}
+        best = next((topic for topic in self._topics if topic in present), self._chosen)
+        if best == self._chosen or self._chosen in present:
             self._absent_since_s = None
         elif self._absent_since_s is None:
             self._absent_since_s = now_s
@@ -172,20 +265,58 @@ class Source:
             self._absent_since_s = None
         return found[self._chosen]
 
-    def _warn_of_types(self, publishers: Sequence[Endpoint], wanted: Sequence[Plan]) -> None:
-        """Say once which types of a topic with several are not heard."""
-        others = {publisher.type for publisher in publishers} - {plan.type for plan in wanted} - self._unheard
-        if others:
-            self._unheard |= others
-            text = '%s: %s is published with several types; %s is logged, not %s'
-            log.warning(text, self.sensor.name, self._chosen, wanted[0].type, ', '.join(sorted(others)))
+    def _has_own(self, topic: str, publishers: Sequence[Endpoint]) -> bool:
+        """Whether somebody publishes the topic with the type that is named for it."""
+        named = self._types_expected.get(topic)
+        return any(not named or publisher.type == named for publisher in publishers)
+
+    def _look_at_others(self, type_name: str, found: Sequence[Endpoint], now_s: float) -> None:
+        """Account for the types that the topic is published under besides this one; name each once in the log."""
+        nodes: dict[str, list[str]] = {}
+        for publisher in found:
+            if publisher.type != type_name:
+                nodes.setdefault(publisher.type, []).append(publisher.node)
+        counted = self._others.follow(self._chosen, list(nodes)) if self._others is not None else ''
+        named = bool(self._types_expected.get(self._chosen))
+        accounts = [self._chosen] if self._others is not None else [f'{sink}{self._chosen}' for sink in SINKS]
+        for name, by in nodes.items():
+            for account in accounts:
+                self._accounts.see_other(account, name, by, counted=name == counted, named=named, only_known=self._others is None)
+            if name not in self._told and (any(by) or self._has_waited(now_s)):
+                how = 'counted as rejected (wrong_type)' if name == counted else 'not listened to'
+                whose = ', '.join(filter(None, by[:MAX_NODES])) or 'a program that is no ROS node'
+                text = f'{self._chosen} is published as {name} too, by {whose}; {type_name} is logged, and that is {how}'
+                self._tell(name, text)
+        if not nodes:
+            self._nameless_since_s = None
+
+    def _has_waited(self, now_s: float) -> bool:
+        """Whether there was time for the graph to learn whose publisher it is."""
+        if self._nameless_since_s is None:
+            self._nameless_since_s = now_s
+        return now_s > self._nameless_since_s + NAMELESS_S
+
+    def _tell(self, type_name: str, text: str) -> None:
+        """In the log, once for each type."""
+        if type_name not in self._told and len(self._told) < MAX_OTHER_TYPES:
+            self._told.add(type_name)
+            log.warning('%s: %s', self.sensor.name, text)
+
+    def _subscribe(self, plan: Plan) -> bool:
+        """Whether the middleware made the subscription; tried again at the next look."""
+        try:
+            self._readers.append(Reader(self._node, plan, self._group))
+        except SubscriptionRefused as error:
+            self._unavailable = str(error)
+            self._tell(plan.type, f'{self._chosen} is not logged: {self._unavailable}')
+            return False
+        return True
 
     def _is_available(self, type_name: str) -> bool:
         """Whether messages of the type can be received here; asked before anything is begun or counted for them."""
         self._unavailable = unavailable(type_name)
-        if self._unavailable and type_name not in self._unheard:
-            self._unheard.add(type_name)
-            log.warning('%s: %s is not logged: %s', self.sensor.name, self._chosen, self._unavailable)
+        if self._unavailable:
+            self._tell(type_name, f'{self._chosen} is not logged: {self._unavailable}')
         return not self._unavailable
 
     def _retype(self, type_name: str, now_s: float) -> None:
@@ -211,6 +342,8 @@ class Source:
     def _abandon(self, now_s: float) -> None:
         """Leave the topic on purpose: what is published there from now on is nobody's loss."""
         self._leave(now_s)
+        if self._others is not None:
+            self._others.follow(self._chosen, ())
         self._accounts.rebase(self._chosen)
 
     def _leave(self, now_s: float) -> None:
@@ -242,7 +375,7 @@ class Source:
         if taken[0].number is None:
             lost = self._lost(reader)
         elif taken[0].publisher is None and not self._senders.gids:
-            self._senders.look([publisher.gid for publisher in endpoints(self._node, self._chosen)])
+            self._senders.look([each.gid for each in endpoints(self._node, self._chosen) if each.type == self._type])
         self._stream.add(taken, self._senders, lost, now_s, paused=self._paused, idle=self._idle)
 
     def _lost(self, reader: Reader) -> int | None:

@@ -152,7 +152,8 @@ class Status:
         for then_s, _, status in self._past:
             before = status['topics'].get(topic)
             if before:
-                row['rate_hz'] = round(_slope(totals.received - before['received'], now_s - then_s), 2)
+                news = totals.received - totals.wrong_type - (before['received'] - before['wrong_type'])
+                row['rate_hz'] = round(_slope(news, now_s - then_s), 2)
                 break
         return row | asdict(totals)
 

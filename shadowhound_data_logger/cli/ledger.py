@@ -108,9 +108,17 @@ def notes(found: Mapping[str, Any]) -> list[str]:
         elsewhere = {state: count for state, count in row['stored_in'].items() if count and state != 'delivered'}
         if elsewhere:
             lines.append(f'{topic}: of {row["stored"]:,} stored, {_listed(elsewhere)}')
+        lines += [f'{topic}: {_other_type(name, other)}' for name, other in row.get('other_types', {}).items()]
         if row['accounting'] in ACCOUNTING:
             lines.append(f'{topic}: {ACCOUNTING[row["accounting"]]}')
     return [*lines, *clock_notes(found.get('clock', {}))]
+
+
+def _other_type(name: str, other: Mapping[str, Any]) -> str:
+    by = ', '.join(other['publishers']) or 'a program that is no ROS node'
+    if other['messages'] is None:
+        return f'published as {name} too, by {by}; nobody listened to that, and how many messages it were is not known'
+    return f'published as {name} too, by {by}; of that {other["messages"]:,} messages were rejected (wrong_type)'
 
 
 def clock_notes(clock: Mapping[str, Any]) -> Iterator[str]:

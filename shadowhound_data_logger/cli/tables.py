@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -11,8 +10,8 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-UNSEEN: Final = frozenset({'Cc', 'Cf', 'Cs', 'Zl', 'Zp'})
-"""Unicode categories that move the cursor, turn the direction or break lines; https://www.unicode.org/reports/tr44/"""
+from shadowhound_data_logger.keys import printable
+
 BAR_COLUMNS: Final = 10
 WIDEST: Final = 1000
 UNITS: Final = ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min'), (60, 'min', 1, 's'))
@@ -20,7 +19,7 @@ UNITS: Final = ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min'), (60, 'min', 1, 
 
 def plain(text: object, style: str = '') -> Text:
     """Text from outside, as it is: no markup in it is obeyed, and a control character becomes a question mark."""
-    return Text(''.join('?' if unicodedata.category(letter) in UNSEEN else letter for letter in str(text)), style)
+    return Text(printable(str(text)), style)
 
 
 def plain_table(title: str, columns: Iterable[str], left: Iterable[str] = ('topic', '')) -> Table:

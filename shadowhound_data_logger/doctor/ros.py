@@ -19,6 +19,7 @@ NAME: Final = 'ros'
 WINDOW_S: Final = 2.5
 PEEK_S: Final = 1.2
 MOST_PEEKS: Final = 3
+MOST_NODES: Final = 3
 TOO_SLOW, TOO_LOSSY = 0.5, 0.1
 """Below half of the expected rate; above a tenth that did not arrive."""
 ENOUGH: Final = 4
@@ -44,7 +45,8 @@ def check(context: Context) -> Iterator[Result]:
         resolved = {topic: node.resolve_topic_name(topic) for sensor in sensors for topic in sensor.topics}
         names = list(dict.fromkeys(resolved.values()))
         found = ros_watch.discover(node, names)
-        heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S)} if any(found.values()) else {}
+        types = {resolved[topic]: name for sensor in sensors for topic, name in zip(sensor.topics, sensor.types, strict=False)}
+        heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S, types)} if any(found.values()) else {}
     if not heard:
         yield from _nobody(context, names)
         return
@@ -125,24 +127,34 @@ def _sensor(sensor: SensorSettings, heard: Sequence[Heard], rates_hz: Mapping[st
 
 
 def _judge(one: Heard, sensor: SensorSettings, stream: Stream, expected_hz: float) -> Iterator[Result]:
-    types = sorted({publisher.type for publisher in one.publishers})
-    if len(types) > 1:
-        yield error(
-            'ros.type',
-            f'{one.topic} is published as {" and as ".join(types)}',
-            'only one of them can be logged',
-            f'ros2 topic info -v {one.topic}  # and stop one of the publishers',
-        )
+    others = sorted({publisher.type for publisher in one.publishers} - {one.type})
+    if others:
+        yield _other_types(one, sensor, others)
+    if not any(publisher.type == one.type for publisher in one.publishers):
+        return
     if one.unavailable:
         yield error(
             'ros.types',
             f'{one.topic} cannot be received: {one.unavailable}',
             'its message package is not here',
-            TYPES_REMEDY.format(package=types[0].partition('/')[0]),
+            TYPES_REMEDY.format(package=one.type.partition('/')[0]),
         )
         return
     yield from _qos(one, stream)
     yield _rate(one, sensor, expected_hz)
+
+
+def _other_types(one: Heard, sensor: SensorSettings, others: Sequence[str]) -> Result:
+    by = sorted({publisher.node for publisher in one.publishers if publisher.type in others} - {''})
+    whose = ', '.join(by[:MOST_NODES]) or 'a program that is no ROS node'
+    own = f'{sensor.name}.types: [{others[0]}]'
+    return error(
+        'ros.type',
+        f'{one.topic} is published as {" and as ".join(others)} by {whose}; {sensor.name} logs {one.type} alone',
+        'messages of another type are never logged as those of this sensor: they are counted as rejected (wrong_type) where '
+        'their type is installed, and else nobody knows how many there are',
+        f'ros2 topic info -v {one.topic}  # and stop that publisher; or, where it is the robot: {own}',
+    )
 
 
 def _qos(one: Heard, stream: Stream) -> Iterator[Result]:
@@ -153,7 +165,7 @@ def _qos(one: Heard, stream: Stream) -> Iterator[Result]:
             'it asks for RELIABLE or TRANSIENT_LOCAL, and the publisher offers less; ROS tells nobody',
             'subscribe with rclpy.qos.qos_profile_sensor_data there; the logger itself follows the publisher',
         )
-    if stream.reliable and not all(publisher.reliable for publisher in one.publishers):
+    if stream.reliable and not all(publisher.reliable for publisher in one.publishers if publisher.type == one.type):
         yield warning(
             'ros.qos',
             f'{one.topic} is published BEST_EFFORT, and RELIABLE is expected',

@@ -6,7 +6,7 @@ It subscribes as the logger does, takes what comes without decoding it, and publ
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -15,8 +15,8 @@ import rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 
-from shadowhound_data_logger.capture.endpoints import Endpoint, plans
-from shadowhound_data_logger.capture.reader import PolledGroup, Reader, TypeUnavailable, endpoints
+from shadowhound_data_logger.capture.endpoints import Endpoint, logged_type, plans
+from shadowhound_data_logger.capture.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
 from shadowhound_data_logger.options import IntakeSettings
 
 NODE: Final = 'shadowhound_doctor'
@@ -33,6 +33,9 @@ class Heard:
 
     topic: str
     publishers: list[Endpoint]
+    """Of all types."""
+    type: str = ''
+    """The one that is logged; empty where there is none."""
     deaf: list[str] = field(default_factory=list)
     """Subscribers that ask for more than its publishers offer: they receive nothing, and nobody tells them."""
     unavailable: str = ''
@@ -84,9 +87,9 @@ def discover(of: Node, topics: Sequence[str], patience_s: float = DISCOVER_S) ->
     return found
 
 
-def listen(of: Node, found: dict[str, list[Endpoint]], window_s: float) -> list[Heard]:
-    """Count what comes on each topic that has publishers."""
-    heard = [Heard(topic, publishers) for topic, publishers in found.items()]
+def listen(of: Node, found: dict[str, list[Endpoint]], window_s: float, types: Mapping[str, str]) -> list[Heard]:
+    """Count what comes on each topic that has publishers; ``types`` are those that the settings name for topics."""
+    heard = [Heard(topic, publishers, logged_type(publishers, types.get(topic))) for topic, publishers in found.items()]
     readers = [(one, reader) for one in heard for reader in _readers(of, one)]
     try:
         settled = time.monotonic() + SETTLE_S
@@ -109,12 +112,13 @@ def listen(of: Node, found: dict[str, list[Endpoint]], window_s: float) -> list[
 
 def _readers(of: Node, one: Heard) -> list[Reader]:
     """As the logger would listen; where two kinds of publishers need two subscriptions, the first is enough to count."""
-    if not one.publishers:
+    publishers = [each for each in one.publishers if each.type == one.type]
+    if not publishers:
         return []
     try:
-        wanted = plans(one.topic, one.publishers, None, IntakeSettings())
+        wanted = plans(one.topic, one.type, publishers, IntakeSettings())
         return [Reader(of, wanted[-1], PolledGroup())]
-    except TypeUnavailable as error:
+    except (TypeUnavailable, SubscriptionRefused) as error:
         one.unavailable = str(error)
         return []
 

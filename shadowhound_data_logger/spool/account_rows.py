@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,6 +18,18 @@ class PublisherRow:
     published: int
     received: int
     missed: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class OtherTypeRow:
+    """A type that a topic was published under, and that was not logged."""
+
+    topic: str
+    type: str
+    publishers: tuple[str, ...]
+    """Nodes, some of them where there were many."""
+    messages: int | None
+    """Counted among the topic's ``rejected``; None where nobody listened to all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +66,11 @@ class Totals:
     paused: int
     missed: int | None
     open: int
+    wrong_type: int = 0
+    """Of those that were received and rejected: they are of another type than the topic's own."""
+    other_types: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Type that is published there besides and not logged -> nodes that publish it, and how many messages of it were
+    counted; ``messages`` is None where nobody listened to all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,3 +79,4 @@ class Snapshot:
 
     topics: tuple[TopicRow, ...]
     publishers: tuple[PublisherRow, ...]
+    other_types: tuple[OtherTypeRow, ...] = ()

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
-from shadowhound_data_logger.spool.account_rows import PublisherRow, Snapshot, TopicRow, Totals
+from shadowhound_data_logger.spool.account_rows import OtherTypeRow, PublisherRow, Snapshot, TopicRow, Totals
 from shadowhound_data_logger.spool.span import Span
 
 PAUSED: Final = 'paused'
@@ -27,8 +27,33 @@ EVENT: Final = 'event:'
 """The same with the bags of events."""
 SINKS: Final = (BAG, EVENT)
 """What is open there is in files, which the next start finds."""
+WRONG_TYPE: Final = 'wrong_type'
+"""Why messages are rejected that a topic carries besides those that are logged. They have one span, of this name: no gaps."""
+MAX_OTHER_TYPES: Final = 8
+"""Of one topic, by name; all further ones are one: MORE_TYPES."""
+MORE_TYPES: Final = '(more)'
+MAX_NODES: Final = 3
+"""Publishers of such a type, by name."""
 TOPIC_WIDE: Final = ''
 """Instead of a publisher, for the span of a topic whose losses the middleware reports without saying whose they are."""
+
+
+@dataclass(slots=True)
+class OtherType:
+    """A type that a topic is published under besides the one that is logged. Guarded as its topic's account is."""
+
+    publishers: list[str] = field(default_factory=list)
+    messages: int | None = 0
+
+    def see(self, nodes: Iterable[str], *, counted: bool) -> bool:
+        """Whether that is news."""
+        before = len(self.publishers), self.messages
+        for node in nodes:
+            if node and node not in self.publishers and len(self.publishers) < MAX_NODES:
+                self.publishers.append(node)
+        if not counted:
+            self.messages = None
+        return before != (len(self.publishers), self.messages)
 
 
 @dataclass(slots=True)
@@ -45,6 +70,7 @@ class TopicAccount:
     publishers: dict[str, Span] = field(default_factory=dict)
     last_kept_ns: int = 0
     """Stamp of the newest sample that is durable: a restarted node goes on sampling after it."""
+    other_types: dict[str, OtherType] = field(default_factory=dict)
 
     @property
     def open(self) -> int:
@@ -99,6 +125,31 @@ class TopicAccount:
                 count -= span.find(count)
             spans[-1].late(count, alone=len(spans) == 1)
 
+    def see_other(self, type_name: str, nodes: Iterable[str], *, counted: bool, named: bool) -> bool:
+        """Another type is published there; whether that is news.
+
+        ``counted``: its messages are received in order to be counted (``refuse``). Where they are not, and no setting has
+        ``named`` the type that is logged, nobody knows which are the topic's own, or what of them was missed.
+        """
+        if type_name not in self.other_types and len(self.other_types) >= MAX_OTHER_TYPES:
+            type_name, counted = MORE_TYPES, False
+        other = self.other_types.get(type_name)
+        is_new = other is None
+        if other is None:
+            other = self.other_types[type_name] = OtherType()
+        if not (counted or named) and self.accounting != RECEIVED_ONLY:
+            self.accounting, is_new = RECEIVED_ONLY, True
+        return other.see(nodes, counted=counted) or is_new
+
+    def refuse(self, type_name: str, count: int) -> None:
+        """Messages of another type came, and were thrown away."""
+        self.received += count
+        self.rejected[WRONG_TYPE] += count
+        self._span(WRONG_TYPE).late(count)
+        other = self.other_types.get(type_name)
+        if other is not None and other.messages is not None:
+            other.messages += count
+
     def _span(self, publisher: str) -> Span:
         span = self.publishers.get(publisher)
         if span is None:
@@ -131,6 +182,20 @@ class Accounts:
     def reject(self, topic: str, reasons: Mapping[str, int]) -> None:
         with self.entry(topic) as account:
             account.rejected.update(reasons)
+
+    def see_other(self, topic: str, type_name: str, nodes: Iterable[str], *, counted: bool, named: bool,
+                  only_known: bool = False) -> None:  # fmt: skip
+        """As of the topic's account; with ``only_known`` where there is one already."""
+        with self._lock:
+            if only_known and topic not in self._topics:
+                return
+            if self._account(topic).see_other(type_name, nodes, counted=counted, named=named):
+                self._dirty = True
+
+    def refuse(self, topic: str, type_name: str, count: int) -> None:
+        """Messages came that are of another type than the topic's."""
+        with self.entry(topic) as account:
+            account.refuse(type_name, count)
 
     def drop(self, topic: str, reason: str, count: int) -> None:
         with self.entry(topic) as account:
@@ -252,6 +317,11 @@ class Accounts:
                     PublisherRow(topic, publisher, span.first, span.last, span.published, span.received, dict(+span.missed))
                     for topic, publisher, span in spans
                 ),
+                tuple(
+                    OtherTypeRow(topic, name, tuple(other.publishers), other.messages)
+                    for topic, account in self._topics.items()
+                    for name, other in account.other_types.items()
+                ),
             )
 
     def mark_dirty(self) -> None:
@@ -280,4 +350,6 @@ def _totals(account: TopicAccount) -> Totals:
     return Totals(
         account.type, account.accounting, account.received, account.stored, account.skipped, account.rejected.total(),
         account.dropped.total() - paused, paused, account.missed, account.open,
+        account.rejected[WRONG_TYPE],
+        {name: {'publishers': list(other.publishers), 'messages': other.messages} for name, other in account.other_types.items()},
     )  # fmt: skip

@@ -20,7 +20,7 @@ from typing import Final
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
-from shadowhound_data_logger.spool.account_rows import PublisherRow, Snapshot, TopicRow
+from shadowhound_data_logger.spool.account_rows import OtherTypeRow, PublisherRow, Snapshot, TopicRow
 from shadowhound_data_logger.spool.schema import definitions, expected, prepare
 
 FORGET_STEP: Final = 10_000
@@ -230,6 +230,11 @@ class Index:
              for row in snapshot.publishers),
         )  # fmt: skip
 
+        self.db.executemany(
+            'INSERT OR REPLACE INTO other_types VALUES (?,?,?,?,?)',
+            ((session, row.topic, row.type, json.dumps(row.publishers), row.messages) for row in snapshot.other_types),
+        )  # fmt: skip
+
     def sessions(self, *, ended: bool) -> list[int]:
         condition = 'NOT NULL' if ended else 'NULL'
         return [row[0] for row in self.db.execute(f'SELECT id FROM sessions WHERE ended_ns IS {condition} ORDER BY id')]  # noqa: S608
@@ -252,6 +257,17 @@ class Index:
             PublisherRow(topic, publisher, first, last, published, received, json.loads(missed))
             for topic, publisher, first, last, published, received, missed in rows
         ]
+
+    def other_types(self) -> list[OtherTypeRow]:
+        """Of all sessions, in their order."""
+        if self._read_only and not self._has('other_types'):
+            return []
+        rows = self.db.execute('SELECT topic, type, publishers, messages FROM other_types ORDER BY session')
+        return [OtherTypeRow(topic, kind, tuple(json.loads(nodes)), count) for topic, kind, nodes, count in rows]
+
+    def _has(self, table: str) -> bool:
+        """An older index is read as it is: only the node brings it up to date."""
+        return self.db.execute('SELECT 1 FROM sqlite_master WHERE name = ?', (table,)).fetchone() is not None
 
     def tally(self) -> list[tuple[str, str, int, int, int]]:
         """(topic or '', state or 'spooled', objects, bytes, samples)."""

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import sqlite3
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import clock_record
-from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY, SINKS
+from shadowhound_data_logger.spool.account_rows import OtherTypeRow
+from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
 from shadowhound_data_logger.spool.index import Index
 
 STATES: Final = tuple(state.value for state in State)
@@ -42,11 +43,11 @@ def of_index(index: Index, robot: str) -> dict[str, Any]:
     """The ledger of an open index, all of one instant."""
     index.db.execute('BEGIN')
     try:
-        topics, publishers, tally = index.topics(), index.publishers(), index.tally()
+        topics, publishers, tally, others = index.topics(), index.publishers(), index.tally(), index.other_types()
     finally:
         index.db.execute('COMMIT')
     names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
-    accounts = {topic: _topic(topic, topics, publishers, tally) for topic in sorted(names)}
+    accounts = {topic: _topic(topic, topics, publishers, tally, others) for topic in sorted(names)}
     sensors = {topic: row for topic, row in accounts.items() if not topic.startswith(SINKS)}
     bags, events = ({topic.removeprefix(sink): row for topic, row in accounts.items() if topic.startswith(sink)}
                     for sink in SINKS)  # fmt: skip
@@ -80,7 +81,8 @@ def imbalances(ledger: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tuple[str, str, int, int, int]]) -> dict[str, Any]:
+def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tuple[str, str, int, int, int]],
+           others: list[OtherTypeRow]) -> dict[str, Any]:  # fmt: skip
     rows = [row for row in topics if row.topic == topic]
     spans = [row for row in publishers if row.topic == topic]
     accounting = max((row.accounting for row in rows), key=GRADES.index, default=RECEIVED_ONLY)
@@ -97,11 +99,23 @@ def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tup
         'missed_by': dict(missed_by) if known else {},
         'skipped': sum(row.skipped for row in rows),
         'rejected': _sum(row.rejected for row in rows),
+        'other_types': _other_types(row for row in others if row.topic == topic),
         'dropped': _sum(row.dropped for row in rows),
         'stored': sum(row.stored for row in rows),
         'open': sum(row.open for row in rows),
         'stored_in': {state: sum(row[4] for row in tally if row[:2] == (topic, state)) for state in STATES},
     }
+
+
+def _other_types(rows: Iterable[OtherTypeRow]) -> dict[str, dict[str, Any]]:
+    """Over all sessions; a count that is not known in one of them is not known."""
+    found: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        known = found.setdefault(row.type, {'publishers': [], 'messages': 0})
+        nodes = [*known['publishers'], *row.publishers]
+        known['publishers'] = list(dict.fromkeys(nodes))[:MAX_NODES]
+        known['messages'] = None if None in {known['messages'], row.messages} else known['messages'] + row.messages
+    return found
 
 
 def _sum(mappings: Any) -> dict[str, int]:

@@ -15,11 +15,13 @@ _NUMBERS: Final = {
     'sessions': ('id', 'pid', 'started_ns', 'ended_ns'),
     'accounts': ('session', 'received', 'skipped', 'stored', 'last_kept_ns'),
     'publishers': ('session', 'first', 'last', 'published', 'received'),
+    'other_types': ('session', 'messages'),
     'tally': ('objects', 'bytes', 'samples'),
     'contents': ('id', 'samples'),
     'sqlite_sequence': ('seq',),
 }
-_COUNTS: Final = frozenset({'id', 'samples', 'bytes', 'received', 'skipped', 'stored', 'published', 'objects', 'seq', 'session'})
+_COUNTS: Final = frozenset({'id', 'samples', 'bytes', 'received', 'skipped', 'stored', 'published', 'objects', 'seq', 'session',
+                            'messages'})  # fmt: skip
 """Never below 0, and no more than can be counted. Times and the numbers of messages are whatever a publisher says."""
 _MOST: Final = 1 << 53
 _TEXTS: Final = {
@@ -27,6 +29,7 @@ _TEXTS: Final = {
     'sessions': ('robot', 'boot_id'),
     'accounts': ('topic', 'type', 'accounting', 'rejected', 'dropped'),
     'publishers': ('topic', 'publisher', 'missed'),
+    'other_types': ('topic', 'type', 'publishers'),
     'tally': ('topic', 'state'),
     'contents': ('topic',),
     'sqlite_sequence': ('name',),
@@ -51,7 +54,7 @@ def check(db: sqlite3.Connection) -> None:
     """Raises sqlite3.DatabaseError for a value that cannot be."""
     for table in _NUMBERS:
         query = f'SELECT rowid FROM {table} WHERE {_wrong(table)} LIMIT 1'  # noqa: S608 - own constants only
-        if table in {'accounts', 'publishers', 'tally', 'contents'}:  # these have no rowid
+        if table in {'accounts', 'publishers', 'other_types', 'tally', 'contents'}:  # these have no rowid
             query = query.replace('rowid', 'topic')
         found = db.execute(query).fetchone()
         if found is not None:

@@ -10,7 +10,7 @@ from typing import Final
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 
-SCHEMA_VERSION: Final = 3
+SCHEMA_VERSION: Final = 4
 CATALOGUE: Final = '_catalog'
 """The sensor of the catalogue's own objects, which have no rows in it."""
 VERSION_LIMIT: Final = 1000
@@ -57,6 +57,12 @@ CREATE TRIGGER contents_forgotten AFTER DELETE ON objects WHEN OLD.topic IS NULL
 END;
 """
 """What an object of several topics holds of each; the totals follow it."""
+_OTHER_TYPES: Final = """
+CREATE TABLE other_types (
+  session INTEGER NOT NULL, topic TEXT NOT NULL, type TEXT NOT NULL, publishers TEXT NOT NULL, messages INTEGER,
+  PRIMARY KEY (session, topic, type)) WITHOUT ROWID;
+"""
+"""Types that a topic was published under and that were not logged; messages is NULL where nobody counted them all."""
 SCHEMA: Final = f"""
 CREATE TABLE objects (
   id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -104,11 +110,13 @@ CREATE TABLE publishers (
   PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
 {_CATALOGUE}
 {_CONTENTS}
+{_OTHER_TYPES}
 PRAGMA user_version = {SCHEMA_VERSION};
 """  # noqa: S608 - own constants only
 MIGRATIONS: Final = {
     1: f'DROP INDEX pending; DROP INDEX waiting; {_BY_BUCKET} {_BY_REASON}',
     2: f'{_CONTENTS} {_CATALOGUE} INSERT INTO uncatalogued SELECT id FROM objects WHERE {_ARRIVED};',  # noqa: S608 - own constants only
+    3: _OTHER_TYPES,
 }
 """Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
 

@@ -32,6 +32,7 @@ _TOPIC: Final[dict[str, Any]] = {
     'sensor': '', 'type': '', 'enabled': True, 'publishers': 0, 'matched': 0, 'may_be_silent': False, 'unavailable': '',
     'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
     'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': None, 'open': 0, 'accounting': 'received-only',
+    'wrong_type': 0, 'other_types': {},
 }  # fmt: skip
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
@@ -182,8 +183,25 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
         lost = {topic: row[what] for topic, row in found['topics'].items() if row[what]}
         if lost:
             yield f'{what} in this session: {_most(lost)}'
+    yield from _other_types(found)
     if store['quarantined']:
         yield f'quarantined in this session: {store["quarantined"]:,} objects'
+
+
+def _other_types(found: Mapping[str, Any]) -> Iterator[str]:
+    """Topics that were published under another type than the one that is logged, of sensors, bags and events."""
+    for where in (found['topics'], found.get('bag', {}).get('topics', {}), found.get('events', {}).get('topics', {})):
+        others = [(topic, name, other) for topic, row in where.items() for name, other in row.get('other_types', {}).items()]
+        yield from (_other_type(topic, where[topic], name, other) for topic, name, other in others[:NAMED])
+        if len(others) > NAMED:
+            yield f'and {len(others) - NAMED} more types on topics that carry another one'
+
+
+def _other_type(topic: str, row: Mapping[str, Any], name: str, other: Mapping[str, Any]) -> str:
+    by = ', '.join(other['publishers']) or 'a program that is no ROS node'
+    count = other['messages']
+    what = 'nobody listened to it: how many messages is not known' if count is None else f'{count:,} messages were refused'
+    return f'{topic} was published as {name} too, by {by}, and is logged as {row["type"] or "nothing"} alone; {what}'
 
 
 def _most(counts: Mapping[str, int]) -> str:

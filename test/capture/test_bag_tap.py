@@ -163,7 +163,7 @@ def test_what_only_the_ring_takes_is_in_a_bag_where_it_is_named_alone(named: tup
     """Without settings a bag has what the sensors take, whatever events keep; what is named needs no subscription more."""
     tap = SimpleNamespace(topics=frozenset())
     choice, graph, nothing = Choice(BagSettings(), named), Any, Any
-    sources = BagSources(graph, choice, tap, IntakeSettings(), nothing, nothing)  # type: ignore[arg-type]
+    sources = BagSources(graph, choice, tap, IntakeSettings(), nothing, nothing, {})  # type: ignore[arg-type]
     sensors = dict.fromkeys(('/imu', '/odom'), False)
     sources.refresh(sensors | {'/rosout': False}, sensors, 0.0, paused=False)
     assert tap.topics == expected

@@ -16,6 +16,7 @@ from shadowhound_data_logger.capture.diagnostics import ERROR, OK, STALE, WARN, 
 TOPIC = {
     'sensor': 'imu', 'type': 'go2_interfaces/msg/IMU', 'enabled': True, 'publishers': 1, 'rate_hz': 100.0, 'age_s': 0.02,
     'received': 1200, 'stored': 1100, 'skipped': 0, 'rejected': 2, 'dropped': 3, 'missed': 4, 'open': 91, 'accounting': 'exact',
+    'other_types': {},
 }  # fmt: skip
 STATUS: dict[str, Any] = {
     'robot': 'thor', 'version': '0.1.0', 'pid': 7, 'uptime_s': 12.3, 'paused': False, 'topics': {'/imu': TOPIC},
@@ -75,6 +76,7 @@ def test_all_is_fine() -> None:
         ({'stalls': {'/imu': 'silent for 7 s'}, 'topic__publishers': 0}, STALE, 'nobody publishes it'),
         ({'stalls': {'/odom': 'silent for 7 s'}}, OK, '100 Hz'),
         ({'topic__age_s': None}, OK, '100 Hz'),
+        ({'topic__other_types': {'B': {}}}, WARN, 'it was published as B too; only go2_interfaces/msg/IMU is logged'),
     ],
 )  # fmt: skip
 def test_a_topic(values: dict[str, Any], level: Any, words: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, depth, plans
+from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, depth, logged_type, plans
 from shadowhound_data_logger.config import IntakeSettings
 
 TYPE, OTHER = 'std_msgs/msg/String', 'std_msgs/msg/Int32'
@@ -12,10 +12,10 @@ SETTINGS = IntakeSettings()
 RELIABLE, BEST_EFFORT, LATCHED = (True, False), (False, False), (True, True)
 
 
-def planned(*publishers: tuple[bool, bool], expected: str | None = None) -> list[tuple[bool, bool]]:
+def planned(*publishers: tuple[bool, bool]) -> list[tuple[bool, bool]]:
     """(reliable, transient_local) of the subscriptions to publishers of these qualities."""
     found = [Endpoint(str(number), TYPE, *quality) for number, quality in enumerate(publishers)]
-    return [(plan.reliable, plan.transient_local) for plan in plans('/topic', found, expected, SETTINGS)]
+    return [(plan.reliable, plan.transient_local) for plan in plans('/topic', TYPE, found, SETTINGS)]
 
 
 @pytest.mark.parametrize(
@@ -38,19 +38,25 @@ def test_every_publisher_can_serve_one(publishers: list[tuple[bool, bool]], subs
 
 def test_an_expected_topic_is_listened_to_both_ways() -> None:
     """Before there is a publisher, whatever comes is matched from its first message on."""
-    assert planned(expected=TYPE) == [RELIABLE, BEST_EFFORT]
+    assert planned() == [RELIABLE, BEST_EFFORT]
 
 
-def test_an_unknown_topic_is_not_listened_to() -> None:
-    """Without publisher and expected type there is nothing to subscribe with."""
-    assert planned() == []
-
-
-def test_the_publisher_overrides_the_expected_type() -> None:
-    """The graph knows better than the settings; of two types the most common one is heard."""
-    publishers = [Endpoint('1', OTHER, *BEST_EFFORT), Endpoint('2', TYPE, *RELIABLE), Endpoint('3', TYPE, *RELIABLE)]
-    (plan,) = plans('/topic', publishers, 'some_msgs/msg/Thing', SETTINGS)
-    assert (plan.type, plan.reliable) == (TYPE, True)
+@pytest.mark.parametrize(
+    ('named', 'current', 'published', 'logged'),
+    [
+        ('', '', [], ''),  # nothing to subscribe with
+        (TYPE, '', [], TYPE),
+        (TYPE, '', [OTHER, OTHER], TYPE),
+        (TYPE, OTHER, [OTHER], TYPE),
+        ('', '', [OTHER, TYPE, TYPE], TYPE),
+        ('', OTHER, [OTHER, TYPE, TYPE], OTHER),
+        ('', OTHER, [TYPE], TYPE),
+    ],
+)
+def test_one_type_of_a_topic_is_logged(named: str, current: str, published: list[str], logged: str) -> None:
+    """The one that is named, whoever publishes what; else the one that is heard already, while it has a publisher."""
+    publishers = [Endpoint(str(number), name, *RELIABLE) for number, name in enumerate(published)]
+    assert logged_type(publishers, named, current) == logged
 
 
 @pytest.mark.parametrize(

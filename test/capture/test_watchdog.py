@@ -13,7 +13,8 @@ from shadowhound_data_logger.capture.watchdog import Watchdog
 
 REQUEST_S = 35.0
 WORKER = {'alive': True, 'failing': False, 'failures': 0, 'deaths': 0, 'last_error': '', 'busy_s': 0.0, 'patience_s': None}
-TOPIC = {'enabled': True, 'publishers': 1, 'matched': 1, 'may_be_silent': False, 'unavailable': '', 'received': 0, 'age_s': None}
+TOPIC = {'enabled': True, 'publishers': 1, 'matched': 1, 'may_be_silent': False, 'unavailable': '', 'received': 0,
+         'wrong_type': 0, 'age_s': None}  # fmt: skip
 STATUS: dict[str, Any] = {
     'topics': {'/imu': TOPIC}, 'queue': {'batches': 0, 'finished': 0}, 'spool': {'pending': 0},
     'store': {'state': 'idle', 'delivered': 0, 'quarantined': 0, 'mbps': 0.0, 'in_flight': 0, 'deferred': 0, 'last_error': ''},

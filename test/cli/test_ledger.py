@@ -115,6 +115,14 @@ def test_causes_are_listed_by_topic() -> None:
     assert '/odom:' not in text
 
 
+def test_other_types_of_a_topic_are_told() -> None:
+    """By whom, and how many messages were refused, or that nobody knows."""
+    others = {'a/msg/A': {'publishers': ['/x'], 'messages': 1234}, 'b/msg/B': {'publishers': [], 'messages': None}}
+    text = shown(a_ledger(odom=a_topic(other_types=others)), 200)
+    assert '/odom: published as a/msg/A too, by /x; of that 1,234 messages were rejected (wrong_type)' in text
+    assert 'published as b/msg/B too, by a program that is no ROS node; nobody listened' in text
+
+
 def test_what_is_not_delivered_is_said() -> None:
     """Stored messages whose objects are elsewhere than in the store are named with where they are."""
     text = shown(a_ledger(imu=a_topic(stored_in=dict.fromkeys(STATES, 0) | {'delivered': 50, 'pending': 10})))

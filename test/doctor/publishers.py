@@ -27,9 +27,10 @@ def main() -> None:
     rclpy.init()
     node = Node('robots', start_parameter_services=False, enable_rosout=False)
     steady = []
-    for name in ('well', 'mute', 'soft', 'deaf', 'two', 'slow', 'unheard'):
-        odometry = node.create_publisher(Odometry, f'/{name}/odom', BEST_EFFORT if name == 'soft' else RELIABLE)
-        steady += [(odometry, Odometry())] if name not in {'mute', 'slow'} else []
+    for name in ('well', 'mute', 'soft', 'deaf', 'two', 'squatted', 'slow', 'unheard'):
+        kind = PoseStamped if name == 'squatted' else Odometry
+        odometry = node.create_publisher(kind, f'/{name}/odom', BEST_EFFORT if name == 'soft' else RELIABLE)
+        steady += [(odometry, kind())] if name not in {'mute', 'slow'} else []
         if name == 'slow':
             slow = odometry
         if name != 'unheard':

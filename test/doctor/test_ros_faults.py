@@ -23,7 +23,7 @@ pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
 
 SENSORS = {'sensors': ['odom', 'imu', 'lidar']}
-ROBOTS = ('well', 'mute', 'soft', 'deaf', 'two', 'slow', 'unheard')
+ROBOTS = ('well', 'mute', 'soft', 'deaf', 'two', 'squatted', 'slow', 'unheard')
 RATES = {'odom': 20.0, 'imu': 20.0, 'point_cloud2': 20.0}
 
 
@@ -76,7 +76,7 @@ def test_two_names_of_one_topic(scene: Scene, monkeypatch: pytest.MonkeyPatch) -
     here = SimpleNamespace(resolve_topic_name=lambda topic: '/' + topic.lstrip('/'))
     monkeypatch.setattr(ros_watch, 'node', lambda **_: nullcontext(here))
     monkeypatch.setattr(ros_watch, 'discover', lambda _, names: {name: ['somebody'] for name in names})
-    monkeypatch.setattr(ros_watch, 'listen', lambda _, found, __: [ros_watch.Heard(name, []) for name in found])
+    monkeypatch.setattr(ros_watch, 'listen', lambda _, found, __, ___: [ros_watch.Heard(name, []) for name in found])
     own = {'sensors': ['imu', 'again'], 'again.topics': ['/imu'], 'again.types': ['sensor_msgs/msg/Imu']}
     context = make(scene.environ, role=scene.role, parameters=own, root=scene.root)
     assert [result.check for result in ros.check(context) if result.is_finding].count('ros.topic') == 2
@@ -101,6 +101,11 @@ FAULTS = {
     'wrong QoS of a publisher': ('soft', 'ros.qos', ('ros2 topic info -v /soft/odom',)),
     'wrong QoS of a subscriber': ('deaf', 'ros.qos', ('qos_profile_sensor_data',)),
     'two types on a topic': ('two', 'ros.type', ('ros2 topic info -v /two/odom',)),
+    'another type than the expected one': (
+        'squatted',
+        'ros.type',
+        ('ros2 topic info -v /squatted/odom', 'odom.types: [geometry_msgs/msg/PoseStamped]'),
+    ),
 }
 
 

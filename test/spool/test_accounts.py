@@ -1,12 +1,25 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from spool.conftest import Open
+from spool.making import receive
 
+from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool import span as module
 from shadowhound_data_logger.spool.account_rows import PublisherRow
-from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts, TopicAccount
+from shadowhound_data_logger.spool.accounts import (
+    EXACT,
+    MAX_NODES,
+    MAX_OTHER_TYPES,
+    MORE_TYPES,
+    RECEIVED_ONLY,
+    Accounts,
+    TopicAccount,
+)
 from shadowhound_data_logger.spool.span import Span
 
 
@@ -206,3 +219,48 @@ def test_the_last_kept_stamp_is_inherited() -> None:
     accounts.store({'/odom': (1, 40)})
     assert accounts.last_kept_ns('/odom') == 50
     assert accounts.last_kept_ns('/imu') == 0
+
+
+def test_messages_of_another_type_are_received_and_rejected(opened: Open, root: Path) -> None:
+    """Not one is the topic's own or missed; both identities hold, across sessions, and what nobody counted is not known."""
+    for counted in (True, False):
+        spool = opened()
+        receive(spool, 5, '/odom')
+        spool.accounts.see_other('/odom', 'b/msg/B', ['/x'], counted=True, named=True)
+        spool.accounts.see_other('/odom', 'c/msg/C', ['', '/y'], counted=counted, named=True)
+        spool.accounts.refuse('/odom', 'b/msg/B', 3)
+        spool.close()
+        found = ledger.read(root, 'thor')
+        assert ledger.imbalances(found) == []
+    row = found['topics']['/odom']
+    assert (row['accounting'], row['published'], row['received'], row['missed']) == ('exact', 16, 16, 0)
+    assert row['rejected'] == {'wrong_type': 6}
+    assert row['other_types'] == {
+        'b/msg/B': {'publishers': ['/x'], 'messages': 6}, 'c/msg/C': {'publishers': ['/y'], 'messages': None},
+    }  # fmt: skip
+
+
+def test_other_types_are_few() -> None:
+    """Whoever invents types fills no memory: beyond some they are one, of which nothing is counted."""
+    accounts = Accounts()
+    for number in range(1000):
+        accounts.see_other('/odom', f'b/msg/B{number}', [f'/{number}'], counted=True, named=True)
+    for number in range(1000):
+        accounts.see_other('/odom', 'b/msg/B1', [f'/{number}'], counted=True, named=True)
+    found = accounts.totals()['/odom'].other_types
+    assert len(found) == MAX_OTHER_TYPES + 1
+    assert found[MORE_TYPES]['messages'] is None
+    assert len(found['b/msg/B1']['publishers']) == len(found[MORE_TYPES]['publishers']) == MAX_NODES
+
+
+def test_without_a_named_type_nobody_knows_whose_messages_are_missed() -> None:
+    """Where another type is published and not counted, what was missed of the topic is unknown, and not 0."""
+    accounts = Accounts()
+    with accounts.entry('/odom') as account:
+        account.receive('p', 1)
+    accounts.see_other('/odom', 'b/msg/B', [], counted=True, named=False)
+    assert accounts.totals()['/odom'].missed == 0
+    accounts.see_other('/odom', 'b/msg/B', [], counted=False, named=False)
+    assert accounts.totals()['/odom'].missed is None
+    accounts.see_other('bag:/odom', 'b/msg/B', [], counted=False, named=False, only_known=True)
+    assert accounts.totals('bag:') == {}

@@ -47,13 +47,13 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
             '/camera': {
                 'type': 'sensor_msgs/msg/CompressedImage', 'accounting': 'exact', 'published': 11, 'received': 9, 'missed': 2,
                 'missed_by': {'transport': 2}, 'skipped': 3, 'rejected': {'truncated': 1}, 'dropped': {'queue_full': 1},
-                'stored': 3, 'open': 1, 'stored_in': {
+                'other_types': {}, 'stored': 3, 'open': 1, 'stored_in': {
                     'delivered': 1, 'pending': 1, 'held': 0, 'evicted': 0, 'quarantined': 1, 'deduplicated': 0,
                 },
             },
             '/imu': {
                 'type': '', 'accounting': 'received-only', 'published': None, 'received': 5, 'missed': None, 'missed_by': {},
-                'skipped': 0, 'rejected': {}, 'dropped': {}, 'stored': 0, 'open': 5, 'stored_in': {
+                'skipped': 0, 'rejected': {}, 'dropped': {}, 'other_types': {}, 'stored': 0, 'open': 5, 'stored_in': {
                     'delivered': 0, 'pending': 0, 'held': 0, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0,
                 },
             },

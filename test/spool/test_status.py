@@ -172,6 +172,17 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
         ({'workers': {'intake': {'failing': True, 'last_error': 'OSError: 5'}}}, 'intake fails: OSError: 5'),
         ({'paused': True}, 'the node is paused: nothing is logged'),
         ({'stalls': {'/imu': 'silent for 7 s'}}, '/imu: silent for 7 s'),
+        (
+            {'topics': {'/odom': {'type': 'A', 'other_types': {'B': {'publishers': ['/x'], 'messages': 1234}}}}},
+            '/odom was published as B too, by /x, and is logged as A alone; 1,234 messages were refused',
+        ),
+        (
+            {'bag': {'topics': {'/map': {'type': 'A', 'other_types': {'B': {'publishers': [], 'messages': None}}}}}},
+            (
+                '/map was published as B too, by a program that is no ROS node, and is logged as A alone; '
+                'nobody listened to it: how many messages is not known'
+            ),
+        ),
     ],
 )
 def test_what_somebody_should_look_at(tmp_path: Path, changes: dict[str, Any], finding: str) -> None:

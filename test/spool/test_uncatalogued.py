@@ -139,7 +139,8 @@ def test_a_spool_from_before_the_catalogue(opened: Open, root: Path) -> None:
     with closing(sqlite3.connect(root / 'index.db')) as connection:
         connection.executescript(
             'DROP TABLE contents; DROP TRIGGER contents_moved; DROP TRIGGER contents_forgotten; DROP TABLE uncatalogued;'
-            ' DROP TRIGGER arrived; DROP TRIGGER known; DROP TRIGGER forgotten; PRAGMA user_version = 2;'
+            ' DROP TRIGGER arrived; DROP TRIGGER known; DROP TRIGGER forgotten; DROP TABLE other_types;'
+            ' PRAGMA user_version = 2;'
         )
     assert not opened().recovery.found_anything
     assert listed(root) == ['a']
