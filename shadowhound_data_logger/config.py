@@ -22,6 +22,7 @@ from shadowhound_data_logger.options import (
     FORMATS,
     GROUPS,
     BagSettings,
+    CaptureSettings,
     CatalogueSettings,
     ClockSettings,
     EncodeSettings,
@@ -38,9 +39,9 @@ from shadowhound_data_logger.options import (
 
 __all__ = [
     'DEFAULT_SENSORS', 'FOREIGN', 'FORMATS', 'BagSettings',
-    'CatalogueSettings', 'ClockSettings', 'EncodeSettings', 'EventSettings', 'IntakeSettings', 'MissionSettings',
-    'QueueSettings', 'SensorSettings', 'Settings', 'ShutdownSettings', 'SpoolSettings', 'StoreSettings', 'UploadSettings',
-    'default_parameters', 'home', 'store_settings',
+    'CaptureSettings', 'CatalogueSettings', 'ClockSettings', 'EncodeSettings', 'EventSettings', 'IntakeSettings',
+    'MissionSettings', 'QueueSettings', 'SensorSettings', 'Settings', 'ShutdownSettings', 'SpoolSettings', 'StoreSettings',
+    'UploadSettings', 'default_parameters', 'home', 'store_settings',
 ]  # fmt: skip
 
 MIN_RATE_HZ: Final = 1e-4
@@ -63,6 +64,7 @@ class Settings:
     home: Path
     sensors: tuple[SensorSettings, ...]
     store: StoreSettings
+    capture: CaptureSettings
     intake: IntakeSettings
     queue: QueueSettings
     encode: EncodeSettings

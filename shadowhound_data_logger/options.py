@@ -19,6 +19,7 @@ BATCHED: Final = ('json', *ARCHIVES)
 CAPTURES: Final = ('always', 'mission')
 RECORDS: Final = ('service', 'mission', 'always')
 COMPRESSIONS: Final = ('zstd', 'none')
+RMW_AUTO, RMW_ROBOT, RMW_FASTRTPS = 'auto', 'robot', 'fastrtps'
 COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
 IMAGE: Final = 'sensor_msgs/msg/Image'
 POINT_CLOUD: Final = 'sensor_msgs/msg/PointCloud2'
@@ -72,6 +73,17 @@ class SensorSettings:
         if self.on_change:
             return SECOND
         return round(1e9 / self.rate_hz) if self.rate_hz else 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaptureSettings:
+    """How the node takes part in ROS."""
+
+    rmw: str = _setting(
+        RMW_AUTO,
+        "By which RMW to listen: the robot's own, fastrtps, or auto, which is fastrtps where that hears as much as Cyclone DDS.",
+        choices=(RMW_AUTO, RMW_ROBOT, RMW_FASTRTPS),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,6 +233,7 @@ class StoreSettings:
 
 
 GROUPS: Final[dict[str, type]] = {
+    'capture': CaptureSettings,
     'intake': IntakeSettings,
     'queue': QueueSettings,
     'encode': EncodeSettings,

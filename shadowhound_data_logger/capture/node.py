@@ -17,6 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from shadowhound_data_logger.capture.log_bridge import RosHandler
+from shadowhound_data_logger.capture.middleware import SETTING, Middleware
 from shadowhound_data_logger.capture.parameters import Parameters
 from shadowhound_data_logger.capture.pipeline import Pipeline
 from shadowhound_data_logger.capture.service import Service
@@ -71,7 +72,7 @@ def refuse(rest: list[str]) -> int:
     return 2
 
 
-def run(arguments: list[str]) -> int:
+def run(arguments: list[str], middleware: Middleware) -> int:
     """From the start of ROS to its end; the exit code. ``arguments`` are those of ROS, without the program's name."""
     bound_heap()
     try:
@@ -82,12 +83,14 @@ def run(arguments: list[str]) -> int:
         print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201
         return 2
     stop = StopSignals()
-    node = Node('sensor_logger_node', automatically_declare_parameters_from_overrides=True)
+    with middleware.profiled(os.environ):
+        node = Node('sensor_logger_node', automatically_declare_parameters_from_overrides=True)
     logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
+    node.get_logger().info(f'listening by {middleware.describe()}')
     if '--params-file' in arguments and not Parameters(node).given():  # which is no error to rcl
         node.get_logger().warning(UNHEARD.format(name=node.get_fully_qualified_name()))
     try:
-        log_until(stop, node)
+        log_until(stop, node, middleware)
     except SettingError as error:
         node.get_logger().fatal(f'{error}')
         return 2
@@ -103,11 +106,15 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
-def log_until(stop: StopSignals, node: Node) -> None:
+def log_until(stop: StopSignals, node: Node, middleware: Middleware) -> None:
     """Until a signal comes."""
     service = Service(os.environ)
     parameters = Parameters(node)
-    pipeline = Pipeline(node, parameters.load(), parameters)
+    given = parameters.load()
+    if given.capture.rmw != middleware.asked:
+        allowed = f'{middleware.asked!r}, which is what the command line says to those who read it before ROS is loaded'
+        raise SettingError(SETTING, given.capture.rmw, allowed)
+    pipeline = Pipeline(node, given, parameters, middleware)
     pipeline.open()
     service.ready(pipeline.describe())
     executor = SingleThreadedExecutor()

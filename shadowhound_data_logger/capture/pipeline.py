@@ -25,6 +25,7 @@ from shadowhound_data_logger.capture.control import ControlSocket
 from shadowhound_data_logger.capture.event_buffer import EventBuffer
 from shadowhound_data_logger.capture.intake import Intake, offer_to
 from shadowhound_data_logger.capture.interface import Interface
+from shadowhound_data_logger.capture.middleware import Middleware
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_tap import MissionTap
 from shadowhound_data_logger.capture.parameters import Parameters, live
@@ -60,9 +61,10 @@ LEDGER_BUCKET = 'sensor-data'
 class Pipeline:
     """New; open once; close once."""
 
-    def __init__(self, node: Node, settings: Settings, parameters: Parameters) -> None:
+    def __init__(self, node: Node, settings: Settings, parameters: Parameters, middleware: Middleware) -> None:
         self._settings = settings
         self._parameters = parameters
+        self._middleware = middleware
         self._record = record = ClockRecord(settings.spool_path, settings.robot)
         self._clock = ClockWatch(SystemClock.of_this_machine(), settings.clock.hold_s, record.steps)
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
@@ -115,7 +117,7 @@ class Pipeline:
         self.pool.observe = self.mission.observe
         self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
-                                       self.recorder, self.event_buffer, self._control)  # fmt: skip
+                                       self.recorder, self.event_buffer, self._control, self._middleware)  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
         node = self._node.get_fully_qualified_name()
         self._commands = Commands(stages, self._parameters, self._status, settings.robot, node)

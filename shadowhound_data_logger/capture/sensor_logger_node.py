@@ -7,14 +7,25 @@ Exit codes: 0 asked to stop, 1 a failure, 2 settings refused.
 
 from __future__ import annotations
 
+import os
 import sys
+
+from shadowhound_data_logger.capture.middleware import asked_for, choose
+from shadowhound_data_logger.errors import SettingError
 
 
 def main(args: list[str] | None = None) -> int:
     """The console script; ``args`` are ROS arguments without the program's name."""
-    from shadowhound_data_logger.capture.node import run  # noqa: PLC0415 - the environment decides which middleware it loads
+    arguments = sys.argv[1:] if args is None else args
+    try:
+        middleware = choose(asked_for(arguments), os.environ)
+    except SettingError as error:
+        print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201 - there is no logger yet
+        return 2
+    middleware.enter(os.environ)
+    from shadowhound_data_logger.capture.node import run  # noqa: PLC0415 - loads the RMW that the environment names
 
-    return run(sys.argv[1:] if args is None else args)
+    return run(arguments, middleware)
 
 
 if __name__ == '__main__':

@@ -20,6 +20,7 @@ from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.capture.control import ControlSocket
 from shadowhound_data_logger.capture.event_buffer import EventBuffer
 from shadowhound_data_logger.capture.intake import Intake
+from shadowhound_data_logger.capture.middleware import Middleware
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.source import SourceStatus
 from shadowhound_data_logger.capture.watchdog import Watchdog
@@ -58,6 +59,7 @@ class Stages:
     recorder: Recorder
     event_buffer: EventBuffer
     control: ControlSocket
+    middleware: Middleware
 
     @property
     def workers(self) -> Sequence[Worker]:
@@ -106,7 +108,7 @@ class Status:
         status = {
             'robot': self._settings.robot, 'version': self.version, 'pid': os.getpid(), 'boot_id': self._clock.boot_id,
             'boot_ns': boot_ns, 'time': iso(self._clock.wall_ns()), 'uptime_s': round((boot_ns - self._began_ns) / SECOND, 1),
-            'paused': self._stages.intake.paused, 'ended': ended,
+            'paused': self._stages.intake.paused, 'ended': ended, 'middleware': self._stages.middleware.status(),
             'mission': self._stages.mission.status(), 'bag': self._bag(), 'events': self._events(), 'topics': self._topics(now_s),
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
             'spool': {'path': str(self._stages.spool.root), **asdict(piles), **asdict(self._settings.spool)},

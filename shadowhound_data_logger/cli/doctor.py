@@ -18,10 +18,11 @@ from rich.text import Text
 
 from shadowhound_data_logger.cli.tables import plain
 from shadowhound_data_logger.doctor.checks import CHECKS
-from shadowhound_data_logger.doctor.context import ParametersUnreadable, make
+from shadowhound_data_logger.doctor.context import make
 from shadowhound_data_logger.doctor.fixes import fix as mend
 from shadowhound_data_logger.doctor.model import Check, Context, Result, Role, Severity
 from shadowhound_data_logger.doctor.run import TIMEOUT_S, Examination
+from shadowhound_data_logger.ros_arguments import ParametersUnreadable
 
 STYLES: Final = {
     Severity.ERROR: 'red',

@@ -13,16 +13,12 @@ from urllib.parse import urlsplit
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.doctor.machine import listening
 from shadowhound_data_logger.doctor.model import Context, Role
-from shadowhound_data_logger.errors import DataLoggerError, SettingError
+from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.ros_arguments import read_parameters
 
 S3_PORT: Final = 9000
 MLFLOW_PORT: Final = 5001
 """Of a Tower as the integration guide sets it up."""
-NODE: Final = 'sensor_logger_node'
-
-
-class ParametersUnreadable(DataLoggerError):
-    """A parameter file is not one."""
 
 
 def make(
@@ -86,34 +82,6 @@ def _serves(environ: Mapping[str, str], root: Path) -> bool:
         except ValueError:
             continue
     return any(port in ports for _, port in listening(root))
-
-
-def read_parameters(path: Path) -> dict[str, Any]:
-    """The parameters of a ROS 2 parameter file for our node, flat. Raises ParametersUnreadable.
-
-    https://docs.ros.org/en/humble/How-To-Guides/Node-arguments.html#parameter-files
-    """
-    try:
-        import yaml  # noqa: PLC0415 - rclpy needs it, too; without ROS it may be missing, and then nobody has such a file
-    except ImportError as error:
-        raise ParametersUnreadable(f'{path} cannot be read: {error}', remedy='pip install pyyaml') from error
-    try:
-        given = yaml.safe_load(path.read_text(encoding='utf-8')) or {}
-        flat: dict[str, Any] = {}
-        for node, content in given.items():
-            if node in {'/**', NODE, f'/{NODE}', '/**/' + NODE}:
-                flat |= _flat(content['ros__parameters'])
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError) as error:
-        text = f'{path} is no parameter file: {error}'
-        raise ParametersUnreadable(text, remedy='see launch_configs/go2.yaml') from error
-    return flat
-
-
-def _flat(given: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in given.items():
-        flat |= _flat(value, f'{prefix}{name}.') if isinstance(value, dict) else {f'{prefix}{name}': value}
-    return flat
 
 
 def to_child(context: Context) -> bytes:

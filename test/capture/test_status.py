@@ -16,6 +16,7 @@ pytest.importorskip('rclpy')
 
 from shadowhound_data_logger.bags.events import EventStatus
 from shadowhound_data_logger.bags.recorder import BagStatus
+from shadowhound_data_logger.capture.middleware import FAST_DDS, Middleware
 from shadowhound_data_logger.capture.source import SourceStatus
 from shadowhound_data_logger.capture.status import Stages, Status
 from shadowhound_data_logger.clock_watch import ClockWatch
@@ -102,7 +103,8 @@ class Setting:
         recorder: Any = Recorders('bag-writer')
         event_buffer: Any = EventBuffers('event-writer')
         control: Any = Threads('control')
-        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder, event_buffer, control)
+        middleware = Middleware('auto', FAST_DDS, FAST_DDS, "the robot's own")
+        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder, event_buffer, control, middleware)
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
         self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 

@@ -124,7 +124,7 @@ class Node(Process):
 
 
 class Publisher(Process):
-    """A process with publishers of its own (publisher.py), told what to do line by line."""
+    """A process with publishers of its own (publisher.py, or cyclone_driver.py), told what to do line by line."""
 
     def create(self, topic: str, type_name: str, *, reliable: bool = True, latched: bool = False, depth: int = 1000) -> None:
         """A publisher by the name of its topic."""
@@ -134,9 +134,21 @@ class Publisher(Process):
         """Wait until somebody listens."""
         self._tell(do='matched', topic=topic)
 
+    def listen(self, topic: str, type_name: str, *, reliable: bool = True, depth: int = 1000) -> None:
+        """A reader beside it, of a Cyclone DDS driver."""
+        self._tell(do='listen', topic=topic, type=type_name, reliable=reliable, latched=False, depth=depth)
+
+    def count(self, topic: str) -> int:
+        """What its reader has received."""
+        return int(self._tell(do='count', topic=topic))
+
     def publish(self, topic: str, messages: Iterable[bytes], period_s: float = 0.002) -> None:
         """Serialized messages; returns when the last one is out."""
         self._tell(do='publish', topic=topic, messages=[message.hex() for message in messages], period_s=period_s)
+
+    def again(self, topic: str, message: bytes, count: int, period_s: float) -> None:
+        """The same message so many times; returns when the last one is out."""
+        self._tell(do='again', topic=topic, message=message.hex(), count=count, period_s=period_s)
 
     def heard(self, topic: str, node: Node, message: bytes) -> None:
         """Publish the message until the node received it, so that whatever follows comes after the match."""
@@ -158,13 +170,15 @@ class Publisher(Process):
         self._tell(do='end')
         assert self.wait() == 0, self.log
 
-    def _tell(self, **order: object) -> None:
+    def _tell(self, **order: object) -> str:
+        """What it answers beyond that it is done."""
         assert self.popen.stdin is not None
         assert self.popen.stdout is not None
         self.popen.stdin.write(json.dumps(order) + '\n')
         self.popen.stdin.flush()
         answer = self.popen.stdout.readline()
-        assert answer == 'done\n', f'{order["do"]}: {answer}{self.log}'
+        assert answer.startswith('done'), f'{order["do"]}: {answer}{self.log}'
+        return answer.removeprefix('done').strip()
 
 
 class Processes:
@@ -214,10 +228,11 @@ class Processes:
         witness.said('ready')
         return witness
 
-    def publisher(self) -> Publisher:
+    def publisher(self, *, cyclone: bool = False, environ: Mapping[str, str] | None = None) -> Publisher:
+        """A process with publishers, of rclpy or as a robot with Cyclone DDS has them."""
         name = self._name('publisher')
-        command = [sys.executable, str(HERE / 'publisher.py')]
-        process = Publisher(name, command, self.folder / f'{name}.log', self.environ, piped=True)
+        command = [sys.executable, str(HERE / ('cyclone_driver.py' if cyclone else 'publisher.py'))]
+        process = Publisher(name, command, self.folder / f'{name}.log', {**self.environ, **(environ or {})}, piped=True)
         self.started.append(process)
         return process
 

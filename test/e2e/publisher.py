@@ -47,6 +47,12 @@ def obey(order: dict[str, Any], node: Node, publishers: dict[str, Any]) -> None:
                 time.sleep(max(0.0, due - time.monotonic()))
                 due += order['period_s']
                 publishers[topic].publish(bytes.fromhex(message))
+        case 'again':
+            message, due = bytes.fromhex(order['message']), time.monotonic()
+            for _ in range(order['count']):
+                time.sleep(max(0.0, due - time.monotonic()))
+                due += order['period_s']
+                publishers[topic].publish(message)
         case 'destroy':
             node.destroy_publisher(publishers.pop(topic))
 
