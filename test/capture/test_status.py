@@ -104,7 +104,8 @@ class Setting:
         event_buffer: Any = EventBuffers('event-writer')
         control: Any = Threads('control')
         middleware = Middleware('auto', FAST_DDS, FAST_DDS, "the robot's own")
-        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder, event_buffer, control, middleware)
+        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder, event_buffer, control,
+                        middleware)  # fmt: skip
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
         self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 
