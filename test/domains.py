@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import os
 import random
-import socket
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,8 +13,8 @@ from pathlib import Path
 import pytest
 from segments import free_orphans
 
-DOMAINS = range(1, 102)
-"""Those whose ports lie below the ephemeral ones on Linux; https://docs.ros.org/en/rolling/Concepts/About-Domain-ID.html"""
+from shadowhound_data_logger.doctor.machine import domains
+from shadowhound_data_logger.sim.demo_processes import DOMAINS
 
 
 @contextmanager
@@ -25,9 +24,10 @@ def free_domain() -> Iterator[int]:
         lock = os.open(Path(tempfile.gettempdir()) / f'shadowhound-test-domain-{domain}.lock', os.O_RDWR | os.O_CREAT, 0o666)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as discovery:
-                discovery.bind(('', 7400 + 250 * domain))  # where every participant of the domain listens
         except OSError:
+            os.close(lock)
+            continue
+        if domain in domains(Path('/')):
             os.close(lock)
             continue
         try:

@@ -6,10 +6,11 @@ A disk that takes nothing costs the messages of that time, which are counted as 
 from __future__ import annotations
 
 import errno
+import itertools
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -75,6 +76,8 @@ class Recording:
         self._writer: SliceWriter | None = None
         self._channels: dict[tuple[str, str], Channel] = {}
         self._written = Counter[str]()  # into the open slice
+        self._unnumbered: dict[str, Iterator[int]] = {}
+        """By topic, the numbers in this bag of messages that have none of their publisher."""
         self._lost = Counter[tuple[str, str]]()  # by topic and reason, not noted yet
         self._broken: list[tuple[Path, Counter[str], str]] = []
         """Slices that the disk refused to go on with, what was written into them, and why it refused."""
@@ -96,10 +99,10 @@ class Recording:
         assert writer is not None
         self._written[lot.topic] += len(lot.messages)
         self.messages += len(lot.messages)
-        channel, count = self._channel(lot), self._written[lot.topic]
+        channel, places = self._channel(lot), self._unnumbered.setdefault(lot.topic, itertools.count(1))
         try:
             for cdr, source_ns, _, number, received_ns in self._place.by_clock_of(self.notes, lot).messages:
-                writer.write(channel, received_ns, source_ns, count if number is None else number, cdr)
+                writer.write(channel, received_ns, source_ns, next(places) if number is None else number, cdr)
         except OSError as error:
             self._break(error)
         else:

@@ -16,6 +16,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.type_support import NoTypeSupportImportedException, check_for_type_support
 from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
 
+from shadowhound_data_logger.capture import librcl
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan
 from shadowhound_data_logger.clock import MAX_AGE_NS
 from shadowhound_data_logger.keys import printable
@@ -128,7 +129,9 @@ class Reader:
         """Number of publishers it is matched with."""
         handle = self._subscription.handle
         with handle:
-            return int(handle.get_publisher_count())
+            if hasattr(handle, 'get_publisher_count'):
+                return int(handle.get_publisher_count())
+            return librcl.publisher_count(handle.pointer)  # Humble
 
     def drain(self) -> Iterator[Taken]:
         """Everything that waits, oldest first."""

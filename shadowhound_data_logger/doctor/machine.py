@@ -10,9 +10,10 @@ from typing import Final
 
 LISTEN: Final = '0A'
 """State of a TCP socket, ``TCP_LISTEN`` of include/net/tcp_states.h."""
-DISCOVERY_PORT: Final = 7400
+DISCOVERY_PORTS: Final = (7400, 7410)
 DOMAIN_GAIN: Final = 250
-"""Every participant of a domain listens on 7400 + 250 * domain (DDSI-RTPS 2.2, 9.6.1.1)."""
+"""Plus 250 * domain: where every participant that uses multicast listens, and the first one that does not, as Cyclone DDS with
+ROS_LOCALHOST_ONLY (DDSI-RTPS 2.2, 9.6.1.1)."""
 MAX_DOMAIN: Final = 232
 
 
@@ -72,8 +73,8 @@ def listening(root: Path) -> set[tuple[bool, int]]:
 def domains(root: Path) -> list[int]:
     """ROS domains in which somebody takes part on this machine."""
     ports = {int(address.rpartition(':')[2], 16) for name in ('udp', 'udp6') for address, _ in _sockets(root, name)}
-    numbers = ((port - DISCOVERY_PORT) / DOMAIN_GAIN for port in ports)
-    return sorted(int(number) for number in numbers if number.is_integer() and 0 <= number <= MAX_DOMAIN)
+    numbers = ((port - base) / DOMAIN_GAIN for port in ports for base in DISCOVERY_PORTS)
+    return sorted({int(number) for number in numbers if number.is_integer() and 0 <= number <= MAX_DOMAIN})
 
 
 def lock_holder(root: Path, path: Path) -> int | None:

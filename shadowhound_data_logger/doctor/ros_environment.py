@@ -44,7 +44,14 @@ def _domain(environ: Mapping[str, str]) -> Result:
 def _range(environ: Mapping[str, str]) -> Iterator[Result]:
     name, given = 'ros.discovery', environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '')
     only = environ.get('ROS_LOCALHOST_ONLY', '')
-    if given and given not in RANGES:
+    if given and environ.get('ROS_DISTRO') == 'humble':
+        yield warning(
+            name,
+            f'ROS_AUTOMATIC_DISCOVERY_RANGE is {given}, which Humble does not know',
+            'only this machine is heard' if only == '1' else 'all nodes in the network are heard, as if it were not set',
+            'unset ROS_AUTOMATIC_DISCOVERY_RANGE; for this machine only: export ROS_LOCALHOST_ONLY=1, for the driver as well',
+        )
+    elif given and given not in RANGES:
         yield error(
             name,
             f'ROS_AUTOMATIC_DISCOVERY_RANGE is {given!r}',

@@ -25,6 +25,9 @@ ENOUGH_SHM: Final = 128 << 20
 """Three participants with the segment of our profile."""
 LARGE: Final = frozenset({IMAGE, POINT_CLOUD})
 _SEGMENT: Final = re.compile(r'<segment_size>\s*(\d+)\s*</segment_size>')
+_LEAST_BUFFER: Final = re.compile(r'<SocketReceiveBufferSize\b[^>]*\bmin=["\']\s*(\d+)\s*([a-z]*)', re.IGNORECASE)
+_UNITS: Final = {'k': 10, 'm': 20, 'g': 30}
+"""kB, MB and MiB in powers of 2; https://cyclonedds.io/docs/cyclonedds/0.10.5/config/config_file_reference.html"""
 SYSCTL: Final = (
     "echo 'net.core.rmem_max = 16777216' | sudo tee /etc/sysctl.d/60-dds.conf && sudo sysctl --system # docs/thor.md, Middleware"
 )
@@ -78,16 +81,30 @@ def _cyclone(context: Context) -> Iterator[Result]:
             f'ls -l {uri.removeprefix("file://")}',
         )
         return
-    if 'SocketReceiveBufferSize' in text:
+    least, limit = _least_buffer(text), number(context.root / 'proc/sys/net/core/rmem_max')
+    if limit is not None and least > 2 * limit:  # the kernel tells twice what it was asked for, see socket(7)
+        yield error(
+            'sockets.cyclone',
+            f'CYCLONEDDS_URI asks for a receive buffer of {least:,} bytes at least, twice net.core.rmem_max is {2 * limit:,}',
+            'Cyclone DDS does not start then',
+            f'{SYSCTL}  # or: SocketReceiveBufferSize min="default" max="10MB"',
+        )
+    elif 'SocketReceiveBufferSize' in text:
         yield ok('sockets.cyclone', 'CYCLONEDDS_URI asks for a receive buffer')
     else:
         yield warning(
             'sockets.cyclone',
             'CYCLONEDDS_URI asks for no receive buffer',
             'Cyclone DDS takes 1 MB unless it is told',
-            'export CYCLONEDDS_URI=file:///etc/shadowhound/cyclonedds.xml  # with SocketReceiveBufferSize min="10MB": '
+            'export CYCLONEDDS_URI=file:///etc/shadowhound/cyclonedds.xml  # with SocketReceiveBufferSize max="10MB": '
             'docs/thor.md',
         )
+
+
+def _least_buffer(text: str) -> int:
+    """The receive buffer, bytes, without which a Cyclone DDS with these settings does not start."""
+    found = _LEAST_BUFFER.search(text)
+    return int(found[1]) << _UNITS.get(found[2][:1].lower(), 0) if found else 0
 
 
 def _profile(context: Context) -> Result:

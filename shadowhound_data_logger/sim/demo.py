@@ -1,6 +1,7 @@
 """``make demo``: a simulated Go2, the real node and a Tower of its own for a minute, and proof that nothing got lost.
 
-Exit codes: 0 all is accounted for and identical in the S3 server, 1 it is not or something failed, 2 bad usage.
+Exit codes: 0 all is accounted for and identical in the S3 server, 1 it is not, or something failed or was logged as an error by
+the node, 2 bad usage.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -91,7 +93,7 @@ def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, m
 
     pictures = demo_pictures.draw(folder, audit.bodies, record)
     demo_report.show_where(folder, [*pictures, *drawn], os.environ, console)
-    return 1 if audit.problems else 0
+    return 1 if audit.problems or record.errors else 0
 
 
 def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, console: Console, *,
@@ -115,7 +117,7 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
         node.stop(demo_processes.STOP_S)
         node.check()
         console.print(f'The robot has stopped. Asked to end (SIGINT), the node did so in {time.monotonic() - began:.1f} s.')
-    return record, run_id
+    return replace(record, errors=tuple(node.errors())), run_id
 
 
 @contextmanager

@@ -9,7 +9,6 @@ import ctypes
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Final
 
+from shadowhound_data_logger.doctor.machine import domains
 from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.spool import ledger
 
@@ -32,10 +32,16 @@ BACKOFF_S: Final = 4.0
 """Longest pause between two tries while the S3 server is away: not 60 as by default, for the minute shall show it catch up."""
 STOP_S: Final = 40.0
 TAIL_LINES: Final = 15
+FAILURES: Final = ('[ERROR]', '[FATAL]', 'Traceback (most recent call last)')
+"""In a line of a ROS log."""
 PR_SET_PDEATHSIG: Final = 1
 """linux/prctl.h"""
 DOMAINS: Final = range(1, 102)
 """Those whose ports lie below Linux's ephemeral ones; https://docs.ros.org/en/kilted/Concepts/Intermediate/About-Domain-ID.html"""
+THIS_MACHINE: Final = (
+    {'ROS_LOCALHOST_ONLY': '1'} if os.environ.get('ROS_DISTRO') == 'humble' else {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+)
+"""The variable that keeps nodes among themselves on one machine: Humble does not know the second one."""
 FOREIGN_VARIABLES: Final = ('AWS_', 'MLFLOW_', 'SHADOWHOUND_', 'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY', 'ROS_NAMESPACE')
 """What would lead the demo to somebody's real Tower or robot; a name or the beginning of one."""
 OUR_VARIABLE: Final = 'SHADOWHOUND_ENVIRONMENT'
@@ -80,6 +86,11 @@ class Child:
         if self._process.poll():
             raise self.failed(f'ended with exit code {self._process.returncode}')
 
+    def errors(self) -> list[str]:
+        """Lines of its log that are of severity ERROR or worse, or tell an unhandled exception."""
+        lines = self.log.read_text(encoding='utf-8', errors='replace').splitlines()
+        return [line for line in lines if any(mark in line for mark in FAILURES)]
+
     def stop(self, timeout_s: float) -> None:
         """SIGINT, and SIGKILL after ``timeout_s``; idempotent."""
         if self.is_running:
@@ -99,16 +110,10 @@ class Child:
 
 
 def free_domain() -> int:
-    """A ROS_DOMAIN_ID on which nobody on this machine listens: its first participant's port is free.
-
-    The ports are those of the RTPS specification, 9.6.1.1: 7400 + 250 * domain + 10 + 2 * participant.
-    """
+    """A ROS_DOMAIN_ID that nobody on this machine uses."""
+    used = domains(Path('/'))
     for domain in random.sample(DOMAINS, len(DOMAINS)):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(('', 7400 + 250 * domain + 10))
-            except OSError:
-                continue
+        if domain not in used:
             return domain
     raise DemoFailed('there is no free ROS_DOMAIN_ID on this machine', remedy='stop some ROS nodes')
 
@@ -116,10 +121,8 @@ def free_domain() -> int:
 def environment(home: Path, tower: Mapping[str, str], domain: int) -> dict[str, str]:
     """Ours, without what leads elsewhere, with the demo's folder, Tower and domain."""
     kept = {name: value for name, value in os.environ.items() if name == OUR_VARIABLE or not name.startswith(FOREIGN_VARIABLES)}
-    is_humble = os.environ.get('ROS_DISTRO') == 'humble'
-    here = {'ROS_LOCALHOST_ONLY': '1'} if is_humble else {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     ours = {'SHADOWHOUND_HOME': str(home), 'SHADOWHOUND_ROBOT': ROBOT, 'ROS_DOMAIN_ID': str(domain), 'PYTHONUNBUFFERED': '1'}
-    return {**kept, **tower, **here, **ours}
+    return {**kept, **tower, **THIS_MACHINE, **ours}
 
 
 def start_logger(folder: Path, environ: Mapping[str, str]) -> Child:

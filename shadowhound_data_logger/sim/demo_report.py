@@ -95,6 +95,9 @@ def show_result(audit: Audit, record: Record, console: Console) -> None:
     console.print(f'The catalogue in {BUCKET}/*/_catalog/ has {audit.rows:,} rows: one for each object but its own.')
     for problem in audit.problems:
         console.print(Text(f'  {problem}', style='red'))
+    if record.errors:
+        console.print(f'[red]Errors that the node logged: {len(record.errors)}[/], all of them in node.log; the first:')
+        console.print(Text(f'  {record.errors[0]}', style='red'))
 
 
 def _remarks(audit: Audit, record: Record) -> Iterator[str]:

@@ -52,6 +52,8 @@ class Record:
     readings: tuple[Reading, ...]
     outage: tuple[float, float] | None
     """From when until when the S3 server was away, seconds since the robot was first heard."""
+    errors: tuple[str, ...] = ()
+    """What the node logged as an error."""
 
     @property
     def backlog(self) -> int:

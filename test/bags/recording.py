@@ -62,8 +62,10 @@ class Desk:
     def root(self) -> Path:
         return self.home / 'bags' / ROBOT
 
-    def hear(self, numbers: range, topic: str = '/talk', size: int = 0) -> None:
+    def hear(self, numbers: range, topic: str = '/talk', size: int = 0, *, numbered: bool = True) -> None:
         heard = lot(numbers, topic, size)
+        if not numbered:
+            heard = heard._replace(messages=[message._replace(publisher=None, number=None) for message in heard.messages])
         with self.spool.accounts.entry(f'{BAG}{topic}') as account:
             for message in heard.messages:
                 assert account.receive(message.publisher, message.number)

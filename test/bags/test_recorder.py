@@ -48,6 +48,24 @@ def test_both_stamps_and_the_number_are_kept(tmp_path: Path) -> None:
         assert schema.name == STRING
 
 
+def test_messages_without_a_number_are_numbered_by_their_place_in_the_bag(tmp_path: Path) -> None:
+    """From 1 for each topic, whatever of them came at once and in whatever slice they are: no sequence repeats."""
+    with desk(tmp_path) as it:
+        name = start(it.recorder)
+        for numbers in (range(1, 6), range(6, 8)):
+            it.hear(numbers, numbered=False)
+            it.hear(numbers, '/other', numbered=False)
+        assert it.recorder.split()[0]
+        it.hear(range(8, 11), numbered=False)
+        it.recorder.stop()
+        found: dict[str, list[int]] = {'/talk': [], '/other': []}
+        for slice_number in (0, 1):
+            with it.objects()[f'{name}/{name}_{slice_number}.mcap'].open('rb') as file:
+                for _, channel, message in make_reader(file).iter_messages():
+                    found[channel.topic].append(message.sequence)
+        assert found == {'/talk': list(range(1, 11)), '/other': list(range(1, 8))}
+
+
 def test_what_is_asked_out_of_turn_is_refused(tmp_path: Path) -> None:
     """One bag at a time; without one there is nothing to stop, split or pause."""
     with desk(tmp_path) as it:

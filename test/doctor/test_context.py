@@ -102,8 +102,8 @@ def test_who_can_reach_what_listens(scene: Scene) -> None:
 
 
 def test_domains_that_are_in_use(scene: Scene) -> None:
-    """By the port on which everybody of a domain listens."""
+    """By the port on which everybody of a domain listens, or the first one who does without multicast; each domain once."""
     (scene.root / 'proc/net/udp').write_text(
-        'head\n 1: 00000000:1CE8 0:0 07\n 2: 00000000:21CA 0:0 07\n 3: 00000000:1CF2 0:0 07\n'
+        'head\n 1: 00000000:1CE8 0:0 07\n 2: 00000000:21CA 0:0 07\n 3: 00000000:1CF2 0:0 07\n 4: 0100007F:23C8 0:0 07\n'
     )
-    assert machine.domains(scene.root) == [0, 5]
+    assert machine.domains(scene.root) == [0, 5, 7]

@@ -40,9 +40,9 @@ def robot(scene: Scene) -> Scene:
     return scene
 
 
-def wrong(name: str, value: str) -> Inject:
-    """One variable of the shell."""
-    return lambda scene: scene.environ.update({name: value})
+def wrong(name: str, value: str, **more: str) -> Inject:
+    """A variable of the shell, and others that decide what is wrong with it."""
+    return lambda scene: scene.environ.update({name: value, **more})
 
 
 def without(*names: str) -> Inject:
@@ -63,9 +63,15 @@ def keys_readable_by_all(scene: Scene) -> None:
 
 def small_buffers(scene: Scene) -> None:
     scene.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
-    scene.environ['CYCLONEDDS_URI'] = '<CycloneDDS><SocketReceiveBufferSize min="10MB"/></CycloneDDS>'
+    scene.environ['CYCLONEDDS_URI'] = '<CycloneDDS><SocketReceiveBufferSize min="default" max="10MB"/></CycloneDDS>'
     scene.environ['AMENT_PREFIX_PATH'] = ''
     (scene.root / 'proc/sys/net/core/rmem_max').write_text('212992\n')
+
+
+def greedy_buffers(scene: Scene) -> None:
+    small_buffers(scene)
+    (scene.root / 'proc/sys/net/core/rmem_max').write_text(f'{8 * MEBI}\n')
+    scene.environ['CYCLONEDDS_URI'] = '<CycloneDDS><SocketReceiveBufferSize max="32MB" min=\'17 MB\'/></CycloneDDS>'
 
 
 def driver_elsewhere(scene: Scene) -> None:
@@ -177,10 +183,15 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
     'keys of a file for all to read': (keys_readable_by_all, 'secrets', 'secrets.mode', ('chmod 600', 'credentials')),
     'default secret': (wrong('AWS_SECRET_ACCESS_KEY', 'minioadmin'), 'secrets', 'secrets.default', ('make tower-secrets',)),
     'wrong domain': (wrong('ROS_DOMAIN_ID', '300'), 'ros.environment', 'ros.domain_id', ('export ROS_DOMAIN_ID=',)),
-    'discovery off': (wrong('ROS_AUTOMATIC_DISCOVERY_RANGE', 'OFF'), 'ros.environment', 'ros.discovery', ('=SUBNET',)),
+    'discovery off': (wrong('ROS_AUTOMATIC_DISCOVERY_RANGE', 'OFF', ROS_DISTRO='jazzy'), 'ros.environment', 'ros.discovery',
+                      ('=SUBNET',)),
     'middleware not installed': (wrong('RMW_IMPLEMENTATION', 'rmw_zenoh_cpp'), 'ros.environment', 'ros.middleware',
                                  ('apt install', 'rmw-zenoh-cpp')),
     'driver in another domain': (driver_elsewhere, 'ros.environment', 'ros.driver', ('export ROS_DOMAIN_ID=5',)),
+    'discovery in a word that is not of Humble': (wrong('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST', ROS_DISTRO='humble'),
+                                                  'ros.environment', 'ros.discovery',
+                                                  ('unset ROS_AUTOMATIC', 'export ROS_LOCALHOST_ONLY=1')),
+    'Cyclone DDS that does not start': (greedy_buffers, 'sockets', 'sockets.cyclone', ('rmem_max', 'min="default" max="10MB"')),
     'small socket buffers': (small_buffers, 'sockets', 'sockets.buffer', ('net.core.rmem_max', 'sysctl')),
     'small shared memory': (without('FASTDDS_DEFAULT_PROFILES_FILE'), 'sockets', 'sockets.profile', ('fastdds_shm.xml',)),
     'small shared memory of the driver': (driver_with_small_memory(), 'sockets', 'sockets.driver',

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE
 from shadowhound_data_logger.spool import ledger
 
 HERE = Path(__file__).parent
@@ -189,7 +190,7 @@ class Processes:
         self.started: list[Process] = []
         foreign = ('AWS_', 'MLFLOW_', 'SHADOWHOUND_HOME', 'SHADOWHOUND_ROBOT', 'ROS_LOCALHOST_ONLY')
         self.environ = {name: value for name, value in os.environ.items() if not name.startswith(foreign)} | {
-            'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(folder / 'ros'),
+            'ROS_DOMAIN_ID': str(domain), **THIS_MACHINE, 'ROS_LOG_DIR': str(folder / 'ros'),
             'RCUTILS_COLORIZED_OUTPUT': '0', 'PYTHONUNBUFFERED': '1',
         }  # fmt: skip
 

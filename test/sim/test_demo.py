@@ -301,6 +301,29 @@ def test_times_that_make_no_sense_are_refused(arguments: list[str], tmp_path: Pa
     assert not (tmp_path / 'demo').exists()
 
 
+def test_errors_of_the_node_are_told(good: Scene) -> None:
+    """How many, and the first of them, as it stands in the log."""
+    record = Record(good.published, (READING,), None, ('[ERROR] [1.0] [sensor_logger]: intake failed', 'another'))
+    text = said(good.audit(), record)
+    assert 'Errors that the node logged: 2' in text
+    assert '[ERROR] [1.0] [sensor_logger]: intake failed' in text
+    assert 'another' not in text
+
+
+@pytest.mark.parametrize(
+    'line',
+    ['[ERROR] [1.1] [sensor_logger]: intake failed', '[FATAL] [1.1] [sensor_logger]: no', 'Traceback (most recent call last):'],
+)
+def test_a_node_that_logged_an_error_is_told(tmp_path: Path, line: str) -> None:
+    """However well the ledger balances: each line counts, and lines that only speak of errors do not."""
+    log = tmp_path / 'node.log'
+    with demo_processes.Child('platform', [], os.environ, log) as child:
+        child.stop(30.0)
+        assert child.errors() == []
+        log.write_text(f'[WARN] [1760788800.0] [sensor_logger]: an ERROR was avoided\n{line}\n', encoding='utf-8')
+        assert child.errors() == [line]
+
+
 @pytest.mark.long('a whole demo')
 @pytest.mark.ros
 @pytest.mark.seaweedfs
