@@ -32,7 +32,7 @@ def alone(uri: str, points: int) -> float:
     from mlflow.entities import Metric  # noqa: PLC0415
 
     client = MlflowClient(uri)
-    run_id = client.create_run('0').info.run_id
+    run_id = client.create_run(client.get_experiment_by_name('thor_missions').experiment_id).info.run_id
     now_ms = time.time_ns() // 1_000_000
     began = time.perf_counter()
     for first in range(0, points, BATCH):
@@ -62,6 +62,7 @@ def measure(options: argparse.Namespace) -> Report:
     os.environ |= ENVIRONMENT
     options.folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=options.folder) as folder, Tower(Path(folder) / 'tower', mlflow=True) as tower:
+        os.environ |= tower.environment()
         progress('log_batch alone')
         theirs = alone(tower.tracking_uri, options.points)
         progress('the replay of a journal')

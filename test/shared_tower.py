@@ -18,6 +18,8 @@ from typing import Any, Final
 from shadowhound_data_logger.config import StoreSettings
 from shadowhound_data_logger.sim.tower import OWNER, Tower
 
+ROBOTS: Final = ('thor', 'tachi')
+"""The latter's password is changed by a test."""
 WAIT_S: Final = 180.0
 """For both servers, on a machine on which all workers begin at the same time."""
 
@@ -27,11 +29,16 @@ class SharedTower:
 
     def __init__(self, told: Mapping[str, Any]) -> None:
         self._environments: dict[str, dict[str, str]] = told['environments']
+        self._trackings: dict[str, dict[str, str]] = told['trackings']
+        self._folder = Path(told['folder'])
         self.endpoint_url: str = told['endpoint_url']
         self.tracking_uri: str = told['tracking_uri']
 
     def environment(self, user: str = OWNER) -> dict[str, str]:
         return dict(self._environments[user])
+
+    def tracking(self, user: str) -> dict[str, str]:
+        return dict(self._trackings[user])
 
     def store_settings(self, user: str = OWNER) -> StoreSettings:
         environ = self._environments[user]
@@ -66,9 +73,13 @@ def _start(folder: Path, arguments: Sequence[str]) -> None:
 
 def main(folder: str, owner: str, users: str, *options: str) -> None:
     watched = os.pidfd_open(int(owner))
-    with Tower(Path(folder) / 'data', mlflow='--mlflow' in options, users=json.loads(users)) as tower:
-        environments = {user: tower.environment(user) for user in (OWNER, *json.loads(users))}
-        told = {'endpoint_url': tower.endpoint_url, 'tracking_uri': tower.tracking_uri, 'environments': environments}
+    data, has_mlflow = Path(folder) / 'data', '--mlflow' in options
+    with Tower(data, mlflow=has_mlflow, users=json.loads(users), robots=ROBOTS) as tower:
+        told = {
+            'folder': str(data), 'endpoint_url': tower.endpoint_url, 'tracking_uri': tower.tracking_uri,
+            'environments': {user: tower.environment(user) for user in (OWNER, *json.loads(users))},
+            'trackings': {user: tower.tracking(user) for user in (OWNER, 'spark', *ROBOTS)} if has_mlflow else {},
+        }  # fmt: skip
         part = Path(folder) / 'tower.json.part'
         part.touch(mode=0o600)
         part.write_text(json.dumps(told))

@@ -48,5 +48,6 @@ def reload_s3(folder: Path) -> None:
 
 
 def remove_database(folder: Path, offset: int) -> None:
-    """Where run.py puts PostgreSQL's files for root, whose own folders its user cannot enter."""
-    shutil.rmtree(run.root_database(folder, offset), ignore_errors=True)
+    """Where run.py puts the files of PostgreSQL and MLflow for root, whose own folders their user cannot enter."""
+    for path in run.unprivileged_folders(folder, offset).values():
+        shutil.rmtree(path, ignore_errors=True)

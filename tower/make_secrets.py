@@ -2,11 +2,13 @@
 """Makes the credentials of a Tower, once, in files that their owner alone can read; it needs the standard library and openssl.
 
     .env                  what compose.yaml and run.py read: passwords, the address to listen on
-    secrets/users.json    the S3 users, their keys (the newest first) and what they may do: the one place where keys stand
+    secrets/users.json    the users, their keys and passwords (the newest first): the one place where these stand
     secrets/s3.json       the same as SeaweedFS reads it
     secrets/seaweedfs.*   what SeaweedFS's own servers know one another by: signing keys and a certificate
     secrets/NAME.env      what a robot or Spark puts into its environment: copy it there, mode 600
-    secrets/NAME.credentials   its keys alone, as a shared-credentials file: what is to be copied when they change
+    secrets/NAME.credentials   its keys and its password alone, as S3 clients and MLflow's read them from a file: what is to be
+                          copied when they change
+    mlflow/users.json     digests of MLflow's passwords, which tell nobody anything: the server reads it, as another user
 
 What is there already stays: running it again adds what is missing. ``--rotate NAME`` gives a user a new key beside the old one,
 so that nothing stops; ``--retire NAME`` ends the old one once the new one is in use.
@@ -15,6 +17,7 @@ so that nothing stops; ``--retire NAME`` ends the old one once the new one is in
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import re
@@ -32,6 +35,8 @@ ADMIN = ('Admin', 'Read', 'Write', 'List', 'Tagging')
 NAME = re.compile(r'[a-z0-9][a-z0-9_-]{0,62}')
 """A robot's name leads its keys, and is part of a pattern here: no wildcard may be in it."""
 OWN_USERS = ('tower', 'mlflow', 'spark')
+NO_LOGIN = 'mlflow'
+"""The server's own user of S3, which is none of MLflow's."""
 SIGNING_KEYS = (
     'WEED_JWT_SIGNING_KEY', 'WEED_JWT_SIGNING_READ_KEY', 'WEED_JWT_FILER_SIGNING_KEY', 'WEED_JWT_FILER_SIGNING_READ_KEY',
 )  # fmt: skip
@@ -59,16 +64,19 @@ def actions(user: str) -> list[str]:
 
 
 def new_key() -> dict[str, str]:
-    """An access key of 20 characters and a secret of 256 bits."""
-    return {'accessKey': secrets.token_hex(10).upper(), 'secretKey': secrets.token_urlsafe(32)}
+    """An access key of 20 characters, its secret and a password for MLflow, of 256 bits each."""
+    return {
+        'accessKey': secrets.token_hex(10).upper(), 'secretKey': secrets.token_urlsafe(32), 'password': secrets.token_urlsafe(32),
+    }  # fmt: skip
 
 
-def write(path: Path, text: str) -> None:
-    """Under its name only when it is whole, and never readable by others, not even for an instant."""
+def write(path: Path, text: str, mode: int = 0o600) -> None:
+    """Under its name only when it is whole, and by default never readable by others, not even for an instant."""
     part = path.with_name(f'{path.name}.part')
     part.unlink(missing_ok=True)
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), 'w', encoding='utf-8') as file:
         file.write(text)
+        os.fchmod(file.fileno(), mode)
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
@@ -97,8 +105,21 @@ def load_users(path: Path) -> dict[str, list[dict[str, str]]]:
 
 def seaweed(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
     """The identities as ``weed s3 -config`` reads them."""
-    identities = [{'name': user, 'credentials': list(keys), 'actions': actions(user)} for user, keys in users.items()]
+    identities = [
+        {'name': user, 'actions': actions(user),
+         'credentials': [{name: key[name] for name in ('accessKey', 'secretKey')} for key in keys]}
+        for user, keys in users.items()
+    ]  # fmt: skip
     return json.dumps({'identities': identities}, indent=1) + '\n'
+
+
+def logins(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
+    """Who may log in to MLflow, as its server checks it (shadowhound_data_logger/sim/mlflow_access.py)."""
+    digests = {
+        user: [hashlib.sha256(key['password'].encode()).hexdigest() for key in keys]
+        for user, keys in users.items() if user != NO_LOGIN
+    }  # fmt: skip
+    return json.dumps(digests, indent=1) + '\n'
 
 
 def environment(user: str, key: Mapping[str, str], host: str, scheme: str) -> str:
@@ -109,14 +130,18 @@ def environment(user: str, key: Mapping[str, str], host: str, scheme: str) -> st
         'AWS_ENDPOINT_URL': store, 'AWS_ACCESS_KEY_ID': key['accessKey'], 'AWS_SECRET_ACCESS_KEY': key['secretKey'],
         'AWS_DEFAULT_REGION': 'us-east-1', 'MLFLOW_TRACKING_URI': f'{scheme}://{host}:5001', 'MLFLOW_S3_ENDPOINT_URL': store,
     }  # fmt: skip
+    if user != NO_LOGIN:
+        values |= {'MLFLOW_TRACKING_USERNAME': user, 'MLFLOW_TRACKING_PASSWORD': key['password']}
     if user not in OWN_USERS:
         values['SHADOWHOUND_ROBOT'] = user
     return lines(values)
 
 
-def credentials(key: Mapping[str, str]) -> str:
-    """A shared-credentials file, which a running program reads again: its environment it cannot."""
-    return f'[default]\naws_access_key_id = {key["accessKey"]}\naws_secret_access_key = {key["secretKey"]}\n'
+def credentials(user: str, key: Mapping[str, str]) -> str:
+    """A shared-credentials file, which a running program reads again, and MLflow's clients as well: its environment it cannot."""
+    keys = f'[default]\naws_access_key_id = {key["accessKey"]}\naws_secret_access_key = {key["secretKey"]}\n'
+    login = f'[mlflow]\nmlflow_tracking_username = {user}\nmlflow_tracking_password = {key["password"]}\n'
+    return keys + (login if user != NO_LOGIN else '')
 
 
 def has_certificate(folder: Path) -> bool:
@@ -134,6 +159,7 @@ def own_settings(folder: Path, host: str | None, users: Mapping[str, Sequence[Ma
         'POSTGRES_PASSWORD': before.get('POSTGRES_PASSWORD') or secrets.token_hex(24),
         'TOWER_ACCESS_KEY_ID': tower['accessKey'], 'TOWER_SECRET_ACCESS_KEY': tower['secretKey'],
         'MLFLOW_ACCESS_KEY_ID': mlflow['accessKey'], 'MLFLOW_SECRET_ACCESS_KEY': mlflow['secretKey'],
+        'TOWER_MLFLOW_PASSWORD': tower['password'],
     }  # fmt: skip
 
 
@@ -179,6 +205,8 @@ def make(
             raise Refused(f'{name!r} is no name for a robot: lower-case letters, digits, "-" and "_"')
     for name in dict.fromkeys((*OWN_USERS, *robots)):
         users.setdefault(name, [new_key()])
+    for key in (key for keys in users.values() for key in keys):  # of before MLflow had passwords
+        key.setdefault('password', secrets.token_urlsafe(32))
     for name in (*rotate, *retire):
         if name not in users:
             raise Refused(f'there is no user {name}; there are {", ".join(users)}')
@@ -192,9 +220,12 @@ def make(
     if not all((hidden / name).is_file() for name in (CERTIFICATE, CERTIFICATE_KEY)):
         make_certificate(hidden)
     write(hidden / 'seaweedfs.env', lines(seaweed_environment(read_env(hidden / 'seaweedfs.env'))))
+    (folder / 'mlflow').mkdir(mode=0o755, exist_ok=True)
+    (folder / 'mlflow').chmod(0o755)
+    write(folder / 'mlflow' / 'users.json', logins(users), 0o644)
     write(folder / '.env', lines(settings))
     for name, keys in users.items():
-        write(hidden / f'{name}.credentials', credentials(keys[0]))
+        write(hidden / f'{name}.credentials', credentials(name, keys[0]))
         write(hidden / f'{name}.env', environment(name, keys[0], settings['TOWER_HOST'], settings['TOWER_SCHEME']))
     return list(users)
 
@@ -217,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     print(f'users {", ".join(users)}: {options.folder / "secrets"}/NAME.env is what each puts into its environment (mode 600)')
     if options.rotate or options.retire:
-        print('the S3 server reads it on SIGHUP: docker compose kill -s HUP s3')
+        print('MLflow knows it; the S3 server reads it on SIGHUP: docker compose kill -s HUP s3')
     return 0
 
 

@@ -1,7 +1,8 @@
 """Runs a Tower without Docker, in the foreground: SeaweedFS, PostgreSQL where it is installed (else SQLite) and MLflow.
 
 The same set-up as compose.yaml, as plain processes of this user, with the credentials of make_secrets.py and the data below one
-folder. It returns when it is interrupted, and leaves no process behind, however it ends.
+folder. It returns when it is interrupted, and leaves no process behind, however it ends. As root it runs PostgreSQL and MLflow as
+another user, whose files are below /var/lib.
 """
 
 from __future__ import annotations
@@ -16,15 +17,18 @@ import signal
 import ssl
 import subprocess
 import sys
+import time
 import urllib.request
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
 import make_secrets
 
 from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.sim import mlflow_access
 from shadowhound_data_logger.sim.servers import GRPC, Server, ServerFailed, find_program, seaweed_sockets
 
 HERE: Final = Path(__file__).resolve().parent
@@ -32,7 +36,8 @@ S3_PORT, MLFLOW_PORT, POSTGRES_PORT, MASTER_PORT = 9000, 5001, 5432, 9333
 LOOPBACK: Final = '127.0.0.1'
 EVERY_ADDRESS: Final = ('0.0.0.0', '::')  # noqa: S104 - as it may be asked for
 READY_S: Final = 120.0
-POSTGRES_USER: Final = 'postgres'
+LOOK_S: Final = 1.0
+POSTGRES_USER, NOBODY = 'postgres', 'nobody'
 
 
 class Runner:
@@ -44,6 +49,8 @@ class Runner:
         self._offset = offset
         self._settings = make_secrets.read_env(folder / '.env')
         self._running = ExitStack()
+        self._owner = _unprivileged()
+        self._given: dict[str, str] = {}
         self._certificate = [folder.absolute() / 'tls' / name for name in ('ca.pem', 'tower.crt', 'tower.key')]
         self._has_tls = make_secrets.has_certificate(folder)
         scheme = 'https' if self._has_tls else 'http'
@@ -59,8 +66,13 @@ class Runner:
             self._start_s3(running)
             self._prepare(robots)
             uri = self._start_postgres(running)
-            self._start_mlflow(running, uri)
+            self._start_mlflow(running, uri, robots)
             self._running = running.pop_all()
+
+    def look(self) -> None:
+        """Hand on to MLflow who its users are by now, where it cannot look itself."""
+        if self._owner:
+            self._give(self._folder / 'mlflow' / 'users.json')
 
     def stop(self) -> None:
         """Ends them, the one that needs the others first; idempotent."""
@@ -122,14 +134,15 @@ class Runner:
         if programs is None:
             print('PostgreSQL is not installed here: MLflow keeps its runs in SQLite (Debian: apt install postgresql)')
             self.database = 'SQLite'
-            return f'sqlite:///{self._folder / "data" / "mlflow" / "mlflow.db"}'
+            before, database = (folder / 'mlflow.db' for folder in (self._folder / 'data' / 'mlflow', self._mlflow_folder()))
+            if before.exists() and not database.exists():  # of when root ran MLflow itself
+                with database.open('xb') as file:
+                    file.write(before.read_bytes())
+                self._hand_over(database)
+            return f'sqlite:///{database}'
         self.database = 'PostgreSQL'
-        home, owner = self._folder / 'data' / 'postgres', _unprivileged()
-        if owner:  # as root PostgreSQL does not run, and its user has to get to its folder
-            home = root_database(self._folder, self._offset)
-            home.mkdir(mode=0o700, exist_ok=True)
-            shutil.chown(home, owner, owner)
-        as_owner = ['setpriv', f'--reuid={owner}', f'--regid={owner}', '--init-groups', '--'] if owner else []
+        home = self._folder_of('postgres') if self._owner else self._folder / 'data' / 'postgres'
+        as_owner = self._as_owner()
         port = POSTGRES_PORT + self._offset
         if not (home / 'data' / 'PG_VERSION').exists():
             made = subprocess.run([*as_owner, str(programs / 'initdb'), '-D', str(home / 'data'), '-U', 'mlflow', '--auth=peer',
@@ -144,35 +157,97 @@ class Runner:
         server.wait(lambda: subprocess.run(ask, check=False, cwd='/').returncode == 0, READY_S)
         return f'postgresql+psycopg2://mlflow@/postgres?host={home}&port={port}'
 
-    def _start_mlflow(self, running: ExitStack, uri: str) -> None:
-        mlflow = find_program('mlflow', 'pip install mlflow')
-        command = [mlflow, 'server', '--host', self._bind, '--port', str(MLFLOW_PORT + self._offset), '--workers', '1',
-                   '--backend-store-uri', uri, '--artifacts-destination', 's3://mlflow']  # fmt: skip
+    def _folder_of(self, name: str) -> Path:
+        """A folder of the unprivileged user, which could not get to root's own, and of nobody else."""
+        folder = unprivileged_folders(self._folder, self._offset)[name]
+        folder.mkdir(mode=0o700, exist_ok=True)
+        self._hand_over(folder)
+        return folder
+
+    def _hand_over(self, path: Path) -> None:
+        if self._owner:
+            user = pwd.getpwnam(self._owner)
+            os.chown(path, user.pw_uid, user.pw_gid, follow_symlinks=False)
+
+    def _as_owner(self) -> list[str]:
+        """What a command begins with to run as the unprivileged user."""
+        if not self._owner:
+            return []
+        group = pwd.getpwnam(self._owner).pw_gid
+        return ['setpriv', f'--reuid={self._owner}', f'--regid={group}', '--init-groups', '--no-new-privs', 'env', '--chdir=/']
+
+    def _mlflow_folder(self) -> Path:
+        """Where MLflow's own files are."""
+        return self._folder_of('mlflow') if self._owner else self._folder / 'data' / 'mlflow'
+
+    def _give(self, path: Path) -> Path:
+        """A file as MLflow can read it: the file itself, or a copy for its user alone, made anew when the file has changed."""
+        if not self._owner:
+            return path
+        copy, content = self._mlflow_folder() / path.name, path.read_text(encoding='utf-8')
+        if content != self._given.get(path.name):
+            make_secrets.write(part := copy.with_suffix('.new'), content)
+            self._hand_over(part)
+            part.replace(copy)
+            self._given[path.name] = content
+        return copy
+
+    def _python(self) -> list[str]:
+        """The command of an interpreter with MLflow that the server's user may run. Raises ServerFailed."""
+        found = find_spec('mlflow')
+        if found is None or not found.origin:
+            raise ServerFailed('MLflow is not installed', remedy='pip install mlflow flask-wtf')
+        if not self._owner:
+            return [sys.executable]
+        places = os.pathsep.join((str(Path(found.origin).parents[1]), str(HERE.parent)))
+        ask = 'import sys; from importlib.util import find_spec; sys.exit(not (find_spec("mlflow") and find_spec(sys.argv[1])))'
+        usual = f'/usr/bin/python{sys.version_info.major}.{sys.version_info.minor}'
+        for command in ([sys.executable], ['env', f'PYTHONPATH={places}', usual]):
+            words = [*self._as_owner(), *command, '-c', ask, mlflow_access.__name__]
+            if subprocess.run(words, capture_output=True, check=False).returncode == 0:
+                return command
+        remedy = 'run the Tower as a user of its own, or install Python where others may read it'
+        raise ServerFailed(f'MLflow does not run as root, and the user {self._owner} cannot run {sys.executable}', remedy=remedy)
+
+    def _start_mlflow(self, running: ExitStack, uri: str, robots: Sequence[str]) -> None:
+        folder, users = self._mlflow_folder(), self._give(self._folder / 'mlflow' / 'users.json')
+        command = [*self._as_owner(), *self._python(), '-m', 'mlflow', 'server', *mlflow_access.APP, '--host', self._bind,
+                   '--port', str(MLFLOW_PORT + self._offset), '--workers', '1', '--backend-store-uri', uri,
+                   '--artifacts-destination', 's3://mlflow']  # fmt: skip
         if self._bind not in EVERY_ADDRESS:  # else MLflow answers to private addresses, and to no name
             command += ['--allowed-hosts', ','.join(f'{host}:*' for host in (self._bind, 'localhost', LOOPBACK))]
         environ = self._environ(
             AWS_ACCESS_KEY_ID=self._settings['MLFLOW_ACCESS_KEY_ID'],
             AWS_SECRET_ACCESS_KEY=self._settings['MLFLOW_SECRET_ACCESS_KEY'], AWS_DEFAULT_REGION='us-east-1',
-            MLFLOW_S3_ENDPOINT_URL=self.store_url, MLFLOW_DISABLE_TELEMETRY='true',
-            MLFLOW_SERVER_ENABLE_JOB_EXECUTION='false',
+            MLFLOW_S3_ENDPOINT_URL=self.store_url, HOME=str(folder), **mlflow_access.environment(folder, users, uri),
         )  # fmt: skip
         trust: ssl.SSLContext | None = None
         if self._has_tls:
-            command += ['--uvicorn-opts', shlex.join(
-                [f'--ssl-certfile={self._certificate[1]}', f'--ssl-keyfile={self._certificate[2]}'])]  # fmt: skip
+            authority, certificate, key = (self._give(path) for path in self._certificate)
+            environ['AWS_CA_BUNDLE'] = str(authority)
+            command += ['--uvicorn-opts', shlex.join([f'--ssl-certfile={certificate}', f'--ssl-keyfile={key}'])]
             trust = ssl.create_default_context(cafile=self._certificate[0])
+        if self._owner:
+            self._hand_over(folder / 'auth.ini')
+            print(f'MLflow does not run as root: it is the user {self._owner} here, and its files are in {folder}')
         server = self._launch(running, 'mlflow', command, environ)
-        server.wait(lambda: _answers(f'{self.tracking_uri}/health', trust), READY_S)
+        server.wait(lambda: mlflow_access.is_up(self.tracking_uri, trust), READY_S)
+        try:
+            for text in mlflow_access.prepare(self.tracking_uri, self._settings['TOWER_MLFLOW_PASSWORD'], robots, trust):
+                print(text)
+        except mlflow_access.NotPrepared as error:
+            raise ServerFailed(str(error)) from error
 
 
-def root_database(folder: Path, offset: int) -> Path:
-    """Where PostgreSQL's files are when root runs the Tower of this folder: each folder's are its own."""
-    return Path('/var/lib') / f'shadowhound-tower-{hashlib.sha256(bytes(folder.absolute())).hexdigest()[:12]}-{offset}'
+def unprivileged_folders(folder: Path, offset: int) -> dict[str, Path]:
+    """Where the files of PostgreSQL and MLflow are when root runs the Tower of this folder: each folder's are its own."""
+    ours = Path('/var/lib') / f'shadowhound-tower-{hashlib.sha256(bytes(folder.absolute())).hexdigest()[:12]}-{offset}'
+    return {'postgres': ours, 'mlflow': ours.with_name(f'{ours.name}-mlflow')}
 
 
-def _answers(url: str, trust: ssl.SSLContext | None = None) -> bool:
+def _answers(url: str) -> bool:
     try:
-        with urllib.request.urlopen(url, timeout=5.0, context=trust) as answer:  # noqa: S310 - http, by us
+        with urllib.request.urlopen(url, timeout=5.0) as answer:  # noqa: S310 - http, by us
             return bool(answer.status == 200)
     except OSError:
         return False
@@ -187,13 +262,11 @@ def _postgres() -> Path | None:
 
 
 def _unprivileged() -> str:
-    """The user that PostgreSQL has to run as; empty where that is this one."""
+    """The user that the servers run as which must not be root; empty where this one is not."""
     if os.geteuid():
         return ''
-    try:
-        return pwd.getpwnam(POSTGRES_USER).pw_name
-    except KeyError as error:
-        raise ServerFailed('PostgreSQL does not run as root', remedy='run the Tower as a user of its own') from error
+    there = {user.pw_name for user in pwd.getpwall()}
+    return POSTGRES_USER if POSTGRES_USER in there else NOBODY
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -220,7 +293,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             tower.start([name for name in users if name not in make_secrets.OWN_USERS])
             print(f'S3 (SeaweedFS)  {tower.store_url}\nMLflow          {tower.tracking_uri}   ({tower.database})')
             print(f'credentials     {options.folder / "secrets"}/NAME.env   (thor, spark, ...)', flush=True)
-            signal.pause()
+            while True:
+                time.sleep(LOOK_S)
+                tower.look()
         finally:
             tower.stop()
     except KeyboardInterrupt:
@@ -228,7 +303,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (DataLoggerError, make_secrets.Refused, OSError) as error:
         print(error, file=sys.stderr)
         return 1
-    return 0
 
 
 if __name__ == '__main__':

@@ -79,14 +79,15 @@ def show(*, folder: MissionFolder, as_json: bool) -> int:
 
 @missions.command()
 @click.option('--deadline', type=click.FloatRange(0.0, 1e6), default=60.0, show_default=True, help='Seconds to wait.')
-@click.option('--experiment', default='thor_missions', show_default=True, help='The MLflow experiment of new runs.')
-def resume(*, deadline: float, experiment: str) -> int:
+@click.option('--experiment', help='The MLflow experiment of new runs.  [default: ROBOT_missions]')
+def resume(*, deadline: float, experiment: str | None) -> int:
     """Send what is unsent, and wait for it. Exit code 1 when something stays; it is tried on for ten minutes then."""
     where = home(os.environ)
     if not _late(overviews(where)):
         click.echo('Nothing is left to send.')
         return 0
-    replayer = Replayer(where, experiment, os.environ)
+    robot = os.environ.get('SHADOWHOUND_ROBOT') or 'thor'
+    replayer = Replayer(where, experiment or f'{robot}_missions', os.environ)
     replayer.start()
     try:
         left = _wait(where, time.monotonic() + deadline)

@@ -12,6 +12,7 @@ from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.doctor import services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.machine import variables
+from shadowhound_data_logger.doctor.mlflow_rest import LOGIN, login
 from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DEFAULTS
 from shadowhound_data_logger.spool import status
@@ -132,6 +133,14 @@ def _tracking(context: Context) -> Iterator[Result]:
         )
     elif uri:
         yield ok('environment.tracking', f'MLFLOW_TRACKING_URI is {services.shown(uri)}')
+    missing = [name for name, value in zip(LOGIN, login(environ, home_of(context)), strict=True) if not value]
+    if uri.startswith('http') and len(missing) == 1:
+        yield error(
+            'environment.login',
+            f'{missing[0]} is not set, and the other half of the pair is',
+            'MLflow sends neither without both',
+            f'export {missing[0]}=...  # or both in ~/.mlflow/credentials',
+        )
     endpoint = context.settings.store.endpoint_url
     if uri.startswith('http') and endpoint and not s3:
         yield info(

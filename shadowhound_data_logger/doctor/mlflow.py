@@ -1,12 +1,13 @@
-"""MLflow: whether it answers, takes an experiment, and whether artifacts reach the store that they are meant for.
+"""MLflow: whether it answers, asks for a password, takes runs, and whether artifacts reach the store that they are meant for.
 
-What it leaves behind: the experiment ``_doctor`` with one tag, and one artifact of 64 bytes under it.
+What it leaves behind: one tag and one artifact of 64 bytes, in the experiment of the robot's missions; on Spark, which only reads
+that, and before there is one, in an experiment of its own (``_doctor``, and the user's name).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from typing import Any, Final
@@ -15,15 +16,14 @@ from urllib.parse import urlsplit
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.doctor import s3_put, services
+from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.mlflow_rest import MlflowRest
-from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, skipped
+from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, skipped, warning
 from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S
 from shadowhound_data_logger.errors import StoreError, TrackingError, TrackingRefused, TrackingUnavailable
 
 NAME: Final = 'mlflow'
 PROBE: Final = '_doctor'
-MISSIONS: Final = 'thor_missions'
-"""The experiment of MissionDataLogger."""
 LOGS: Final = 'on Tower: docker logs --tail 50 mlflow || docker compose logs --tail 50 mlflow'
 S3_OF_SERVER: Final = (
     "MLflow's own environment on Tower lacks AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY or MLFLOW_S3_ENDPOINT_URL, "
@@ -42,14 +42,28 @@ def check(context: Context) -> Iterator[Result]:
         yield skipped(NAME, failed)
         return
     try:
-        rest = MlflowRest(service, context.environ)
+        rest = MlflowRest(service, context.environ, home_of(context))
         yield from _health(rest, service.url)
-        experiment = _probe(rest)
-        yield ok('mlflow.experiment', f'the experiment {PROBE} was written to')
-        yield from _missions(rest)
-        yield from _artifacts(rest, str(experiment['artifact_location']), context)
+        if rest.is_open():
+            yield warning(
+                'mlflow.open',
+                f'{service.url} asks nobody for a password',
+                'whoever reaches that port reads, changes and deletes missions, and runs the server as they like',
+                'on Tower: make tower-secrets, and start MLflow as tower/compose.yaml does (docs/tower.md)',
+            )
+        missions = f'{context.settings.robot}_missions'
+        found = rest.experiment(missions)
+        yield from _missions(missions, found)
+        if found is not None and found.get('lifecycle_stage') == 'deleted':
+            return
+        if found is None or context.role is Role.SPARK:
+            missions = f'{PROBE}_{rest.user}' if rest.user else PROBE
+            found = _own(rest, missions)
+        rest.tag(found['experiment_id'], 'shadowhound.doctor', iso(time.time_ns()))
+        yield ok('mlflow.experiment', f'the experiment {missions} was written to')
+        yield from _artifacts(rest, missions, str(found['artifact_location']), context)
     except TrackingError as problem:
-        yield _failed(problem, service.variable)
+        yield _failed(problem, service.variable, context.settings.robot)
     except OSError as problem:  # a file of certificates; network.mlflow.tls has more to say
         yield error('mlflow.tls', f'no certificate of {service.url} can be judged: {problem}', '', 'see network.mlflow.tls')
 
@@ -62,7 +76,7 @@ def _health(rest: MlflowRest, url: str) -> Iterator[Result]:
     yield ok('mlflow.health', f'MLflow {version} answers', version=version)
 
 
-def _failed(problem: TrackingError, variable: str) -> Result:
+def _failed(problem: TrackingError, variable: str, robot: str) -> Result:
     status, text = problem.data.get('status', 0), problem.data.get('text', '')
     cause, remedy = 'the server hangs, or waits for a database that is away', f'{LOGS} ; docker compose restart mlflow'
     if 'Host header' in text:
@@ -70,8 +84,21 @@ def _failed(problem: TrackingError, variable: str) -> Result:
             'MLflow takes requests for its own names only',
             'on Tower: mlflow server --allowed-hosts TOWER_IP:5001,...',
         )
-    elif status in {401, 403} and not text.startswith('<'):
-        cause, remedy = 'it wants a user, or another one', 'export MLFLOW_TRACKING_USERNAME=... MLFLOW_TRACKING_PASSWORD=...'
+    elif status == 401 and not text.startswith('<'):
+        return error(
+            'mlflow.login',
+            str(problem),
+            'it wants a user and a password, or another one: they may have been changed',
+            'export MLFLOW_TRACKING_USERNAME=... MLFLOW_TRACKING_PASSWORD=...  # of tower/secrets/NAME.env on Tower, or '
+            'its NAME.credentials as ~/.mlflow/credentials',
+        )
+    elif status == 403 and not text.startswith('<'):
+        return error(
+            'mlflow.login',
+            str(problem),
+            f'this user may not: MLFLOW_TRACKING_USERNAME is that of another machine, or Tower does not know {robot} as a robot',
+            f'on Tower: make tower-secrets TOWER_ARGS="--robot {robot}", start MLflow again, and bring {robot}.env here',
+        )
     elif 400 <= status < 500 or 'like an MLflow server' in str(problem):
         cause, remedy = 'something else listens on this port', f'export {variable}=http://TOWER_IP:5001'
     elif status >= 500:
@@ -79,42 +106,38 @@ def _failed(problem: TrackingError, variable: str) -> Result:
     return error('mlflow.answer', str(problem), cause, remedy)
 
 
-def _probe(rest: MlflowRest) -> dict[str, Any]:
-    """The probe's experiment, made or brought back where need be, and written to."""
-    found = rest.experiment(PROBE)
+def _own(rest: MlflowRest, name: str) -> dict[str, Any]:
+    """An experiment of the doctor's own, made or brought back where need be."""
+    found = rest.experiment(name)
     if found is None:
         try:
-            rest.create(PROBE)
+            rest.create(name)
         except TrackingRefused as problem:
             if problem.data['code'] != 'RESOURCE_ALREADY_EXISTS':  # another doctor's
                 raise
-        found = rest.experiment(PROBE)
+        found = rest.experiment(name)
     if found is None:
-        raise TrackingUnavailable(f'the experiment {PROBE} was created and is not there', code='')
+        raise TrackingUnavailable(f'the experiment {name} was created and is not there', code='')
     if found.get('lifecycle_stage') == 'deleted':
         rest.restore(found['experiment_id'])
-    rest.tag(found['experiment_id'], 'shadowhound.doctor', iso(time.time_ns()))
     return found
 
 
-def _missions(rest: MlflowRest) -> Iterator[Result]:
+def _missions(name: str, found: Mapping[str, Any] | None) -> Iterator[Result]:
     """The experiment of the missions, if there is one: where artifacts go is fixed when it is created."""
-    found = rest.experiment(MISSIONS)
     if found is None:
-        yield info('mlflow.missions', f'there is no experiment {MISSIONS} yet: no mission has been logged')
+        yield info('mlflow.missions', f'there is no experiment {name} yet: no mission has been logged')
         return
     where = str(found['artifact_location'])
     if found.get('lifecycle_stage') == 'deleted':
         yield error(
             'mlflow.missions',
-            f'the experiment {MISSIONS} is deleted',
+            f'the experiment {name} is deleted',
             'missions wait until it is back',
             f'on Tower: mlflow experiments restore -x {found["experiment_id"]}',
         )
-    elif _is_folder(where):
-        yield _local(f'the experiment {MISSIONS}', where)
-    else:
-        yield ok('mlflow.missions', f'the experiment {MISSIONS} keeps its artifacts in {where}')
+    elif not _is_folder(where):
+        yield ok('mlflow.missions', f'the experiment {name} keeps its artifacts in {where}')
 
 
 def _is_folder(location: str) -> bool:
@@ -132,7 +155,7 @@ def _local(who: str, location: str) -> Result:
     )
 
 
-def _artifacts(rest: MlflowRest, location: str, context: Context) -> Iterator[Result]:
+def _artifacts(rest: MlflowRest, name: str, location: str, context: Context) -> Iterator[Result]:
     """One artifact to where this server's clients send them, and back."""
     scheme = urlsplit(location).scheme
     if scheme == 'mlflow-artifacts':
@@ -140,7 +163,7 @@ def _artifacts(rest: MlflowRest, location: str, context: Context) -> Iterator[Re
     elif scheme == 's3':
         yield from _direct(location, context)
     elif _is_folder(location):
-        yield _local('a new experiment', location)
+        yield _local(f'the experiment {name}', location)
     else:
         yield info('mlflow.artifacts', f'artifacts go to {location}, which is not asked')
 

@@ -6,10 +6,12 @@ https://mlflow.org/docs/latest/api_reference/rest-api.html
 from __future__ import annotations
 
 import base64
+import configparser
 import http.client
 import json
 import ssl
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final
 from urllib.error import HTTPError, URLError
 from urllib.parse import quote, urlencode
@@ -18,6 +20,7 @@ from urllib.request import Request, urlopen
 from shadowhound_data_logger.doctor.services import ANSWER_S, Service
 from shadowhound_data_logger.errors import TrackingError, TrackingRefused, TrackingUnavailable
 
+LOGIN: Final = ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD')
 TEXT: Final = 300
 """Letters of an answer that are shown."""
 
@@ -25,9 +28,12 @@ TEXT: Final = 300
 class MlflowRest:
     """One server. Raises TrackingUnavailable without an answer, TrackingRefused (data: status, code, text) after others."""
 
-    def __init__(self, service: Service, environ: Mapping[str, str]) -> None:
+    def __init__(self, service: Service, environ: Mapping[str, str], home: Path) -> None:
+        """``home`` is the user's, where MLflow's clients look for a user and a password that are not in the environment."""
         self._url = service.url
-        self._headers = {'Content-Type': 'application/json', 'User-Agent': 'shadowhound-doctor', **_authorization(environ)}
+        self.user, password = login(environ, home)
+        self._headers = {'Content-Type': 'application/json', 'User-Agent': 'shadowhound-doctor'}
+        self._authorization = _authorization(self.user, password, environ.get('MLFLOW_TRACKING_TOKEN', ''))
         self._trust: ssl.SSLContext | None = None
         if service.tls:
             bundle = environ.get('MLFLOW_TRACKING_SERVER_CERT_PATH') or environ.get('REQUESTS_CA_BUNDLE') or None
@@ -45,6 +51,14 @@ class MlflowRest:
             raise
         found: dict[str, Any] = answer['experiment']
         return found
+
+    def is_open(self) -> bool:
+        """Whether it shows its experiments to somebody without a password."""
+        try:
+            self.ask('POST', f'{self._url}/api/2.0/mlflow/experiments/search', b'{"max_results": 1}', as_stranger=True)
+        except TrackingRefused:
+            return False
+        return True
 
     def create(self, name: str) -> None:
         self._json('POST', 'experiments/create', {'name': name})
@@ -72,10 +86,11 @@ class MlflowRest:
             raise TrackingUnavailable(f'{self._url} does not answer like an MLflow server', code='') from error
         return found
 
-    def ask(self, method: str, url: str, data: bytes | None = None) -> bytes:
+    def ask(self, method: str, url: str, data: bytes | None = None, *, as_stranger: bool = False) -> bytes:
         """One request."""
         try:
-            request = Request(url, data, self._headers, method=method)  # noqa: S310 - http(s), see services
+            headers = self._headers if as_stranger else {**self._headers, **self._authorization}
+            request = Request(url, data, headers, method=method)  # noqa: S310 - http(s), see services
             with urlopen(request, timeout=ANSWER_S, context=self._trust) as answer:  # noqa: S310
                 content: bytes = answer.read()
                 return content
@@ -98,9 +113,18 @@ def _refused(url: str, error: HTTPError) -> TrackingError:
     return TrackingRefused(f'{url} answers {error.code} {code}: {message[:TEXT]}', status=error.code, code=code, text=message)
 
 
-def _authorization(environ: Mapping[str, str]) -> dict[str, str]:
-    user, password = (environ.get(f'MLFLOW_TRACKING_{name}', '') for name in ('USERNAME', 'PASSWORD'))
+def login(environ: Mapping[str, str], home: Path) -> tuple[str, str]:
+    """User and password as MLflow's clients find them, each empty where there is none: variables, then ~/.mlflow/credentials."""
+    parser = configparser.ConfigParser(interpolation=None)
+    try:
+        parser.read_string((home / '.mlflow/credentials').read_text(encoding='utf-8'))
+    except (OSError, ValueError, configparser.Error):
+        parser.clear()
+    user, password = (environ.get(name) or parser.get('mlflow', name.lower(), fallback=None) or '' for name in LOGIN)
+    return user, password
+
+
+def _authorization(user: str, password: str, token: str) -> dict[str, str]:
     if user:
         return {'Authorization': 'Basic ' + base64.b64encode(f'{user}:{password}'.encode()).decode('ascii')}
-    token = environ.get('MLFLOW_TRACKING_TOKEN')
     return {'Authorization': f'Bearer {token}'} if token else {}

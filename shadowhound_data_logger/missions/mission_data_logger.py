@@ -48,10 +48,10 @@ class MissionDataLogger:
 
     def __init__(
         self, *, robot: str | None = None, home: str | os.PathLike[str] | None = None, tracking_uri: str | None = None,
-        experiment: str = 'thor_missions', start_timeout_s: float = 2.0, frame_artifact_every_s: float = 5.0,
+        experiment: str | None = None, start_timeout_s: float = 2.0, frame_artifact_every_s: float = 5.0,
         replay: bool = True,
     ) -> None:  # fmt: skip
-        """What is not given is read from SHADOWHOUND_ROBOT, SHADOWHOUND_HOME and MLFLOW_TRACKING_URI.
+        """What is not given is read from SHADOWHOUND_ROBOT, SHADOWHOUND_HOME and MLFLOW_TRACKING_URI; experiment: ROBOT_missions.
 
         Of the frames, one every ``frame_artifact_every_s`` seconds becomes an artifact of the run. ``replay=False`` only writes
         journals: another logger of the same home sends them.
@@ -68,7 +68,7 @@ class MissionDataLogger:
         self._newest: MissionFolder | None = None
         self._warned: set[str] = set()
         self._wake = threading.Event()
-        self._replayer = Replayer(self.home, experiment, self._environ) if replay else None
+        self._replayer = Replayer(self.home, experiment or f'{self.robot}_missions', self._environ) if replay else None
         self._worker = Worker('missions', self._step)
         self._closed = False
         _alive.add(self)

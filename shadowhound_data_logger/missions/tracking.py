@@ -40,6 +40,9 @@ REFUSALS: Final = frozenset({
     'RESOURCE_CONFLICT', 'NOT_IMPLEMENTED',
 })  # fmt: skip
 """MLflow's error codes after which trying the same again is no use."""
+LOGIN_CODES: Final = frozenset({'PERMISSION_DENIED', 'UNAUTHENTICATED', 'CUSTOMER_UNAUTHORIZED'})
+STATUS_CODES: Final = {401: 'UNAUTHENTICATED', 403: 'PERMISSION_DENIED'}
+"""Of answers that come without a code, such as those of the proxy for artifacts."""
 TOO_LARGE: Final = 413
 """The HTTP status of a proxy that will never take this file, whatever it takes besides."""
 RUN_GONE: Final = 'RUN_GONE'
@@ -151,8 +154,19 @@ class MlflowTracking:
             for run in self._runs(self._experiment_of(), mission_id):
                 if run.info.run_id != run_id:  # made by a request that seemed lost
                     self._client.set_tag(run.info.run_id, DUPLICATE_TAG, run_id)
-                    self._client.delete_run(run.info.run_id)
+                    self._delete(run.info.run_id)
             self._client.set_terminated(run_id, status=status, end_time=end_ms)
+
+    def _delete(self, run_id: str) -> None:
+        """Where this user may not delete, as on a Tower with passwords, the run stays, ended and with its tag."""
+        from mlflow.exceptions import MlflowException  # noqa: PLC0415 - see open
+
+        try:
+            self._client.delete_run(run_id)
+        except MlflowException as error:
+            if error.error_code != 'PERMISSION_DENIED':
+                raise
+            self._client.set_terminated(run_id, status='KILLED')
 
     def _is_gone(self, run_id: str) -> bool:
         try:
@@ -180,6 +194,10 @@ class MlflowTracking:
         try:
             return self._client.get_experiment(self._client.create_experiment(self._experiment, artifact_location=location))
         except MlflowException as error:
+            if error.error_code == 'PERMISSION_DENIED':
+                text = f'there is no experiment {self._experiment} in {self.where}, and this user may not make it'
+                remedy = 'on Tower: make tower-secrets TOWER_ARGS="--robot NAME", and start MLflow again'
+                raise TrackingUnavailable(text, remedy=remedy, code=error.error_code) from error
             if error.error_code != 'RESOURCE_ALREADY_EXISTS':
                 raise
             return self._client.get_experiment_by_name(self._experiment)
@@ -187,7 +205,8 @@ class MlflowTracking:
     def _runs(self, experiment: str, mission_id: str) -> list[Any]:
         """The runs of a mission that nobody deleted, always in the same order."""
         found = self._client.search_runs([experiment], f"tags.`{MISSION_TAG}` = '{mission_id}'", max_results=10)
-        return sorted(found, key=lambda run: (run.info.start_time, run.info.run_id))
+        ours = [run for run in found if DUPLICATE_TAG not in run.data.tags]
+        return sorted(ours, key=lambda run: (run.info.start_time, run.info.run_id))
 
     @contextmanager
     def _translated(self, what: str, remedy: str = '') -> Iterator[None]:
@@ -196,6 +215,8 @@ class MlflowTracking:
 
         try:
             yield
+        except TrackingUnavailable:
+            raise
         except MlflowException as error:
             code, is_own = error.error_code, isinstance(error, RestException) or not self._uri.startswith('http')
             text = f'{self.where} {what}: {_USER.sub("//", str(error))[:500]}'
@@ -206,9 +227,11 @@ class MlflowTracking:
         except Exception as error:  # what a client, or a store of artifacts, raises besides (a portal's page is no JSON)
             self._raise_distrust(error)
             text = f'{self.where} {what}: {type(error).__name__}: {_USER.sub("//", str(error))[:500]}'
-            if getattr(getattr(error, 'response', None), 'status_code', 0) == TOO_LARGE:
+            status = getattr(getattr(error, 'response', None), 'status_code', 0)
+            if status == TOO_LARGE:
                 raise TrackingRefused(text, remedy='let the proxy before MLflow take larger files', code='TOO_LARGE') from error
-            raise TrackingUnavailable(text, remedy=remedy or remedy_for('')) from error
+            code = STATUS_CODES.get(status, '')
+            raise TrackingUnavailable(text, remedy=remedy_for(code) if code else remedy or remedy_for(''), code=code) from error
 
     def _raise_distrust(self, error: Exception) -> None:
         """Raises TrackingUnavailable where the certificate of the server is not believed, or of the store of artifacts."""
@@ -232,8 +255,11 @@ def _without(module: str) -> Iterator[None]:
 
 def remedy_for(code: str) -> str:
     """What an operator can do about an error code of MLflow."""
-    if code in {'PERMISSION_DENIED', 'UNAUTHENTICATED', 'CUSTOMER_UNAUTHORIZED'}:
-        return 'check MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD, or MLFLOW_TRACKING_TOKEN'
+    if code in LOGIN_CODES:
+        return (
+            'check MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD (or ~/.mlflow/credentials, which is read again by '
+            'itself), or MLFLOW_TRACKING_TOKEN'
+        )
     if code == 'ENDPOINT_NOT_FOUND':
         return 'is MLFLOW_TRACKING_URI the address of an MLflow server?'
     return 'is MLFLOW_TRACKING_URI right, and Tower on? It is tried again by itself'

@@ -26,6 +26,7 @@ from rich.console import Console
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.sim import demo_audit, demo_mission, demo_processes, demo_report, demo_run
+from shadowhound_data_logger.sim.mlflow_access import READER
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 
@@ -78,7 +79,7 @@ def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, m
         if mlflow:
             console.print(f'  MLflow     {tower.tracking_uri}')
         record, run_id = _patrol(folder, tower, duration_s, outage_s, console, with_mission=mlflow)
-        drawn = [demo_mission.picture(tower.tracking_uri, run_id, folder / 'mission.png')] if run_id else []
+        drawn = [demo_mission.picture(tower.tracking(READER), run_id, folder / 'mission.png')] if run_id else []
         console.print('\nReading everything back from the S3 server ...\n')
         store = open_store(tower.store_settings(), UploadSettings())
         try:

@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+from base64 import b64encode
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.error import URLError
 from urllib.parse import urlencode
-from urllib.request import urlopen
+from urllib.request import Request, urlopen
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions.folder import missions
@@ -48,11 +49,13 @@ def end(agent: Child) -> str:
     return str(json.loads(agent.output.splitlines()[-1])['run_id'])
 
 
-def picture(tracking_uri: str, run_id: str, path: Path) -> Path:
-    """The way over the floor plan, an artifact of the run, as a file. Raises DemoFailed."""
-    asked = f'{tracking_uri}/get-artifact?{urlencode({"path": PICTURE, "run_uuid": run_id})}'
+def picture(tracking: Mapping[str, str], run_id: str, path: Path) -> Path:
+    """The way over the floor plan, an artifact of the run, as a file. ``tracking`` are variables of MLflow. Raises DemoFailed."""
+    url = f'{tracking["MLFLOW_TRACKING_URI"]}/get-artifact?{urlencode({"path": PICTURE, "run_uuid": run_id})}'
+    login = f'{tracking["MLFLOW_TRACKING_USERNAME"]}:{tracking["MLFLOW_TRACKING_PASSWORD"]}'
+    headers = {'Authorization': 'Basic ' + b64encode(login.encode()).decode()}
     try:
-        with urlopen(asked, timeout=READY_S) as answer:  # noqa: S310 - our own server on 127.0.0.1
+        with urlopen(Request(url, headers=headers), timeout=READY_S) as answer:  # noqa: S310 - our own server on 127.0.0.1
             path.write_bytes(answer.read())
     except (URLError, TimeoutError) as error:
         raise DemoFailed(f'the run {run_id} gives no {PICTURE}: {error}') from error

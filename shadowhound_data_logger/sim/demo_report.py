@@ -159,7 +159,7 @@ def show_where(folder: Path, pictures: list[Path], environ: Mapping[str, str], c
     console.print(f'  {prefix}python -m shadowhound_data_logger.sim.tower --folder {place}/tower', soft_wrap=True)
     console.print('Paste the "export" lines it prints into another terminal, and use any S3 client:')
     console.print('  aws s3 ls --recursive s3://sensor-data/ --endpoint-url "$AWS_ENDPOINT_URL"', soft_wrap=True)
-    console.print('It prints where MLflow is as well: experiment thor_missions has the mission.')
+    console.print('It prints where MLflow is as well, and who may look at its pages: experiment thor_missions has the mission.')
     console.print('The ledger again, as on a robot:')
     console.print(f'  SHADOWHOUND_HOME={place}/home {prefix}shadowhound-data ledger', soft_wrap=True)
 

@@ -14,7 +14,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import urllib.request
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -22,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import DataLoggerError, StoreError
+from shadowhound_data_logger.sim import mlflow_access
 from shadowhound_data_logger.sim.servers import GRPC, Ports, Server, ServerFailed, find_program, seaweed_sockets
 from shadowhound_data_logger.stores.s3 import S3Store
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 HOST: Final = '127.0.0.1'
 OWNER: Final = 'tower'
 """The identity that may do everything."""
+ROBOT: Final = 'thor'
 S3_READY_S: Final = 30.0
 MLFLOW_READY_S: Final = 120.0
 """It takes some 8 s on an idle machine, most of it imports and the schema of a new database."""
@@ -43,14 +44,20 @@ GRPC_PARTS: Final = ('MASTER', 'VOLUME', 'FILER', 'S3', 'CLIENT', 'ADMIN', 'WORK
 class Tower:
     """An S3 server and, with ``mlflow=True``, an MLflow server. Life: New; start; ``stop_s3``/``start_s3`` any number; stop.
 
-    ``users`` are further S3 identities by name with SeaweedFS actions such as ``Read:sensor-data`` or ``Write:sensor-data``.
-    The credentials are new at each start; the data in ``folder`` stay. Not thread-safe.
+    ``users`` are further S3 identities by name with SeaweedFS actions such as ``Read:sensor-data`` or ``Write:sensor-data``;
+    MLflow knows ``tower``, ``spark`` and the ``robots``. The credentials are new at each start; the data in ``folder`` stay.
+    Not thread-safe.
     """
 
-    def __init__(self, folder: Path, *, mlflow: bool = False, users: Mapping[str, Sequence[str]] | None = None) -> None:
+    def __init__(
+        self, folder: Path, *, mlflow: bool = False, users: Mapping[str, Sequence[str]] | None = None,
+        robots: Sequence[str] = (ROBOT,),
+    ) -> None:  # fmt: skip
         self._folder = folder.absolute()
         self._mlflow = mlflow
         self._users = {OWNER: ('Admin', 'Read', 'Write', 'List', 'Tagging'), **(users or {})}
+        self._robots = tuple(robots)
+        self._passwords: dict[str, str] = {}
         self._keys: dict[str, tuple[str, str]] = {}
         self._ports = Ports(HOST)
         self._s3: Server | None = None
@@ -83,7 +90,11 @@ class Tower:
                 self._mlflow_server.start()
             self._await_s3(self._s3)
             if self._mlflow_server is not None:
-                self._mlflow_server.wait(self._mlflow_answers, MLFLOW_READY_S)
+                self._mlflow_server.wait(lambda: mlflow_access.is_up(self.tracking_uri), MLFLOW_READY_S)
+                mlflow_access.prepare(self.tracking_uri, self._passwords[OWNER], self._robots)
+        except mlflow_access.NotPrepared as error:
+            self.stop()
+            raise ServerFailed(str(error)) from error
         except BaseException:
             self.stop()
             raise
@@ -108,7 +119,7 @@ class Tower:
             self._await_s3(self._s3)
 
     def environment(self, user: str = OWNER) -> dict[str, str]:
-        """The variables with which every S3 and MLflow client finds this Tower."""
+        """The variables with which every S3 and MLflow client finds this Tower; to MLflow it is the first robot."""
         key, secret = self._keys[user]
         environ = {
             'AWS_ENDPOINT_URL': self.endpoint_url,
@@ -117,7 +128,14 @@ class Tower:
             'AWS_DEFAULT_REGION': 'us-east-1',
             'MLFLOW_S3_ENDPOINT_URL': self.endpoint_url,
         }
-        return environ | ({'MLFLOW_TRACKING_URI': self.tracking_uri} if self.tracking_uri else {})
+        return environ | (self.tracking(self._robots[0]) if self.tracking_uri else {})
+
+    def tracking(self, user: str) -> dict[str, str]:
+        """The variables with which a client of MLflow is this user."""
+        return {
+            'MLFLOW_TRACKING_URI': self.tracking_uri, 'MLFLOW_TRACKING_USERNAME': user,
+            'MLFLOW_TRACKING_PASSWORD': self._passwords[user],
+        }  # fmt: skip
 
     def store_settings(self, user: str = OWNER) -> StoreSettings:
         """What ``open_store`` needs to write to it."""
@@ -167,10 +185,13 @@ class Tower:
             {'name': user, 'credentials': [{'accessKey': key, 'secretKey': secret}], 'actions': list(self._users[user])}
             for user, (key, secret) in self._keys.items()
         ]
-        path = self._folder / 's3.json'
+        return self._write_private('s3.json', {'identities': identities})
+
+    def _write_private(self, name: str, content: object) -> Path:
+        path = self._folder / name
         path.unlink(missing_ok=True)
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), 'w', encoding='utf-8') as file:
-            json.dump({'identities': identities}, file)
+            json.dump(content, file)
         return path
 
     def _mlflow_command(self) -> Server:
@@ -178,11 +199,17 @@ class Tower:
         port = self._ports.take()
         self.tracking_uri = f'http://{HOST}:{port}'
         home = self._folder / 'mlflow'
+        database = f'sqlite:///{home / "mlflow.db"}'
         command = [
-            mlflow, 'server', '--host', HOST, '--port', str(port), '--workers', '1',
-            '--backend-store-uri', f'sqlite:///{home / "mlflow.db"}', '--artifacts-destination', str(home / 'artifacts'),
+            mlflow, 'server', *mlflow_access.APP, '--host', HOST, '--port', str(port), '--workers', '1',
+            '--backend-store-uri', database, '--artifacts-destination', str(home / 'artifacts'),
         ]  # fmt: skip
-        environ = self._environ() | {'MLFLOW_SERVER_ENABLE_JOB_EXECUTION': 'false', 'MLFLOW_DISABLE_TELEMETRY': 'true'}
+        self._passwords = {
+            user: secrets.token_urlsafe(SECRET_BYTES) for user in (mlflow_access.ADMIN, mlflow_access.READER, *self._robots)
+        }
+        digests = {user: [mlflow_access.digest(password)] for user, password in self._passwords.items()}
+        users = self._write_private('mlflow/users.json', digests)
+        environ = self._environ() | mlflow_access.environment(home, users, database)
         return Server('MLflow', command, log=self._folder / 'mlflow.log', environ=environ)
 
     def _environ(self) -> dict[str, str]:
@@ -207,13 +234,6 @@ class Tower:
         finally:
             store.close()
 
-    def _mlflow_answers(self) -> bool:
-        try:
-            with urllib.request.urlopen(f'{self.tracking_uri}/health', timeout=5.0) as answer:  # noqa: S310 - http, by us
-                return bool(answer.status == 200)
-        except OSError:
-            return False
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a Tower until SIGINT or SIGTERM, and print what to put into a shell to use it."""
@@ -226,6 +246,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with Tower(options.folder, mlflow=not options.no_mlflow) as tower:
             for name, value in tower.environment().items():
                 print(f'export {name}={shlex.quote(value)}', flush=True)
+            if tower.tracking_uri:
+                print(f"# MLflow's pages: user {mlflow_access.READER}, password "
+                      f"{tower.tracking(mlflow_access.READER)['MLFLOW_TRACKING_PASSWORD']}", flush=True)  # fmt: skip
             signal.pause()
     except KeyboardInterrupt:
         return 0

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import socket
+import sqlite3
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +71,10 @@ def patient(seconds: float) -> Iterator[None]:
 def rest(tower: Tower, path: str, **body: Any) -> Any:
     """One request to MLflow."""
     url = f'{tower.tracking_uri}/api/2.0/mlflow/{path}'
-    request = urllib.request.Request(url, json.dumps(body).encode(), {'Content-Type': 'application/json'})  # noqa: S310 - ours
+    password = tower.tracking('tower')['MLFLOW_TRACKING_PASSWORD']
+    login = 'Basic ' + base64.b64encode(f'tower:{password}'.encode()).decode()
+    headers = {'Content-Type': 'application/json', 'Authorization': login}
+    request = urllib.request.Request(url, json.dumps(body).encode(), headers)  # noqa: S310 - ours
     with urllib.request.urlopen(request, timeout=30.0) as answer:  # noqa: S310
         return json.loads(answer.read())
 
@@ -79,7 +84,7 @@ def test_a_healthy_tower_gives_no_finding(robot: Scene, servers: Tower) -> None:
     for role in (Role.THOR, Role.THOR, Role.TOWER, Role.SPARK):
         robot.role = role
         user = {Role.TOWER: 'tower', Role.SPARK: 'spark'}.get(role, 'thor')
-        robot.environ |= servers.environment(user)
+        robot.environ |= servers.environment(user) | servers.tracking(user)
         results = robot.ask(*NETWORK, *SERVICES, 'environment', 'secrets')
         assert [result for result in results if result.is_finding] == []
         asked = {result.check for result in results if result.severity is Severity.OK}
@@ -160,6 +165,10 @@ FAULTS: dict[str, tuple[Inject, str, tuple[str, ...]]] = {
     'login page of a network': (fronted(Fault.PORTAL), 's3.answer', ('login page',)),
     'MLflow down': (nobody_there('MLFLOW_TRACKING_URI'), 'network.mlflow.tcp', ('ss -ltnp', 'docker compose ps')),
     'MLflow hangs': (hanging('MLFLOW_TRACKING_URI'), 'mlflow.answer', ('docker logs',)),
+    'MLflow without a login': (lambda scene: scene.environ.pop('MLFLOW_TRACKING_USERNAME'), 'mlflow.login',
+                               ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD', '~/.mlflow/credentials')),
+    'wrong password of MLflow': (keys(MLFLOW_TRACKING_PASSWORD='mistyped'), 'mlflow.login', ('MLFLOW_TRACKING_PASSWORD',)),
+    'robot that Tower does not know': (keys(SHADOWHOUND_ROBOT='rex'), 'mlflow.login', ('--robot rex',)),
     'MLflow without a name': (keys(MLFLOW_TRACKING_URI='http://tower.invalid:5001'), 'network.mlflow.dns', ('getent hosts',)),
 }  # fmt: skip
 
@@ -246,6 +255,26 @@ def test_what_is_missing_on_tower(robot: Scene, servers: Tower) -> None:
         admin.close()
 
 
+def test_an_mlflow_that_asks_nobody(robot: Scene) -> None:
+    """An open server is named, with what that means."""
+    robot.environ['MLFLOW_TRACKING_URI'] = robot.stack.enter_context(served(FakeS3(answer=(200, b'OK')))).url
+    found = {result.check: result for result in robot.findings('mlflow')}
+    assert found['mlflow.open'].severity is Severity.WARNING
+    assert 'make tower-secrets' in found['mlflow.open'].remedy
+
+
+def test_a_login_from_mlflow_s_own_file(robot: Scene, servers: Tower) -> None:
+    """~/.mlflow/credentials counts where the environment has none, as for MLflow's clients; half a login is found."""
+    user, password = (robot.environ.pop(name) for name in ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD'))
+    file = Path(robot.environ['HOME']) / '.mlflow/credentials'
+    file.parent.mkdir()
+    file.write_text(f'[mlflow]\nmlflow_tracking_username = {user}\n')
+    file.chmod(0o600)
+    expect(robot.findings('environment'), 'environment.login', 'MLFLOW_TRACKING_PASSWORD')
+    file.write_text(f'[mlflow]\nmlflow_tracking_username = {user}\nmlflow_tracking_password = {password}\n')
+    assert robot.findings('environment', 'mlflow') == []
+
+
 def test_artifacts_that_do_not_reach_their_store(robot: Scene, servers: Tower) -> None:
     """MLflow answers and takes experiments; only the artifact itself shows it."""
     artifacts = servers._folder / 'mlflow/artifacts'
@@ -263,12 +292,22 @@ def test_artifacts_that_do_not_reach_their_store(robot: Scene, servers: Tower) -
 
 def test_artifacts_that_stay_on_the_robot(robot: Scene, servers: Tower, tmp_path: Path) -> None:
     """The guide's last story: the run succeeds, and its artifacts are in no store."""
-    made = rest(servers, 'experiments/create', name='thor_missions', artifact_location=f'file://{tmp_path}')
+    experiment = rest(servers, 'experiments/search', filter="name = 'thor_missions'", max_results=1)['experiments'][0]
+    number = experiment['experiment_id']
+    with closing(sqlite3.connect(servers._folder / 'mlflow/mlflow.db')) as database:  # as a server of before made it
+        move = 'update experiments set artifact_location = ? where experiment_id = ?'
+        with database:
+            database.execute(move, (f'file://{tmp_path}', number))
+        try:
+            expect(robot.findings('mlflow'), 'mlflow.artifacts', '--artifacts-destination s3://mlflow')
+        finally:
+            with database:
+                database.execute(move, (experiment['artifact_location'], number))
+    rest(servers, 'experiments/delete', experiment_id=number)
     try:
-        expect(robot.findings('mlflow'), 'mlflow.artifacts', '--artifacts-destination s3://mlflow')
+        expect(robot.findings('mlflow'), 'mlflow.missions', f'mlflow experiments restore -x {number}')
     finally:
-        rest(servers, 'experiments/delete', experiment_id=made['experiment_id'])
-    expect(robot.findings('mlflow'), 'mlflow.missions', f'mlflow experiments restore -x {made["experiment_id"]}')
+        rest(servers, 'experiments/restore', experiment_id=number)
 
 
 def test_artifacts_that_go_to_s3_directly(robot: Scene, servers: Tower) -> None:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.folder import FOLDER, missions, read_json
 from shadowhound_data_logger.missions.journal import read
-from shadowhound_data_logger.missions.tracking import MlflowTracking
+from shadowhound_data_logger.missions.tracking import DUPLICATE_TAG, MISSION_TAG, MlflowTracking
 
 pytestmark = [pytest.mark.seaweedfs, pytest.mark.slow]
 
@@ -148,10 +149,57 @@ def test_a_killed_agent_s_mission(server: Server, home: Path, tmp_path: Path) ->
     assert server.keys(prefix) == {f'{prefix}frame_{number:06d}.jpg': 1 for number in frames}
 
 
+def test_a_wrong_password_costs_no_mission(server: Server, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mission waits and it is said why; once the right one is in ~/.mlflow/credentials it is sent, without a restart."""
+    user, password = (os.environ[name] for name in ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD'))
+    for name in ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD'):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv('HOME', str(tmp_path))
+    (tmp_path / '.mlflow').mkdir()
+
+    def put(word: str) -> None:
+        part = tmp_path / 'part'
+        part.write_text(f'[mlflow]\nmlflow_tracking_username = {user}\nmlflow_tracking_password = {word}\n')
+        part.replace(tmp_path / '.mlflow/credentials')
+
+    put('mistyped')
+    with closing(MissionDataLogger(home=home)) as logger:
+        logger.start_mission('patrol', 'with a wrong password')
+        logger.log_metric('a', 1.0, step=0)
+        logger.end_mission(True, 1.0, 1.0)
+        wrong = until(lambda: read_json(home / FOLDER / 'replay.json').get('errors'), 'the sender says what is wrong')
+        assert 'MLFLOW_TRACKING_PASSWORD' in wrong['tracking']['remedy']
+        assert 'mistyped' not in str(wrong) + (home / FOLDER / 'replay.log').read_text()
+        assert not complete(home)
+        put(password)
+        until(lambda: complete(home), 'it is sent')
+    assert server.run('with a wrong password').data.metrics['a'] == 1.0
+
+
+def test_a_second_run_is_closed_where_it_may_not_be_deleted(server: Server) -> None:
+    """A robot deletes nothing on a Tower with passwords: the run stays, ended and tagged, and is not taken for the mission's."""
+    tracking = MlflowTracking(server.wire.url, 'thor_missions')
+    run = tracking.run_of('twice', 'patrol', 1, {})
+    second = server.client.create_run(run.experiment_id, start_time=0, tags={MISSION_TAG: 'twice'})
+    tracking.finish(run.run_id, 'twice', 'FINISHED', 2)
+    closed = server.client.get_run(second.info.run_id)
+    assert (closed.info.status, closed.data.tags[DUPLICATE_TAG]) == ('KILLED', run.run_id)
+    assert tracking.run_of('twice', 'patrol', 1, {}) == run
+
+
+def test_an_experiment_that_a_robot_may_not_make(server: Server) -> None:
+    """It is waited for, and said who makes it."""
+    with pytest.raises(TrackingUnavailable, match=r'^there is no experiment of_another') as caught:
+        MlflowTracking(server.wire.url, 'of_another').run_of('patrol_1', 'patrol', 1, {})
+    assert 'make tower-secrets' in caught.value.remedy
+
+
 def test_artifacts_in_s3(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where artifacts lie in S3 the error names the missing variable, and with it they arrive."""
-    server.client.create_experiment('in s3', artifact_location='s3://sensor-data/mlflow')
-    tracking = MlflowTracking(server.wire.url, 'in s3')
+    uri = f'file://{tmp_path}/mlruns'  # a Tower's own server lets nobody choose
+    MlflowTracking(uri, '').open()
+    type(server.client)(uri).create_experiment('in s3', artifact_location='s3://sensor-data/mlflow')
+    tracking = MlflowTracking(uri, 'in s3')
     run = tracking.run_of('patrol_1', 'patrol', 1, {})
     path = tmp_path / 'frame_000000.jpg'
     path.write_bytes(jpeg(0))
@@ -166,7 +214,7 @@ def test_artifacts_in_s3(server: Server, tmp_path: Path, monkeypatch: pytest.Mon
     assert server.keys('mlflow/') == {key: 1}
     monkeypatch.setenv('MLFLOW_S3_ENDPOINT_URL', 'http://127.0.0.1:9')
     with pytest.raises(TrackingUnavailable, match='s3://sensor-data/mlflow') as caught:
-        MlflowTracking(server.wire.url, 'in s3').artifact(run, path, 'camera')
+        MlflowTracking(uri, 'in s3').artifact(run, path, 'camera')
     assert 'MLFLOW_S3_ENDPOINT_URL' in caught.value.remedy
 
 

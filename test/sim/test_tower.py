@@ -256,10 +256,12 @@ def test_in_the_foreground_it_prints_what_a_shell_needs(tmp_path: Path) -> None:
 @pytest.mark.seaweedfs
 @pytest.mark.long('half a minute for a server nothing logs to yet')
 def test_mlflow_keeps_runs_and_artifacts_in_the_folder(tower: Tower) -> None:
-    """The tracking server answers, and its artifacts need neither credentials nor a path on the client's side."""
-    assert tower.environment()['MLFLOW_TRACKING_URI'] == tower.tracking_uri
-    artifact = f'{tower.tracking_uri}/api/2.0/mlflow-artifacts/artifacts/note.txt'
-    http = urllib3.PoolManager()
+    """The tracking server answers, and its artifacts need neither keys of S3 nor a path on the client's side."""
+    environ = tower.environment()
+    assert environ['MLFLOW_TRACKING_URI'] == tower.tracking_uri
+    login = f'{environ["MLFLOW_TRACKING_USERNAME"]}:{environ["MLFLOW_TRACKING_PASSWORD"]}'
+    artifact = f'{tower.tracking_uri}/api/2.0/mlflow-artifacts/artifacts/1/note.txt'
+    http = urllib3.PoolManager(headers=urllib3.make_headers(basic_auth=login))
     assert http.request('GET', f'{tower.tracking_uri}/version', timeout=10).status == 200
     assert http.request('PUT', artifact, body=b'kept', timeout=30).status == 200
     assert http.request('GET', artifact, timeout=30).data == b'kept'

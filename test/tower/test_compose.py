@@ -15,6 +15,7 @@ import pytest
 import yaml
 from tower_scripts import TOWER, make_secrets, prepare
 
+from shadowhound_data_logger.sim import mlflow_access
 from shadowhound_data_logger.sim.servers import Ports, Server, find_program
 
 
@@ -30,8 +31,8 @@ def test_every_image_is_pinned(services: dict[str, Any]) -> None:
         assert re.fullmatch(r'[\w./-]+:\d+\.\d+[\w.-]*', service['image'])
     built = (TOWER / 'Dockerfile.mlflow').read_text(encoding='utf-8')
     assert re.search(r'^FROM python:3\.12', built, re.MULTILINE)
-    packages = [word for word in built.split() if word.startswith(('mlflow', 'psycopg2', 'boto3')) and '=' in word]
-    assert [package.partition('==')[0] for package in packages] == ['mlflow', 'psycopg2-binary', 'boto3']
+    packages = re.findall(r' ([\w-]+)==\d', built)
+    assert packages == ['mlflow', 'psycopg2-binary', 'boto3', 'flask-wtf']
 
 
 def test_servers_are_watched_and_come_back(services: dict[str, Any]) -> None:
@@ -72,6 +73,24 @@ def test_a_running_server_sees_the_keys_that_are_changed(services: dict[str, Any
     assert mounts == [['./secrets', '/secrets', 'ro']]
     assert '-s3.config=/secrets/s3.json' in services['s3']['command']
     assert services['s3']['working_dir'] == '/secrets', 'seaweedfs.env names files there'
+
+
+def test_mlflow_asks_for_passwords_and_never_runs_as_root(services: dict[str, Any], secured: dict[str, Any]) -> None:
+    """It is started by the program that says who may do what, which knows its arguments and finds its files."""
+    for service in (services['mlflow'], {**services['mlflow'], **secured['mlflow']}):
+        ours, _, theirs = service['command'].partition(' -- ')
+        program, *words = shlex.split(ours)[1:]
+        mounts = {place: source for source, place in (volume.split(':')[:2] for volume in services['mlflow']['volumes'])}
+        assert (TOWER / mounts[program]).resolve() == Path(mlflow_access.__file__)
+        told = mlflow_access.parser().parse_args([*words, '--', *shlex.split(theirs)])
+        assert mounts[str(told.users.parent)] == './mlflow'
+        assert told.command[:2] == ['mlflow', 'server']
+        assert told.command[told.command.index('--port') + 1] == '5000'
+        assert mlflow_access.ADMIN_LOGIN in service['environment']
+    assert 'USER mlflow' in (TOWER / 'Dockerfile.mlflow').read_text()
+    assert f'install -d -o mlflow -g mlflow -m 0700 {told.folder}' in (TOWER / 'Dockerfile.mlflow').read_text()
+    assert 'user' not in services['mlflow']
+    assert 'exec setpriv --reuid=mlflow' in secured['mlflow']['entrypoint'][2]
 
 
 @pytest.mark.long('a Tower of its own')
@@ -145,5 +164,5 @@ def test_the_server_knows_its_options(services: dict[str, Any], secured: dict[st
 def test_mlflow_knows_its_options(services: dict[str, Any]) -> None:
     """Every option of the MLflow server is one of `mlflow server`."""
     told = subprocess.run([find_program('mlflow', ''), 'server', '--help'], capture_output=True, text=True, check=True)
-    words = services['mlflow']['command'].split()
+    words = services['mlflow']['command'].partition(' -- ')[2].split()
     assert {word for word in words if word.startswith('--')} <= set(re.findall(r'--[\w-]+', told.stdout))

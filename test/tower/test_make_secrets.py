@@ -12,6 +12,9 @@ import pytest
 from botocore.configloader import raw_config_parse
 from tower_scripts import TOWER, make_secrets
 
+from shadowhound_data_logger.doctor.mlflow_rest import login
+from shadowhound_data_logger.sim import mlflow_access
+
 
 def _modes(folder: Path) -> set[str]:
     return {oct(stat.S_IMODE(path.stat().st_mode)) for path in folder.rglob('*') if path.is_file()}
@@ -22,9 +25,14 @@ def _key(folder: Path, user: str) -> str:
 
 
 def test_only_their_owner_can_read_them(tmp_path: Path) -> None:
-    """Every file has mode 600 and the folder 700, whatever the umask."""
+    """Every file has mode 600 and the folder 700, whatever the umask; but for the digests, which tell nobody a password."""
     code = 'import os, sys; os.umask(0); sys.path.insert(0, sys.argv[1]); import make_secrets; make_secrets.main(sys.argv[2:])'
     subprocess.run([sys.executable, '-c', code, str(TOWER), '--folder', str(tmp_path)], check=True, capture_output=True)
+    digests = tmp_path / 'mlflow' / 'users.json'
+    assert (oct(stat.S_IMODE(digests.stat().st_mode)), oct(stat.S_IMODE(digests.parent.stat().st_mode))) == ('0o644', '0o755')
+    logins = [key['password'] for keys in make_secrets.load_users(tmp_path / 'secrets/users.json').values() for key in keys]
+    assert not [password for password in logins if password in digests.read_text()]
+    digests.unlink()
     assert _modes(tmp_path) == {'0o600'}
     assert stat.S_IMODE((tmp_path / 'secrets').stat().st_mode) == 0o700
 
@@ -81,7 +89,7 @@ def test_nothing_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     printed = ''.join(capsys.readouterr())
     settings = make_secrets.read_env(tmp_path / '.env') | make_secrets.read_env(tmp_path / 'secrets' / 'seaweedfs.env')
     secret = {value for name, value in settings.items() if 'SECRET' in name or 'PASSWORD' in name or 'JWT' in name}
-    assert len(secret) == 7
+    assert len(secret) == 8
     assert not [value for value in secret if value in printed]
 
 
@@ -99,8 +107,40 @@ def test_a_key_is_changed_without_a_gap(tmp_path: Path) -> None:
     assert old != new
 
 
+def test_a_password_of_mlflow_is_changed_with_the_keys(tmp_path: Path) -> None:
+    """The new one beside the old one until that is retired; the server's own user of S3 has none."""
+    make_secrets.make(tmp_path, None, ['thor'])
+    old = make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')['MLFLOW_TRACKING_PASSWORD']
+    make_secrets.make(tmp_path, None, [], rotate=['thor'])
+    environ = make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')
+    new, file = environ['MLFLOW_TRACKING_PASSWORD'], tmp_path / 'mlflow' / 'users.json'
+    assert json.loads(file.read_text())['thor'] == [mlflow_access.digest(new), mlflow_access.digest(old)]
+    make_secrets.make(tmp_path, None, [], retire=['thor'])
+    known = json.loads(file.read_text())
+    assert known['thor'] == [mlflow_access.digest(new)]
+    assert known.keys() == {'tower', 'spark', 'thor'}
+    assert environ['MLFLOW_TRACKING_USERNAME'] == 'thor'
+    assert 'MLFLOW_TRACKING_USERNAME' not in make_secrets.read_env(tmp_path / 'secrets' / 'mlflow.env')
+
+
+def test_a_folder_of_before_there_were_passwords_gets_them(tmp_path: Path) -> None:
+    """Its keys stay, and S3 knows nothing of passwords."""
+    make_secrets.make(tmp_path, None, ['thor'])
+    path = tmp_path / 'secrets' / 'users.json'
+    before = {user: [{name: key[name] for name in ('accessKey', 'secretKey')} for key in keys]
+              for user, keys in make_secrets.load_users(path).items()}  # fmt: skip
+    path.write_text(json.dumps(before))
+    (tmp_path / 'mlflow' / 'users.json').unlink()
+    make_secrets.make(tmp_path, None, [])
+    identities = json.loads((tmp_path / 'secrets' / 's3.json').read_text())['identities']
+    assert {one['name']: one['credentials'] for one in identities} == before
+    environ = make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')
+    digests = json.loads((tmp_path / 'mlflow' / 'users.json').read_text())
+    assert digests['thor'] == [mlflow_access.digest(environ['MLFLOW_TRACKING_PASSWORD'])]
+
+
 def test_a_file_of_keys_is_the_environment_of_its_user(tmp_path: Path) -> None:
-    """The same pair is read from it by botocore, the newest."""
+    """The same pair is read from it by botocore, the newest; and by MLflow's clients, as ~/.mlflow/credentials, its password."""
     make_secrets.make(tmp_path, None, ['thor'])
     make_secrets.make(tmp_path, None, [], rotate=['thor'])
     found = raw_config_parse(str(tmp_path / 'secrets' / 'thor.credentials'))['default']
@@ -108,6 +148,9 @@ def test_a_file_of_keys_is_the_environment_of_its_user(tmp_path: Path) -> None:
     assert found == {
         'aws_access_key_id': environ['AWS_ACCESS_KEY_ID'], 'aws_secret_access_key': environ['AWS_SECRET_ACCESS_KEY'],
     }  # fmt: skip
+    (tmp_path / '.mlflow').mkdir()
+    (tmp_path / '.mlflow' / 'credentials').symlink_to(tmp_path / 'secrets' / 'thor.credentials')
+    assert login({}, tmp_path) == ('thor', environ['MLFLOW_TRACKING_PASSWORD'])
 
 
 def test_a_certificate_makes_the_addresses_https(tmp_path: Path) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import errno
 import signal
 import socket
 import subprocess
 import sys
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -70,15 +72,61 @@ def test_others_reach_nothing_that_asks_for_no_key(folder: Path, offset: int) ->
 
 
 def test_artifacts_go_through_mlflow_to_the_store(folder: Path, offset: int) -> None:
-    """What is put to MLflow's artifact service lies in the bucket mlflow; the sender needs no key for it."""
+    """What is put to MLflow's artifact service lies in the bucket mlflow; the sender needs a password, and no key of S3."""
+    environ = make_secrets.read_env(folder / 'secrets' / 'thor.env')
+    login = f'{environ["MLFLOW_TRACKING_USERNAME"]}:{environ["MLFLOW_TRACKING_PASSWORD"]}'
     url = f'http://{HOST}:{5001 + offset}/api/2.0/mlflow-artifacts/artifacts/1/hello.txt'
     request = urllib.request.Request(url, data=b'hello', method='PUT')
+    with pytest.raises(urllib.error.HTTPError, match='401'):
+        urllib.request.urlopen(request, timeout=60)  # noqa: S310 - http, by us
+    request.add_header('Authorization', 'Basic ' + base64.b64encode(login.encode()).decode())
     with urllib.request.urlopen(request, timeout=60) as answer:  # noqa: S310 - http, by us
         assert answer.status == 200
     key = make_secrets.load_users(folder / 'secrets' / 'users.json')['tower'][0]
     s3: Any = boto3.client('s3', endpoint_url=f'http://{HOST}:{9000 + offset}', aws_access_key_id=key['accessKey'],
                            aws_secret_access_key=key['secretKey'], region_name='us-east-1')  # fmt: skip
     assert s3.get_object(Bucket='mlflow', Key='1/hello.txt')['Body'].read() == b'hello'
+
+
+def test_mlflow_is_nobody_of_importance(folder: Path, offset: int) -> None:
+    """Its processes are not root's, whoever runs the Tower."""
+    port = str(5001 + offset).encode()
+    servers = [entry.parent for entry in Path('/proc').glob('[0-9]*/cmdline')
+               if b'--port' in (words := _words(entry)) and port in words and b'_guard.py' not in b' '.join(words)]  # fmt: skip
+    assert servers
+    assert 0 not in {server.stat().st_uid for server in servers}
+
+
+def test_a_password_of_mlflow_is_changed_while_it_runs(folder: Path, offset: int) -> None:
+    """The new one works beside the old one, and the retired one no more; nothing is told to do so."""
+
+    def works(password: str) -> bool:
+        request = urllib.request.Request(f'http://{HOST}:{5001 + offset}/version')
+        request.add_header('Authorization', 'Basic ' + base64.b64encode(f'spark:{password}'.encode()).decode())
+        try:
+            urllib.request.urlopen(request, timeout=60).close()  # noqa: S310 - http, by us
+        except urllib.error.HTTPError:
+            return False
+        return True
+
+    def newest() -> str:
+        return str(make_secrets.load_users(folder / 'secrets' / 'users.json')['spark'][0]['password'])
+
+    old = newest()
+    assert works(old)
+    make_secrets.make(folder, None, [], rotate=['spark'])
+    _until(lambda: works(newest()), 20)
+    assert works(old)
+    make_secrets.make(folder, None, [], retire=['spark'])
+    _until(lambda: not works(old), 20)
+    assert works(newest())
+
+
+def _words(cmdline: Path) -> list[bytes]:
+    try:
+        return cmdline.read_bytes().split(b'\0')
+    except OSError:
+        return []
 
 
 def test_a_key_is_changed_while_it_runs(folder: Path, offset: int) -> None:

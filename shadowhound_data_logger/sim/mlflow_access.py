@@ -1,0 +1,257 @@
+"""Who may do what on the MLflow server of a Tower. It asks everybody for a password, and lets each user do only what it is for.
+
+MLflow's own app ``basic-auth`` decides about experiments and runs; this module adds what it leaves open. The server loads it to
+check the password of each request (``authenticate``), so that a user can have two while they are changed, and to refuse what is
+none of a user's business before MLflow looks at it: without a rule here, nothing but ``tower`` gets through. Nobody chooses where
+artifacts go, ``tower`` included.
+
+Only the standard library and what MLflow itself needs: the container of compose.yaml has this file alone, and runs ``main``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import hmac
+import json
+import os
+import re
+import secrets
+import signal
+import ssl
+import subprocess
+import sys
+import time
+from base64 import b64encode
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.error import HTTPError
+from urllib.parse import urlencode
+from urllib.request import Request, urlopen
+
+if TYPE_CHECKING:
+    from flask import Response
+    from werkzeug.datastructures import Authorization
+
+ADMIN: Final = 'tower'
+READER: Final = 'spark'
+USERS: Final = 'SHADOWHOUND_MLFLOW_USERS'
+"""The variable of the server that names the file of its users: JSON, user -> SHA-256 of each password, in hex."""
+ADMIN_LOGIN: Final = 'TOWER_MLFLOW_PASSWORD'
+"""The variable with the password of ``tower``, for ``main``."""
+APP: Final = ('--app-name', 'basic-auth')
+"""What ``mlflow server`` has to be told besides."""
+SOURCES: Final = r'\A(runs|models|mlflow-artifacts):/[^\r\n]*\Z'
+"""Where a model's files may come from: from what the server stores itself."""
+ANSWER_S: Final = 30.0
+START_S: Final = 180.0
+POLL_S: Final = 0.5
+
+_API: Final = r'/(?:ajax-)?api/[23]\.0/(?:preview/)?mlflow/'
+_ARTIFACTS: Final = r'/(?:ajax-)?api/2\.0/mlflow-artifacts/artifacts(?:/.*)?'
+_ROBOT: Final = (
+    ('GET', _API + r'(?:experiments/get-by-name|experiments/get|runs/get|artifacts/list|metrics/get-history|users/current)'),
+    ('POST', _API + r'runs/(?:create|update|search|log-batch|log-metric|log-parameter|set-tag|delete-tag)'),
+    ('POST', _API + r'(?:experiments/set-experiment-tag|logged-models/search)'),  # the latter is part of listing artifacts
+    ('GET', _ARTIFACTS),
+    ('PUT', _ARTIFACTS),
+    ('GET', r'/version'),
+)
+"""What a robot needs: to log missions. It makes no experiment and deletes nothing."""
+_READER: Final = (
+    *_ROBOT,
+    *((method, _API + r'(?:experiments|runs|metrics|artifacts|logged-models|registered-models|model-versions)/(?!permissions).*')
+      for method in ('GET', 'POST', 'PATCH', 'DELETE')),
+    ('POST', _API + r'(?:upload-artifact|traces/search)'),
+    ('DELETE', _ARTIFACTS),
+    ('POST', r'/(?:ajax-api/2\.0/mlflow/)?graphql'),
+    ('GET', r'/(?:(?:model-versions/)?get-artifact)?'),
+)  # fmt: skip
+"""Training besides: experiments and models of one's own, and the pages."""
+
+
+class NotPrepared(Exception):
+    """MLflow could not be given its users; the text says why, without a password."""
+
+
+def digest(password: str) -> str:
+    """As it stands in the file of users. A random password of 256 bits needs nothing slower: nobody finds it by trying."""
+    return hashlib.sha256(password.encode()).hexdigest()
+
+
+def may(user: str, method: str, path: str) -> bool:
+    """Whether a request is a user's business at all; whose experiment it is about, MLflow decides afterwards."""
+    if user == ADMIN:
+        return True
+    rules = _READER if user == READER else _ROBOT
+    return any(method == allowed and re.fullmatch(pattern, path, re.DOTALL) for allowed, pattern in rules)
+
+
+def authenticate() -> Authorization | Response:
+    """MLflow's ``authorization_function``: called in the server, with Flask's request, before anything is looked at."""
+    from flask import request  # noqa: PLC0415 - those who only start the server do not need it
+
+    given = request.authorization
+    user, password = (given.username or '', given.password or '') if given and given.type == 'basic' else ('', '')
+    with open(os.environ[USERS], encoding='utf-8') as file:  # noqa: PTH123 - each time: a change counts at once
+        known: list[str] = json.load(file).get(user, [])
+    told = digest(password)
+    if given is None or not any(hmac.compare_digest(told, one) for one in known):
+        return _refusal(401, 'UNAUTHENTICATED', 'MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD are no user of this Tower')
+    if not may(user, request.method, request.path):
+        return _refusal(403, 'PERMISSION_DENIED', f'the user {user} may not do this on this Tower')
+    return given
+
+
+def _refusal(status: int, code: str, message: str) -> Response:
+    from flask import jsonify  # noqa: PLC0415 - see authenticate
+
+    made = jsonify(error_code=code, message=message)
+    made.status_code = status
+    if status == 401:
+        made.headers['WWW-Authenticate'] = 'Basic realm="Tower"'
+    return made
+
+
+def environment(folder: Path, users: Path, database: str) -> dict[str, str]:
+    """The variables of ``mlflow server`` with ``APP``. Writes its settings, and in them the address of the database.
+
+    ``folder``, for the settings, belongs to the server's user alone; ``database`` is an SQLAlchemy URI, the server's own or
+    another one.
+    """
+    package = __name__.rpartition('.')[0]
+    here = Path(__file__).resolve()
+    module = f'{package}.{here.stem}' if package else here.stem
+    settings = {
+        'default_permission': 'NO_PERMISSIONS', 'database_uri': database.replace('%', '%%'), 'admin_username': ADMIN,
+        'authorization_function': f'{module}:{authenticate.__name__}', 'grant_default_workspace_access': 'false',
+    }  # fmt: skip
+    path = folder / 'auth.ini'
+    path.unlink(missing_ok=True)
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), 'w', encoding='utf-8') as file:
+        file.write('[mlflow]\n' + ''.join(f'{name} = {value}\n' for name, value in settings.items()))
+    root = here.parents[package.count('.') + 1] if package else here.parent
+    return {
+        USERS: str(users), 'MLFLOW_AUTH_CONFIG_PATH': str(path),
+        'MLFLOW_AUTH_ADMIN_PASSWORD': secrets.token_urlsafe(32),  # of its own list of users, which nobody logs in by
+        'MLFLOW_FLASK_SERVER_SECRET_KEY': secrets.token_urlsafe(32),
+        'MLFLOW_BASIC_AUTH_FAIL_CLOSED': 'true',
+        'MLFLOW_ARTIFACT_LOCATION_MAX_LENGTH': '0',  # an experiment that names one is refused
+        'MLFLOW_CREATE_MODEL_VERSION_SOURCE_VALIDATION_REGEX': SOURCES,
+        'MLFLOW_DISABLE_TELEMETRY': 'true', 'MLFLOW_SERVER_ENABLE_JOB_EXECUTION': 'false',
+        'PYTHONPATH': os.pathsep.join(filter(None, (str(root), os.environ.get('PYTHONPATH')))),
+    }  # fmt: skip
+
+
+def is_up(url: str, trust: ssl.SSLContext | None = None) -> bool:
+    """Whether a server answers at all."""
+    try:
+        with urlopen(f'{url}/health', timeout=ANSWER_S, context=trust) as answer:  # noqa: S310 - http(s), by us
+            return bool(answer.status == 200)
+    except OSError:
+        return False
+
+
+def experiment_of(robot: str) -> str:
+    """Where a robot's missions are."""
+    return f'{robot}_missions'
+
+
+def prepare(url: str, password: str, robots: Iterable[str], trust: ssl.SSLContext | None = None) -> list[str]:
+    """Give a server its users, each robot its experiment, and ``spark`` a look at it; to be run again at any time.
+
+    ``password`` is that of ``tower``. Returns a sentence for each experiment whose artifacts lie where this Tower would not put
+    them. Raises NotPrepared.
+    """
+    server = _Server(url, password, trust)
+    robots = list(robots)
+    for user in (READER, *robots):
+        server.ask('POST', '2.0/mlflow/users/create', {'username': user, 'password': secrets.token_urlsafe(32)})
+    for robot in robots:
+        name = experiment_of(robot)
+        server.ask('POST', '2.0/mlflow/experiments/create', {'name': name})
+        found = server.ask('GET', '2.0/mlflow/experiments/get-by-name?' + urlencode({'experiment_name': name}))['experiment']
+        for user, permission in ((robot, 'EDIT'), (READER, 'READ')):
+            grant = {'resource_type': 'experiment', 'resource_id': found['experiment_id'], 'permission': permission}
+            server.ask('POST', '3.0/mlflow/users/permissions/grant', {'username': user, **grant})
+    return [
+        f'the experiment {one["name"]} keeps its artifacts in {one["artifact_location"]}: delete it, or look who made it'
+        for one in server.experiments() if not one['artifact_location'].startswith('mlflow-artifacts:')
+    ]  # fmt: skip
+
+
+class _Server:
+    """As ``tower``. Raises NotPrepared."""
+
+    def __init__(self, url: str, password: str, trust: ssl.SSLContext | None) -> None:
+        self._url = url
+        self._headers = {
+            'Content-Type': 'application/json', 'Authorization': 'Basic ' + b64encode(f'{ADMIN}:{password}'.encode()).decode(),
+        }  # fmt: skip
+        self._trust = trust
+
+    def ask(self, method: str, path: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """What is there already is fine, and answered by nothing."""
+        data = json.dumps(body).encode() if body is not None else None
+        try:
+            request = Request(f'{self._url}/api/{path}', data, self._headers, method=method)  # noqa: S310 - http(s), by us
+            with urlopen(request, timeout=ANSWER_S, context=self._trust) as answer:  # noqa: S310
+                found: dict[str, Any] = json.loads(answer.read() or b'{}')
+                return found
+        except HTTPError as error:
+            with error:
+                said = error.read().decode(errors='replace')[:300]
+            if 'RESOURCE_ALREADY_EXISTS' in said:
+                return {}
+            raise NotPrepared(f'{self._url} answers {error.code} to {path.partition("?")[0]}: {said}') from error
+        except (OSError, ValueError) as error:
+            raise NotPrepared(f'{self._url} cannot be asked: {error}') from error
+
+    def experiments(self) -> Iterable[dict[str, Any]]:
+        page = ''
+        while True:
+            question = {'max_results': 1000, 'view_type': 'ALL', **({'page_token': page} if page else {})}
+            found = self.ask('POST', '2.0/mlflow/experiments/search', question)
+            yield from found.get('experiments', [])
+            if not (page := found.get('next_page_token', '')):
+                return
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line; what follows ``--`` is the command of ``mlflow server``."""
+    made = argparse.ArgumentParser(description='Run mlflow server with the users of a Tower.')
+    made.add_argument('--users', type=Path, required=True, help='the file of users and digests, from make_secrets.py')
+    made.add_argument('--folder', type=Path, required=True, help="where the server's settings go, readable by this user alone")
+    made.add_argument('command', nargs='+', help='mlflow server ...')
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a server and prepare it."""
+    options = parser().parse_args(arguments)
+    password = os.environ.pop(ADMIN_LOGIN)
+    settings = environment(options.folder, options.users, os.environ['MLFLOW_BACKEND_STORE_URI'])
+    is_tls = any('--ssl-certfile' in word for word in options.command)
+    url = f'{"https" if is_tls else "http"}://127.0.0.1:{options.command[options.command.index("--port") + 1]}'
+    trust = ssl._create_unverified_context() if is_tls else None  # noqa: S323 - ourselves, by the loopback
+    with subprocess.Popen([*options.command, *APP], env={**os.environ, **settings}) as server:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: server.terminate())
+        end_s = time.monotonic() + START_S
+        while server.poll() is None and not is_up(url, trust) and time.monotonic() < end_s:
+            time.sleep(POLL_S)
+        try:
+            robots = [name for name in json.loads(options.users.read_text(encoding='utf-8')) if name not in {ADMIN, READER}]
+            for text in prepare(url, password, robots, trust) if server.poll() is None else ():
+                print(text, file=sys.stderr, flush=True)
+        except NotPrepared as error:
+            print(f'mlflow: {error}', file=sys.stderr, flush=True)
+            server.terminate()
+            server.wait()
+            return 1
+        return server.wait()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

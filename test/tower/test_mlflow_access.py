@@ -1,0 +1,297 @@
+"""Attacks on a real MLflow server of a Tower: by a stranger, with a robot's password and with Spark's; and what each is for."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+import pytest
+import urllib3
+
+from shadowhound_data_logger.sim import mlflow_access
+from shadowhound_data_logger.sim.tower import Tower
+
+pytestmark = pytest.mark.seaweedfs
+API = ('/api/2.0/mlflow', '/api/2.0/preview/mlflow', '/ajax-api/2.0/mlflow', '/ajax-api/2.0/preview/mlflow')
+"""Under which MLflow serves, or has served, the same."""
+
+
+@dataclass
+class User:
+    """What somebody sends to MLflow; ``name`` is empty for a stranger."""
+
+    tower: Tower
+    name: str = ''
+    http: urllib3.PoolManager = field(default_factory=urllib3.PoolManager)
+    password: str | None = None
+
+    def send(self, method: str, path: str, body: Any = None) -> urllib3.BaseHTTPResponse:
+        headers = {'Content-Type': 'application/json'}
+        if self.name:
+            password = self.password or self.tower.tracking(self.name)['MLFLOW_TRACKING_PASSWORD']
+            headers['Authorization'] = 'Basic ' + base64.b64encode(f'{self.name}:{password}'.encode()).decode()
+        content = body if isinstance(body, bytes) or body is None else json.dumps(body).encode()
+        return self.http.request(
+            method, self.tower.tracking_uri + path, body=content, headers=headers, redirect=False, timeout=60
+        )
+
+    def status(self, method: str, path: str, body: Any = None) -> int:
+        return int(self.send(method, path, body).status)
+
+    def call(self, method: str, path: str, body: Any = None) -> dict[str, Any]:
+        """Something that has to go well."""
+        answer = self.send(method, f'/api/2.0/mlflow/{path}', body)
+        assert answer.status == 200, answer.data
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def experiment(self, name: str) -> str:
+        return str(
+            self.call('GET', 'experiments/get-by-name?' + urlencode({'experiment_name': name}))['experiment']['experiment_id']
+        )
+
+    def run(self, experiment: str) -> dict[str, Any]:
+        return dict(self.call('POST', 'runs/create', {'experiment_id': experiment})['run']['info'])
+
+
+@pytest.fixture(scope='module')
+def users(tower: Tower) -> Iterator[dict[str, User]]:
+    http = urllib3.PoolManager()
+    yield {name: User(tower, name, http) for name in ('', 'tower', 'spark', 'thor', 'tachi')}
+    http.clear()
+
+
+@pytest.fixture(scope='module')
+def run(users: dict[str, User]) -> dict[str, Any]:
+    """One of thor's, with an artifact."""
+    made = users['thor'].run(users['thor'].experiment('thor_missions'))
+    assert users['thor'].status('PUT', _artifact(made), b'frame') == 200
+    return made
+
+
+def _artifact(run: dict[str, Any], name: str = 'a.txt') -> str:
+    return f'/api/2.0/mlflow-artifacts/artifacts/{run["experiment_id"]}/{run["run_id"]}/artifacts/{name}'
+
+
+DOORS = [
+    *((method, f'{api}/{path}') for api in API for method, path in (
+        ('POST', 'experiments/create'), ('POST', 'experiments/search'),
+        ('GET', 'experiments/get-by-name?experiment_name=Default'),
+        ('POST', 'experiments/delete'), ('POST', 'experiments/update'), ('POST', 'runs/create'), ('POST', 'runs/search'),
+        ('POST', 'runs/delete'), ('POST', 'runs/log-batch'), ('POST', 'registered-models/create'),
+        ('POST', 'model-versions/create'),
+        ('POST', 'users/create'), ('GET', 'users/list'), ('POST', 'traces'), ('POST', 'webhooks'), ('POST', 'logged-models'),
+        ('POST', 'upload-artifact'), ('POST', 'gateway-proxy'),
+    )),
+    *((method, f'{api}/{path}') for api in ('/api/3.0/mlflow', '/ajax-api/3.0/mlflow') for method, path in (
+        ('POST', 'traces'), ('POST', 'traces/search'), ('POST', 'gateway/secrets/create'), ('POST', 'gateway/endpoints/create'),
+        ('POST', 'users/permissions/grant'), ('POST', 'roles/create'), ('POST', 'datasets/create'), ('POST', 'scorers/register'),
+        ('POST', 'assistant/message'), ('GET', 'assistant/config'), ('POST', 'demo/generate'), ('POST', 'scorer/invoke'),
+    )),
+    *((method, f'{api}/mlflow-artifacts/artifacts/1/x/artifacts/a') for api in ('/api/2.0', '/ajax-api/2.0')
+      for method in ('GET', 'PUT', 'DELETE')),
+    ('POST', '/api/2.0/mlflow-artifacts/mpu/create/1/x'), ('GET', '/api/2.0/mlflow-artifacts/presigned/1/x'),
+    ('GET', '/api/2.0/mlflow-artifacts/artifacts?path=1'), ('POST', '/graphql'), ('POST', '/v1/traces'), ('POST', '/v1/metrics'),
+    ('GET', '/'), ('GET', '/signup'), ('GET', '/get-artifact?path=a&run_uuid=1'), ('GET', '/model-versions/get-artifact'),
+    ('POST', '/gateway/x/mlflow/invocations'), ('POST', '/gateway/openai/v1/chat/completions'), ('GET', '/gateway/proxy'),
+    ('POST', '/ajax-api/3.0/jobs'), ('POST', '/ajax-api/3.0/jobs/search'), ('GET', '/nowhere'), ('GET', '/docs'),
+    ('GET', '/metrics'),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize('name', ['', 'nobody', 'mlflow', 'thor'])
+def test_without_a_password_no_door_opens(users: dict[str, User], tower: Tower, name: str) -> None:
+    """A stranger, a user that is none and a user with the wrong password get 401 or 403 of everything but the health."""
+    user = User(tower, name, users[''].http, password='guess')
+    opened = {(method, path): status for method, path in DOORS
+              if (status := user.status(method, path, b'{}' if method != 'GET' else None)) not in {401, 403}}  # fmt: skip
+    assert opened == {}
+    assert {user.status('GET', '/health'), user.status('GET', '/api/3.0/mlflow/server-info')} == {200}
+    assert user.send('GET', '/').headers['WWW-Authenticate'] == 'Basic realm="Tower"'
+
+
+@pytest.mark.parametrize(
+    'method', ['Bearer x', 'Basic', 'Basic !!!', 'Basic ' + base64.b64encode(b'tower').decode(), 'Digest username=tower']
+)
+def test_half_a_login_is_none(tower: Tower, users: dict[str, User], method: str) -> None:
+    """Whatever else may be in the header."""
+    for path in ('/api/2.0/mlflow/experiments/search', '/api/2.0/mlflow-artifacts/artifacts/1/a', '/ajax-api/3.0/jobs/search'):
+        answer = users[''].http.request('GET', tower.tracking_uri + path, headers={'Authorization': method}, timeout=60)
+        assert answer.status == 401, path
+
+
+def test_a_robot_logs_its_own_missions(users: dict[str, User], run: dict[str, Any]) -> None:
+    """All that the sender of missions asks for."""
+    thor = users['thor']
+    run_id = run['run_id']
+    thor.call('POST', 'runs/log-batch', {'run_id': run_id, 'metrics': [{'key': 'a', 'value': 1, 'timestamp': 1, 'step': 0}]})
+    thor.call('POST', 'runs/set-tag', {'run_id': run_id, 'key': 'a', 'value': 'b'})
+    thor.call('POST', 'runs/update', {'run_id': run_id, 'status': 'FINISHED'})
+    assert [
+        one['info']['run_id'] for one in thor.call('POST', 'runs/search', {'experiment_ids': [run['experiment_id']]})['runs']
+    ] == [run_id]
+    assert thor.send('GET', _artifact(run)).data == b'frame'
+
+
+def test_a_robot_does_nothing_else(users: dict[str, User], run: dict[str, Any]) -> None:
+    """It makes and deletes no experiment, run, model, artifact, user or trace, by none of the paths; not even its own."""
+    thor, experiment, run_id = users['thor'], run['experiment_id'], run['run_id']
+    tried = [
+        *(('POST', f'{api}/{path}', body) for api in API for path, body in (
+            ('experiments/create', {'name': 'mine'}), ('experiments/delete', {'experiment_id': experiment}),
+            ('experiments/update', {'experiment_id': experiment, 'new_name': 'x'}), ('experiments/search', {'max_results': 5}),
+            ('runs/delete', {'run_id': run_id}), ('runs/restore', {'run_id': run_id}),
+            ('registered-models/create', {'name': 'mine'}),
+            ('users/create', {'username': 'mallory', 'password': 'x' * 20}),
+            ('model-versions/create', {'name': 'm', 'source': 's'}),
+        )),
+        ('DELETE', _artifact(run), None),
+        ('PATCH', '/api/2.0/mlflow/users/update-password', {'username': 'thor', 'password': 'x' * 20}),
+        ('PATCH', '/api/2.0/mlflow/users/update-admin', {'username': 'thor', 'is_admin': True}),
+        ('POST', '/api/3.0/mlflow/users/permissions/grant',
+         {'username': 'thor', 'resource_type': 'experiment', 'resource_id': '0', 'permission': 'MANAGE'}),
+        ('POST', '/graphql', {'query': f'query{{mlflowGetRun(input:{{runId:"{run_id}"}}){{run{{info{{runId}}}}}}}}'}),
+        ('POST', '/v1/traces', b''), ('POST', '/ajax-api/3.0/jobs/search', {}), ('GET', '/', None),
+        ('POST', '/api/2.0/mlflow-artifacts/mpu/create/1/x', {}),
+    ]  # fmt: skip
+    done = {path: status for method, path, body in tried if (status := thor.status(method, path, body)) != 403}
+    assert done == {}
+    assert users['tower'].call('GET', f'runs/get?run_id={run_id}')['run']['info']['lifecycle_stage'] == 'active'
+
+
+def test_a_robot_is_nobody_in_anothers_experiment(users: dict[str, User], run: dict[str, Any]) -> None:
+    """It neither reads nor writes there, nor by a path that leads out of its own artifacts."""
+    tachi, experiment, run_id = users['tachi'], run['experiment_id'], run['run_id']
+    own = tachi.experiment('tachi_missions')
+    metric = {'key': 'a', 'value': 9, 'timestamp': 1, 'step': 0}
+    tried = [
+        ('GET', f'/api/2.0/mlflow/experiments/get?experiment_id={experiment}', None),
+        ('GET', '/api/2.0/mlflow/experiments/get-by-name?experiment_name=thor_missions', None),
+        ('GET', f'/api/2.0/mlflow/runs/get?run_id={run_id}', None),
+        ('GET', f'/api/2.0/mlflow/metrics/get-history?run_id={run_id}&metric_key=a', None),
+        ('GET', f'/api/2.0/mlflow/artifacts/list?run_id={run_id}', None),
+        *((method, f'{api}/{path}', body) for api in API[::2] for method, path, body in (
+            ('POST', 'runs/create', {'experiment_id': experiment}), ('POST', 'runs/create', {'experimentId': experiment}),
+            ('POST', 'runs/log-batch', {'run_id': run_id, 'metrics': [metric]}),
+            ('POST', 'runs/log-metric', {'run_id': run_id, **metric}),
+            ('POST', 'runs/log-batch', {'runId': run_id, 'metrics': [metric]}),
+            ('POST', 'runs/set-tag', {'run_id': run_id, 'key': 'a', 'value': 'b'}),
+            ('POST', 'runs/update', {'run_id': run_id, 'status': 'FAILED'}),
+            ('POST', 'runs/update', {'run_uuid': run_id, 'status': 'FAILED'}),
+            ('POST', 'experiments/set-experiment-tag', {'experiment_id': experiment, 'key': 'a', 'value': 'b'}),
+        )),
+        ('GET', _artifact(run), None), ('PUT', _artifact(run), b'x'),
+        ('PUT', f'/api/2.0/mlflow-artifacts/artifacts/{own}/../{experiment}/x', b'x'),
+        ('PUT', f'/api/2.0/mlflow-artifacts/artifacts/{own}/%2e%2e/{experiment}/x', b'x'),
+        ('PUT', f'/api/2.0/mlflow-artifacts/artifacts/{own}%2f..%2f{experiment}%2fx', b'x'),
+        ('PUT', '/api/2.0/mlflow-artifacts/artifacts/x', b'x'), ('PUT', '/api/2.0/mlflow-artifacts/artifacts//etc/x', b'x'),
+        ('GET', f'/api/2.0/mlflow-artifacts/artifacts?path={experiment}', None),
+        ('GET', '/api/2.0/mlflow-artifacts/artifacts', None),
+        ('GET', f'/api/2.0/mlflow-artifacts/artifacts?path={own}/../{experiment}', None),
+    ]  # fmt: skip
+    done = {(method, path): answer.data for method, path, body in tried
+            if (answer := tachi.send(method, path, body)).status not in {400, 403, 404}}  # fmt: skip
+    assert done == {}
+    assert tachi.call('POST', 'runs/search', {'experiment_ids': [experiment, own]}).get('runs', []) == []
+    found = users['tower'].call('GET', f'runs/get?run_id={run_id}')['run']
+    assert [one['value'] for one in found['data'].get('metrics', [])] in ([], [1])
+    assert users['thor'].send('GET', _artifact(run)).data == b'frame'
+
+
+PLACES = ['file:///etc', '/etc', 'file:/etc', 'FILE:///etc', 'sftp://localhost/etc', 'http://localhost:1',
+          's3://sensor-data/thor', 's3://mlflow/0', 'mlflow-artifacts:/0', 'mlflow-artifacts://elsewhere/0', 'runs:/1/a',
+          '../..', ' file:///etc']  # fmt: skip
+
+
+@pytest.mark.parametrize('user', ['spark', 'tower'])
+def test_nobody_chooses_where_artifacts_go(users: dict[str, User], user: str) -> None:
+    """Neither by the field's name in the protocol nor by that in JSON, on none of the paths, and nothing is made."""
+    bodies = [{'name': f'{user}-{number}', field: place} for number, place in enumerate(PLACES)
+              for field in ('artifact_location', 'artifactLocation')]  # fmt: skip
+    bodies += [{**bodies[0], 'artifactLocation': ''}, {**bodies[0], 'artifactLocation': 'file:///etc', 'artifact_location': ''}]
+    kinds = [(api, json.dumps(body).encode(coding)) for api in API for body in bodies for coding in ('utf-8', 'utf-16')]
+    taken = [(api, body) for api, body in kinds if users[user].status('POST', f'{api}/experiments/create', body) == 200]
+    made = users['tower'].call('POST', 'experiments/search', {'max_results': 1000})['experiments']
+    assert {one['artifact_location'] for one in made if not one['artifact_location'].startswith('mlflow-artifacts:/')} == set()
+    assert taken == []
+
+
+@pytest.mark.parametrize('place', [*PLACES, 'mlflow-artifacts:/0/x\nfile:///etc', 'file:///etc#runs:/1'])
+def test_no_model_comes_from_elsewhere(users: dict[str, User], run: dict[str, Any], place: str) -> None:
+    """A version of a model whose files would be read from another place is refused."""
+    spark = users['spark']
+    spark.send('POST', '/api/2.0/mlflow/registered-models/create', {'name': 'policy'})
+    for more in ({}, {'run_id': run['run_id']}, {'runId': run['run_id']}):
+        assert spark.status('POST', '/api/2.0/mlflow/model-versions/create', {'name': 'policy', 'source': place, **more}) == 400
+
+
+def test_spark_looks_at_missions_and_keeps_its_own(users: dict[str, User], run: dict[str, Any]) -> None:
+    """It reads every robot's runs and changes none; experiments and models of its own it makes, and deletes."""
+    spark = users['spark']
+    read = spark.call('POST', 'runs/search', {'experiment_ids': [run['experiment_id']]})['runs']
+    assert run['run_id'] in [one['info']['run_id'] for one in read]
+    assert spark.send('GET', _artifact(run)).data == b'frame'
+    assert spark.status('GET', '/') == 200
+    for method, path, body in (
+        ('PUT', _artifact(run), b'x'), ('DELETE', _artifact(run), None),
+        ('POST', '/api/2.0/mlflow/runs/create', {'experiment_id': run['experiment_id']}),
+        ('POST', '/api/2.0/mlflow/runs/delete', {'run_id': run['run_id']}),
+        ('POST', '/api/2.0/mlflow/experiments/delete', {'experiment_id': run['experiment_id']}),
+        ('POST', '/api/2.0/mlflow/experiments/set-experiment-tag',
+         {'experiment_id': run['experiment_id'], 'key': 'a', 'value': 'b'}),
+        ('POST', '/api/2.0/mlflow/users/create', {'username': 'mallory', 'password': 'x' * 20}),
+        ('POST', '/api/2.0/mlflow/webhooks', {}), ('POST', '/api/3.0/mlflow/gateway/secrets/create', {}),
+        ('POST', '/v1/traces', b''), ('POST', '/ajax-api/3.0/jobs', {}), ('GET', '/ajax-api/3.0/mlflow/assistant/config', None),
+    ):  # fmt: skip
+        assert spark.status(method, path, body) == 403, path
+    own = str(spark.call('POST', 'experiments/create', {'name': 'training'})['experiment_id'])
+    mine = spark.run(own)
+    assert spark.status('PUT', _artifact(mine), b'weights') == 200
+    assert users['thor'].status('GET', _artifact(mine)) == 403
+    spark.send('POST', '/api/2.0/mlflow/registered-models/create', {'name': 'policy'})
+    source = {'source': f'runs:/{mine["run_id"]}/a.txt', 'run_id': mine['run_id']}
+    spark.call('POST', 'model-versions/create', {'name': 'policy', **source})
+    spark.call('POST', 'experiments/delete', {'experiment_id': own})
+
+
+def test_a_second_password_counts_at_once(users: dict[str, User], tower: Tower, tmp_path: Path) -> None:
+    """And a retired one no more: the server reads its users anew, nothing is restarted, nothing stops while both are there."""
+    old, new = 'the old one', 'the new one'
+    file = next(tower._folder.glob('mlflow/users.json'))
+    before = file.read_text()
+
+    def put(content: str) -> None:
+        (tmp_path / 'users.json').write_text(content)
+        (tmp_path / 'users.json').chmod(0o600)
+        os.replace(tmp_path / 'users.json', file)
+
+    try:
+        for known, works in (([new, old], {new, old}), ([new], {new})):
+            put(json.dumps({**json.loads(before), 'tachi': [mlflow_access.digest(one) for one in known]}))
+            asked = {word: User(tower, 'tachi', users['tachi'].http, word).status('GET', '/version') for word in (old, new)}
+            assert {word for word, status in asked.items() if status == 200} == works
+    finally:
+        put(before)
+
+
+def test_its_files_hold_no_password(tower: Tower) -> None:
+    """Neither files, logs nor command lines; and what holds addresses is its owner's alone."""
+    folder = tower._folder
+    words = {tower.tracking(name)['MLFLOW_TRACKING_PASSWORD'].encode() for name in ('tower', 'spark', 'thor', 'tachi')}
+    for path in (folder / 'mlflow').glob('*'):
+        if path.is_file():
+            assert not [word for word in words if word in path.read_bytes()], path
+    assert not [word for word in words if word in (folder / 'mlflow.log').read_bytes()]
+    assert {(folder / 'mlflow' / name).stat().st_mode & 0o777 for name in ('auth.ini', 'users.json')} == {0o600}
+    for entry in Path('/proc').glob('[0-9]*/cmdline'):
+        try:
+            assert not [word for word in words if word in entry.read_bytes()]
+        except OSError:
+            continue
+    assert not [word for word in words if word.decode() in repr(tower)]
