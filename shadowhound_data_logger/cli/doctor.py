@@ -78,7 +78,7 @@ def doctor(  # noqa: PLR0913 - one for each option
 ) -> int:  # fmt: skip
     """Why does it not work? Asks this machine, its network, Tower and ROS, and says what to do.
 
-    Leaves probe objects of 64 bytes under ROBOT/_doctor/ in the store and the experiment _doctor in MLflow; changes nothing
+    Leaves probe objects of 64 bytes under ROBOT/_doctor/ in the store and in the missions of MLflow; changes nothing
     else without --fix. Exit code 1 on errors and warnings, 0 when there are none.
     """
     try:

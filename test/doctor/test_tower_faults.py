@@ -6,9 +6,11 @@ import base64
 import json
 import socket
 import sqlite3
+import threading
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -255,9 +257,31 @@ def test_what_is_missing_on_tower(robot: Scene, servers: Tower) -> None:
         admin.close()
 
 
+class _Open(BaseHTTPRequestHandler):
+    """As far as an MLflow server without users is asked before anything is written."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(b'OK')
+
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers['Content-Length']))
+        self.do_GET()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
 def test_an_mlflow_that_asks_nobody(robot: Scene) -> None:
     """An open server is named, with what that means."""
-    robot.environ['MLFLOW_TRACKING_URI'] = robot.stack.enter_context(served(FakeS3(answer=(200, b'OK')))).url
+    server = ThreadingHTTPServer(('127.0.0.1', 0), _Open)
+    serving = threading.Thread(target=server.serve_forever)
+    serving.start()
+    robot.stack.callback(serving.join)
+    robot.stack.callback(server.server_close)
+    robot.stack.callback(server.shutdown)
+    robot.environ['MLFLOW_TRACKING_URI'] = f'http://127.0.0.1:{server.server_port}'
     found = {result.check: result for result in robot.findings('mlflow')}
     assert found['mlflow.open'].severity is Severity.WARNING
     assert 'make tower-secrets' in found['mlflow.open'].remedy

@@ -88,7 +88,8 @@ def rotate(folder: Path, file: Path, secrets: list[str]) -> None:
     part.replace(file)
     make_secrets.make(folder, None, [], retire=['thor'])
     reload_s3(folder)
-    secrets.append(make_secrets.load_users(folder / 'secrets' / 'users.json')['thor'][0]['secretKey'])
+    key = make_secrets.load_users(folder / 'secrets' / 'users.json')['thor'][0]
+    secrets += [key['secretKey'], key['password']]
 
 
 def everything(environ: dict[str, str]) -> list[str]:
@@ -105,12 +106,15 @@ def test_a_robot_lives_with_its_own_keys(
 ) -> None:
     """Sensors, a mission, a bag and the catalogue arrive; two rotations meanwhile lose and quarantine nothing."""
     environ = environment(tower, 'thor', offset)
-    secrets = [environ.pop('AWS_SECRET_ACCESS_KEY')]
-    del environ['AWS_ACCESS_KEY_ID']
+    secrets = [environ.pop('AWS_SECRET_ACCESS_KEY'), environ.pop('MLFLOW_TRACKING_PASSWORD')]
+    del environ['AWS_ACCESS_KEY_ID'], environ['MLFLOW_TRACKING_USERNAME']
     file = tmp_path / 'credentials'
     file.write_text((tower / 'secrets' / 'thor.credentials').read_text())
     environ |= {'AWS_SHARED_CREDENTIALS_FILE': str(file), 'AWS_CONFIG_FILE': str(tmp_path / 'none')}
-    for name in ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY'):
+    (tmp_path / '.mlflow').mkdir()
+    (tmp_path / '.mlflow' / 'credentials').symlink_to(file)
+    monkeypatch.setenv('HOME', str(tmp_path))
+    for name in ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY', 'MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD'):
         monkeypatch.delenv(name, raising=False)
     for name, value in environ.items():
         monkeypatch.setenv(name, value)
