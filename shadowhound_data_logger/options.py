@@ -57,6 +57,11 @@ class SensorSettings:
         0, 'With dedup: JPEGs that look alike are repeats too, where at most so many of 64 bits differ.', low=0, high=32
     )
     priority: int = _setting(5, '0 ships first and is dropped or evicted last, 9 the other way round.', low=0, high=9, live=True)
+    expected_hz: float = _setting(
+        0.0, 'How often it is published, to estimate what is lost where messages have no numbers; 0 learns it.', low=0.0, high=1e5
+    )
+    counter: str = _setting('', 'The same: a field that counts messages or milliseconds, such as tick; used instead of stamps.')
+    counter_step: float = _setting(0.0, 'By how much it grows from one message to the next; 0 learns it.', low=0.0, high=1e12)
 
     @property
     def batched(self) -> bool:

@@ -29,13 +29,13 @@ class Claims:
         """An event has it now; what is no repeat of it."""
         with self._accounts.entry(f'{EVENT}{held.lot.topic}') as account:
             account.type = held.lot.type
-            receive, reported = account.receive, held.lost is not None
             if held.again:
                 for each in held.lot.messages:
-                    account.receive_again(each.publisher, reported=reported)
+                    account.receive_again(each.publisher, each.number)
                 return list(held.lot.messages)
-            fresh = [each for each in held.lot.messages if receive(each.publisher, each.number, reported=reported)]
-            account.lose(held.lost)
+            unknown = account.unknown
+            fresh = [each for each in held.lot.messages if account.receive(each.publisher, each.number)]
+            account.appraise(account.unknown - unknown, held.lost)
         return fresh
 
     def lose(self, held: Iterable[Held], reason: str = RING_FULL) -> None:

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.spool.accounts import Losses
 
 MESSAGE_BYTES: Final = 256
 """What CPython needs for a message beside its content: a tuple of five, its bytes' head, three integers, a place in a list."""
@@ -25,8 +26,8 @@ class Held(NamedTuple):
     """A piece of what one drain took of a topic."""
 
     lot: Lot
-    lost: int | None
-    """What the middleware reports to have lost with it; None where it reports nothing."""
+    lost: Losses
+    """What is estimated to have been lost before the last of it; None where nobody knows."""
     at_s: float
     """When it was drained, by the monotonic clock."""
     size: int
@@ -64,7 +65,7 @@ class Ring:
         with self._lock:
             return self._items[-1].at_s - self._items[0].at_s if self._items else 0.0
 
-    def put(self, lot: Lot, lost: int | None, now_s: float, latched: int = 0) -> list[Held]:
+    def put(self, lot: Lot, lost: Losses, now_s: float, latched: int = 0) -> list[Held]:
         """Take in messages; whatever is too old or too much goes, the oldest first. What an event asked for of that."""
         pieces = [piece._replace(latched=latched) for piece in _pieces(lot, lost, now_s)]
         with self._lock:
@@ -142,14 +143,14 @@ class Ring:
         return sum(held.size for kept in self._latched.values() for held in kept)
 
 
-def _pieces(lot: Lot, lost: int | None, now_s: float) -> Iterator[Held]:
+def _pieces(lot: Lot, lost: Losses, now_s: float) -> Iterator[Held]:
     """A lot in parts of about ``PIECE_BYTES``; what was lost belongs to the last of them."""
     part: list[Taken] = []
     size = 0
     for message in lot.messages:
         cost = len(message.cdr) + MESSAGE_BYTES
         if part and size + cost > PIECE_BYTES:
-            yield Held(lot._replace(messages=part), None if lost is None else 0, now_s, size)
+            yield Held(lot._replace(messages=part), None if lost is None else {}, now_s, size)
             part, size = [], 0
         part.append(message)
         size += cost

@@ -13,10 +13,11 @@ from rclpy.node import Node
 from shadowhound_data_logger.bags.metadata import offered_qos
 from shadowhound_data_logger.bags.queue import QUEUE_FULL, BagQueue, Lot
 from shadowhound_data_logger.capture.endpoints import Senders
-from shadowhound_data_logger.capture.stream import Repeats, Shared, is_named
+from shadowhound_data_logger.capture.stream import Pace, Repeats, Shared, is_named
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.model import Taken
-from shadowhound_data_logger.spool.accounts import BAG, PAUSED, Accounts, TopicAccount
+from shadowhound_data_logger.spool.accounts import BAG, PAUSED, Accounts, Losses, TopicAccount
+from shadowhound_data_logger.spool.estimator import TopicEstimate
 
 
 class BagTap:
@@ -44,19 +45,19 @@ class BagTap:
             self._before = self._accounts.last_numbers(BAG)
         self._topics = topics
 
-    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: int | None, *, paused: bool) -> None:
-        """Count messages that are no repeats, their senders named, and hand them on; ``lost`` as in ``Stream.add``."""
+    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: Losses, *, paused: bool) -> None:
+        """Count messages that are no repeats, their senders named, and hand them on; ``lost`` as in ``TopicAccount.appraise``."""
         if not taken:
             return
         paused = paused or self._queue.paused
         with self._accounts.entry(f'{BAG}{topic}') as account:
             account.type = type_name
-            receive, reported = account.receive, lost is not None
+            receive, unknown = account.receive, account.unknown
             fresh = [
                 message for message in taken
-                if receive(message.publisher, message.number, reported=reported) or self._is_earlier(topic, message, account)
+                if receive(message.publisher, message.number) or self._is_earlier(topic, message, account)
             ]  # fmt: skip
-            account.lose(lost)
+            account.appraise(account.unknown - unknown, lost)
             if paused:
                 account.dropped[PAUSED] += len(fresh)
         if fresh and paused:
@@ -75,7 +76,7 @@ class BagTap:
         if mark in self._again:
             return False
         self._again.add(mark)
-        account.receive_again(mark[1])
+        account.receive_again(mark[1], message.number)
         return True
 
     def _qos_of(self, topic: str, type_name: str) -> str:
@@ -102,22 +103,29 @@ class BagStream:
         self._type = type_name
         self._tap = shared.tap
         self._repeats = Repeats()
+        self._pace = Pace()
+        self._estimate = TopicEstimate()
 
     def update(self, sensor: SensorSettings) -> None:
         """Nothing of it is sampled."""
 
-    def add(self, taken: Sequence[Taken], senders: Senders, lost: int | None, now_s: float, *, paused: bool,  # noqa: ARG002
+    def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool,
             idle: bool = False) -> None:  # noqa: ARG002  # fmt: skip
         """Take messages in the order in which they came."""
-        fresh = []
+        fresh: list[Taken] = []
+        sent: dict[str, list[int]] = {}
         for message in taken:
             publisher = message.publisher or senders.name(message.number, message.source_ns)
             if is_named(message) or not self._repeats.has(message):
                 fresh.append(message if message.publisher else message._replace(publisher=publisher))
+                if publisher is None or message.number is None:
+                    sent.setdefault(message.publisher or '', []).append(message.source_ns)
+        lost = self._estimate.observe(sent, self._pace.hear(senders, now_s)).lost if sent else None
         self._tap.add(self._topic, self._type, fresh, lost, paused=paused)
 
-    def close_due(self, now_s: float, grace_s: float) -> None:
+    def close_due(self, now_s: float, grace_s: float) -> None:  # noqa: ARG002
         """There are no batches."""
+        self._pace.look(now_s)
 
     def close_batch(self) -> None:
         """There are no batches."""

@@ -83,6 +83,9 @@ def _topic(row: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> tup
         return OK, 'not enabled'
     lost = {what: (row[what] or 0) - (before[what] or 0) for what in ('missed', 'dropped', 'rejected')}
     grown = [f'{count} {what}' for what, count in lost.items() if count > 0]
+    about = (row['missed_estimated'] or 0) - (before['missed_estimated'] or 0)
+    if about > 0:
+        grown.insert(0, f'~{about} missed')
     if grown:
         return WARN, f'{", ".join(grown)} lately'
     if row['other_types']:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil
+from math import ceil, inf
 from typing import Final
 
 from shadowhound_data_logger.config import IntakeSettings
@@ -102,14 +102,21 @@ class Senders:
 
     def __init__(self) -> None:
         self.gids: list[str] = []
+        self.changed_s = -inf
+        """When one came that was not there before, by the monotonic clock; the first ones are not counted."""
+        self.several_s: float | None = None
+        """Since when there are several."""
         self._successors = 0
         self._number = 0
         self._number_before = 0
         self._sent_ns = 0
 
-    def look(self, gids: list[str]) -> None:
+    def look(self, gids: list[str], now_s: float = 0.0) -> None:
         """What the graph says now."""
+        self.several_s = None if len(gids) < 2 else now_s if self.several_s is None else self.several_s
         if gids and gids != self.gids:
+            if self.gids and not set(gids) <= set(self.gids):
+                self.changed_s = now_s
             self.gids = gids
             self._successors = 0
 

@@ -22,7 +22,7 @@ from shadowhound_data_logger.capture.stream import Tap
 from shadowhound_data_logger.conditions import Condition, conditions
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.options import EventSettings
-from shadowhound_data_logger.spool.accounts import PAUSED
+from shadowhound_data_logger.spool.accounts import PAUSED, Losses
 
 SEEN: Final = 10
 """Messages of one drain that conditions look at, evenly chosen: 50 a second."""
@@ -78,7 +78,7 @@ class EventTap:
         self._claims = claims
         self._qos: dict[tuple[str, str, str | None], str] = {}
 
-    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: int | None, *, paused: bool) -> None:
+    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: Losses, *, paused: bool) -> None:
         """Take in messages, their senders named; repeats are left out by whoever writes them."""
         if not taken:
             return
@@ -121,7 +121,7 @@ class Taps:
         """One of them may want other topics than before."""
         self.topics = frozenset().union(*(tap.topics for tap in self._taps))
 
-    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: int | None, *, paused: bool) -> None:
+    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: Losses, *, paused: bool) -> None:
         for tap in self._taps:
             if topic in tap.topics:
                 tap.add(topic, type_name, taken, lost, paused=paused)

@@ -27,8 +27,6 @@ try:
 except ImportError:  # Humble
     from rclpy.qos_event import SubscriptionEventCallbacks
 
-EventHandle: Any = getattr(rclpy_implementation, 'EventHandle', None) or getattr(rclpy_implementation, 'QoSEvent', None)
-"""An event of a subscription that is asked by hand, outside any wait set; the second name is Humble's."""
 MAX_TAKES: Final = 20_000
 """Takes of one drain: beyond it the other topics have their turn first."""
 
@@ -109,8 +107,6 @@ class Reader:
         self._node = node
         self._class = message_class(plan.type)
         self._names: dict[bytes, str] = {}
-        self._losses: Any = None
-        self._overrun = False
         profile = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
             depth=plan.depth,
@@ -138,40 +134,17 @@ class Reader:
         handle = self._subscription.handle
         with handle:
             take, message_type = handle.take_message, self._class
-            for count in range(MAX_TAKES):
+            for _ in range(MAX_TAKES):
                 taken = take(message_type, True)
                 if taken is None:
-                    self._overrun = self._overrun or count >= self.plan.depth
                     return
                 cdr, info = taken
                 yield Taken(
                     cdr, info['source_timestamp'], self._publisher(info), info.get('publication_sequence_number'),
                     info['received_timestamp'] or _came_ns(info['source_timestamp']),
                 )  # fmt: skip
-            self._overrun = True
-
-    def lost(self) -> int | None:
-        """Messages that the middleware reports as lost since the last call, the first time since the match.
-
-        None where it reports none, and when the history was full: what it overwrites there it does not report.
-        """
-        overrun, self._overrun = self._overrun, False
-        if overrun:
-            return None
-        if self._losses is None:
-            kind = rclpy_implementation.rcl_subscription_event_type_t.RCL_SUBSCRIPTION_MESSAGE_LOST
-            try:
-                with self._subscription.handle:
-                    self._losses = EventHandle(self._subscription.handle, kind)
-            except rclpy_implementation.UnsupportedEventTypeError:
-                return None
-        with self._losses:
-            report = self._losses.take_event()
-        return 0 if report is None else int(report.total_count_change)
 
     def close(self) -> None:
-        if self._losses is not None:
-            self._losses.destroy_when_not_in_use()
         self._node.destroy_subscription(self._subscription)
 
     def _publisher(self, info: Mapping[str, Any]) -> str | None:

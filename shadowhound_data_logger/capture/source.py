@@ -29,6 +29,8 @@ MakeStream = Callable[[SensorSettings, str, str, int, Shared], AnyStream]
 
 FALLBACK_S: Final = 1.0
 """How long the preferred topic must be without a publisher before another one is taken."""
+PAUSE_S: Final = 0.3
+"""After a longer one who publishes now is looked up before messages that do not name their sender are counted."""
 OVERLAP_S: Final = 0.5
 """How long the old subscription lives beside its successor, at least until that is matched."""
 NAMELESS_S: Final = 2.0
@@ -191,7 +193,7 @@ class Source:
         if publishers:
             self.is_latched = all(publisher.transient_local for publisher in publishers)
             self.has_latched = any(publisher.transient_local for publisher in publishers)
-        self._senders.look([publisher.gid for publisher in publishers])
+        self._senders.look([publisher.gid for publisher in publishers], now_s)
         self._look_at_others(type_name, found, now_s)
         if not type_name or not self._is_available(type_name):
             return
@@ -370,20 +372,9 @@ class Source:
         taken = list(reader.drain())
         if not taken or self._stream is None:
             return
-        self._last_received_s = now_s
-        lost: int | None = None
-        if taken[0].number is None:
-            lost = self._lost(reader)
-        elif taken[0].publisher is None and not self._senders.gids:
-            self._senders.look([each.gid for each in endpoints(self._node, self._chosen) if each.type == self._type])
-        self._stream.add(taken, self._senders, lost, now_s, paused=self._paused, idle=self._idle)
-
-    def _lost(self, reader: Reader) -> int | None:
-        """What the middleware reports to have lost; None where that cannot be known.
-
-        What one of two subscriptions lost the other one may have received. While it is not known yet which one is wanted,
-        nobody is asked: the wanted one tells it later.
-        """
-        if self._heard == {reader.plan}:
-            return reader.lost()
-        return None if len(self._heard) > 1 else 0
+        last_s, self._last_received_s = self._last_received_s, now_s
+        is_unnamed = taken[0].publisher is None or taken[0].number is None
+        if is_unnamed and (not self._senders.gids or last_s is None or now_s - last_s > PAUSE_S):
+            gids = [each.gid for each in endpoints(self._node, self._chosen) if each.type == self._type]
+            self._senders.look(gids, now_s)
+        self._stream.add(taken, self._senders, now_s, paused=self._paused, idle=self._idle)

@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 PERIOD_S: Final = 1.0
 WINDOW_S: Final = 5.0
 """Rates are over so long, and what is new is new for so long."""
-_NOTHING: Final = Totals('', 'received-only', 0, 0, 0, 0, 0, 0, None, 0)
+_NOTHING: Final = Totals('', None, 0, 0, 0, 0, 0, 0, None, None, 0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,8 +12,9 @@ import click
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.cli.tables import number, plain, plain_table, show_whole, volume
+from shadowhound_data_logger.cli.tables import figure, number, plain, plain_table, show_whole, unsure, volume
 from shadowhound_data_logger.config import home
+from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.ledger import imbalances, read
 from shadowhound_data_logger.spool.status import robots
 
@@ -21,9 +22,11 @@ COLUMNS: Final = ('published', 'received', 'missed', 'skipped', 'rejected', 'dro
 ALWAYS: Final = frozenset({'published', 'received', 'missed', 'skipped', 'stored'})
 """The other columns appear once there is something in them."""
 CAUSES: Final = {'missed': 'missed_by', 'rejected': 'rejected', 'dropped': 'dropped'}
+GRADED: Final = ('published', 'received', 'missed')
+"""What is known of each grade by itself."""
 ACCOUNTING: Final = {
-    'reported': 'its messages carry no numbers here: what was missed is known only as far as the middleware reports it',
-    'received-only': 'its messages carry no numbers here: what was missed is not known',
+    ESTIMATED: 'its messages carry no numbers here: what was missed is estimated (~) from the rhythm of those that came',
+    RECEIVED_ONLY: 'its messages carry no numbers here, and no rhythm: what was missed is not known',
 }
 
 
@@ -78,12 +81,18 @@ def _whose(found: Mapping[str, Any]) -> str:
 def _table(title: str, topics: Mapping[str, Any]) -> RenderableType:
     rows = {topic: _figures(row) for topic, row in topics.items()}
     columns = [name for name in COLUMNS if name in ALWAYS or any(row[name] for row in rows.values())]
-    table = plain_table(title, ('topic', *columns))
+    graded = any(set(row['by_grade']) - {EXACT} for row in topics.values())
+    table = plain_table(title, ('topic', *(['grade'] if graded else []), *columns), left=('topic', 'grade'))
     for topic, row in rows.items():
-        table.add_row(plain(topic), *(_lossy(name, row[name]) for name in columns))
+        grade = [topics[topic]['accounting'] or '-'] if graded else []
+        table.add_row(plain(topic), *grade, *(_lossy(name, row) for name in columns))
+        parts = topics[topic]['by_grade']
+        for part in parts if len(parts) > 1 else ():
+            table.add_row('', part, *(_lossy(name, parts[part]) if name in GRADED else '' for name in columns), style='dim')
     if len(rows) > 1:
         table.add_section()
-        table.add_row('all', *(_lossy(name, _sum(row[name] for row in rows.values())) for name in columns), style='bold')
+        total = _total([row for topic, row in rows.items() if topics[topic]['accounting']], columns)
+        table.add_row('all', *([''] if graded else []), *(_lossy(name, total) for name in columns), style='bold')
     return table
 
 
@@ -104,12 +113,15 @@ def notes(found: Mapping[str, Any]) -> list[str]:
     for topic, row in (*found['topics'].items(), *in_files):
         for name, key in CAUSES.items():
             if row[key]:
-                lines.append(f'{topic}: {name} by {_listed(row[key])}')
+                mark = '~' if row.get(f'{name}_estimated') is not None else ''
+                lines.append(f'{topic}: {name} by {_listed(row[key], mark)}')
         elsewhere = {state: count for state, count in row['stored_in'].items() if count and state != 'delivered'}
         if elsewhere:
             lines.append(f'{topic}: of {row["stored"]:,} stored, {_listed(elsewhere)}')
         lines += [f'{topic}: {_other_type(name, other)}' for name, other in row.get('other_types', {}).items()]
-        if row['accounting'] in ACCOUNTING:
+        if not row['received']:
+            lines.append(f'{topic}: not one message of it was received')
+        elif row['accounting'] in ACCOUNTING:
             lines.append(f'{topic}: {ACCOUNTING[row["accounting"]]}')
     return [*lines, *clock_notes(found.get('clock', {}))]
 
@@ -133,27 +145,44 @@ def clock_notes(clock: Mapping[str, Any]) -> Iterator[str]:
 def verdict(found: Mapping[str, Any]) -> Text:
     """One line, or one for each identity that does not hold."""
     if found['balanced']:
-        return Text.assemble(('The ledger balances', 'green'), ': every message is stored, skipped, or listed as lost.')
+        return Text.assemble(('The ledger balances', 'green'), f': {_known(found["topics"])}')
     return Text('\n').join(Text.assemble(('Does not balance', 'red'), f': {line}') for line in imbalances(dict(found)))
 
 
+def _known(topics: Mapping[str, Any]) -> str:
+    """What the ledger says of all messages: no more than the worst grade among them."""
+    graded = [{*row['by_grade'], row['accounting']} - {None} for row in topics.values()]
+    worst = [max(grades, key=GRADES.index) for grades in graded if grades]
+    if not set(worst) - {EXACT}:
+        return 'every message is stored, skipped, or listed as lost.'
+    return f'every message that was received is stored, skipped, or listed as lost; what was missed is {unsure(worst)}.'
+
+
 def _figures(row: Mapping[str, Any]) -> dict[str, int | None]:
-    return {name: sum(row[name].values()) if isinstance(row[name], Mapping) else row[name] for name in COLUMNS}
+    about = {f'{name}_estimated': row[f'{name}_estimated'] for name in ('published', 'missed')}
+    return about | {name: sum(row[name].values()) if isinstance(row[name], Mapping) else row[name] for name in COLUMNS}
 
 
-def _sum(values: Iterable[int | None]) -> int | None:
-    """None as soon as one is not known."""
-    known = list(values)
-    return None if None in known else sum(value for value in known if value is not None)
+def _total(rows: Sequence[Mapping[str, int | None]], columns: Iterable[str]) -> dict[str, int | None]:
+    """Of topics that were heard: an estimate as soon as one figure is, None as soon as one is not known."""
+    total: dict[str, int | None] = {}
+    for name in columns:
+        about = f'{name}_estimated'
+        known = [row[name] if row.get(about) is None else row[about] for row in rows]
+        is_estimated = any(row.get(about) is not None for row in rows)
+        total[about if is_estimated else name] = None if None in known else sum(value or 0 for value in known)
+        total.setdefault(name, None)
+    return total
 
 
-def _lossy(name: str, value: int | None) -> str:
-    return f'[yellow]{number(value)}[/]' if name in CAUSES and value else number(value)
+def _lossy(name: str, row: Mapping[str, Any]) -> str:
+    is_loss = name in CAUSES and (row[name] or row.get(f'{name}_estimated'))
+    return f'[yellow]{figure(row, name)}[/]' if is_loss else figure(row, name)
 
 
-def _listed(counts: Mapping[str, int]) -> str:
+def _listed(counts: Mapping[str, int], mark: str = '') -> str:
     """``restart 12, transport 3``, the largest first."""
-    return ', '.join(f'{name} {count:,}' for name, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+    return ', '.join(f'{name} {mark}{count:,}' for name, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
 
 def _section(lines: list[str]) -> list[RenderableType]:

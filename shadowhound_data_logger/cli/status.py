@@ -16,11 +16,12 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from shadowhound_data_logger.cli.tables import bar, duration, fit, number, plain, plain_table, show_whole, volume
+from shadowhound_data_logger.cli.tables import bar, duration, figure, fit, number, plain, plain_table, show_whole, unsure, volume
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
 from shadowhound_data_logger.config import home
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.spool.accounts import EXACT
 from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, read, robots
 
 LOSSES: Final = ('dropped', 'rejected')
@@ -109,10 +110,18 @@ def view(found: Mapping[str, Any], console: Console) -> list[RenderableType]:
         parts.append(Text('What became of every message: shadowhound-data ledger', 'dim'))
     parts += [plain(line, 'yellow') for line in found['findings'] if live or line != NOT_RUNNING_TEXT]
     if not found['findings']:
-        parts.append(Text('Fine: nothing was missed, dropped, rejected or quarantined in this session.', 'green'))
+        parts.append(Text(_fine(found['topics']), 'green'))
     if found['others']:
         parts.append(plain(f'Also running here: {", ".join(found["others"])} (--robot NAME)', 'dim'))
     return parts
+
+
+def _fine(topics: Mapping[str, Any]) -> str:
+    """Nothing to be looked at; what nobody can know is not called nothing."""
+    heard = [row['accounting'] for row in topics.values() if row['received']]
+    if not set(heard) - {EXACT}:
+        return 'Fine: nothing was missed, dropped, rejected or quarantined in this session.'
+    return f'Fine: nothing was dropped, rejected or quarantined in this session; what was missed is {unsure(heard)}.'
 
 
 def _head(found: Mapping[str, Any]) -> Text:
@@ -148,7 +157,8 @@ def _topics(topics: Mapping[str, Any]) -> Iterator[RenderableType]:
         rate = f'{row["rate_hz"]:,.1f}' if row['enabled'] else 'off'
         age = '-' if row['age_s'] is None else duration(row['age_s'])
         counts = (number(row[name]) for name in ('received', 'stored'))
-        lost = (Text(number(row[name]), 'yellow' if row[name] else '') for name in ('missed', *losses))
+        lost = (Text(figure(row, name), 'yellow' if row[name] or row.get(f'{name}_estimated') else '')
+                for name in ('missed', *losses))  # fmt: skip
         table.add_row(plain(topic), rate, age, *counts, *lost)
     if rows:
         yield table

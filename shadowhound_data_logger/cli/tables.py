@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Final
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
 
 from rich.console import Console, Group, RenderableType
 from rich.measure import Measurement
@@ -11,9 +11,11 @@ from rich.table import Table
 from rich.text import Text
 
 from shadowhound_data_logger.keys import printable
+from shadowhound_data_logger.spool.accounts import ESTIMATED, RECEIVED_ONLY
 
 BAR_COLUMNS: Final = 10
 WIDEST: Final = 1000
+UNSURE: Final = {ESTIMATED: 'estimated', RECEIVED_ONLY: 'not known'}
 UNITS: Final = ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min'), (60, 'min', 1, 's'))
 
 
@@ -64,6 +66,18 @@ def bar(share: float, console: Console) -> Text:
 def number(value: int | None) -> str:
     """With separators; a dash for what is not known."""
     return '-' if value is None else f'{value:,}'
+
+
+def figure(row: Mapping[str, Any], name: str) -> str:
+    """A figure of a ledger or a status: ``~12`` where it is estimated, a dash where it is not known."""
+    about = row.get(f'{name}_estimated')
+    return number(row[name]) if about is None else f'~{about:,}'
+
+
+def unsure(grades: Sequence[str]) -> str:
+    """``estimated for 2 topics and not known for 1 topic``, of the grades of several."""
+    counts = {text: grades.count(grade) for grade, text in UNSURE.items()}
+    return ' and '.join(f'{text} for {count} topic{"s" * (count > 1)}' for text, count in counts.items() if count)
 
 
 def volume(count: float) -> str:

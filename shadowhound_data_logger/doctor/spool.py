@@ -96,9 +96,8 @@ def _node(found: Mapping[str, Any], folder: Path) -> Iterator[Result]:
             STORE,
         )
     missed = {
-        topic: row['missed'] + row['dropped'] + row['rejected']
+        topic: (row['missed'] or row['missed_estimated'] or 0) + row['dropped'] + row['rejected']
         for topic, row in found['topics'].items()
-        if row['missed'] is not None
     }
     for text in found['findings']:
         if not text.startswith('delivery:'):

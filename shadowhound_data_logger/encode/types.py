@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
@@ -29,6 +29,12 @@ PLACEHOLDER: Final = 'structure_needs_at_least_one_member'
 """The field that rosidl puts into a message without any; it carries nothing."""
 
 _TYPE_NAME = re.compile(r'[A-Za-z]\w*/msg/[A-Za-z]\w*', re.ASCII)
+_WHOLE: Final = {'int8': 'b', 'uint8': 'B', 'byte': 'B', 'int16': 'h', 'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q'}
+_SIZES: Final = {
+    **{name: struct.calcsize(code) for name, code in _WHOLE.items()}, 'uint64': 8, 'float32': 4, 'float64': 8, 'bool': 1,
+    'char': 1,
+}  # fmt: skip
+"""Bytes of a field of a type in CDR, and what it is aligned to."""
 _STAMP_LE: Final = struct.Struct('<iI')
 _STAMP_BE: Final = struct.Struct('>iI')
 _LENGTH_LE: Final = struct.Struct('<I')
@@ -53,6 +59,26 @@ def header_frame_id(cdr: bytes) -> str:
         return ''
     (length,) = (_LENGTH_LE if cdr[1] else _LENGTH_BE).unpack_from(cdr, start - _LENGTH_LE.size)
     return cdr[start : start + length - 1].decode('utf-8', 'replace') if 0 < length <= len(cdr) - start else ''
+
+
+class CounterField(NamedTuple):
+    """Where a whole number is in the CDR of every message of a type."""
+
+    offset: int
+    little: struct.Struct
+    big: struct.Struct
+
+    @property
+    def wrap(self) -> int:
+        """It begins anew after so many values."""
+        return 1 << 8 * self.little.size
+
+    def read(self, cdr: bytes) -> int:
+        """The number; 0 where the bytes are too few."""
+        if len(cdr) < self.offset + self.little.size:
+            return 0
+        (value,) = (self.little if cdr[1] else self.big).unpack_from(cdr, self.offset)
+        return int(value)
 
 
 class MessageTypes:
@@ -99,6 +125,49 @@ class MessageTypes:
         except Rejected:
             return False
         return description == (Nodetype.NAME, HEADER)
+
+    def counter(self, type_name: str, field: str) -> CounterField:
+        """How to read a whole number at ``field`` (dotted: bms_state.cycle) from the CDR of a message.
+
+        Raises Rejected: ``unknown_type``, or ``unknown_field`` where there is none, or none at a place that is always the same.
+        """
+        place, kind = 0, ''
+        rest: list[str] = field.split('.')
+        while rest:
+            wanted = rest.pop(0)
+            for name, description in self.fields(type_name):
+                if name == wanted:
+                    break
+                place = self._end(description, place)
+            else:
+                raise Rejected('unknown_field', f'{type_name} has no field {wanted!r}')
+            if description[0] == Nodetype.NAME:
+                type_name = description[1]
+            elif description[0] == Nodetype.BASE and description[1][0] in _WHOLE and not rest:
+                kind = description[1][0]
+            else:
+                break
+        if not kind:
+            raise Rejected('unknown_field', f'{field!r} is no field of {type_name} with a whole number')
+        size = struct.calcsize(_WHOLE[kind])
+        place += -place % size
+        return CounterField(place + ENCAPSULATION_BYTES, struct.Struct(f'<{_WHOLE[kind]}'), struct.Struct(f'>{_WHOLE[kind]}'))
+
+    def _end(self, description: FieldDesc, place: int) -> int:
+        """Where a field ends that begins at ``place`` or, aligned, after it, in bytes after the encapsulation (XCDR1)."""
+        if description[0] == Nodetype.BASE and description[1][0] in _SIZES:
+            size = _SIZES[description[1][0]]
+            return place + -place % size + size
+        if description[0] == Nodetype.ARRAY:
+            of, count = description[1]
+            for _ in range(count):
+                place = self._end(of, place)
+            return place
+        if description[0] == Nodetype.NAME:
+            for _, each in self.fields(description[1]):
+                place = self._end(each, place)
+            return place
+        raise Rejected('unknown_field', 'it comes after a field whose length changes')
 
     def _load(self, type_name: str) -> Fielddefs:
         with self._lock:

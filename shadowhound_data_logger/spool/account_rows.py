@@ -45,6 +45,12 @@ class TopicRow:
     rejected: Mapping[str, int]
     dropped: Mapping[str, int]
     last_kept_ns: int
+    estimated: int = 0
+    """Of ``received``, those without numbers whose losses are estimated."""
+    unknown: int = 0
+    """Of ``received``, those of which only that is known."""
+    missed: Mapping[str, int] = field(default_factory=dict)
+    """Estimated losses by cause; those that numbers tell are in the rows of the publishers."""
 
     @property
     def open(self) -> int:
@@ -56,7 +62,8 @@ class Totals:
     """A topic of this session at one instant, as sums."""
 
     type: str
-    accounting: str
+    accounting: str | None
+    """The grade of the newest message; None before the first."""
     received: int
     stored: int
     skipped: int
@@ -65,6 +72,9 @@ class Totals:
     """Without those of a pause, which somebody asked for."""
     paused: int
     missed: int | None
+    """None where it is not known exactly."""
+    missed_estimated: int | None
+    """None where it is known exactly, or not at all."""
     open: int
     wrong_type: int = 0
     """Of those that were received and rejected: they are of another type than the topic's own."""
@@ -74,9 +84,25 @@ class Totals:
 
 
 @dataclass(frozen=True, slots=True)
+class RhythmRow:
+    """What is known of the rhythm of a topic without numbers (``estimator``), for the next session."""
+
+    topic: str
+    publisher: str
+    """The gid of its only one; '' where there are several, or where that is not known."""
+    of: str
+    """What has the rhythm: ``stamps``, or ``counter:FIELD``."""
+    period: float
+    """ns, or counts; 0 where it is not known."""
+    last: int
+    """The newest stamp or count."""
+
+
+@dataclass(frozen=True, slots=True)
 class Snapshot:
     """The accounts at one instant, as a group commit writes them."""
 
     topics: tuple[TopicRow, ...]
     publishers: tuple[PublisherRow, ...]
     other_types: tuple[OtherTypeRow, ...] = ()
+    rhythms: tuple[RhythmRow, ...] = ()

@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
-from shadowhound_data_logger.spool.account_rows import OtherTypeRow, PublisherRow, Snapshot, TopicRow, Totals
+from shadowhound_data_logger.spool.account_rows import OtherTypeRow, PublisherRow, RhythmRow, Snapshot, TopicRow, Totals
+from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
 from shadowhound_data_logger.spool.span import Span
 
 PAUSED: Final = 'paused'
 """Why messages are dropped that come during a pause."""
-EXACT, REPORTED, RECEIVED_ONLY = 'exact', 'reported', 'received-only'
-GRADES: Final = (EXACT, REPORTED, RECEIVED_ONLY)
-"""How good a topic's accounting is, best first; over several sessions the worst counts."""
+EXACT, ESTIMATED, RECEIVED_ONLY = 'exact', 'estimated', 'received-only'
+GRADES: Final = (EXACT, ESTIMATED, RECEIVED_ONLY)
+"""How good the accounting of a message is, best first: what was missed beside it is known by numbers, by a rhythm, or not."""
 BAG: Final = 'bag:'
 """Before the name of a topic: its account with the bags, a sink of its own. No name of ROS has a colon."""
 EVENT: Final = 'event:'
@@ -34,8 +35,8 @@ MAX_OTHER_TYPES: Final = 8
 MORE_TYPES: Final = '(more)'
 MAX_NODES: Final = 3
 """Publishers of such a type, by name."""
-TOPIC_WIDE: Final = ''
-"""Instead of a publisher, for the span of a topic whose losses the middleware reports without saying whose they are."""
+Losses = Mapping[str, int] | None
+"""What was lost before some messages, by cause, as far as it is estimated; None where nobody knows."""
 
 
 @dataclass(slots=True)
@@ -61,16 +62,28 @@ class TopicAccount:
     """One topic of one session. Mutated only under the lock of the Accounts it belongs to."""
 
     type: str = ''
-    accounting: str = EXACT
+    accounting: str = ''
+    """The grade of the newest message; '' before the first."""
+    before: str = ''
+    """The same of the sessions before."""
     received: int = 0
     skipped: int = 0
     stored: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
     publishers: dict[str, Span] = field(default_factory=dict)
+    estimated: int = 0
+    """Of ``received``, those without numbers that a rhythm counts."""
+    unknown: int = 0
+    """Of ``received``, those without numbers of which nothing else is known."""
+    missed_estimated: Counter[str] = field(default_factory=Counter)
+    """Beside those that were estimated, by cause."""
+    estimate: TopicEstimate = field(default_factory=TopicEstimate)
     last_kept_ns: int = 0
     """Stamp of the newest sample that is durable: a restarted node goes on sampling after it."""
     other_types: dict[str, OtherType] = field(default_factory=dict)
+    is_doubtful: bool = False
+    """Whether nobody knows which of its messages are the topic's own: their numbers tell nothing then."""
 
     @property
     def open(self) -> int:
@@ -79,51 +92,87 @@ class TopicAccount:
 
     @property
     def missed(self) -> int | None:
-        """Messages that were published and never taken; None where that cannot be known."""
-        if self.accounting == RECEIVED_ONLY:
+        """Messages that were published and never taken; None where that is not known exactly."""
+        if self.accounting != EXACT or self.estimated or self.unknown:
             return None
         return sum(span.missed.total() for span in self.publishers.values())
 
-    def receive(self, publisher: str | None, number: int | None, *, reported: bool = False) -> bool:
-        """Count one taken message; False for a repeat.
+    @property
+    def about_missed(self) -> int | None:
+        """The same where a part of it is estimated; None where all is known exactly, or a part not at all."""
+        if not self.estimated or self.unknown or self.is_doubtful:
+            return None
+        return self.missed_estimated.total() + sum(span.missed.total() for span in self.publishers.values())
 
-        Without number or publisher, from then on, all that can be said of the topic is what the middleware itself reports to
-        have lost (``reported``: it does), or nothing.
-        """
-        if publisher is None or number is None or self.accounting != EXACT:
-            if self.accounting != RECEIVED_ONLY:
-                self.accounting = REPORTED if reported else RECEIVED_ONLY
-            if self.accounting == REPORTED:
-                self._span(TOPIC_WIDE).count()
-        elif not self._span(publisher).observe(number):
-            return False
+    def receive(self, publisher: str | None, number: int | None) -> bool:
+        """Count one taken message; False for a repeat. One without publisher or number is unknown until ``appraise``."""
+        if publisher is not None and number is not None and (self.accounting == EXACT or self._begin_numbers()):
+            if not self._span(publisher).observe(number):
+                return False
+        else:
+            if self.accounting != ESTIMATED:
+                self.accounting = RECEIVED_ONLY
+            self.unknown += 1
         self.received += 1
         return True
 
-    def receive_again(self, publisher: str | None, *, reported: bool = False) -> None:
+    def receive_again(self, publisher: str | None, number: int | None) -> None:
         """Count a message that was counted before, and that is wanted once more; arguments as above."""
-        if publisher is None or self.accounting != EXACT:
-            self.receive(None, None, reported=reported)
+        if publisher is None or number is None or not (self.accounting == EXACT or self._begin_numbers()):
+            self.receive(None, None)
             return
         self._span(publisher).count()
         self.received += 1
 
-    def lose(self, count: int | None) -> None:
-        """What the middleware reports to have lost since it was last asked; None where it may have lost more without a word."""
-        if self.accounting == REPORTED:
-            if count is None:
-                self.accounting = RECEIVED_ONLY
-            elif count:
-                self._span(TOPIC_WIDE).lose(count)
+    def expect(self, expected: Expectation) -> None:
+        """What is known of the stamps of messages without numbers."""
+        self.estimate.expect(expected)
+
+    def observe(self, stamps: Mapping[str, Sequence[int]], hearing: Hearing) -> Losses:
+        """Estimate what was lost before messages without numbers, just received: publisher ('' where not known) -> stamps."""
+        found = self.estimate.observe(stamps, hearing)
+        self.unknown -= found.covered
+        self.estimated += found.covered
+        self.missed_estimated.update(found.missed)
+        self.accounting = ESTIMATED if self.estimate.known else RECEIVED_ONLY
+        return found.lost
+
+    def appraise(self, count: int, lost: Losses) -> None:
+        """Somebody else estimated what was lost before ``count`` messages without numbers, just received."""
+        if count:
+            self.accounting = RECEIVED_ONLY if lost is None else ESTIMATED
+            if lost is not None:
+                self.unknown -= count
+                self.estimated += count
+                for cause, change in lost.items():
+                    self.missed_estimated[cause] = max(0, self.missed_estimated[cause] + change)
 
     def find(self, count: int) -> None:
         """Messages of the session before, of which its accounts did not know yet, turned up in a file of it."""
         self.received += count
-        if self.accounting != RECEIVED_ONLY:
-            spans = list(self.publishers.values()) or [self._span(TOPIC_WIDE)]
-            for span in spans:
-                count -= span.find(count)
-            spans[-1].late(count, alone=len(spans) == 1)
+        spans = list(self.publishers.values())
+        if not spans or (self.accounting or self.before) in {ESTIMATED, RECEIVED_ONLY}:
+            self.unknown += count
+            return
+        for span in spans:
+            count -= span.find(count)
+        spans[-1].late(count, alone=len(spans) == 1)
+
+    def rebase(self) -> None:
+        """What is published until the next message was not listened to on purpose: it is not missed."""
+        for span in self.publishers.values():
+            span.rebase()
+        self.estimate.rebase()
+
+    def _begin_numbers(self) -> bool:
+        """From now on messages have numbers, and those that had none are in no gap of them; False where they tell nothing."""
+        if self.is_doubtful:
+            return False
+        if (self.accounting or self.before) in {ESTIMATED, RECEIVED_ONLY}:
+            for span in self.publishers.values():
+                span.rebase()
+        self.accounting = EXACT
+        return True
 
     def see_other(self, type_name: str, nodes: Iterable[str], *, counted: bool, named: bool) -> bool:
         """Another type is published there; whether that is news.
@@ -137,8 +186,8 @@ class TopicAccount:
         is_new = other is None
         if other is None:
             other = self.other_types[type_name] = OtherType()
-        if not (counted or named) and self.accounting != RECEIVED_ONLY:
-            self.accounting, is_new = RECEIVED_ONLY, True
+        if not (counted or named or self.is_doubtful):
+            self.accounting, self.is_doubtful, is_new = RECEIVED_ONLY, True, True
         return other.see(nodes, counted=counted) or is_new
 
     def refuse(self, type_name: str, count: int) -> None:
@@ -160,12 +209,18 @@ class TopicAccount:
 class Accounts:
     """All topics of this session. Thread-safe: ``entry`` holds the lock, the other methods take it."""
 
-    def __init__(self, inherited: Iterable[PublisherRow] = (), last_kept: Mapping[str, int] | None = None) -> None:
+    def __init__(self, inherited: Iterable[PublisherRow] = (), last_kept: Mapping[str, int] | None = None,
+                 rhythms: Iterable[RhythmRow] = (), grades: Mapping[str, str] | None = None) -> None:  # fmt: skip
+        """``grades`` are those of the newest messages, by account: a gap after others is no loss that these numbers tell."""
         self._lock = threading.Lock()
         self._topics: dict[str, TopicAccount] = {}
         self._dirty = False
         self._written: list[Span] = []
         self._inherited: dict[str, dict[str, Span]] = {}
+        self._grades = dict(grades or {})
+        self._rhythms = {
+            row.topic: row if self._grades.get(row.topic) == ESTIMATED else replace(row, publisher='') for row in rhythms
+        }
         self._carried = Counter[str]()
         self._last_kept = dict(last_kept or {})
         for row in inherited:
@@ -216,6 +271,8 @@ class Accounts:
                 account = self._account(row.topic)
                 account.type, account.accounting = row.type, row.accounting
                 account.received += row.received
+                account.estimated += row.estimated
+                account.unknown += row.unknown
                 self._carried[row.topic] += row.received
 
     def find(self, counts: Mapping[str, int]) -> None:
@@ -260,9 +317,7 @@ class Accounts:
     def rebase(self, topic: str) -> None:
         """What is published on the topic until its next message was not listened to on purpose: it is not missed."""
         with self._lock:
-            account = self._topics.get(topic)
-            for span in (account.publishers if account else self._inherited.get(topic, {})).values():
-                span.rebase()
+            self._rebase(topic)
 
     def last_numbers(self, sink: str) -> dict[str, dict[str, int]]:
         """Account -> publisher -> the highest number that it counted, in this session or an earlier one."""
@@ -276,14 +331,9 @@ class Accounts:
     def rebase_all(self, sink: str) -> None:
         """As ``rebase``, of every account whose name begins so."""
         with self._lock:
-            for topic, account in self._topics.items():
+            for topic in {*self._topics, *self._inherited, *self._rhythms}:
                 if topic.startswith(sink):
-                    for span in account.publishers.values():
-                        span.rebase()
-            for topic, spans in self._inherited.items():
-                if topic.startswith(sink):
-                    for span in spans.values():
-                        span.rebase()
+                    self._rebase(topic)
 
     def totals(self, sink: str = '') -> dict[str, Totals]:
         """Every topic of this session as it stands now; with ``sink`` (BAG, EVENT) what became of it there."""
@@ -311,6 +361,7 @@ class Accounts:
             self._written = [span for _, _, span in spans]
             for span in self._written:
                 span.changed = False
+            rhythms = (account.estimate.row(topic) for topic, account in self._topics.items())
             return Snapshot(
                 tuple(self._row(topic, account, *stored.get(topic, (0, 0))) for topic, account in self._topics.items()),
                 tuple(
@@ -322,6 +373,7 @@ class Accounts:
                     for topic, account in self._topics.items()
                     for name, other in account.other_types.items()
                 ),
+                tuple(row for row in rhythms if row is not None),
             )
 
     def mark_dirty(self) -> None:
@@ -331,10 +383,21 @@ class Accounts:
             for span in self._written:
                 span.changed = True
 
+    def _rebase(self, topic: str) -> None:
+        if account := self._topics.get(topic):
+            account.rebase()
+        for span in self._inherited.get(topic, {}).values():
+            span.rebase()
+        if row := self._rhythms.get(topic):
+            self._rhythms[topic] = replace(row, publisher='')
+
     def _account(self, topic: str) -> TopicAccount:
         account = self._topics.get(topic)
         if account is None:
-            account = self._topics[topic] = TopicAccount(publishers=self._inherited.pop(topic, {}))
+            account = self._topics[topic] = TopicAccount(
+                publishers=self._inherited.pop(topic, {}), before=self._grades.get(topic, ''),
+                estimate=TopicEstimate(before=self._rhythms.pop(topic, None)),
+            )  # fmt: skip
         return account
 
     @staticmethod
@@ -342,14 +405,15 @@ class Accounts:
         return TopicRow(
             topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
             dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
+            account.estimated, account.unknown, dict(+account.missed_estimated),
         )  # fmt: skip
 
 
 def _totals(account: TopicAccount) -> Totals:
     paused = account.dropped[PAUSED]
     return Totals(
-        account.type, account.accounting, account.received, account.stored, account.skipped, account.rejected.total(),
-        account.dropped.total() - paused, paused, account.missed, account.open,
+        account.type, account.accounting or None, account.received, account.stored, account.skipped, account.rejected.total(),
+        account.dropped.total() - paused, paused, account.missed, account.about_missed, account.open,
         account.rejected[WRONG_TYPE],
         {name: {'publishers': list(other.publishers), 'messages': other.messages} for name, other in account.other_types.items()},
     )  # fmt: skip

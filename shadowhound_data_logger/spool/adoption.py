@@ -202,4 +202,4 @@ def _more(row: TopicRow | None, topic: str, samples: int, item: DataObject) -> T
     """The account with the samples of one more file."""
     count, newest_ns = (row.stored, row.last_kept_ns) if row else (0, 0)
     count += samples
-    return TopicRow(topic, item.type, RECEIVED_ONLY, count, 0, count, {}, {}, max(newest_ns, item.t_end_ns))
+    return TopicRow(topic, item.type, RECEIVED_ONLY, count, 0, count, {}, {}, max(newest_ns, item.t_end_ns), unknown=count)

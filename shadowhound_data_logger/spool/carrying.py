@@ -6,6 +6,7 @@ A message is open until its file is spooled, or known to be lost. The two rows c
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 from shadowhound_data_logger.spool.account_rows import Snapshot, TopicRow
 from shadowhound_data_logger.spool.index import Index
@@ -17,10 +18,19 @@ def carry(index: Index, session: int, robot: str, sink: str) -> list[TopicRow]:
     for number in _ended(index, robot, sink):
         for row in index.topics(number):
             if row.topic.startswith(sink) and row.open > 0:
-                before = moved[row.topic].received if row.topic in moved else 0
-                moved[row.topic] = TopicRow(row.topic, row.type, row.accounting, before + row.open, 0, 0, {}, {}, 0)
+                before = moved.get(row.topic) or TopicRow(row.topic, '', '', 0, 0, 0, {}, {}, 0)
+                unknown = min(row.unknown, row.open)
+                estimated = min(row.estimated, row.open - unknown)
+                moved[row.topic] = replace(
+                    before, type=row.type, accounting=row.accounting, received=before.received + row.open,
+                    estimated=before.estimated + estimated, unknown=before.unknown + unknown,
+                )  # fmt: skip
+                place = number, row.topic
+                query = 'UPDATE accounts SET received = received - ? WHERE session = ? AND topic = ?'
+                index.db.execute(query, (row.open, *place))
                 index.db.execute(
-                    'UPDATE accounts SET received = received - ? WHERE session = ? AND topic = ?', (row.open, number, row.topic)
+                    'UPDATE estimates SET estimated = estimated - ?, unknown = unknown - ? WHERE session = ? AND topic = ?',
+                    (estimated, unknown, *place),
                 )
     index.write(session, Snapshot(tuple(moved.values()), ()))
     return list(moved.values())

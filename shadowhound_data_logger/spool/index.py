@@ -20,7 +20,7 @@ from typing import Final
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
-from shadowhound_data_logger.spool.account_rows import OtherTypeRow, PublisherRow, Snapshot, TopicRow
+from shadowhound_data_logger.spool.account_rows import OtherTypeRow, PublisherRow, RhythmRow, Snapshot, TopicRow
 from shadowhound_data_logger.spool.schema import definitions, expected, prepare
 
 FORGET_STEP: Final = 10_000
@@ -229,6 +229,15 @@ class Index:
             ((session, row.topic, row.publisher, row.first, row.last, row.published, row.received, json.dumps(row.missed))
              for row in snapshot.publishers),
         )  # fmt: skip
+        self.db.executemany(
+            'INSERT OR REPLACE INTO estimates VALUES (?,?,?,?,?)',
+            ((session, row.topic, row.estimated, row.unknown, json.dumps(row.missed))
+             for row in snapshot.topics if row.estimated or row.unknown or row.missed),
+        )  # fmt: skip
+        self.db.executemany(
+            'INSERT OR REPLACE INTO rhythms VALUES (?,?,?,?,?)',
+            ((row.topic, row.publisher, row.of, row.period, row.last) for row in snapshot.rhythms),
+        )
 
         self.db.executemany(
             'INSERT OR REPLACE INTO other_types VALUES (?,?,?,?,?)',
@@ -242,12 +251,15 @@ class Index:
     def topics(self, session: int | None = None) -> list[TopicRow]:
         """Accounts of one session, or of all in the order of the sessions."""
         where, values = ('WHERE session = ?', (session,)) if session is not None else ('', ())
-        columns = 'topic, type, accounting, received, skipped, stored, last_kept_ns, rejected, dropped'
-        rows = self.db.execute(f'SELECT {columns} FROM accounts {where} ORDER BY session', values)  # noqa: S608
+        columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, rejected, dropped,'
+                   " ifnull(estimated, 0), ifnull(unknown, 0), ifnull(missed, '{}')")  # fmt: skip
+        query = f'SELECT {columns} FROM accounts LEFT JOIN estimates USING (session, topic) {where} ORDER BY session'  # noqa: S608
         return [
-            TopicRow(topic, kind, accounting, received, skipped, stored, json.loads(rejected), json.loads(dropped), last_ns)
-            for topic, kind, accounting, received, skipped, stored, last_ns, rejected, dropped in rows
-        ]
+            TopicRow(topic, kind, accounting, received, skipped, stored, json.loads(rejected), json.loads(dropped), last_ns,
+                     estimated, unknown, json.loads(missed))
+            for topic, kind, accounting, received, skipped, stored, last_ns, rejected, dropped, estimated, unknown, missed
+            in self.db.execute(query, values)
+        ]  # fmt: skip
 
     def publishers(self) -> list[PublisherRow]:
         """All spans in the order of the sessions: the last row of a publisher says where its numbers stand."""
@@ -268,6 +280,10 @@ class Index:
     def _has(self, table: str) -> bool:
         """An older index is read as it is: only the node brings it up to date."""
         return self.db.execute('SELECT 1 FROM sqlite_master WHERE name = ?', (table,)).fetchone() is not None
+
+    def rhythms(self) -> list[RhythmRow]:
+        """What is known of topics without numbers, one row each."""
+        return [RhythmRow(*row) for row in self.db.execute('SELECT topic, publisher, of, period, last FROM rhythms')]
 
     def tally(self) -> list[tuple[str, str, int, int, int]]:
         """(topic or '', state or 'spooled', objects, bytes, samples)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +12,7 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import clock_record
 from shadowhound_data_logger.spool.account_rows import OtherTypeRow
-from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
+from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
 from shadowhound_data_logger.spool.index import Index
 
 STATES: Final = tuple(state.value for state in State)
@@ -68,10 +68,7 @@ def imbalances(ledger: Mapping[str, Any]) -> list[str]:
         settled = row['skipped'] + sum(row['rejected'].values()) + sum(row['dropped'].values()) + row['stored'] + row['open']
         if row['received'] != settled or row['open'] < 0:
             found.append(f'{topic}: received {row["received"]}, but skipped + rejected + dropped + stored + open = {settled}')
-        if row['published'] is not None and row['published'] != row['received'] + row['missed']:
-            found.append(f'{topic}: published {row["published"]}, but received + missed = {row["received"] + row["missed"]}')
-        if row['missed'] is not None and row['missed'] != sum(row['missed_by'].values()):
-            found.append(f'{topic}: missed {row["missed"]}, but by cause {sum(row["missed_by"].values())}')
+        found += [f'{topic}: {sentence}' for sentence in _ungraded(row)]
         if row['stored'] != sum(row['stored_in'].values()):
             found.append(f'{topic}: stored {row["stored"]}, but in objects there are {sum(row["stored_in"].values())}')
     for what in ('objects', 'bytes'):
@@ -81,22 +78,32 @@ def imbalances(ledger: Mapping[str, Any]) -> list[str]:
     return found
 
 
+def _ungraded(row: Mapping[str, Any]) -> Iterator[str]:
+    """One sentence for each identity of published and missed that does not hold, of the whole and by grade."""
+    for part in (*row['by_grade'].values(), row):
+        about = '' if part['missed'] is not None else '_estimated'
+        published, missed, causes = part[f'published{about}'], part[f'missed{about}'], sum(part['missed_by'].values())
+        if published is not None and published != part['received'] + missed:
+            yield f'published {published}, but received + missed = {part["received"] + missed}'
+        if missed is not None and missed != causes:
+            yield f'missed {missed}, but by cause {causes}'
+    graded = sum(part['received'] for part in row['by_grade'].values())
+    if row['received'] != graded:
+        yield f'received {row["received"]}, but by grade {graded}'
+
+
 def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tuple[str, str, int, int, int]],
            others: list[OtherTypeRow]) -> dict[str, Any]:  # fmt: skip
     rows = [row for row in topics if row.topic == topic]
     spans = [row for row in publishers if row.topic == topic]
-    accounting = max((row.accounting for row in rows), key=GRADES.index, default=RECEIVED_ONLY)
-    missed_by: Counter[str] = Counter()
-    for span in spans:
-        missed_by.update(span.missed)
-    known = accounting != RECEIVED_ONLY
+    received = sum(row.received for row in rows)
+    grades = _by_grade(rows, spans)
+    heard = [row.accounting for row in rows if row.received and row.accounting]
     return {
         'type': rows[-1].type if rows else '',
-        'accounting': accounting,
-        'published': sum(span.published for span in spans) if known else None,
-        'received': sum(row.received for row in rows),
-        'missed': missed_by.total() if known else None,
-        'missed_by': dict(missed_by) if known else {},
+        'accounting': heard[-1] if heard else None,
+        **(_whole(received, grades) if heard and heard[-1] != RECEIVED_ONLY else {**_UNKNOWN, 'received': received}),
+        'by_grade': grades,
         'skipped': sum(row.skipped for row in rows),
         'rejected': _sum(row.rejected for row in rows),
         'other_types': _other_types(row for row in others if row.topic == topic),
@@ -116,6 +123,40 @@ def _other_types(rows: Iterable[OtherTypeRow]) -> dict[str, dict[str, Any]]:
         known['publishers'] = list(dict.fromkeys(nodes))[:MAX_NODES]
         known['messages'] = None if None in {known['messages'], row.messages} else known['messages'] + row.messages
     return found
+
+
+def _by_grade(rows: list[Any], spans: list[Any]) -> dict[str, dict[str, Any]]:
+    """What is known of the messages of each grade that there is."""
+    unknown, estimated = sum(row.unknown for row in rows), sum(row.estimated for row in rows)
+    numbered = sum(row.received for row in rows) - estimated - unknown
+    exact = _counted(numbered, _sum(span.missed for span in spans), sum(span.published for span in spans))
+    about = _sum(row.missed for row in rows)
+    found = {
+        EXACT: exact,
+        ESTIMATED: _counted(estimated, about, estimated + sum(about.values()), '_estimated'),
+        RECEIVED_ONLY: {**_UNKNOWN, 'received': unknown},
+    }
+    return {grade: found[grade] for grade in GRADES if found[grade]['received'] or found[grade]['missed_by']}
+
+
+_UNKNOWN: Final[dict[str, Any]] = {
+    'published': None, 'published_estimated': None, 'received': 0, 'missed': None, 'missed_estimated': None, 'missed_by': {},
+}  # fmt: skip
+
+
+def _counted(received: int, missed_by: dict[str, int], published: int, about: str = '') -> dict[str, Any]:
+    missed = sum(missed_by.values())
+    return {**_UNKNOWN, f'published{about}': published, 'received': received, f'missed{about}': missed, 'missed_by': missed_by}
+
+
+def _whole(received: int, grades: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """All grades as one: no better than the worst of them."""
+    if not grades or RECEIVED_ONLY in grades:
+        return {**_UNKNOWN, 'received': received}
+    about = '_estimated' if ESTIMATED in grades else ''
+    parts = [(part, '_estimated' if grade == ESTIMATED else '') for grade, part in grades.items()]
+    published = sum(part[f'published{kind}'] for part, kind in parts)
+    return _counted(received, _sum(part['missed_by'] for part, _ in parts), published, about)
 
 
 def _sum(mappings: Any) -> dict[str, int]:

@@ -16,12 +16,14 @@ _NUMBERS: Final = {
     'accounts': ('session', 'received', 'skipped', 'stored', 'last_kept_ns'),
     'publishers': ('session', 'first', 'last', 'published', 'received'),
     'other_types': ('session', 'messages'),
+    'estimates': ('session', 'estimated', 'unknown'),
+    'rhythms': ('last',),
     'tally': ('objects', 'bytes', 'samples'),
     'contents': ('id', 'samples'),
     'sqlite_sequence': ('seq',),
 }
 _COUNTS: Final = frozenset({'id', 'samples', 'bytes', 'received', 'skipped', 'stored', 'published', 'objects', 'seq', 'session',
-                            'messages'})  # fmt: skip
+                            'messages', 'estimated', 'unknown'})  # fmt: skip
 """Never below 0, and no more than can be counted. Times and the numbers of messages are whatever a publisher says."""
 _MOST: Final = 1 << 53
 _TEXTS: Final = {
@@ -30,11 +32,15 @@ _TEXTS: Final = {
     'accounts': ('topic', 'type', 'accounting', 'rejected', 'dropped'),
     'publishers': ('topic', 'publisher', 'missed'),
     'other_types': ('topic', 'type', 'publishers'),
+    'estimates': ('topic', 'missed'),
+    'rhythms': ('topic', 'publisher', 'of'),
     'tally': ('topic', 'state'),
     'contents': ('topic',),
     'sqlite_sequence': ('name',),
 }
-_JSON: Final = {'accounts': ('rejected', 'dropped'), 'publishers': ('missed',), 'objects': ('metadata',)}
+_JSON: Final = {
+    'accounts': ('rejected', 'dropped'), 'publishers': ('missed',), 'estimates': ('missed',), 'objects': ('metadata',),
+}  # fmt: skip
 _UNSAFE: Final = (
     "length(key) > 1024 OR length(bucket) > 64 OR bucket GLOB '*[^A-Za-z0-9_.-]*' OR bucket IN ('', '.', '..')"
     " OR '/' || key || '/' GLOB '*/../*' OR '/' || key || '/' GLOB '*/./*' OR '/' || key || '/' GLOB '*//*'"
@@ -54,7 +60,7 @@ def check(db: sqlite3.Connection) -> None:
     """Raises sqlite3.DatabaseError for a value that cannot be."""
     for table in _NUMBERS:
         query = f'SELECT rowid FROM {table} WHERE {_wrong(table)} LIMIT 1'  # noqa: S608 - own constants only
-        if table in {'accounts', 'publishers', 'other_types', 'tally', 'contents'}:  # these have no rowid
+        if table in {'accounts', 'publishers', 'other_types', 'estimates', 'rhythms', 'tally', 'contents'}:  # these have no rowid
             query = query.replace('rowid', 'topic')
         found = db.execute(query).fetchone()
         if found is not None:
@@ -81,5 +87,7 @@ def _wrong(table: str) -> str:
         conditions.append(f"typeof({column}) NOT IN ('integer', 'null')")
         if column in _COUNTS:
             conditions.append(f'{column} NOT BETWEEN 0 AND {_MOST}')
+    if table == 'rhythms':
+        conditions.append(f"typeof(period) <> 'real' OR period NOT BETWEEN 0 AND {_MOST}")
     conditions += [f"{column} NOT GLOB '{{*}}'" for column in _JSON.get(table, ())]
     return ' OR '.join((*conditions, *([_UNSAFE] if table == 'objects' else [])))

@@ -10,9 +10,11 @@ from typing import Final
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 
-SCHEMA_VERSION: Final = 4
+SCHEMA_VERSION: Final = 5
 CATALOGUE: Final = '_catalog'
 """The sensor of the catalogue's own objects, which have no rows in it."""
+REGRADED: Final = 5
+"""The version from which on accounts have grades as they are now."""
 VERSION_LIMIT: Final = 1000
 """A version from here on is damage, not a future."""
 _STATES: Final = ', '.join(f"'{state.value}'" for state in State)
@@ -63,6 +65,22 @@ CREATE TABLE other_types (
   PRIMARY KEY (session, topic, type)) WITHOUT ROWID;
 """
 """Types that a topic was published under and that were not logged; messages is NULL where nobody counted them all."""
+_ESTIMATES: Final = """
+CREATE TABLE estimates (
+  session INTEGER NOT NULL, topic TEXT NOT NULL, estimated INTEGER NOT NULL, unknown INTEGER NOT NULL, missed TEXT NOT NULL,
+  PRIMARY KEY (session, topic)) WITHOUT ROWID;
+CREATE TABLE rhythms (
+  topic TEXT NOT NULL PRIMARY KEY, publisher TEXT NOT NULL, of TEXT NOT NULL, period REAL NOT NULL, last INTEGER NOT NULL
+  ) WITHOUT ROWID;
+"""
+"""Of accounts with messages that have no numbers: how many of the received ones those are."""
+_REGRADED: Final = """
+INSERT INTO estimates SELECT session, topic, 0, received, '{}' FROM accounts WHERE accounting <> 'exact';
+UPDATE accounts SET accounting = 'received-only' WHERE accounting <> 'exact';
+UPDATE publishers SET published = 0, received = 0, missed = '{}'
+  WHERE (session, topic) IN (SELECT session, topic FROM estimates);
+"""
+"""What a middleware reported to have lost was no account: those sessions know what was received."""
 SCHEMA: Final = f"""
 CREATE TABLE objects (
   id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -111,14 +129,23 @@ CREATE TABLE publishers (
 {_CATALOGUE}
 {_CONTENTS}
 {_OTHER_TYPES}
+{_ESTIMATES}
 PRAGMA user_version = {SCHEMA_VERSION};
 """  # noqa: S608 - own constants only
 MIGRATIONS: Final = {
     1: f'DROP INDEX pending; DROP INDEX waiting; {_BY_BUCKET} {_BY_REASON}',
     2: f'{_CONTENTS} {_CATALOGUE} INSERT INTO uncatalogued SELECT id FROM objects WHERE {_ARRIVED};',  # noqa: S608 - own constants only
     3: _OTHER_TYPES,
+    4: f'{_ESTIMATES} {_REGRADED}',
 }
 """Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
+_AS_NOW: Final = f"""
+CREATE TEMP TABLE accounts AS SELECT * FROM main.accounts;
+CREATE TEMP TABLE publishers AS SELECT * FROM main.publishers;
+{_ESTIMATES.replace('CREATE TABLE', 'CREATE TEMP TABLE')}
+{_REGRADED}
+"""  # noqa: S608 - own constants only
+"""What makes the accounts of an older index readable where it may not be changed: a node of that version may be at it."""
 
 
 def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> None:
@@ -133,6 +160,8 @@ def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> N
         raise SpoolError(f'the spool index {path} is of version {version}, this program knows {SCHEMA_VERSION}',
                          remedy='update shadowhound_data_logger')  # fmt: skip
     if read_only:
+        if 0 < version < REGRADED:
+            connection.executescript(_AS_NOW)
         return
     connection.execute('PRAGMA journal_mode = WAL')
     connection.execute('PRAGMA synchronous = FULL')

@@ -279,9 +279,12 @@ def _continued(index: Index) -> Accounts:
     """Accounts of a session that goes on where the earlier ones ended."""
     last = {(row.topic, row.publisher): row for row in index.publishers()}
     kept: dict[str, int] = {}
+    grades: dict[str, str] = {}
     for row in index.topics():
         kept[row.topic] = max(kept.get(row.topic, 0), row.last_kept_ns)
-    return Accounts(last.values(), kept)
+        if row.received:
+            grades[row.topic] = row.accounting
+    return Accounts(last.values(), kept, index.rhythms(), grades)
 
 
 def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, int]]:

@@ -17,6 +17,7 @@ from typing import Any, Final
 from shadowhound_data_logger.clock import SECOND, Clock, iso
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.piles import look
 
@@ -31,8 +32,8 @@ NAMED: Final = 3
 _TOPIC: Final[dict[str, Any]] = {
     'sensor': '', 'type': '', 'enabled': True, 'publishers': 0, 'matched': 0, 'may_be_silent': False, 'unavailable': '',
     'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
-    'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': None, 'open': 0, 'accounting': 'received-only',
-    'wrong_type': 0, 'other_types': {},
+    'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': None, 'missed_estimated': None, 'open': 0,
+    'accounting': None, 'wrong_type': 0, 'other_types': {},
 }  # fmt: skip
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
@@ -107,11 +108,16 @@ def _load(path: Path) -> dict[str, Any] | None:
     try:
         given = json.loads(path.read_bytes())
         sections = {name: {**rest, **given.get(name, {})} for name, rest in _SECTIONS.items()}
-        topics = {name: {**_TOPIC, **row} for name, row in given.get('topics', {}).items()}
+        topics = {name: _graded({**_TOPIC, **row}) for name, row in given.get('topics', {}).items()}
         workers = {name: {**_WORKER, **row} for name, row in given.get('workers', {}).items()}
         return {**_HEAD, **given, **sections, 'topics': topics, 'workers': workers}
     except (OSError, ValueError, TypeError, AttributeError):
         return None
+
+
+def _graded(row: dict[str, Any]) -> dict[str, Any]:
+    """A node of an older version called an account what its middleware reported to have lost."""
+    return {**row, 'accounting': RECEIVED_ONLY, 'missed': None} if row['accounting'] == 'reported' else row
 
 
 def _state(written: Mapping[str, Any] | None, silent_ns: int | None) -> str:
@@ -183,6 +189,9 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
         lost = {topic: row[what] for topic, row in found['topics'].items() if row[what]}
         if lost:
             yield f'{what} in this session: {_most(lost)}'
+    about = {topic: row['missed_estimated'] for topic, row in found['topics'].items() if row['missed_estimated']}
+    if about:
+        yield f'missed in this session, as estimated: {_most(about, "~")}'
     yield from _other_types(found)
     if store['quarantined']:
         yield f'quarantined in this session: {store["quarantined"]:,} objects'
@@ -204,8 +213,8 @@ def _other_type(topic: str, row: Mapping[str, Any], name: str, other: Mapping[st
     return f'{topic} was published as {name} too, by {by}, and is logged as {row["type"] or "nothing"} alone; {what}'
 
 
-def _most(counts: Mapping[str, int]) -> str:
+def _most(counts: Mapping[str, int], mark: str = '') -> str:
     """``/imu 340, /odom 170, /lowstate 68 and 5 more``."""
     first = sorted(counts, key=lambda topic: (-counts[topic], topic))[:NAMED]
     more = f' and {len(counts) - NAMED} more' if len(counts) > NAMED else ''
-    return ', '.join(f'{topic} {counts[topic]:,}' for topic in first) + more
+    return ', '.join(f'{topic} {mark}{counts[topic]:,}' for topic in first) + more

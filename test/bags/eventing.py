@@ -22,7 +22,7 @@ from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.options import BagSettings, EventSettings
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.accounts import EVENT
+from shadowhound_data_logger.spool.accounts import EVENT, Losses
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
@@ -52,7 +52,7 @@ class Buffer:
     def root(self) -> Path:
         return self.home / 'bags' / ROBOT
 
-    def hear(self, numbers: range, topic: str = '/talk', size: int = 0, lost: int | None = None) -> None:
+    def hear(self, numbers: range, topic: str = '/talk', size: int = 0, lost: Losses = None) -> None:
         gone = self.ring.put(Lot(topic, STRING, '', messages(numbers, size)), lost, self.now_s[0])
         self.events.claims.lose(gone)
 

@@ -46,11 +46,11 @@ def test_what_is_too_much_goes_the_oldest_first() -> None:
 def test_a_large_lot_goes_in_pieces() -> None:
     """One drain of a fast camera does not push out a whole second; what was lost with it belongs to its end."""
     ring = Ring(8 * PIECE_BYTES, KEEP_S)
-    ring.put(lot(range(10), size=PIECE_BYTES // 2), 3, 0.0)
+    ring.put(lot(range(10), size=PIECE_BYTES // 2), {'transport': 3}, 0.0)
     ring.claim(0.0)
     pieces = list(iter(lambda: ring.next(0.0), None))
     assert [told(piece) for piece in pieces] == [[number] for number in range(10)]
-    assert [piece.lost for piece in pieces] == [0] * 9 + [3]
+    assert [piece.lost for piece in pieces] == [{}] * 9 + [{'transport': 3}]
 
 
 def test_a_message_that_is_larger_than_the_ring_is_not_kept() -> None:

@@ -53,7 +53,7 @@ class Ear:
         self.stream = BagStream(sensor, TOPIC, TYPE, 0, shared) if own else Stream(sensor, TOPIC, TYPE, 0, shared)
 
     def add(self, taken: list[Taken], *, paused: bool = False, idle: bool = False) -> None:
-        self.stream.add(taken, Senders(), None, 0.0, paused=paused, idle=idle)
+        self.stream.add(taken, Senders(), 0.0, paused=paused, idle=idle)
 
     def heard(self) -> list[int]:
         """The numbers of what the bag got."""

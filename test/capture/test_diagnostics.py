@@ -16,7 +16,7 @@ from shadowhound_data_logger.capture.diagnostics import ERROR, OK, STALE, WARN, 
 TOPIC = {
     'sensor': 'imu', 'type': 'go2_interfaces/msg/IMU', 'enabled': True, 'publishers': 1, 'rate_hz': 100.0, 'age_s': 0.02,
     'received': 1200, 'stored': 1100, 'skipped': 0, 'rejected': 2, 'dropped': 3, 'missed': 4, 'open': 91, 'accounting': 'exact',
-    'other_types': {},
+    'missed_estimated': None, 'other_types': {},
 }  # fmt: skip
 STATUS: dict[str, Any] = {
     'robot': 'thor', 'version': '0.1.0', 'pid': 7, 'uptime_s': 12.3, 'paused': False, 'topics': {'/imu': TOPIC},
@@ -69,6 +69,7 @@ def test_all_is_fine() -> None:
         ({'topic__paused': 9}, OK, '100 Hz'),
         ({'topic__missed': 6, 'paused': True}, WARN, '2 missed lately'),
         ({'topic__missed': None}, OK, '100 Hz'),
+        ({'topic__missed': None, 'topic__missed_estimated': 7}, WARN, '~7 missed lately'),
         ({'topic__publishers': 0}, STALE, 'nobody publishes it'),
         ({'topic__publishers': 0, 'topic__missed': 5}, WARN, '1 missed lately'),
         ({'topic__enabled': False, 'topic__publishers': 0}, OK, 'not enabled'),

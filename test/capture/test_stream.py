@@ -13,7 +13,7 @@ from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch
-from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, REPORTED, Accounts, TopicAccount
+from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, RECEIVED_ONLY, Accounts, TopicAccount
 
 TOPIC, TYPE = '/talk', 'std_msgs/msg/String'
 NOON_NS = 1_760_788_800 * SECOND
@@ -38,8 +38,8 @@ class Talk:
         made = [Taken(b'%d' % number, NOON_NS + number * SECOND // 10, 'p', number) for number in taken]
         return [one._replace(**fields) for one in made]  # type: ignore[arg-type]
 
-    def add(self, taken: list[Taken], lost: int | None = None, *, paused: bool = False, idle: bool = False) -> None:
-        self.stream.add(taken, self.senders, lost, 0.0, paused=paused, idle=idle)
+    def add(self, taken: list[Taken], now_s: float = 0.0, *, paused: bool = False, idle: bool = False) -> None:
+        self.stream.add(taken, self.senders, now_s, paused=paused, idle=idle)
 
     def update(self, **settings: float) -> None:
         self.sensor = replace(self.sensor, **settings)  # type: ignore[arg-type]
@@ -124,52 +124,74 @@ def test_other_settings_do_not_repeat_what_has_not_changed() -> None:
 # -- without numbers ---------------------------------------------------------------------------------------------------
 
 
-def test_numbers_make_it_exact_whatever_is_reported() -> None:
-    """Where the middleware numbers messages, gaps are counted by their numbers alone."""
-    talk = Talk()
-    first, _, third = talk.messages(3)
-    talk.add([first, third], lost=7)
-    assert (talk.account.accounting, talk.account.missed, talk.account.received) == (EXACT, 1, 2)
+def spoken(talk: Talk, how_many: int, **fields: object) -> None:
+    """The next messages, taken as the intake does: once their time is over."""
+    for _ in range(how_many):
+        taken = talk.messages(1, **fields)
+        talk.add(taken, taken[0].source_ns / SECOND)
+        talk.stream.close_due(taken[0].source_ns / SECOND, 0.0)
 
 
-def test_without_numbers_losses_are_those_reported() -> None:
-    """Losses that the middleware reports are missed, and with what was received they are what was published."""
-    talk = Talk()
-    talk.add(talk.messages(3, **UNNUMBERED), lost=0)
-    talk.add(talk.messages(2, **UNNUMBERED), lost=5)
-    account = talk.account
-    assert (account.accounting, account.missed, account.received) == (REPORTED, 5, 5)
-    (span,) = account.publishers.values()
-    assert (span.published, span.received, span.missed) == (10, 5, {'transport': 5})
-
-
-def test_without_numbers_and_reports_nothing_is_claimed() -> None:
+def test_without_numbers_and_rhythm_nothing_is_claimed() -> None:
     """What is not known is None, never 0."""
     talk = Talk()
-    talk.add(talk.messages(3, **UNNUMBERED))
-    assert (talk.account.accounting, talk.account.missed) == (RECEIVED_ONLY, None)
-
-
-def test_one_time_without_a_report_is_for_ever() -> None:
-    """Once messages may have been lost without a word the session stays received-only, whatever is reported later."""
-    talk = Talk()
-    for lost in (1, None, 2):
-        talk.add(talk.messages(2, **UNNUMBERED), lost=lost)
-    assert (talk.account.accounting, talk.account.missed, talk.account.received) == (RECEIVED_ONLY, None, 6)
-
-
-def test_a_second_sender_makes_numbers_useless() -> None:
-    """From the first message of an unknown sender on the reports count; a gap in the numbers after it is not a second loss."""
-    talk = Talk()
     talk.senders.look(['a'])
-    talk.add(talk.messages(3, publisher=None), lost=0)
-    talk.senders.look(['a', 'b'])
-    talk.add(talk.messages(3, publisher=None), lost=1)
-    talk.senders.look(['a'])
-    talk.add(talk.messages(3, publisher=None), lost=0)
+    spoken(talk, 3, **UNNUMBERED)
     account = talk.account
-    assert (account.accounting, account.received, account.missed) == (REPORTED, 9, 1)
-    assert sum(span.published for span in account.publishers.values()) == 10
+    assert (account.accounting, account.missed, account.about_missed, account.unknown) == (RECEIVED_ONLY, None, None, 3)
+
+
+def test_a_rhythm_counts_what_is_lost() -> None:
+    """Once it is known, also what was lost before."""
+    talk = Talk()
+    talk.senders.look(['a'])
+    for _ in range(3):
+        spoken(talk, 100, **UNNUMBERED)
+        talk.messages(7)  # which nobody takes
+    spoken(talk, 1, **UNNUMBERED)
+    account = talk.account
+    assert (account.accounting, account.missed, account.about_missed) == (ESTIMATED, None, 21)
+    assert (account.received, account.estimated, account.unknown) == (301, 301, 0)
+
+
+def test_a_declared_rate_needs_no_learning() -> None:
+    """With it even the first gap counts."""
+    talk = Talk(expected_hz=10.0)
+    talk.senders.look(['a'])
+    spoken(talk, 2, **UNNUMBERED)
+    talk.messages(5)
+    spoken(talk, 2, **UNNUMBERED)
+    assert (talk.account.accounting, talk.account.about_missed) == (ESTIMATED, 5)
+
+
+def test_what_another_publisher_did_not_publish_is_not_lost() -> None:
+    """Between one publisher and the next there is no loss; between one that went away and came back there is."""
+    for successor, lost in (('b', 0), ('a', 50)):
+        talk = Talk(expected_hz=10.0)
+        talk.senders.look(['a'])
+        spoken(talk, 10, **UNNUMBERED)
+        talk.messages(50)
+        now_s = talk.messages(1)[0].source_ns / SECOND
+        talk.senders.look([], now_s - 3.0)
+        talk.senders.look([successor], now_s)
+        next(talk.numbers)
+        spoken(talk, 10, **UNNUMBERED)
+        assert talk.account.about_missed == lost + bool(lost) * 2
+
+
+def test_a_second_sender_leaves_the_numbers_of_the_first_alone() -> None:
+    """Messages whose sender nobody knows are received, and no gap in the numbers of the one that goes on."""
+    talk = Talk()
+    talk.senders.look(['a'])
+    talk.add(talk.messages(3, publisher=None))
+    talk.senders.look(['a', 'b'])
+    talk.add(talk.messages(3, publisher=None))
+    assert (talk.account.accounting, talk.account.missed) == (RECEIVED_ONLY, None)
+    talk.senders.look(['a'])
+    talk.add(talk.messages(3, publisher=None))
+    account = talk.account
+    assert (account.accounting, account.received, account.unknown, account.missed) == (EXACT, 9, 3, None)
+    assert sum(span.published for span in account.publishers.values()) == 6
 
 
 def test_what_two_subscriptions_deliver_is_counted_once() -> None:
@@ -178,7 +200,7 @@ def test_what_two_subscriptions_deliver_is_counted_once() -> None:
         talk = Talk()
         taken = talk.messages(3, **fields)
         for part in (taken[:2], taken):
-            talk.add(part, lost=0)
+            talk.add(part)
         assert talk.account.received == 3
         assert talk.kept() == [1, 2, 3]
 
@@ -188,8 +210,8 @@ def test_a_history_that_comes_again_when_a_second_sender_appears() -> None:
     talk = Talk()
     talk.senders.look(['a'])
     taken = talk.messages(3, publisher=None)
-    talk.add(taken, lost=0)
+    talk.add(taken)
     talk.senders.look(['a', 'b'])
-    talk.add([*talk.messages(1, publisher=None), *taken], lost=0)
+    talk.add([*talk.messages(1, publisher=None), *taken])
     assert talk.account.received == 4
     assert talk.kept() == [1, 2, 3, 4]

@@ -25,7 +25,11 @@ def a_topic(**figures: Any) -> dict[str, Any]:
         'type': 'x/msg/Y', 'accounting': 'exact', 'published': 100, 'received': 100, 'missed': 0, 'missed_by': {}, 'skipped': 40,
         'rejected': {}, 'dropped': {}, 'stored': 60, 'open': 0, 'stored_in': dict.fromkeys(STATES, 0) | {'delivered': 60},
     }  # fmt: skip
-    return row | figures
+    row = {'published_estimated': None, 'missed_estimated': None, **row, **figures}
+    if 'by_grade' not in row:
+        about = ('published', 'published_estimated', 'received', 'missed', 'missed_estimated', 'missed_by')
+        row['by_grade'] = {row['accounting']: {name: row[name] for name in about}}
+    return row
 
 
 def a_ledger(balanced: bool = True, **topics: dict[str, Any]) -> dict[str, Any]:
@@ -133,9 +137,57 @@ def test_accounting_is_mentioned_only_where_it_is_not_exact() -> None:
     """Unknown figures are dashes, never 0, and a line says why; the total of a column with one is unknown too."""
     text = shown(a_ledger(imu=a_topic(accounting='received-only', published=None, missed=None), odom=a_topic()))
     assert '/imu: its messages carry no numbers' in text
-    assert next(line for line in text.splitlines() if line.startswith('/imu')).split()[1:4] == ['-', '100', '-']
+    assert next(line for line in text.splitlines() if line.startswith('/imu')).split()[1:5] == ['received-only', '-', '100', '-']
     assert next(line for line in text.splitlines() if line.startswith('all')).split()[1:4] == ['-', '200', '-']
-    assert 'exact' not in text
+    assert 'exact' not in shown(a_ledger(odom=a_topic()))
+
+
+ABOUT: dict[str, Any] = {
+    'accounting': 'estimated', 'published': None, 'published_estimated': 123, 'missed': None, 'missed_estimated': 23,
+    'missed_by': {'transport': 20, 'restart': 3},
+}  # fmt: skip
+
+
+def test_an_estimate_is_marked_wherever_it_stands() -> None:
+    """In the row of the topic, in the total, and with its causes."""
+    text = shown(a_ledger(imu=a_topic(**ABOUT), odom=a_topic()))
+    assert next(line for line in text.splitlines() if line.startswith('/imu')).split()[1:5] == ['estimated', '~123', '100', '~23']
+    assert next(line for line in text.splitlines() if line.startswith('all')).split()[1:4] == ['~223', '200', '~23']
+    assert '/imu: missed by transport ~20, restart ~3' in text
+
+
+def test_several_grades_have_a_line_each() -> None:
+    """The topic has its present grade, and what is known of each."""
+    parts = a_topic(received=40, published=45, missed=5)['by_grade'] | a_topic(**ABOUT)['by_grade']
+    text = shown(a_ledger(imu=a_topic(received=140, published=None, missed=None, by_grade=parts)))
+    lines = [line.split() for line in text.splitlines()]
+    assert ['/imu', 'exact', '-', '140', '-'] in [line[:5] for line in lines]
+    assert ['exact', '45', '40', '5'] in lines
+    assert ['estimated', '~123', '100', '~23'] in lines
+
+
+@pytest.mark.parametrize(
+    ('rows', 'words'),
+    [
+        ([{}], 'every message is stored, skipped, or listed as lost.'),
+        ([{}, ABOUT], 'or listed as lost; what was missed is estimated for 1 topic.'),
+        ([{'accounting': 'received-only', 'missed': None, 'published': None}] * 2, 'what was missed is not known for 2 topics.'),
+    ],
+)
+def test_no_sentence_claims_more_than_the_grades(rows: list[dict[str, Any]], words: str) -> None:
+    """That every message is accounted for is said of exact accounting alone."""
+    text = shown(a_ledger(**{f't{number}': a_topic(**row) for number, row in enumerate(rows)}), 200)
+    assert words in text
+    assert ('balances: every message is stored' in text) == (rows == [{}])
+
+
+def test_a_topic_that_was_never_heard() -> None:
+    """Its figures are not known, and it spoils no total."""
+    never = a_topic(accounting=None, received=0, published=None, missed=None, stored=0, skipped=0, by_grade={})
+    text = shown(a_ledger(imu=never, odom=a_topic()))
+    assert next(line for line in text.splitlines() if line.startswith('/imu')).split()[1:4] == ['-', '0', '-']
+    assert next(line for line in text.splitlines() if line.startswith('all')).split()[1:4] == ['100', '100', '0']
+    assert '/imu: not one message of it was received' in text
 
 
 def test_what_does_not_balance_is_named() -> None:

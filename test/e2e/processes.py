@@ -151,6 +151,13 @@ class Publisher(Process):
         """The same message so many times; returns when the last one is out."""
         self._tell(do='again', topic=topic, message=message.hex(), count=count, period_s=period_s)
 
+    def begin(self, topic: str, type_name: str, period_s: float, size: int = 0) -> None:
+        """Publish numbers from 0 on, as text of that size, evenly until ``halt``."""
+        self._tell(do='begin', topic=topic, type=type_name, period_s=period_s, size=size)
+
+    def halt(self, topic: str) -> None:
+        self._tell(do='halt', topic=topic)
+
     def heard(self, topic: str, node: Node, message: bytes) -> None:
         """Publish the message until the node received it, so that whatever follows comes after the match."""
         self.matched(topic)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -14,6 +16,8 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 
 MATCH_S = 15.0
+ends: dict[str, threading.Event] = {}
+"""By topics that are published evenly."""
 
 
 def profile(order: dict[str, Any]) -> QoSProfile:
@@ -53,8 +57,25 @@ def obey(order: dict[str, Any], node: Node, publishers: dict[str, Any]) -> None:
                 time.sleep(max(0.0, due - time.monotonic()))
                 due += order['period_s']
                 publishers[topic].publish(message)
+        case 'begin':
+            stopped = ends[topic] = threading.Event()
+            kind = message_class(order['type'])
+            run = partial(publish_evenly, publishers[topic], kind, order['period_s'], order['size'], stopped)
+            threading.Thread(target=run, daemon=True).start()
+        case 'halt':
+            ends.pop(topic).set()
         case 'destroy':
             node.destroy_publisher(publishers.pop(topic))
+
+
+def publish_evenly(publisher: Any, kind: Any, period_s: float, size: int, stopped: threading.Event) -> None:
+    """Numbers from 0 on, as text of a size; one that is late does not delay the next."""
+    due = time.monotonic()
+    number = 0
+    while not stopped.wait(max(0.0, due - time.monotonic())):
+        publisher.publish(kind(data=f'{number}'.ljust(size)))
+        number += 1
+        due += period_s
 
 
 def answer() -> None:

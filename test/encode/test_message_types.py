@@ -44,6 +44,32 @@ def test_both_endiannesses(ros: Any, little_endian: bool) -> None:
     assert message.temperature == -7
 
 
+@pytest.mark.parametrize('little_endian', [True, False])
+def test_a_counter_is_read_where_it_is(ros: Any, little_endian: bool) -> None:
+    """Behind arrays of messages, at the place that their sizes and alignments give it."""
+    low = 'go2_interfaces/msg/LowState'
+    cdr = ros.cdr(low, tick=4_000_000_000, little_endian=little_endian)
+    counter = ros.types.counter(low, 'tick')
+    assert (counter.read(cdr), counter.wrap) == (4_000_000_000, 1 << 32)
+    assert counter.read(cdr[:100]) == 0
+    cycle = ros.types.counter(low, 'bms_state.cycle')
+    assert (cycle.read(cdr), cycle.wrap) == (0, 1 << 16)
+
+
+@pytest.mark.parametrize('field', ['tock', 'imu_state', 'power_v', 'tick.of', 'foot_force', 'imu_state.tock', ''])
+def test_what_is_no_counter(ros: Any, field: str) -> None:
+    """A field that is not there, or no single whole number."""
+    with pytest.raises(Rejected, match='unknown_field'):
+        ros.types.counter('go2_interfaces/msg/LowState', field)
+
+
+def test_a_counter_behind_a_text_has_no_place(ros: Any) -> None:
+    """Its place changes from message to message."""
+    assert ros.types.counter('sensor_msgs/msg/Image', 'header.stamp.nanosec').offset == 8
+    with pytest.raises(Rejected, match='length changes'):
+        ros.types.counter('sensor_msgs/msg/Image', 'height')
+
+
 def test_the_machine_comes_before_the_shipped_definitions(ros: Any, tmp_path: Path) -> None:
     """A definition in a prefix wins over the one of the same name that rosbags ships, and the first prefix wins."""
     first = define(tmp_path / 'a', 'std_msgs', ColorRGBA='uint8 shade\n')

@@ -165,7 +165,12 @@ def test_without_a_number_a_message_is_only_received() -> None:
     assert account.accounting == EXACT
     assert account.receive('p', None)
     assert account.receive(None, 3)
-    assert (account.accounting, account.received) == (RECEIVED_ONLY, 3)
+    assert (account.accounting, account.received, account.unknown, account.missed) == (RECEIVED_ONLY, 3, 2, None)
+
+
+def test_before_the_first_message_nothing_is_known() -> None:
+    """A topic that was not heard has not missed 0."""
+    assert (TopicAccount().missed, TopicAccount().about_missed) == (None, None)
 
 
 def test_two_publishers_have_numbers_of_their_own() -> None:

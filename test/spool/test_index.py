@@ -21,6 +21,7 @@ VERSION_1 = """
 DROP INDEX pending; DROP INDEX waiting; DROP INDEX held;
 DROP TABLE contents; DROP TRIGGER contents_moved; DROP TRIGGER contents_forgotten;
 DROP TABLE uncatalogued; DROP TRIGGER arrived; DROP TRIGGER known; DROP TRIGGER forgotten; DROP TABLE other_types;
+DROP TABLE estimates; DROP TABLE rhythms;
 CREATE INDEX pending ON objects (priority, id) WHERE state = 'pending';
 CREATE INDEX waiting ON objects (id) WHERE state = 'pending';
 PRAGMA user_version = 1;

@@ -140,6 +140,7 @@ def test_a_spool_from_before_the_catalogue(opened: Open, root: Path) -> None:
         connection.executescript(
             'DROP TABLE contents; DROP TRIGGER contents_moved; DROP TRIGGER contents_forgotten; DROP TABLE uncatalogued;'
             ' DROP TRIGGER arrived; DROP TRIGGER known; DROP TRIGGER forgotten; DROP TABLE other_types;'
+            ' DROP TABLE estimates; DROP TABLE rhythms;'
             ' PRAGMA user_version = 2;'
         )
     assert not opened().recovery.found_anything
