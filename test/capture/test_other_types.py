@@ -37,7 +37,7 @@ ABSENT: Final = 'no_such_msgs/msg/Thing'
 SMALL: Final = IntakeSettings(max_rate_hz=1.0)
 """A history of ten messages: what is published between two drains beyond that is missed."""
 HISTORY: Final = 10
-NOTHING: Final = Totals('', EXACT, 0, 0, 0, 0, 0, 0, None, 0)
+NOTHING: Final = Totals('', None, 0, 0, 0, 0, 0, 0, None, None, 0)
 
 
 class Publishing:
