@@ -81,8 +81,6 @@ def robot_network(environ: Mapping[str, str], domain: int, *, has_range: bool) -
     if names and not found and not problem:
         problem = f'{" and ".join(names)} of {CYCLONE_URI} has no IPv4 address here'
     multicast = scope != 'LOCALHOST' if config.multicast is None else config.multicast
-    if found and all(address.startswith('127.') for address in found):
-        multicast = False
     index = MAX_INDEX if config.max_index is None else max(config.max_index, MAX_INDEX)
     return Network(found, multicast, tuple(peers), index, scope == 'OFF', problem)
 
@@ -181,7 +179,8 @@ def _resolve(host: str) -> list[str]:
 
 def announced_to(network: Network, domain: int) -> list[tuple[str, int]]:
     """(address, port) of everybody who is told that we are there; empty where the default, multicast, does."""
-    if network.is_off or (network.multicast and not network.peers):
+    is_inside = bool(network.interfaces) and all(address.startswith('127.') for address in network.interfaces)
+    if network.is_off or (network.multicast and not network.peers and not is_inside):  # some have no multicast inside a machine
         return []
     base = PORT_BASE + DOMAIN_GAIN * domain
     ports = [base + UNICAST_OFFSET + PARTICIPANT_GAIN * index for index in range(network.max_index + 1)]
@@ -213,6 +212,7 @@ def profile(receive_bytes: int, network: Network | None = None, domain: int = 0,
         transports=''.join(TRANSPORT.format(name=name, kind=kind, rest=rest) for name, (kind, rest) in kinds.items()),
         announcement='<sec>0</sec><nanosec>200000000</nanosec>' if not builtin else '<sec>3</sec>',
         builtin=''.join(builtin),
+        properties=PROPERTIES if network is not None else '',
         used=''.join(f'<transport_id>shadowhound_{name}</transport_id>' for name in reversed(kinds)),
     )
 
@@ -225,6 +225,12 @@ def _wrap(name: str, inside: Iterable[str]) -> str:
     return f'<{name}>{"".join(inside)}</{name}>'
 
 
+PROPERTIES: Final = """
+        <propertiesPolicy><properties>
+          <property><name>fastdds.type_propagation</name><value>disabled</value></property>
+        </properties></propertiesPolicy>"""
+"""Types match by their names. Fast DDS 3 describes them as well, and so does a driver that is no ROS;
+where the two cannot be compared (that of sensor_msgs/Image, for one) they never match."""
 TRANSPORT: Final = """
       <transport_descriptor><transport_id>shadowhound_{name}</transport_id><type>{kind}</type>{rest}</transport_descriptor>"""
 TEMPLATE: Final = """\
@@ -244,7 +250,7 @@ TEMPLATE: Final = """\
           {builtin}
         </builtin>
         <userTransports>{used}</userTransports>
-        <useBuiltinTransports>false</useBuiltinTransports>
+        <useBuiltinTransports>false</useBuiltinTransports>{properties}
       </rtps>
     </participant>
   </profiles>

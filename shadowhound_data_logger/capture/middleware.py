@@ -27,7 +27,7 @@ RMW: Final = 'RMW_IMPLEMENTATION'
 FAST_DDS, CYCLONE_DDS = 'rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp'
 SETTING: Final = 'capture.rmw'
 PROFILE_FILES: Final = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
-"""What names a profile for Fast DDS 2, and for Fast DDS 3."""
+"""What names a profile for Fast DDS 2, and for Fast DDS 3; neither reads the other's."""
 TRANSPORTS: Final = 'FASTDDS_BUILTIN_TRANSPORTS'
 SHIPPED: Final = 'fastdds_shm.xml'
 """The profile for drivers, in launch_configs; ours has what is in it, and more."""
@@ -155,7 +155,6 @@ def choose(asked: str, environ: Mapping[str, str]) -> Middleware:
     ours = _ours(environ, version)
     if ours:
         variables |= {LOCALHOST_ONLY: None, PEERS: None, RANGE: 'OFF' if network.is_off else 'SYSTEM_DEFAULT'}
-        variables |= dict.fromkeys(PROFILE_FILES)
     why = 'Fast DDS hands on the numbers of its messages' + (f', by {SETTING}, though {problem}' if problem else '')
     return Middleware(asked, robot, FAST_DDS, why, network if ours else None, domain, variables, ours)
 
@@ -192,8 +191,8 @@ def _folder() -> str:
 
 
 def _installed(environ: Mapping[str, str]) -> Iterator[tuple[str, tuple[int, int]]]:
-    """(RMW, version as major and minor) of what is in the sourced prefixes."""
-    for prefix in environ.get('AMENT_PREFIX_PATH', '').split(':'):
+    """(RMW, version as major and minor) of what is in the sourced prefixes; the one that counts comes last."""
+    for prefix in reversed(environ.get('AMENT_PREFIX_PATH', '').split(':')):
         folder = Path(prefix or '/nowhere') / 'share'
         for mark in folder.glob('ament_index/resource_index/rmw_typesupport/*'):
             if mark.name == 'rmw_implementation':  # it only loads the others
@@ -208,10 +207,9 @@ def _installed(environ: Mapping[str, str]) -> Iterator[tuple[str, tuple[int, int
 
 def _ours(environ: Mapping[str, str], version: tuple[int, int]) -> str:
     """The variable that is to name our profile; empty where the operator told Fast DDS its transports."""
-    given = [environ[name] for name in PROFILE_FILES if environ.get(name)]
-    if environ.get(TRANSPORTS) or any(Path(file).name != SHIPPED for file in given):
-        return ''
-    return PROFILE_FILES[version >= FAST_DDS_3]
+    name = PROFILE_FILES[version >= FAST_DDS_3]
+    theirs = environ.get(name)
+    return '' if environ.get(TRANSPORTS) or (theirs and Path(theirs).name != SHIPPED) else name
 
 
 def _impossible(robot: str, versions: Mapping[str, tuple[int, int]], environ: Mapping[str, str]) -> str:

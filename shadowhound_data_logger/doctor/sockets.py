@@ -15,7 +15,7 @@ from shadowhound_data_logger.options import IMAGE, POINT_CLOUD
 
 NAME: Final = 'sockets'
 PROFILES: Final = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
-"""Fast DDS 3, which reads the second as well, and Fast DDS 2."""
+"""Of Fast DDS 3, and of Fast DDS 2."""
 PROFILE_FILE: Final = '$(ros2 pkg prefix shadowhound_data_logger)/share/shadowhound_data_logger/launch_configs/fastdds_shm.xml'
 ENOUGH_BUFFER: Final = 8 << 20
 """net.core.rmem_max: a second of clouds of 320 KB at 10 Hz twice over, or eight raw images (docs/thor.md, Middleware)."""

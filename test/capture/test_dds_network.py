@@ -40,10 +40,10 @@ def test_by_default_all_interfaces_and_multicast() -> None:
 
 
 def test_localhost_only_is_the_loopback_interface_on_humble() -> None:
-    """And everybody on it is told by unicast, since it has no multicast."""
+    """Where everybody is told by unicast as well: Cyclone DDS 0.10 has no multicast there, and 11 has."""
     found = network(has_range=False, ROS_LOCALHOST_ONLY='1', ROS_AUTOMATIC_DISCOVERY_RANGE='SUBNET')
-    assert (found.interfaces, found.multicast) == (('127.0.0.1',), False)
-    assert announced_to(found, 5) == [('127.0.0.1', port) for port in LOCAL]
+    assert (found.interfaces, found.multicast) == (('127.0.0.1',), True)
+    assert announced_to(found, 5) == [('239.255.0.1', 8650), *(('127.0.0.1', port) for port in LOCAL)]
     assert network(has_range=False, ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_STATIC_PEERS='10.0.0.9') == Network()
 
 

@@ -67,7 +67,7 @@ def test_a_fast_dds_robot_keeps_its_own(installed: dict[str, str], rmw: str) -> 
 
 
 @pytest.mark.parametrize(
-    ('name', 'value'), [('FASTRTPS_DEFAULT_PROFILES_FILE', '/mine.xml'), ('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')]
+    ('name', 'value'), [('FASTDDS_DEFAULT_PROFILES_FILE', '/mine.xml'), ('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')]
 )
 @pytest.mark.parametrize('robot', [{}, CYCLONE])
 def test_what_the_operator_told_fast_dds_holds(installed: dict[str, str], name: str, value: str, robot: dict[str, str]) -> None:
@@ -88,6 +88,14 @@ def test_fast_dds_2_has_another_variable(tmp_path: Path) -> None:
     assert found.profile_variable == 'FASTRTPS_DEFAULT_PROFILES_FILE'
     assert found.network is not None
     assert found.network.multicast
+
+
+def test_the_first_prefix_counts(tmp_path: Path) -> None:
+    """As it does for everything of ROS: a workspace lies over the distribution."""
+    over = prefix(tmp_path / 'over', {'rmw_fastrtps_cpp': '6.2.7'})['AMENT_PREFIX_PATH']
+    under = prefix(tmp_path / 'under', KILTED)['AMENT_PREFIX_PATH']
+    found = choose('fastrtps', {**CYCLONE, 'AMENT_PREFIX_PATH': f'{over}:{under}'})
+    assert found.profile_variable == 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 @pytest.mark.parametrize(

@@ -101,11 +101,11 @@ def qos(order: dict[str, Any]) -> Qos:
 
 
 class Driver:
-    """One participant."""
+    """One participant, in the domain of these variables; a process has one domain of each number."""
 
-    def __init__(self) -> None:
-        domain = int(os.environ.get('ROS_DOMAIN_ID', '0'))
-        self._domain = Domain(domain, as_ros_has_it(os.environ))
+    def __init__(self, environ: Mapping[str, str]) -> None:
+        domain = int(environ.get('ROS_DOMAIN_ID', '0'))
+        self._domain = Domain(domain, as_ros_has_it(environ))
         self._participant = DomainParticipant(domain)
         self._types = Types()
         self._topics: dict[str, Any] = {}
@@ -127,7 +127,7 @@ class Driver:
                 with self._lock:
                     return self._counts[topic]
             case 'matched':
-                self._wait_for(topic, order.get('count', 1))
+                self._wait_for(topic, order['count'])
             case 'publish':
                 self._publish(topic, [bytes.fromhex(message) for message in order['messages']], order['period_s'])
             case 'again':
@@ -140,9 +140,13 @@ class Driver:
         """For ever: count what comes."""
         while True:
             time.sleep(TAKE_S)
-            with self._lock:
-                for topic, reader in self._readers.items():
-                    self._counts[topic] += sum(bool(info.valid_data) for _, info in ddspy_take(reader._ref, NOT_READ, 100))
+            self.look()
+
+    def look(self) -> None:
+        """Count what came meanwhile."""
+        with self._lock:
+            for topic, reader in self._readers.items():
+                self._counts[topic] += sum(bool(info.valid_data) for _, info in ddspy_take(reader._ref, NOT_READ, 100))
 
     def close(self) -> None:
         """Leave as a node should, so that the others know at once."""
@@ -179,7 +183,7 @@ def answer(value: Any = None) -> None:
 
 
 def main() -> None:
-    driver = Driver()
+    driver = Driver(os.environ)
     threading.Thread(target=driver.take, daemon=True).start()
     for line in sys.stdin:
         order = json.loads(line)

@@ -131,9 +131,9 @@ class Publisher(Process):
         """A publisher by the name of its topic."""
         self._tell(do='create', topic=topic, type=type_name, reliable=reliable, latched=latched, depth=depth)
 
-    def matched(self, topic: str) -> None:
-        """Wait until somebody listens."""
-        self._tell(do='matched', topic=topic)
+    def matched(self, topic: str, count: int = 1) -> None:
+        """Wait until so many listen."""
+        self._tell(do='matched', topic=topic, count=count)
 
     def listen(self, topic: str, type_name: str, *, reliable: bool = True, depth: int = 1000) -> None:
         """A reader beside it, of a Cyclone DDS driver."""

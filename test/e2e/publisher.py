@@ -41,7 +41,7 @@ def obey(order: dict[str, Any], node: Node, publishers: dict[str, Any]) -> None:
             publishers[topic] = node.create_publisher(message_class(order['type']), topic, profile(order))
         case 'matched':
             end = time.monotonic() + MATCH_S
-            while not publishers[topic].get_subscription_count():
+            while publishers[topic].get_subscription_count() < order['count']:
                 if time.monotonic() > end:
                     raise TimeoutError(f'nobody listens to {topic}')
                 time.sleep(0.005)

@@ -1,0 +1,191 @@
+"""Two machines in one network, made of namespaces: we find whom a reader in the robot's Cyclone DDS finds, in each setting."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from e2e.finding import TOPICS
+from e2e.processes import HERE, WAIT_S
+
+pytest.importorskip('cyclonedds')
+
+ROBOT, OTHER, SECOND = '10.77.0.1', '10.77.0.2', '10.78.0.1'
+MAKE = f"""
+set -e
+ip link set lo up
+ip link add eth0 type veth peer name eth1
+ip link set eth1 netns "$1"
+ip addr add {ROBOT}/24 dev eth0
+ip link set eth0 up
+ip link add wlan0 type veth peer name nobody
+ip addr add {SECOND}/24 dev wlan0
+ip link set wlan0 up
+ip link set nobody up
+"""
+"""The robot has a second interface, with nobody on it."""
+JOIN = f'set -e; ip link set lo up; ip addr add {OTHER}/24 dev eth1; ip link set eth1 up'
+MORE_S = 2.0
+"""For somebody who is not to be found to be found all the same."""
+BOTH, ONE, NONE = ['/here', '/there'], ['/here'], list[str]()
+
+
+def uri(general: str = '', discovery: str = '') -> dict[str, str]:
+    text = f'<CycloneDDS><Domain><General>{general}</General><Discovery>{discovery}</Discovery></Domain></CycloneDDS>'
+    return {'CYCLONEDDS_URI': text}
+
+
+def on(*names: str) -> dict[str, str]:
+    return uri(f'<Interfaces>{"".join(f"<NetworkInterface {name}/>" for name in names)}</Interfaces>')
+
+
+def peers(*addresses: str) -> dict[str, str]:
+    listed = ''.join(f'<Peer address="{address}"/>' for address in addresses)
+    return uri('<AllowMulticast>false</AllowMulticast>', f'<ParticipantIndex>auto</ParticipantIndex><Peers>{listed}</Peers>')
+
+
+HUMBLE = {'AS_HUMBLE': 'yes'}
+OWN = on('name="eth0"')
+"""With two interfaces Cyclone DDS takes one of them, and which one is not said: so it is named wherever that matters."""
+CASES: dict[str, tuple[dict[str, str], dict[str, str], list[str]]] = {
+    'default': (OWN, {}, BOTH),
+    'humble': ({**HUMBLE, **OWN}, HUMBLE, BOTH),
+    'localhost only': ({'ROS_LOCALHOST_ONLY': '1', **OWN}, {}, ONE),
+    'localhost only, humble': ({**HUMBLE, 'ROS_LOCALHOST_ONLY': '1'}, HUMBLE, ONE),
+    'localhost': ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **OWN}, {}, ONE),
+    'localhost, static peer': (
+        {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_STATIC_PEERS': OTHER, **OWN},
+        {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_STATIC_PEERS': ROBOT}, BOTH,
+    ),
+    'subnet': ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', **OWN}, {}, BOTH),
+    'subnet, static peer': ({'ROS_STATIC_PEERS': OTHER, **OWN}, {}, BOTH),
+    'system default': ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT', **OWN}, {}, BOTH),
+    'off': ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF', **OWN}, {}, NONE),
+    'interface by address': (on(f'address="{ROBOT}"'), {}, BOTH),
+    'the other interface': (on('name="wlan0"'), {}, ONE),
+    'loopback': (on('name="lo"'), {}, ONE),
+    'peers only': (peers(ROBOT, OTHER), peers(OTHER, ROBOT), BOTH),
+    'peers on this machine': (peers(ROBOT), peers(OTHER), ONE),
+}  # fmt: skip
+"""Variables of the robot, of the other machine, and which topics are to be heard."""
+
+
+class Machines:
+    """Two of them, in a user namespace of their own where this user is not root; both end with ``stack``."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        """Skips where this user may make none."""
+        self._stack = stack
+        user = [] if os.geteuid() == 0 else ['--user', '--map-root-user']
+        self._robot = self._hold(['unshare', *user, '--net'])
+        self._other = self._hold([*self._inside(self._robot), 'unshare', '--net'])
+        self._run(self._robot, MAKE, str(self._other))
+        self._run(self._other, JOIN)
+
+    def start(self, *arguments: str, other: bool = False) -> subprocess.Popen[str]:
+        """finding.py there; returns once it is ready."""
+        command = [*self._inside(self._other if other else self._robot), sys.executable, str(HERE / 'finding.py'), *arguments]
+        path = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get('PYTHONPATH')])])
+        own = ('CYCLONEDDS_', 'ROS_LOCALHOST', 'ROS_AUTO', 'ROS_STATIC', 'RMW_', 'FASTDDS_', 'FASTRTPS_')
+        environ = {name: value for name, value in os.environ.items() if not name.startswith(own)} | {'PYTHONPATH': path}
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environ)
+        self._stack.callback(_end, process)
+        return process
+
+    def _hold(self, command: Sequence[str]) -> int:
+        """A process that is there; its number, which unshare and nsenter keep."""
+        holder = subprocess.Popen([*command, 'sh', '-c', 'echo there; exec cat'], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                                  stderr=subprocess.PIPE, text=True)  # fmt: skip
+        self._stack.callback(_end, holder)
+        assert holder.stdout is not None
+        if holder.stdout.readline() != 'there\n':
+            pytest.skip(f'no namespaces here: {holder.communicate()[1]}')
+        return holder.pid
+
+    @staticmethod
+    def _inside(pid: int) -> list[str]:
+        user = [] if os.geteuid() == 0 else ['--user', '--preserve-credentials']
+        return ['nsenter', '--target', str(pid), *user, '--net']
+
+    def _run(self, pid: int, script: str, *arguments: str) -> None:
+        command = [*self._inside(pid), 'sh', '-c', script, 'sh', *arguments]
+        ran = subprocess.run(command, capture_output=True, text=True, check=False)
+        if ran.returncode:
+            pytest.skip(f'no network of our own here: {ran.stderr}')
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.communicate()
+
+
+def ready(process: subprocess.Popen[str]) -> subprocess.Popen[str]:
+    assert process.stdout is not None
+    assert process.stdout.readline() == 'ready\n'
+    return process
+
+
+def heard(process: subprocess.Popen[str]) -> Any:
+    """What it has heard so far."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write('\n')
+    process.stdin.flush()
+    return json.loads(process.stdout.readline())
+
+
+@pytest.fixture(scope='module')
+def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, tuple[list[str], list[str]]]]:
+    """By case: what a reader in the robot's Cyclone DDS heard, and what we heard. All cases at once, each in its domain."""
+    domains = {name: {'ROS_DOMAIN_ID': str(number)} for number, name in enumerate(CASES, 1)}
+    rmw = {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
+    robot = [{**CASES[name][0], **domains[name], **rmw} for name in CASES]
+    other = [{**CASES[name][1], **domains[name]} for name in CASES]
+    humble = as_humble(tmp_path_factory.mktemp('humble'))
+    with ExitStack() as stack:
+        machines = Machines(stack)
+        started = [
+            machines.start('publish', '/here', json.dumps(robot)),
+            machines.start('publish', '/there', json.dumps(other), other=True),
+            reader := machines.start('listen', json.dumps(robot)),
+        ]
+        finders = [machines.start('find', json.dumps({**(humble if 'AS_HUMBLE' in case else {}), **case})) for case in robot]
+        for process in (*started, *finders):
+            ready(process)
+        expected = [case[2] for case in CASES.values()]
+        end, settled_s = time.monotonic() + WAIT_S, 0.0
+        while time.monotonic() < end:
+            by_cyclone, by_us = heard(reader), [heard(finder) for finder in finders]
+            is_whole = all(set(names) <= set(ours) for names, ours in zip(expected, by_us, strict=True))
+            settled_s = settled_s or (time.monotonic() if is_whole else 0.0)
+            if settled_s and time.monotonic() > settled_s + MORE_S:
+                break
+            time.sleep(0.1)
+        yield dict(zip(CASES, zip(by_cyclone, by_us, strict=True), strict=True))
+
+
+def as_humble(folder: Path) -> Mapping[str, str]:
+    """Variables in which rmw_fastrtps_cpp has the version of Humble, so that the range means nothing."""
+    index = folder / 'share/ament_index/resource_index/rmw_typesupport'
+    index.mkdir(parents=True)
+    (index / 'rmw_fastrtps_cpp').touch()
+    (folder / 'share/rmw_fastrtps_cpp').mkdir()
+    (folder / 'share/rmw_fastrtps_cpp/package.xml').write_text('<package><version>6.2.7</version></package>')
+    return {'AMENT_PREFIX_PATH': f'{folder}:{os.environ["AMENT_PREFIX_PATH"]}'}
+
+
+@pytest.mark.parametrize('case', CASES)
+def test_whom_cyclone_dds_finds_we_find(found: dict[str, tuple[list[str], list[str]]], case: str) -> None:
+    """Nothing that the robot's own RMW hears is lost, and nobody else is heard."""
+    by_cyclone, by_us = found[case]
+    assert set(by_cyclone) <= set(by_us), 'the robot hears what we do not'
+    assert by_us == CASES[case][2]
+    assert set(by_cyclone) <= set(TOPICS)
