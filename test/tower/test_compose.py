@@ -5,14 +5,19 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
+import signal
 import subprocess
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import boto3
 import pytest
+import urllib3
 import yaml
+from missions.server import until
 from tower_scripts import TOWER, make_secrets, prepare
 
 from shadowhound_data_logger.sim import mlflow_access
@@ -91,6 +96,47 @@ def test_mlflow_asks_for_passwords_and_never_runs_as_root(services: dict[str, An
     assert f'install -d -o mlflow -g mlflow -m 0700 {told.folder}' in (TOWER / 'Dockerfile.mlflow').read_text()
     assert 'user' not in services['mlflow']
     assert 'exec setpriv --reuid=mlflow' in secured['mlflow']['entrypoint'][2]
+
+
+@pytest.mark.long('an MLflow server of its own')
+def test_mlflow_starts_from_one_file(services: dict[str, Any], tmp_path: Path) -> None:
+    """As in its container, where the rest of the package is not: it knows users and experiments, and stops when told."""
+    make_secrets.make(tmp_path, None, ['thor', 'tachi'])
+    shutil.copy(mlflow_access.__file__, tmp_path)
+    with ExitStack() as stack:
+        ports = Ports('127.0.0.1')
+        stack.callback(ports.release)
+        port = str(ports.take())
+        places = {'/tower/': f'{tmp_path}/', '/users/': f'{tmp_path}/mlflow/', '/var/lib/mlflow': f'{tmp_path}',
+                  '0.0.0.0': '127.0.0.1', 's3://mlflow': f'{tmp_path}/artifacts',
+                  '${TOWER_HOST:?run make tower-secrets first}': '127.0.0.1',
+                  '--port 5000': f'--port {port}', '--workers 2': '--workers 1'}  # fmt: skip
+        command = services['mlflow']['command']
+        for theirs, ours in places.items():
+            assert theirs in command
+            command = command.replace(theirs, ours)
+        environ = {name: value for name, value in os.environ.items() if not name.startswith(('MLFLOW_', 'PYTHONPATH', 'AWS_'))}
+        environ['MLFLOW_BACKEND_STORE_URI'] = f'sqlite:///{tmp_path}/mlflow.db'
+        environ[mlflow_access.ADMIN_LOGIN] = make_secrets.read_env(tmp_path / '.env')[mlflow_access.ADMIN_LOGIN]
+        program, *words = shlex.split(command)
+        assert program == 'python'
+        server = stack.enter_context(subprocess.Popen([sys.executable, *words], env=environ, cwd='/'))
+        stack.callback(server.kill)
+        http = stack.enter_context(urllib3.PoolManager())
+
+        def status(user: str) -> int:
+            password = make_secrets.read_env(tmp_path / 'secrets' / f'{user}.env')['MLFLOW_TRACKING_PASSWORD']
+            url = f'http://127.0.0.1:{port}/api/2.0/mlflow/experiments/get-by-name?experiment_name=tachi_missions'
+            try:
+                return http.request(
+                    'GET', url, headers=urllib3.make_headers(basic_auth=f'{user}:{password}'), retries=False
+                ).status
+            except urllib3.exceptions.HTTPError:
+                return 0
+
+        until(lambda: [status(user) for user in ('tachi', 'spark', 'thor')] == [200, 200, 403], 'they are told', 150)
+        server.terminate()
+        assert server.wait(60) in {0, -signal.SIGTERM}
 
 
 @pytest.mark.long('a Tower of its own')
