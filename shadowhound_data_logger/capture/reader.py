@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from importlib import import_module
+from importlib.machinery import PathFinder
+from importlib.util import find_spec
 from typing import Any, Final
 
 from rclpy.callback_groups import CallbackGroup
@@ -38,6 +41,11 @@ class PolledGroup(CallbackGroup):  # type: ignore[misc]  # rclpy has no types
     with an event of an undrained subscription returns at once, for ever (a whole core, measured on Kilted).
     """
 
+    def add_entity(self, entity: Any) -> None:
+        """Forget those that are destroyed, which rclpy does not, and know this one."""
+        self.entities: set[Any] = {known for known in self.entities if known() is not None}
+        super().add_entity(entity)
+
     def can_execute(self, entity: Any) -> bool:  # noqa: ARG002 - the base class's arguments
         return False
 
@@ -48,6 +56,10 @@ class PolledGroup(CallbackGroup):  # type: ignore[misc]  # rclpy has no types
         pass
 
 
+_TYPE: Final = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', re.ASCII)
+"""https://design.ros2.org/articles/interface_definition.html"""
+MAX_PUBLISHERS: Final = 1000
+"""Senders that a subscription knows by name at once."""
 UNKNOWN_NODE: Final = '_NODE_NAME_UNKNOWN_'
 """What rmw calls the node of a publisher that is no ROS node, or of which it does not know yet."""
 
@@ -61,8 +73,17 @@ class SubscriptionRefused(RuntimeError):
 
 
 def message_class(type_name: str) -> type:
-    """The rclpy class of ``package/msg/Name``; raises TypeUnavailable."""
-    package, _, name = type_name.partition('/msg/')
+    """The rclpy class of ``package/msg/Name``; raises TypeUnavailable.
+
+    The name may be any neighbour's in the network: a package is imported only where it has messages, because to import one
+    runs what is in it.
+    """
+    match = _TYPE.fullmatch(type_name)
+    if match is None:
+        raise TypeUnavailable(f'{type_name}: this is no name of a message')
+    package, name = match.groups()
+    if not _has_messages(package):
+        raise TypeUnavailable(f'{type_name}: no package {package} with messages')
     try:
         found: type = getattr(import_module(f'{package}.msg'), name)
         check_for_type_support(found)
@@ -72,6 +93,15 @@ def message_class(type_name: str) -> type:
         text = f'{type_name}: a library of {package} does not load: is its workspace sourced, and built for this Python?'
         raise TypeUnavailable(text) from error
     return found
+
+
+def _has_messages(package: str) -> bool:
+    """Looked up without running anything."""
+    try:
+        spec = find_spec(package)
+    except (ImportError, ValueError):
+        return False
+    return spec is not None and PathFinder.find_spec(f'{package}.msg', spec.submodule_search_locations or ()) is not None
 
 
 @lru_cache
@@ -155,6 +185,8 @@ class Reader:
         data = gid['data']
         name = self._names.get(data)
         if name is None:
+            if len(self._names) >= MAX_PUBLISHERS:
+                self._names.clear()
             name = self._names[data] = bytes(data).hex()
         return name
 

@@ -34,7 +34,30 @@ def test_a_package_without_its_library(tmp_path: Path, monkeypatch: pytest.Monke
     sys.modules.pop('broken_interfaces.msg')
 
 
-@pytest.mark.parametrize('name', ['no_such_package/msg/X', 'std_msgs/msg/NoSuchName', 'std_msgs', 'os/msg/X'])
+@pytest.mark.parametrize('layout', ['careless.py', 'careless/__init__.py'])
+def test_a_package_without_messages_is_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str) -> None:
+    """A neighbour that publishes a type of that name would have whatever is installed here run."""
+    path = tmp_path / layout
+    path.parent.mkdir(exist_ok=True)
+    path.write_text('raise SystemExit("it was run")')
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(TypeUnavailable, match='no package careless with messages'):
+        message_class('careless/msg/Thing')
+    assert 'careless' not in sys.modules
+
+
+@pytest.mark.parametrize(
+    'name',
+    [
+        'no_such_package/msg/X',
+        'std_msgs/msg/NoSuchName',
+        'std_msgs',
+        'os/msg/X',
+        'os.path/msg/X',
+        '/msg/X',
+        'std_msgs/msg/__doc__',
+    ],
+)
 def test_a_type_that_is_none(name: str) -> None:
     """Each is told as the package that is missing, whatever the import raised."""
     with pytest.raises(TypeUnavailable, match=name):
