@@ -21,6 +21,10 @@ class Choice:
     def asks_graph(self) -> bool:
         return self._regex is not None
 
+    def names(self, topic: str) -> bool:
+        """Whether the settings name this very topic."""
+        return topic in self._named
+
     def wanted(self, sensors: Iterable[str], graph: Iterable[str]) -> frozenset[str]:
         """Full names; ``sensors`` are the topics that sensors take, ``graph`` all that there are (asked for a regex only)."""
         if self._regex is None:

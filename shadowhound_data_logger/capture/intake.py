@@ -74,6 +74,11 @@ class Intake:
         """Of topics that only a bag or the ring wants."""
         return *self._bag.own, *(self._ring.own if self._ring is not None else ())
 
+    @property
+    def left_out(self) -> tuple[int, int]:
+        """Topics that a bag, and the ring of the events, would have by an expression, and do not: there are too many."""
+        return self._bag.left_out, self._ring.left_out if self._ring is not None else 0
+
     def status(self) -> list[SourceStatus]:
         return [source.status() for source in self._sources]
 

@@ -162,12 +162,13 @@ class Status:
     def _bag(self) -> dict[str, Any]:
         """What is recorded, with the messages of this session by topic."""
         topics = {topic: asdict(totals) for topic, totals in self._stages.spool.accounts.totals(BAG).items()}
-        return {**asdict(self._stages.recorder.status()), 'topics': topics}
+        return {**asdict(self._stages.recorder.status()), 'topics': topics, 'left_out': self._stages.intake.left_out[0]}
 
     def _events(self) -> dict[str, Any]:
         """Ring and events, with the messages that events asked for in this session by topic."""
         topics = {topic: asdict(totals) for topic, totals in self._stages.spool.accounts.totals(EVENT).items()}
-        return {**asdict(self._stages.event_buffer.events.status()), 'topics': topics}
+        left_out = self._stages.intake.left_out[1]
+        return {**asdict(self._stages.event_buffer.events.status()), 'topics': topics, 'left_out': left_out}
 
     def _store(self, upload: UploadStatus, now_s: float) -> dict[str, Any]:
         then_s, sent_bytes, _ = self._past[0] if self._past else (now_s, upload.sent_bytes, {})

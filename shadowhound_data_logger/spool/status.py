@@ -193,8 +193,15 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
     if about:
         yield f'missed in this session, as estimated: {_most(about, "~")}'
     yield from _other_types(found)
+    yield from _left_out(found)
     if store['quarantined']:
         yield f'quarantined in this session: {store["quarantined"]:,} objects'
+
+
+def _left_out(found: Mapping[str, Any]) -> Iterator[str]:
+    for what, name in (('bag', 'recorded'), ('events', 'kept for events')):
+        if count := found.get(what, {}).get('left_out', 0):
+            yield f'{count:,} topics are not {name}: there are too many that no setting names ({what}.topics, {what}.exclude)'
 
 
 def _other_types(found: Mapping[str, Any]) -> Iterator[str]:

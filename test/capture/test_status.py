@@ -34,6 +34,7 @@ class Intake:
 
     def __init__(self) -> None:
         self.paused = False
+        self.left_out = 0, 0
         self.worker = Worker('intake', lambda: None)
         self.sources = [SourceStatus('imu', '/imu', enabled=True, publishers=1, received_s=None)]
 
