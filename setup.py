@@ -10,7 +10,7 @@ setup(
     name=PACKAGE,
     version='0.1.0',
     description='Takes the sensor data of a Unitree Go2 off the robot: whole, verified, and accounted for.',
-    long_description='A ROS 2 data logger that stores every message, or lists it with the reason why not.',
+    long_description='A ROS 2 data logger that stores what it receives, or lists it with the reason why not.',
     author='ShadowHound maintainers',
     maintainer='ShadowHound maintainers',
     maintainer_email='maintainers@shadowhound.invalid',

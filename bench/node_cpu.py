@@ -71,8 +71,9 @@ def _node(world: World) -> dict[str, Any]:
     """The node's own account of the run."""
     found = world.ledger()
     rows = found['topics'].values()
+    missed = [row['missed'] for row in rows]
     return {
-        'received': sum(row['received'] for row in rows), 'missed': sum(row['missed'] or 0 for row in rows),
+        'received': sum(row['received'] for row in rows), 'missed': None if None in missed else sum(missed),
         'dropped': sum(sum(row['dropped'].values()) for row in rows), 'objects': found['objects'],
     }  # fmt: skip
 

@@ -143,6 +143,7 @@ class Stream:
         self._type = type_name
         self._pace = Pace()
         self._counter: CounterField | None = None
+        self._is_refuted = False
         self._track = shared.robot.of(topic, type_name) if shared.robot is not None else None
         with shared.accounts.entry(topic) as account:
             account.type = type_name
@@ -224,6 +225,11 @@ class Stream:
                 else:
                     account.skipped += 1
             lost = account.observe(sent, self._pace.hear(senders, now_s)) if sent else None
+            is_refuted = bool(sent) and account.estimate.refuted
+        if is_refuted and not self._is_refuted:
+            self._is_refuted = True
+            text = '%s: messages come more often than %s says: how often they are published is learned instead'
+            log.warning(text, self._topic, 'counter_step' if self._counter else 'expected_hz')
         return kept, lost
 
     def _time(self, cdr: bytes, source_ns: int) -> int:

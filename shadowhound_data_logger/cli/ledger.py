@@ -37,7 +37,7 @@ ACCOUNTING: Final = {
 @click.option('--deep', is_flag=True, help='Verify by reading every object back.')
 @click.option('--again', is_flag=True, help='Verify from the beginning, also where a run was interrupted.')
 def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: bool) -> int:
-    """Account for every message: stored and where, or lost and why.
+    """What became of the messages: stored and where, or lost and why. ~ is an estimate, - is not known.
 
     Reads the spool while the node runs and when it does not. Exit code 1 when the ledger does not balance, or when the store
     does not hold what was delivered; an interrupted --verify goes on where it was.

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from shadowhound_data_logger.cli.ledger import verdict
-from shadowhound_data_logger.cli.tables import number, plain_table, show_whole, volume
+from shadowhound_data_logger.cli.tables import figure, number, plain_table, show_whole, volume
 from shadowhound_data_logger.sim.demo_audit import BUCKET, Audit
 from shadowhound_data_logger.sim.demo_processes import OUR_VARIABLE
 from shadowhound_data_logger.sim.demo_run import Reading, Record, Show
@@ -119,9 +119,9 @@ def messages_table(audit: Audit) -> Table:
     has_before = any(row.before_match for row in audit.messages.values())
     table = plain_table('What became of the messages', ('topic', 'published', *(['before match'] if has_before else ()), *fates))
     for topic, row in sorted(audit.messages.items()):
-        account: Mapping[str, int | None] = row.account or {}
+        account = row.account or dict.fromkeys(fates)
         before = [number(row.before_match)] if has_before else []
-        table.add_row(topic, number(row.published), *before, *(number(account.get(name)) for name in fates))
+        table.add_row(topic, number(row.published), *before, *(figure(account, name) for name in fates))
     return table
 
 

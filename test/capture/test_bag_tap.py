@@ -103,6 +103,19 @@ def test_repeats_without_a_sender_are_dropped(ear: Ear) -> None:
     assert ear.heard() == [1, 2, 3]
 
 
+def test_a_bag_is_told_what_the_rhythm_says(ear: Ear) -> None:
+    """What came before it was known stays unknown; what is lost after that is estimated, by the same rhythm as the sensor's."""
+    senders = Senders()
+    senders.look(['a'])
+    for start in (*range(0, 300, 20), *range(340, 400, 20)):
+        taken = [message._replace(number=None) for message in messages(*range(start, start + 20), publisher=None)]
+        ear.stream.add(taken, senders, (start + 20) / 100, paused=False)
+        ear.stream.close_due((start + 20) / 100, 0.0)
+    account = ear.account
+    assert (account.received, account.estimated + account.unknown, account.unknown) == (360, 360, 220)
+    assert (account.missed, account.about_missed, account.missed_estimated) == (None, None, {'transport': 40})
+
+
 def test_a_pause_counts_and_drops(ear: Ear) -> None:
     """That of the node and that of the bag alike."""
     ear.add(messages(1, 2), paused=True)

@@ -23,7 +23,7 @@ UNNUMBERED: dict[str, None] = {'publisher': None, 'number': None}
 class Talk:
     """A stream of Strings that are sent every 100 ms."""
 
-    def __init__(self, last_kept_ns: int = 0, **settings: float) -> None:
+    def __init__(self, last_kept_ns: int = 0, **settings: float | str) -> None:
         self.sensor = SensorSettings(name='talk', **{'rate_hz': 0.0, 'batch_s': 3600.0, **settings})  # type: ignore[arg-type]
         self.accounts = Accounts()
         self.batches: list[Batch] = []
@@ -162,6 +162,24 @@ def test_a_declared_rate_needs_no_learning() -> None:
     talk.messages(5)
     spoken(talk, 2, **UNNUMBERED)
     assert (talk.account.accounting, talk.account.about_missed) == (ESTIMATED, 5)
+
+
+def test_a_declared_rate_that_is_wrong_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    """Messages that come more often refute it: their rhythm is learned."""
+    talk = Talk(expected_hz=4.0)
+    talk.senders.look(['a'])
+    spoken(talk, 500, **UNNUMBERED)
+    assert (talk.account.accounting, talk.account.about_missed) == (ESTIMATED, 0)
+    assert [record.getMessage().partition(':')[0] for record in caplog.records] == [TOPIC]
+
+
+def test_a_counter_that_cannot_be_read_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    """Stamps are used then."""
+    talk = Talk(counter='data')
+    talk.senders.look(['a'])
+    spoken(talk, 300, **UNNUMBERED)
+    assert talk.account.accounting == ESTIMATED
+    assert 'talk.counter is not used' in caplog.text
 
 
 def test_what_another_publisher_did_not_publish_is_not_lost() -> None:

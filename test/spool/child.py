@@ -15,11 +15,14 @@ from typing import Any
 
 from spool.making import make, new_spool, put, receive
 
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.model import Binding, State
+from shadowhound_data_logger.spool.estimator import Hearing
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Outcome
 
+PERIOD_NS = SECOND // 100
 TEST = Path(__file__).parents[1]
 
 
@@ -67,6 +70,12 @@ def load(root: Path) -> None:
         receive(spool, 4)
         with spool.accounts.entry('/camera') as account:
             account.skipped += 1
+        with spool.accounts.entry('/unnumbered') as account:
+            for _ in range(30):
+                account.receive(None, None)
+            stamps = [(40 * number + place) * PERIOD_NS for place in range(30)]  # in each turn ten are lost
+            account.observe({'': stamps}, Hearing(elapsed_s=60.0, gid='p'))
+            account.skipped += 30
         items = spool.commit([make(f'thor/{os.getpid()}/{number % 7}/{index}.jpg', os.urandom(2000)) for index in range(2)])
         say(committed=[[item.key, item.sha256] for item in items])
         outcomes = [Outcome(items[0], State.DELIVERED)]
