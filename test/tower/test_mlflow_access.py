@@ -247,7 +247,8 @@ def test_spark_looks_at_missions_and_keeps_its_own(users: dict[str, User], run: 
          {'experiment_id': run['experiment_id'], 'key': 'a', 'value': 'b'}),
         ('POST', '/api/2.0/mlflow/users/create', {'username': 'mallory', 'password': 'x' * 20}),
         ('POST', '/api/2.0/mlflow/webhooks', {}), ('POST', '/api/3.0/mlflow/gateway/secrets/create', {}),
-        ('POST', '/v1/traces', b''), ('POST', '/ajax-api/3.0/jobs', {}), ('GET', '/ajax-api/3.0/mlflow/assistant/config', None),
+        ('POST', '/v1/traces', b''), ('POST', '/ajax-api/3.0/jobs', {}),
+        ('POST', '/api/2.0/mlflow-artifacts/mpu/create/1/x', {}), ('GET', '/ajax-api/3.0/mlflow/assistant/config', None),
     ):  # fmt: skip
         assert spark.status(method, path, body) == 403, path
     own = str(spark.call('POST', 'experiments/create', {'name': 'training'})['experiment_id'])
