@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 MAX_RECENT: Final = 10_000
 """Messages without a sender's gid that are remembered, to know what a second subscription delivers again."""
 DEAD_S: Final = 15.0
-"""A publisher that was killed stays in the graph for so long at most: DDS gives it up after ten seconds."""
+"""A publisher that was killed stays in the graph for less: Cyclone DDS gives it up after ten seconds."""
 NEW_S: Final = 2.0
 """The graph may know a publisher so long before its first message is taken, and its predecessor's last one."""
 Offer = Callable[[Batch], None]

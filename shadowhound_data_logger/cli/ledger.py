@@ -21,7 +21,7 @@ from shadowhound_data_logger.spool.status import robots
 COLUMNS: Final = ('published', 'received', 'missed', 'skipped', 'rejected', 'dropped', 'stored', 'open')
 ALWAYS: Final = frozenset({'published', 'received', 'missed', 'skipped', 'stored'})
 """The other columns appear once there is something in them."""
-CAUSES: Final = {'missed': 'missed_by', 'rejected': 'rejected', 'dropped': 'dropped'}
+LOSSES: Final = frozenset({'missed', 'rejected', 'dropped'})
 GRADED: Final = ('published', 'received', 'missed')
 """What is known of each grade by itself."""
 ACCOUNTING: Final = {
@@ -111,10 +111,11 @@ def notes(found: Mapping[str, Any]) -> list[str]:
     lines = []
     in_files = ((f'{topic} in {sink}', row) for sink in ('bags', 'events') for topic, row in found.get(sink, {}).items())
     for topic, row in (*found['topics'].items(), *in_files):
-        for name, key in CAUSES.items():
-            if row[key]:
-                mark = '~' if row.get(f'{name}_estimated') is not None else ''
-                lines.append(f'{topic}: {name} by {_listed(row[key], mark)}')
+        for grade, part in row['by_grade'].items():
+            if part['missed_by']:
+                mark = '~' if part['missed'] is None else ''
+                lines.append(f'{topic}: missed by {_listed(part["missed_by"], mark)}{f" ({grade})" * (len(row["by_grade"]) > 1)}')
+        lines += [f'{topic}: {name} by {_listed(row[name])}' for name in ('rejected', 'dropped') if row[name]]
         elsewhere = {state: count for state, count in row['stored_in'].items() if count and state != 'delivered'}
         if elsewhere:
             lines.append(f'{topic}: of {row["stored"]:,} stored, {_listed(elsewhere)}')
@@ -176,7 +177,7 @@ def _total(rows: Sequence[Mapping[str, int | None]], columns: Iterable[str]) -> 
 
 
 def _lossy(name: str, row: Mapping[str, Any]) -> str:
-    is_loss = name in CAUSES and (row[name] or row.get(f'{name}_estimated'))
+    is_loss = name in LOSSES and (row[name] or row.get(f'{name}_estimated'))
     return f'[yellow]{figure(row, name)}[/]' if is_loss else figure(row, name)
 
 

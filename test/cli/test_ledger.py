@@ -164,6 +164,7 @@ def test_several_grades_have_a_line_each() -> None:
     assert ['/imu', 'exact', '-', '140', '-'] in [line[:5] for line in lines]
     assert ['exact', '45', '40', '5'] in lines
     assert ['estimated', '~123', '100', '~23'] in lines
+    assert '/imu: missed by transport ~20, restart ~3 (estimated)' in text
 
 
 @pytest.mark.parametrize(

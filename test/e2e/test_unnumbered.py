@@ -80,6 +80,26 @@ def test_what_is_lost_is_estimated(processes: Processes, tmp_path: Path) -> None
     assert set(row['missed_by']) <= {'restart', 'transport'}
 
 
+def test_what_a_dead_publisher_did_not_publish_is_not_lost(processes: Processes, tmp_path: Path) -> None:
+    """One that is killed, and another one in its place two seconds later: the gap between them is nobody's loss."""
+    node = started(processes, tmp_path, ['calm'])
+    for turn in range(2):
+        publisher = processes.publisher()
+        publisher.create('/calm', STRING)
+        publisher.matched('/calm')
+        before = node.topic('/calm').get('received', 0)
+        publisher.begin('/calm', STRING, PERIOD_S)
+        if turn == 0:
+            until(lambda: node.topic('/calm').get('accounting') == 'estimated', 'the rhythm is known')
+        else:
+            node.received('/calm', before + COUNT)
+        publisher.kill()
+        time.sleep(2.0)
+    row = node.stop()['topics']['/calm']
+    assert row['accounting'] == 'estimated'
+    assert row['missed_estimated'] <= 10, row
+
+
 def stored(node: Node) -> list[int]:
     """The numbers of all messages in its store, a folder."""
     paths = (node.home / 'store' / 'sensor-data' / node.robot).rglob('*_lossy*.json')
