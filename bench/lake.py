@@ -116,10 +116,10 @@ class Counting:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._inner, name)
 
-    def read(self, key: str) -> bytes:
+    def read(self, key: str, most: int) -> bytes:
         date = key.split('/')[2]
         self.dates[date] = self.dates.get(date, 0) + 1
-        return self._inner.read(key)
+        return self._inner.read(key, most)
 
 
 def ask(source: Any, day: int) -> tuple[float, list[str]]:

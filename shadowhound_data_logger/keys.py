@@ -39,13 +39,18 @@ def check_name(name: str, what: str, most: int = MAX_NAME_BYTES) -> str:
 
     Raises NameRefused otherwise; ``what`` says in the error whose name it is.
     """
-    if not _NAME.fullmatch(name) or '..' in name or len(name.encode(errors='replace')) > most:
+    if not is_name(name, most):
         raise NameRefused(
             f'{what} {name[:80]!r} cannot be part of an object key',
             remedy=f'use letters, digits, "_", "-" and ".", at most {most}, beginning with a letter or digit',
             name=name,
         )
     return name
+
+
+def is_name(name: str, most: int = MAX_NAME_BYTES) -> bool:
+    """Whether ``check_name`` allows it."""
+    return bool(_NAME.fullmatch(name)) and '..' not in name and len(name.encode(errors='replace')) <= most
 
 
 def check_key(key: str) -> str:

@@ -24,12 +24,12 @@ from shadowhound_data_logger.bags.metadata import metadata_yaml
 from shadowhound_data_logger.bags.naming import BUCKET, METADATA
 from shadowhound_data_logger.bags.packed import Packed
 from shadowhound_data_logger.bags.plain import Plain, is_plain
-from shadowhound_data_logger.bags.ranges import LocalFile, Meter, StoredFile
-from shadowhound_data_logger.bags.remote import Listing, RemoteBag, natural
+from shadowhound_data_logger.bags.ranges import LocalFile, Meter, StoredFile, read_whole
+from shadowhound_data_logger.bags.remote import Listing, RemoteBag, document, natural
 from shadowhound_data_logger.bags.slice_writer import SliceWriter
 from shadowhound_data_logger.bags.span import when
 from shadowhound_data_logger.clock import iso
-from shadowhound_data_logger.errors import BagError, SettingError
+from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
 
 UNFINISHED: Final = '.part'
@@ -86,7 +86,7 @@ def cut_remote(store: Listing, bag: RemoteBag, out: Path, choice: Choice) -> Cut
         raise BagError(f'{bag.name} is an archive, of which no part can be read', remedy='fetch it, unpack it and cut the folder')
     meter = Meter()
     file = bag.file(METADATA)
-    told = of_metadata(store.get(BUCKET, file.key), file.key) if file else None
+    told = of_metadata(document(store, file), file.key) if file else None
     with _new_folder(out) as folder:
         if is_plain(told, [each.name for each in bag.slices]):
             sources = [StoredFile(store, BUCKET, each.key, each.size, meter) for each in bag.slices]
@@ -94,7 +94,7 @@ def cut_remote(store: Listing, bag: RemoteBag, out: Path, choice: Choice) -> Cut
             return _cut(Plain(sources, told), folder, out, choice, meter, bag.size, others)
         fetched = fetch(store, bag, folder / SOURCE)
         meter.add(fetched.downloaded)
-        return _cut(Packed(fetched.folder), folder, out, choice, meter, bag.size)
+        return _cut(_packed(fetched.folder, told), folder, out, choice, meter, bag.size)
 
 
 def cut_folder(folder: Path, out: Path, choice: Choice) -> Cut:
@@ -103,14 +103,20 @@ def cut_folder(folder: Path, out: Path, choice: Choice) -> Cut:
         raise BagError(f'{out} is within the bag that is cut', remedy='choose a folder beside it')
     meter = Meter()
     names = sorted((path.name for path in folder.glob('*.*') if path.is_file()), key=natural)
-    told = of_metadata((folder / METADATA).read_bytes(), str(folder / METADATA)) if METADATA in names else None
+    told = of_metadata(read_whole(LocalFile(folder / METADATA)), str(folder / METADATA)) if METADATA in names else None
     slices = [name for name in names if name.endswith('.mcap')]
     size = sum((folder / name).stat().st_size for name in names)
     with _new_folder(out) as new:
         if is_plain(told, slices):
             plain = Plain([LocalFile(folder / name, meter) for name in slices], told)
             return _cut(plain, new, out, choice, meter, size, _others(told, slices))
-        return _cut(Packed(folder), new, out, choice, meter, size)
+        return _cut(_packed(folder, told), new, out, choice, meter, size)
+
+
+def _packed(folder: Path, told: Description | None) -> Packed:
+    if told is None:
+        raise BagDamaged(f'{folder} has neither {METADATA} nor MCAP slices alone', path=str(folder))
+    return Packed(folder, told)
 
 
 def _cut(source: Material, folder: Path, out: Path, choice: Choice, meter: Meter, bag_bytes: int,

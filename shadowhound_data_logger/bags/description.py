@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-
 from shadowhound_data_logger.bags.mcap_index import McapIndex
 from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.untrusted import check_size, from_yaml
 
-MOST_BYTES: Final = 4 << 20
-"""Of a metadata.yaml: that of some 15,000 slices, which takes half a minute to read."""
+MOST_QOS_BYTES: Final = 64 << 10
+"""Of one topic's profiles: some 200 publishers."""
+_LATEST_NS: Final = 1 << 63
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +61,9 @@ class Description:
 
 def of_metadata(content: bytes, name: str) -> Description:
     """From a metadata.yaml of any version of rosbag2. Raises BagDamaged for what is none."""
-    if len(content) > MOST_BYTES:
-        raise BagDamaged(f'{name} is no metadata of a rosbag2 bag: it has {len(content)} bytes', path=name)
     try:
-        found = YAML(typ='safe').load(content.decode())['rosbag2_bagfile_information']
-        return _described(found)
-    except (YAMLError, RecursionError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        return _described(from_yaml(content.decode())['rosbag2_bagfile_information'])
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise BagDamaged(f'{name} is no metadata of a rosbag2 bag: {type(error).__name__} {error}', path=name) from error
 
 
@@ -95,7 +91,8 @@ def slice_info(index: McapIndex, path: Path, size: int, sha256: str = '') -> Sli
     """A slice as its own summary tells it."""
     counts: dict[str, int] = {channel.topic: 0 for channel in index.channels.values()}
     for number, count in index.counts.items():
-        counts[index.channels[number].topic] += count
+        if number in index.channels:
+            counts[index.channels[number].topic] += count
     return SliceInfo(path, size, sha256, index.t_start_ns, index.t_end_ns, index.messages, counts, tuple(index.channels.values()))
 
 
@@ -103,23 +100,24 @@ def profiles(qos: object) -> Sequence[Mapping[str, Any]]:
     """Offered QoS profiles: rosbag2 keeps them as a list, before its version 9 as the YAML of one."""
     if isinstance(qos, str):
         try:
-            qos = YAML(typ='safe').load(qos) if qos else []
-        except YAMLError:
+            check_size(len(qos), MOST_QOS_BYTES)
+            qos = from_yaml(qos) if qos else []
+        except ValueError:
             return ()
     return tuple(each for each in qos if isinstance(each, Mapping)) if isinstance(qos, list) else ()
 
 
 def _described(found: Mapping[str, Any]) -> Description:
-    start = int(found['starting_time']['nanoseconds_since_epoch'])
+    start = _whole(found['starting_time'], 'nanoseconds_since_epoch')
     paths = [PurePosixPath(path).name for path in found['relative_file_paths']]
     told = {PurePosixPath(each['path']).name: each for each in found.get('files') or ()}
-    compression = ' '.join(str(found.get(name) or '') for name in ('compression_format', 'compression_mode')).strip()
-    messages = _count(found)
+    compression = ' '.join(_text(found.get(name) or '') for name in ('compression_format', 'compression_mode')).strip()
+    messages = _whole(found, 'message_count')
     return Description(
-        storage=str(found['storage_identifier']), compression='' if compression.lower() == 'none' else compression.lower(),
-        distro=str(found.get('ros_distro') or ''), topics=tuple(_topics(found['topics_with_message_count'] or ())),
+        storage=_text(found['storage_identifier']), compression='' if compression.lower() == 'none' else compression.lower(),
+        distro=_text(found.get('ros_distro') or ''), topics=tuple(_topics(found['topics_with_message_count'] or ())),
         parts=tuple(_part(path, told.get(path)) for path in paths), messages=messages,
-        t_start_ns=start if messages else 0, t_end_ns=start + int(found['duration']['nanoseconds']) if messages else 0,
+        t_start_ns=start if messages else 0, t_end_ns=start + _whole(found['duration'], 'nanoseconds') if messages else 0,
     )  # fmt: skip
 
 
@@ -127,21 +125,30 @@ def _topics(found: Iterable[Mapping[str, Any]]) -> Iterable[Topic]:
     for each in found:
         told = each['topic_metadata']
         yield Topic(
-            str(told['name']), str(told['type']), _count(each), profiles(told.get('offered_qos_profiles')),
-            str(told.get('type_description_hash') or ''),
+            _text(told['name']), _text(told['type']), _whole(each, 'message_count'), profiles(told.get('offered_qos_profiles')),
+            _text(told.get('type_description_hash') or ''),
         )  # fmt: skip
 
 
 def _part(path: str, told: Mapping[str, Any] | None) -> Part:
     if told is None:
         return Part(path, None, None, None)
-    start = int(told['starting_time']['nanoseconds_since_epoch'])
-    messages = _count(told)
-    return Part(path, messages, start if messages else None, start + int(told['duration']['nanoseconds']) if messages else None)
+    start, messages = _whole(told['starting_time'], 'nanoseconds_since_epoch'), _whole(told, 'message_count')
+    return Part(
+        path, messages, start if messages else None, start + _whole(told['duration'], 'nanoseconds') if messages else None
+    )
 
 
-def _count(told: Mapping[str, Any]) -> int:
-    count = int(told['message_count'])
-    if count < 0:
-        raise ValueError(f'message_count is {count}')
-    return count
+def _whole(told: Mapping[str, Any], name: str) -> int:
+    found = told[name]
+    if isinstance(found, str) and found.isdecimal() and len(found) < 20:
+        found = int(found)
+    if type(found) is not int or not 0 <= found < _LATEST_NS:
+        raise ValueError(f'{name} is no whole number of 0 ... 2^63')
+    return found
+
+
+def _text(found: object) -> str:
+    if not isinstance(found, str):
+        raise TypeError('a list or a number stands where a text should')
+    return found

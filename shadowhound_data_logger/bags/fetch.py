@@ -21,14 +21,14 @@ from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.mcap_index import read_index
 from shadowhound_data_logger.bags.metadata import metadata_yaml
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
-from shadowhound_data_logger.bags.ranges import LocalFile, Meter
+from shadowhound_data_logger.bags.ranges import LocalFile, Meter, check_document, read_whole
 from shadowhound_data_logger.bags.remote import Listing, RemoteBag, RemoteFile, missing_of
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import BagDamaged, BagError, ObjectRefused, StoreUnavailable
-from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.ship.retry import backoff
 from shadowhound_data_logger.stores.download import UNFINISHED, download
+from shadowhound_data_logger.untrusted import path_below
 
 THREADS: Final = 4
 TRIES: Final = 6
@@ -81,14 +81,15 @@ def on_disk(folder: Path) -> Iterator[None]:
 
 
 def _fetch(store: Listing, bag: RemoteBag, to: Path, threads: int, told: Told) -> Fetched:
-    folder = to if bag.is_archive else to / bag.name
+    folder = to if bag.is_archive else path_below(to, bag.name)
     folder.mkdir(parents=True, exist_ok=True)
     meter = Meter()
     told.begin(bag.size)
     manifest = None
     if (file := bag.file(MANIFEST)) is not None:
+        check_document(file.key, file.size)
         _have(store, file, folder, None, meter, told)
-        manifest = Manifest.from_json((folder / MANIFEST).read_bytes(), file.key)
+        manifest = Manifest.from_json(read_whole(LocalFile(folder / MANIFEST)), file.key)
     others = [file for file in bag.files if file.name != MANIFEST]
     promised = {each.file: each.sha256 for each in manifest.slices} if manifest else {}
 
@@ -117,7 +118,7 @@ def _side_by_side(one: Callable[[RemoteFile], str], files: Sequence[RemoteFile],
 
 def _have(store: Listing, file: RemoteFile, folder: Path, promised: str | None, got: Meter, told: Told) -> str:
     """Make it be there; returns the SHA-256 that it was checked against, empty where none is known."""
-    path = folder / check_key(file.name)
+    path = path_below(folder, file.name)
     sha256 = promised or _recorded(store, file)
     if path.is_file() and path.stat().st_size == file.size and (not sha256 or fingerprint(path)[1] == sha256):
         told.have(file.size)

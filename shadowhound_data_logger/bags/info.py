@@ -14,7 +14,7 @@ from shadowhound_data_logger.bags.local import local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.mcap_index import read_index
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
-from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile
+from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
 from shadowhound_data_logger.bags.remote import (
     FOREIGN,
     GROWING,
@@ -88,9 +88,9 @@ def info_folder(folder: Path) -> BagInfo:
 def _info(robot: str, name: str, sources: Mapping[str, Ranged], where: Mapping[str, tuple[int, str]], meter: Meter,
           tags: Mapping[str, str]) -> BagInfo:  # fmt: skip
     files = RemoteBag(robot, name, tuple(RemoteFile(each, '', where[each][0]) for each in sorted(where, key=natural)))
-    manifest = Manifest.from_json(_whole(sources[MANIFEST]), sources[MANIFEST].name) if MANIFEST in sources else None
+    manifest = Manifest.from_json(read_whole(sources[MANIFEST]), sources[MANIFEST].name) if MANIFEST in sources else None
     if METADATA in sources:
-        description = of_metadata(_whole(sources[METADATA]), sources[METADATA].name)
+        description = of_metadata(read_whole(sources[METADATA]), sources[METADATA].name)
     else:
         slices = [sources[each.name] for each in files.slices if each.name.endswith('.mcap') and each.name in sources]
         if not slices:
@@ -105,10 +105,6 @@ def _info(robot: str, name: str, sources: Mapping[str, Ranged], where: Mapping[s
 
 def _slice(source: Ranged) -> SliceInfo:
     return slice_info(read_index(source), Path(source.name), source.size)
-
-
-def _whole(source: Ranged) -> bytes:
-    return source.read(0, source.size)
 
 
 def _tags(store: Listing, bag: RemoteBag, waiting: Mapping[str, Waiting]) -> Mapping[str, str]:

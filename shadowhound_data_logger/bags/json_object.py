@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any, Final
 
 from shadowhound_data_logger.errors import BagDamaged
@@ -44,7 +43,10 @@ class JsonObject:
         found = self._fields.get(name)
         if not isinstance(found, (int, float)) or isinstance(found, bool):
             raise self.wrong(name, 'a number')
-        return float(found)
+        try:
+            return float(found)
+        except OverflowError:
+            raise self.wrong(name, 'a number of 64 bits') from None
 
     def counts(self, name: str) -> dict[str, int]:
         inner = JsonObject(self._fields.get(name), self._file, self._at(name))
@@ -67,7 +69,8 @@ class JsonObject:
         return [JsonObject(one, self._file, f'{self._at(name)}[{place}]') for place, one in enumerate(found)]
 
     def wrong(self, name: str, allowed: str) -> BagDamaged:
-        found = json.dumps(self._fields[name])[:80] if name in self._fields else 'nothing'
+        value = self._fields.get(name, 'nothing')
+        found = f'a {type(value).__name__}' if isinstance(value, (dict, list)) else repr(value)[:80]
         return BagDamaged(
             f'{self._file}: {self._at(name)} is {found} and must be {allowed}', path=self._file, field=self._at(name)
         )

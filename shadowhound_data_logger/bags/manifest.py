@@ -34,6 +34,7 @@ from typing import Final
 from shadowhound_data_logger.bags.json_object import JsonObject
 from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.untrusted import from_json, is_path
 
 VERSION: Final = 1
 COMPLETE: Final = 'complete'
@@ -150,8 +151,8 @@ class Manifest:
     def from_json(cls, content: bytes, name: str = 'manifest.json') -> Manifest:
         """Raises BagDamaged, naming the first field that is not as it must be; ``name`` is the file's, for that."""
         try:
-            found = json.loads(content)
-        except (ValueError, RecursionError) as error:
+            found = from_json(content)
+        except ValueError as error:
             raise BagDamaged(f'{name} is no JSON: {error}', path=name) from error
         top = JsonObject(found, name, '')
         if (version := top.count('version')) != VERSION:
@@ -207,6 +208,8 @@ def read_clock(one: JsonObject) -> ClockOf:
 
 
 def _slice(one: JsonObject) -> SliceEntry:
+    if not is_path(one.text('file')):
+        raise one.wrong('file', 'the name of a file')
     sha256 = one.text('sha256')
     if not _SHA256.fullmatch(sha256):
         raise one.wrong('sha256', 'a SHA-256 in hex')

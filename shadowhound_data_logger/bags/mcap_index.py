@@ -20,6 +20,8 @@ FOOTER_BYTES: Final = 20
 TAIL_BYTES: Final = RECORD.size + FOOTER_BYTES + len(MAGIC)
 FIRST_READ: Final = 64 << 10
 """From the end: the whole summary of most slices, so that one request does."""
+MOST_SUMMARY_BYTES: Final = 64 << 20
+"""That of a hundred thousand chunks: a bag of 100 GB in one file."""
 _CHUNK_INDEX = struct.Struct('<QQQQ')
 _STATISTICS = struct.Struct('<QHIIIIQQ')
 _ID_COUNT = struct.Struct('<HQ')
@@ -101,6 +103,8 @@ def read_index(source: Ranged) -> McapIndex:
         return McapIndex({}, (), {}, 0, 0, 0, footer_start, is_indexed=False)
     if not len(MAGIC) <= summary_start <= footer_start:
         raise BagDamaged(f'{source.name} has its summary at {summary_start}, outside the file', path=source.name)
+    if footer_start - summary_start > MOST_SUMMARY_BYTES:
+        raise BagDamaged(f'{source.name} has a summary of {footer_start - summary_start:,} bytes', path=source.name)
     if summary_start < tail_start:
         tail = source.read(summary_start, tail_start - summary_start) + tail
         tail_start = summary_start

@@ -6,7 +6,6 @@ Every chunk that is opened is checked against its CRC-32, where the writer left 
 from __future__ import annotations
 
 import struct
-import sys
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -14,18 +13,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from lz4.frame import decompress as lz4_decompress  # type: ignore[import-untyped]
-
 from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.mcap_format import CHUNK, MAGIC, RECORD, Op
 from shadowhound_data_logger.bags.mcap_index import Chunk, Fields, McapIndex, Schemas, records
 from shadowhound_data_logger.bags.ranges import Ranged
 from shadowhound_data_logger.errors import BagDamaged
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
+from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, unpacked
 
 SPAN_BYTES: Final = 8 << 20
 """Neighbouring chunks are read with one request up to this size."""
@@ -35,8 +28,8 @@ READ_AHEAD: Final = 4
 """Spans that are read at the same time, while the first of them is unpacked."""
 BLOCK_BYTES: Final = 4 << 20
 """Of a file that is read from one end to the other."""
-MOST_CHUNK_BYTES: Final = 1 << 30
-"""Unpacked; a larger one is a wrong length."""
+MOST_RECORD_BYTES: Final = MOST_CHUNK_BYTES + 1024
+"""A chunk, and what says of it how it is packed."""
 _MESSAGE = struct.Struct('<HIQQ')
 
 
@@ -71,8 +64,11 @@ def read_messages(source: Ranged, index: McapIndex, wanted: Wanted) -> Iterator[
         if chunk.t_start_ns < wanted.end_ns and chunk.t_end_ns >= wanted.start_ns
         and any(count and number in channels for number, count in chunk.counts.items())
     ]  # fmt: skip
+    for chunk in chunks:
+        if chunk.length > MOST_RECORD_BYTES:
+            raise BagDamaged(f'{source.name} has a chunk of {chunk.length:,} bytes at {chunk.start}', path=source.name)
     for chunk, record in _read_chunks(source, chunks):
-        kind, length = RECORD.unpack_from(record)
+        kind, length = RECORD.unpack_from(record) if len(record) >= RECORD.size else (0, 0)
         if (kind, RECORD.size + length) != (Op.CHUNK, chunk.length):
             raise BagDamaged(f'{source.name} has no chunk at {chunk.start}', path=source.name)
         content = unpack(record[RECORD.size :], f'the chunk at {chunk.start} of {source.name}')
@@ -86,10 +82,10 @@ def unpack(content: memoryview, name: str) -> memoryview:
         _, _, size, crc = fields.unpack(CHUNK)
         compression, packed = fields.text(), fields.uint(8)
         body = fields.rest()
-        if packed != len(body) or size > MOST_CHUNK_BYTES:
+        if packed != len(body):
             raise BagDamaged(f'{name} has wrong lengths', path=name)
-        found = body if not compression else memoryview(_decompressed(compression, bytes(body), name))
-    except (struct.error, UnicodeDecodeError, zstd.ZstdError, RuntimeError) as error:  # lz4 raises the last
+        found = body if not compression else memoryview(unpacked(compression, bytes(body), size))
+    except (struct.error, ValueError) as error:
         raise BagDamaged(f'{name} cannot be unpacked: {error}', path=name) from error
     if len(found) != size or (crc and zlib.crc32(found) != crc):
         raise BagDamaged(f'{name} is not what was written: its CRC-32 or its length is another', path=name)
@@ -106,20 +102,14 @@ def walk(source: Ranged, end: int) -> Iterator[tuple[int, int, memoryview]]:
         size = RECORD.size + length
         if start + size > end:
             raise BagDamaged(f'{source.name} has a torn record at {start}', path=source.name)
+        if size > MOST_RECORD_BYTES:
+            raise BagDamaged(f'{source.name} has a record of {size:,} bytes at {start}', path=source.name)
         if len(block) < size:
             more = min(max(BLOCK_BYTES, size), end - start) - len(block)
             block = memoryview(bytes(block) + source.read(start + len(block), more))
             continue
         yield block[0], start, block[RECORD.size : size]
         start, block = start + size, block[size:]
-
-
-def _decompressed(compression: str, body: bytes, name: str) -> bytes:
-    if compression == 'zstd':
-        return zstd.decompress(body)
-    if compression == 'lz4':
-        return bytes(lz4_decompress(body))
-    raise BagDamaged(f'{name} is compressed with {compression!r}, which nobody here knows', path=name)
 
 
 def _in_chunk(content: memoryview, channels: dict[int, Channel], wanted: Wanted, name: str) -> Iterator[Message]:
@@ -129,6 +119,8 @@ def _in_chunk(content: memoryview, channels: dict[int, Channel], wanted: Wanted,
 
 
 def _message(record: memoryview, channels: dict[int, Channel], wanted: Wanted) -> Message | None:
+    if len(record) < _MESSAGE.size:
+        return None  # no message, whatever its first byte says
     number, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(record)
     channel = channels.get(number)
     if channel is None or not wanted.start_ns <= log_ns < wanted.end_ns:
@@ -182,7 +174,14 @@ def _scan(source: Ranged, index: McapIndex, wanted: Wanted) -> Iterator[Message]
             inner = list(records(unpack(content, name), name))
         for part, _, record in inner:
             if part in {Op.SCHEMA, Op.CHANNEL}:
-                schemas.add(part, record)
+                _add(schemas, part, record, source.name)
                 known = {number: channel for number, channel in schemas.channels.items() if wanted.channel(channel)}
             elif part == Op.MESSAGE and (found := _message(record, known, wanted)):
                 yield found
+
+
+def _add(schemas: Schemas, kind: int, record: memoryview, name: str) -> None:
+    try:
+        schemas.add(kind, record)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise BagDamaged(f'{name} has a schema or channel that cannot be read: {error}', path=name) from error

@@ -19,6 +19,7 @@ from shadowhound_data_logger.bags.remote import (
     Listing,
     RemoteBag,
     RemoteFile,
+    document,
     find_bags,
     missing_of,
     read_manifest,
@@ -162,11 +163,13 @@ def _facts(store: Listing, bag: RemoteBag, manifest: Manifest | None, tags: Iter
             return _Facts(messages, len(topics))
         return _span(messages, len(topics), [(each.t_start_ns + step_ns, each.t_end_ns + step_ns) for each in filled])
     if file := bag.file(METADATA):
-        told = of_metadata(store.get(BUCKET, file.key), file.key)
+        told = of_metadata(document(store, file), file.key)
         return _span(told.messages, len({topic.name for topic in told.topics}), [(told.t_start_ns, told.t_end_ns)])
     try:
         told_of = [{name: int(tag[name]) for name in ('messages', 't_start_ns', 't_end_ns')} for tag in tags]
     except (KeyError, ValueError):
+        return _Facts()
+    if not all(0 <= value < 1 << 63 for each in told_of for value in each.values()):
         return _Facts()
     spans = [(each['t_start_ns'], each['t_end_ns']) for each in told_of if each['messages']]
     return _span(sum(each['messages'] for each in told_of), None, spans) if told_of else _Facts()

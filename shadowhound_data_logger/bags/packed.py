@@ -1,65 +1,161 @@
-"""Bags that only rosbags reads: SQLite, and those that are compressed outside the storage. They lie on the disk."""
+"""Bags that are no plain MCAP: SQLite, and those that are compressed outside the storage. They lie on the disk.
+
+rosbags reads the SQLite, once it is known that its tables are tables: a view would be a program of whoever wrote the file.
+"""
 
 from __future__ import annotations
 
+import shutil
+import sqlite3
 import sys
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import IO, Final
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.metadata import dump_qos_v8
 
 from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.definitions import describe
+from shadowhound_data_logger.bags.description import Description
 from shadowhound_data_logger.bags.mcap_messages import Message, Wanted
-from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.bags.plain import Plain
+from shadowhound_data_logger.bags.ranges import LocalFile
+from shadowhound_data_logger.errors import BagDamaged, DataLoggerError
+from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, path_below, unpacked
 
 if sys.version_info >= (3, 14):
     from compression import zstd
 else:
     from backports import zstd
 
+PIECE_BYTES: Final = 1 << 20
+MOST_RATIO: Final = 1000
+"""Of a file that is unpacked onto the disk, to what it is packed; half of the disk's free room is never exceeded."""
 _ENCODINGS = {MessageDefinitionFormat.MSG: 'ros2msg', MessageDefinitionFormat.IDL: 'ros2idl'}
+_TABLES: Final = {'messages', 'topics', 'schema', 'metadata', 'message_definitions'}
 
 
 class Packed:
-    """A folder with a metadata.yaml. It knows one stamp alone: when a message was received; it stands for the other one too."""
+    """The files of a folder that its metadata name. SQLite knows one stamp alone, when a message came; it stands for both."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, told: Description) -> None:
         self._folder = folder
+        self._told = told
 
     def span(self) -> tuple[int, int]:
-        with self._opened() as reader:
-            return (reader.start_time, reader.end_time - 1) if reader.message_count else (0, 0)
+        return (self._told.t_start_ns, self._told.t_end_ns) if self._told.messages else (0, 0)
 
     def topics(self) -> set[str]:
-        with self._opened() as reader:
-            return {connection.topic for connection in reader.connections}
+        return {topic.name for topic in self._told.topics}
 
     def messages(self, wanted: Wanted) -> Iterator[Message]:
-        with self._opened() as reader:
-            channels = {connection.id: channel_of(connection) for connection in reader.connections}
-            chosen = [connection for connection in reader.connections if wanted.channel(channels[connection.id])]
-            if chosen:
-                for connection, log_ns, cdr in reader.messages(chosen, wanted.start_ns, wanted.end_ns):
-                    yield Message(channels[connection.id], log_ns, log_ns, 0, bytes(cdr))
+        is_by_message = 'message' in self._told.compression
+        for part in self._told.parts:
+            with self._unpacked(part.name) as path:
+                found = Plain([LocalFile(path)], None).messages(wanted) if path.suffix == '.mcap' else _stored(path, wanted)
+                for message in found:
+                    yield _plain(message, path) if is_by_message else message
 
     @contextmanager
-    def _opened(self) -> Iterator[Reader]:
-        try:
-            with Reader(self._folder) as reader:
-                yield reader
-        except (ReaderError, zstd.ZstdError, FileNotFoundError) as error:
-            raise BagDamaged(f'{self._folder} cannot be read: {error}', path=str(self._folder)) from error
+    def _unpacked(self, name: str) -> Iterator[Path]:
+        """The file as its storage wrote it."""
+        path = path_below(self._folder, name)
+        if 'file' not in self._told.compression:
+            yield path
+            return
+        if not self._told.compression.startswith('zstd'):
+            raise BagDamaged(f'{path} is compressed with {self._told.compression!r}, which nobody here knows', path=str(path))
+        with tempfile.TemporaryDirectory(prefix='shadowhound-bag-') as folder:
+            whole = Path(folder, path.stem)
+            _unpack(path, whole)
+            yield whole
+
+
+def check_tables(path: Path) -> None:
+    """Raises BagDamaged for a SQLite file of which a table is none, or holds what is larger than any message."""
+    try:
+        with closing(sqlite3.connect(f'{path.absolute().as_uri()}?mode=ro&immutable=1', uri=True)) as database:
+            why = _refusal(database)
+    except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
+        raise BagDamaged(f'{path} cannot be read: {error}', path=str(path)) from error
+    if why:
+        raise BagDamaged(f'{path} is no SQLite bag: {why}', path=str(path))
+
+
+def _refusal(database: sqlite3.Connection) -> str:
+    kinds = database.execute('SELECT type, name, sql FROM sqlite_master').fetchmany(1000)
+    found = {name for kind, name, made in kinds if kind == 'table' and not str(made).upper().startswith('CREATE VIRTUAL')}
+    if not {'messages', 'topics'} <= found or any(kind == 'view' for kind, _, _ in kinds):
+        return 'it has other tables'
+    for table in sorted(_TABLES & found):
+        columns = database.execute(f'PRAGMA table_xinfo({table})').fetchall()
+        if any(hidden for *_, hidden in columns):
+            return f'it computes a column of {table}'
+        names = [str(name) for _, name, *_ in columns if str(name).isidentifier()]
+        longest = [database.execute(f'SELECT max(length("{name}")) FROM {table}').fetchone()[0] for name in names]  # noqa: S608 - checked
+        if max(filter(None, longest), default=0) > MOST_CHUNK_BYTES:
+            return f'a row of {table} has {max(filter(None, longest)):,} bytes'
+    return ''
 
 
 def channel_of(connection: Connection) -> Channel:
     """A bag without definitions (SQLite before Iron) gets those that are known here."""
     encoding, definition, type_hash = _ENCODINGS.get(connection.msgdef.format, ''), connection.msgdef.data, connection.digest
+    if not all(isinstance(text, str) for text in (connection.topic, connection.msgtype, definition, type_hash)):
+        raise TypeError('the name, type or definition of a topic is no text')
     if not encoding or not definition:
         encoding, definition, known = describe(connection.msgtype)
         type_hash = type_hash or known
     qos = dump_qos_v8(connection.ext.offered_qos_profiles) if isinstance(connection.ext, ConnectionExtRosbag2) else ''
     return Channel(connection.topic, connection.msgtype, encoding, definition, type_hash, qos)
+
+
+def _stored(path: Path, wanted: Wanted) -> Iterator[Message]:
+    check_tables(path)
+    try:
+        with Reader(path) as reader:
+            channels = {connection.id: channel_of(connection) for connection in reader.connections}
+            chosen = [connection for connection in reader.connections if wanted.channel(channels[connection.id])]
+            for connection, log_ns, cdr in reader.messages(chosen, wanted.start_ns, wanted.end_ns) if chosen else ():
+                yield _message(channels[connection.id], log_ns, cdr)
+    except DataLoggerError:
+        raise
+    except Exception as error:  # whatever rosbags, apsw and ruamel make of a file that is none
+        raise BagDamaged(f'{path} cannot be read: {error}', path=str(path)) from error
+
+
+def _message(channel: Channel, log_ns: object, cdr: object) -> Message:
+    """SQLite keeps whatever it is given in any column."""
+    if type(log_ns) is not int or not 0 <= log_ns < 1 << 63 or not isinstance(cdr, (bytes, bytearray, memoryview)):
+        raise TypeError('a message has no time or no content')
+    return Message(channel, log_ns, log_ns, 0, bytes(cdr))
+
+
+def _plain(message: Message, path: Path) -> Message:
+    try:
+        return message._replace(cdr=unpacked('zstd', message.cdr))
+    except ValueError as error:
+        raise BagDamaged(f'a message in {path} cannot be unpacked: {error}', path=str(path)) from error
+
+
+def _unpack(path: Path, whole: Path) -> None:
+    """Raises BagDamaged for what is no zstd, or unpacks to more than it may."""
+    try:
+        most = min(path.stat().st_size * MOST_RATIO, shutil.disk_usage(whole.parent).free // 2)
+        with path.open('rb') as raw, zstd.open(raw, 'rb') as packed, whole.open('wb') as out:
+            _copy(packed, out, most)
+    except (zstd.ZstdError, OSError, EOFError, ValueError) as error:
+        raise BagDamaged(f'{path} cannot be unpacked: {error}', path=str(path)) from error
+
+
+def _copy(packed: zstd.ZstdFile, out: IO[bytes], most: int) -> None:
+    left = most
+    while piece := packed.read(PIECE_BYTES):
+        left -= len(piece)
+        if left < 0:
+            raise ValueError(f'it unpacks to more than {most:,} bytes')
+        out.write(piece)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size
 
 
 class Ranged(Protocol):
@@ -89,6 +90,20 @@ class StoredFile:
         found = self._store.get_range(self._bucket, self._key, start, length)
         self._meter.add(len(found))
         return whole(found, length, self.name, start)
+
+
+def read_whole(source: Ranged) -> bytes:
+    """A manifest or a metadata.yaml. Raises BagDamaged for one that is larger than any, before it is read."""
+    check_document(source.name, source.size)
+    return source.read(0, source.size)
+
+
+def check_document(name: str, size: int) -> None:
+    """Raises BagDamaged."""
+    try:
+        check_size(size, MOST_DOCUMENT_BYTES)
+    except ValueError as error:
+        raise BagDamaged(f'{name} is no manifest and no metadata: {error}', path=name) from error
 
 
 def whole(found: bytes, length: int, name: str, start: int) -> bytes:

@@ -14,6 +14,7 @@ from typing import Final, Protocol
 
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, prefix_of
+from shadowhound_data_logger.bags.ranges import StoredFile, read_whole
 from shadowhound_data_logger.errors import BagError
 from shadowhound_data_logger.model import ObjectInfo
 
@@ -111,7 +112,12 @@ def find_bag(store: Listing, robot: str, bag: str) -> RemoteBag:
 def read_manifest(store: Listing, bag: RemoteBag) -> Manifest | None:
     """None when there is none. Raises BagDamaged for one that says nothing, StoreError."""
     file = bag.file(MANIFEST)
-    return Manifest.from_json(store.get(BUCKET, file.key), file.key) if file else None
+    return Manifest.from_json(document(store, file), file.key) if file else None
+
+
+def document(store: Listing, file: RemoteFile) -> bytes:
+    """A manifest or a metadata.yaml. Raises BagDamaged for one that is larger than any, StoreError."""
+    return read_whole(StoredFile(store, BUCKET, file.key, file.size))
 
 
 def missing_of(bag: RemoteBag, manifest: Manifest) -> list[str]:

@@ -19,9 +19,11 @@ from shadowhound_data_logger.bags.mcap_format import Op
 from shadowhound_data_logger.bags.mcap_index import read_index, records
 from shadowhound_data_logger.bags.mcap_messages import unpack, walk
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
-from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile
-from shadowhound_data_logger.bags.remote import FOREIGN, Listing, RemoteBag, RemoteFile, state_of
+from shadowhound_data_logger.bags.packed import check_tables
+from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
+from shadowhound_data_logger.bags.remote import FOREIGN, Listing, RemoteBag, RemoteFile, document, state_of
 from shadowhound_data_logger.errors import BagDamaged, BagError
+from shadowhound_data_logger.untrusted import is_path
 
 THREADS: Final = 4
 PIECE_BYTES: Final = 8 << 20
@@ -98,7 +100,7 @@ def verify_folder(folder: Path, *, deep: bool = False, told: Telling = lambda _:
     manifest, described, early = _writers_word(lambda name: _local(folder / name))
     if manifest is None and described is None and not bag.slices:
         raise BagError(f'{folder} holds no bag: neither {METADATA} nor a slice is in it', path=str(folder))
-    checks = [_check_local(folder / each.name, each, deep, told) for each in _expected(manifest, described, files)]
+    checks = [_check_local(folder, each, deep, told) for each in _expected(manifest, described, files)]
     state = state_of(bag, manifest, {}) if manifest else FOREIGN
     return Verified(folder.name, state, (*early, *checks), sum(files.values()), _missing(manifest))
 
@@ -151,7 +153,10 @@ def _check_remote(store: Listing, file: RemoteFile, expected: _Expected, meter: 
     return _check_summary(source, expected, 'sha256' if held.sha256 else 'size')
 
 
-def _check_local(path: Path, expected: _Expected, deep: bool, told: Telling) -> Check:
+def _check_local(folder: Path, expected: _Expected, deep: bool, told: Telling) -> Check:
+    if not is_path(expected.name):
+        return Check(expected.name, 'is the name of no file', 'presence')
+    path = folder / expected.name
     if not path.is_file():
         return Check(expected.name, 'is missing', 'presence')
     size = path.stat().st_size
@@ -233,6 +238,10 @@ class _Once:
 
 def _check_sqlite(path: Path, expected: _Expected) -> Check:
     try:
+        check_tables(path)
+    except BagDamaged as error:
+        return Check(expected.name, f'is no SQLite bag: {error}', 'content')
+    try:
         with sqlite3.connect(f'{path.absolute().as_uri()}?mode=ro&immutable=1', uri=True) as database:
             answer = database.execute('PRAGMA quick_check(1)').fetchone()[0]
             count = database.execute('SELECT count(*) FROM messages').fetchone()[0]
@@ -248,11 +257,11 @@ def _check_sqlite(path: Path, expected: _Expected) -> Check:
 
 def _stored(store: Listing, bag: RemoteBag, name: str) -> bytes | None:
     file = bag.file(name)
-    return store.get(BUCKET, file.key) if file else None
+    return document(store, file) if file else None
 
 
 def _local(path: Path) -> bytes | None:
-    return path.read_bytes() if path.is_file() else None
+    return read_whole(LocalFile(path)) if path.is_file() else None
 
 
 def _tags(store: Listing, bag: RemoteBag) -> Mapping[str, str]:

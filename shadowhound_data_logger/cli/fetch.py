@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
-from shadowhound_data_logger.cli.question import asking, question, settings
+from shadowhound_data_logger.cli.question import asking, question, quietly, settings, tell_left_out
 from shadowhound_data_logger.cli.tables import duration, number, plain, volume
 
 SHOWN: Final = 20
@@ -43,7 +44,8 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
 
         store = settings()
         begun_s = time.monotonic()
-        rows = [] if prefix is not None else _asked(flags, limit)
+        left_out = quietly()
+        rows = [] if prefix is not None else _asked(flags, limit, left_out)
         wishes = list(dict.fromkeys(lake.Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows))
         if prefix is not None:
             wishes = lake.under(open_source(store, bucket), prefix)
@@ -55,20 +57,22 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
     took_s = time.monotonic() - begun_s
     if as_json:
         told = {'to': str(to), 'asked': len(wishes), 'moved': found.moved, 'present': found.present, 'bytes': found.bytes,
-                'unverified': found.unverified, 'failed': found.failed, 'took_s': round(took_s, 3)}  # fmt: skip
+                'unverified': found.unverified, 'failed': found.failed, 'left_out': [asdict(one) for one in left_out],
+                'took_s': round(took_s, 3)}  # fmt: skip
         click.echo(json.dumps(told, indent=2))
     else:
         where = f'{"" if prefix is None else f"under {prefix} "}in {open_source(store, bucket).describe()}'
         _show(found, len(wishes), took_s, to, where)
-    return 1 if found.failed else 0
+        tell_left_out(left_out)
+    return 1 if found.failed or len(left_out) else 0
 
 
-def _asked(flags: Mapping[str, Any], limit: int | None) -> list[dict[str, Any]]:
+def _asked(flags: Mapping[str, Any], limit: int | None, left_out: Any) -> list[dict[str, Any]]:
     """The rows of the catalogue."""
     from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
 
     with lake.answering():
-        rows = lake.objects(lake.default_source(settings()), **flags).sort('t_start_ns')
+        rows = lake.objects(lake.default_source(settings()), findings=left_out, **flags).sort('t_start_ns')
         found: list[dict[str, Any]] = (rows.limit(limit) if limit else rows).to_pylist()
     return found
 

@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from datetime import date, timedelta
-from typing import Final
+from typing import Any, Final
 
 import click
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TaskID, TextColumn
 
 from shadowhound_data_logger.cli.lake_verify import verify
-from shadowhound_data_logger.cli.question import asking, settings
+from shadowhound_data_logger.cli.question import asking, quietly, settings, tell_left_out
 from shadowhound_data_logger.cli.tables import number, plain, plain_table, show_whole, volume
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.stores import open_store
@@ -42,10 +42,11 @@ def status(*, robot: str | None, as_json: bool) -> int:
         from shadowhound_data_logger.lake.state import state  # noqa: PLC0415
 
     source = default_source(settings())
-    found = state(source, robot)
+    left_out = quietly()
+    found = state(source, robot, left_out)
     if as_json:
         click.echo(json.dumps([asdict(row) for row in found], indent=2))
-        return 0
+        return tell_left_out(left_out)
     table = plain_table('', COLUMNS, ('robot', 'first', 'last'))
     table.title = None
     for row in found:
@@ -53,7 +54,7 @@ def status(*, robot: str | None, as_json: bool) -> int:
         table.add_row(plain(row.robot), number(row.days), row.first, row.last, number(counts[0]), volume(counts[1]),
                       *map(number, counts[2:]))  # fmt: skip
     show_whole([table] if found else [plain(f'There is no catalogue yet in {source.describe()}.')], Console(highlight=False))
-    return 0
+    return tell_left_out(left_out)
 
 
 @lake.command()
@@ -64,7 +65,10 @@ def status(*, robot: str | None, as_json: bool) -> int:
               help='How long files stay that a compacted one stands for: somebody may be reading them.')  # fmt: skip
 @_as_json
 def compact(*, robot: str | None, before: str | None, keep: bool, grace: float, as_json: bool) -> int:
-    """Make one file of the many of each day that is over, and delete those that an earlier run made one of."""
+    """Make one file of the many of each day that is over, and delete those that an earlier run made one of.
+
+    Exit code 1 when a file is no part of a catalogue, or has rows that are not its robot's: it is named and stays as it is.
+    """
     if before:
         try:
             date.fromisoformat(before)
@@ -75,15 +79,15 @@ def compact(*, robot: str | None, before: str | None, keep: bool, grace: float, 
         from shadowhound_data_logger.lake import compact as library  # noqa: PLC0415
         from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
 
-    store = settings()
+    store, left_out = settings(), quietly()
+    how: dict[str, Any] = {'robot': robot, 'before': before or '', 'grace': None if keep else timedelta(minutes=grace)}
     with closing(open_store(store, UploadSettings())) as target, _spinner() as (bar, task):
-        patience = None if keep else timedelta(minutes=grace)
-        for day in library.compact(default_source(store), target, robot=robot, before=before or '', grace=patience):
+        for day in library.compact(default_source(store), target, findings=left_out, **how):
             found.append(day)
             bar.update(task, description=f'{day.robot} {day.date}')
     if as_json:
         click.echo(json.dumps([asdict(day) for day in found], indent=2))
-        return 0
+        return tell_left_out(left_out)
     merged, deleted, kept = (sum(getattr(day, name) for day in found) for name in ('merged', 'deleted', 'kept'))
     days = sum(day.merged > 0 for day in found)
     click.echo(f'{number(merged)} files are {number(days)} now, one a day.' if merged else 'There is nothing to merge.')
@@ -93,7 +97,7 @@ def compact(*, robot: str | None, before: str | None, keep: bool, grace: float, 
         click.echo(f'{number(kept)} that are stood for are still there: a later run deletes them.')
     if any(day.denied for day in found):
         click.echo('These credentials may not delete: that costs room, and nothing else.')
-    return 0
+    return tell_left_out(left_out)
 
 
 @lake.command()
@@ -105,9 +109,9 @@ def reindex(*, robot: str, as_json: bool) -> int:
         from shadowhound_data_logger.lake import reindex as library  # noqa: PLC0415
         from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
 
-    store = settings()
+    store, left_out = settings(), quietly()
     with closing(open_store(store, UploadSettings())) as target, _spinner() as (bar, task):
-        found = library.reindex(default_source(store), target, robot, tell=lambda so_far: bar.update(
+        found = library.reindex(default_source(store), target, robot, findings=left_out, tell=lambda so_far: bar.update(
             task, description=f'{number(so_far.listed)} objects listed, {number(so_far.added)} added'))  # fmt: skip
     if as_json:
         click.echo(json.dumps(asdict(found), indent=2))
@@ -117,7 +121,7 @@ def reindex(*, robot: str, as_json: bool) -> int:
         )
         if found.gone:
             click.echo(f'{number(found.gone)} rows name objects that are gone from the store.')
-    return 0
+    return tell_left_out(left_out)
 
 
 @contextmanager

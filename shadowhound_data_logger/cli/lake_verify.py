@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -13,7 +14,7 @@ import click
 from rich.console import Console
 from rich.text import Text
 
-from shadowhound_data_logger.cli.question import asking, question, settings
+from shadowhound_data_logger.cli.question import asking, question, quietly, settings, tell_left_out
 from shadowhound_data_logger.cli.tables import duration, number, plain, show_whole
 from shadowhound_data_logger.cli.verify import findings, piles, progress
 from shadowhound_data_logger.config import UploadSettings
@@ -49,8 +50,9 @@ def verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool, thre
 
         store = settings()
         begun_s = time.monotonic()
-        own = library.rows(query.default_source(store), **flags)
-        theirs = library.rows(selecting.fetched(catalogue), **flags) if catalogue else own
+        left_out = quietly()
+        own = library.rows(query.default_source(store), left_out, **flags)
+        theirs = library.rows(selecting.fetched(catalogue), left_out, **flags) if catalogue else own
         if not len(theirs) and catalogue:
             raise click.UsageError(f'there are no rows in {catalogue}: `shadowhound-data fetch ROBOT/_catalog/ --to {catalogue}`')
         rows, lacking = (theirs.joined(own), theirs.lacking(own)) if catalogue else (own, [])
@@ -61,10 +63,13 @@ def verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool, thre
         where = target.describe()
     said = {'store': where, 'catalogue': catalogue and str(catalogue), **_said(rows, found, lacking, deep=deep)}
     said['took_s'] = round(time.monotonic() - begun_s, 3)
+    said['left_out'] = [asdict(one) for one in left_out]
+    said['ok'] = said['ok'] and not said['left_out']
     if as_json:
         click.echo(json.dumps(said, indent=2))
     else:
         _show(said)
+        tell_left_out(left_out)
     return 0 if said['ok'] else 1
 
 
@@ -98,5 +103,7 @@ def _verdict(said: Mapping[str, Any]) -> Text:
         return Text.assemble(('Nothing is verified', 'yellow'), ': the catalogue has no such objects.')
     if said['ok']:
         return Text.assemble(('All of them are there', 'green'), f', {how}.')
+    if not said['findings']:
+        return Text.assemble(('All that it tells of are there', 'yellow'), f', {how}; but it is not whole.')
     wrong = len({(one['bucket'], one['key']) for piled in said['findings'].values() for one in piled['first']})
     return Text.assemble((f'{number(wrong)} are not as the catalogue says', 'red'), f', {how}.')

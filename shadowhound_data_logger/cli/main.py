@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 
 import click
@@ -17,6 +18,7 @@ from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.cli.spool import spool
 from shadowhound_data_logger.cli.status import status
 from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.untrusted import visible
 
 
 @click.group(context_settings={'help_option_names': ['-h', '--help']})
@@ -47,13 +49,20 @@ def main() -> None:
     except click.exceptions.Exit as error:
         sys.exit(error.exit_code)
     except click.ClickException as error:
-        error.show()
+        told = io.StringIO()
+        error.show(told)
+        click.echo(visible_lines(told.getvalue()), nl=False, err=True)
         sys.exit(2)
     except click.Abort:
         sys.exit(130)
     except DataLoggerError as error:
-        click.echo(f'shadowhound-data: {error}', err=True)
+        click.echo(f'shadowhound-data: {visible_lines(str(error))}', err=True)
         sys.exit(1)
+
+
+def visible_lines(text: str) -> str:
+    """An error may name what a robot wrote."""
+    return '\n'.join(map(visible, text.split('\n')))
 
 
 if __name__ == '__main__':

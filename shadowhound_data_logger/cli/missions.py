@@ -22,6 +22,7 @@ from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder
 from shadowhound_data_logger.missions.overview import ACTIVE, export, find, overview, overviews
 from shadowhound_data_logger.missions.report import is_sending
+from shadowhound_data_logger.untrusted import csv_cell
 
 POLL_S: Final = 0.5
 STYLES: Final = {'FINISHED': 'green', ACTIVE: 'cyan'}
@@ -112,7 +113,7 @@ def export_(*, folder: MissionFolder, kind: str, to: IO[str]) -> int:
     else:
         rows = csv.writer(to, lineterminator='\n')
         rows.writerow(COLUMNS)
-        rows.writerows(_rows(found))
+        rows.writerows(map(csv_cell, row) for row in _rows(found))
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,8 +14,9 @@ from typing import Any, Final
 import click
 from rich.console import Console, RenderableType
 
-from shadowhound_data_logger.cli.question import asking, question, settings, words
+from shadowhound_data_logger.cli.question import asking, question, quietly, settings, tell_left_out, words
 from shadowhound_data_logger.cli.tables import number, plain, plain_table, show_whole, volume
+from shadowhound_data_logger.untrusted import csv_cell, visible
 
 SHOWN: Final = 30
 """Rows of a table unless --limit says more."""
@@ -40,12 +42,15 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
     SQL knows the views objects, missions and topics, restricted by the flags:
 
         shadowhound-data query "SELECT sensor, count(*) AS n FROM objects GROUP BY sensor" --since yesterday
+
+    Exit code 1 when parts of the catalogue are none and left out; they are named on standard error.
     """
     with asking():
         from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
 
-        source = lake.default_source(settings())
-        frame = lake.sql(sql, source, **flags) if sql else lake.objects(source, **flags)
+        source, left_out = lake.default_source(settings()), quietly()
+        ask = functools.partial(lake.sql, sql) if sql else lake.objects
+        frame = ask(source, findings=left_out, **flags)
         with lake.answering():
             frame = _ordered(frame, order or ('t_start_ns' if not sql else None))
             found = (frame.limit(limit) if limit else frame).to_arrow()
@@ -53,9 +58,9 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
         raise click.UsageError('keys and pictures need the columns bucket and key among what the SQL selects')
     with asking():
         if sheet or ground:
-            _pictures(source, found.to_pylist(), flags, sheet, ground)
+            _pictures(source, found.to_pylist(), flags, left_out, sheet, ground)
     _print(found, 'json' if as_json else kind, source.describe(), is_objects=not sql, is_limited=limit is not None)
-    return 0
+    return tell_left_out(left_out)
 
 
 def _ordered(frame: Any, order: str | None) -> Any:
@@ -70,13 +75,13 @@ def _ordered(frame: Any, order: str | None) -> Any:
 def _print(found: Any, kind: str, where: str, *, is_objects: bool, is_limited: bool) -> None:
     if kind == 'keys':
         for bucket, key in zip(found['bucket'].to_pylist(), found['key'].to_pylist(), strict=True):
-            click.echo(f'{bucket}/{key}')
+            click.echo(visible(f'{bucket}/{key}'))
     elif kind == 'json':
         click.echo(json.dumps([_told(row) for row in found.to_pylist()], indent=2, default=str))
     elif kind == 'csv':
         writer = csv.writer(sys.stdout, lineterminator='\n')
-        writer.writerow(found.column_names)
-        writer.writerows(_told(row).values() for row in found.to_pylist())
+        writer.writerow(map(csv_cell, found.column_names))
+        writer.writerows(map(csv_cell, _told(row).values()) for row in found.to_pylist())
     else:
         show_whole(list(_table(found, where, is_objects=is_objects, is_limited=is_limited)), Console(highlight=False))
 
@@ -119,7 +124,7 @@ def _told(row: Mapping[str, Any]) -> dict[str, Any]:
     return {name: f'{value:%Y-%m-%dT%H:%M:%S.%fZ}' if isinstance(value, datetime) else value for name, value in row.items()}
 
 
-def _pictures(source: Any, rows: Sequence[Mapping[str, Any]], flags: Mapping[str, Any], sheet: Path | None,
+def _pictures(source: Any, rows: Sequence[Mapping[str, Any]], flags: Mapping[str, Any], left_out: Any, sheet: Path | None,
               ground: Path | None) -> None:  # fmt: skip
     from shadowhound_data_logger.lake import pictures  # noqa: PLC0415
     from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415
@@ -131,7 +136,7 @@ def _pictures(source: Any, rows: Sequence[Mapping[str, Any]], flags: Mapping[str
         click.echo(f'Wrote {sheet}', err=True)
     if ground:
         around = {name: flags[name] for name in ('robot', 'since', 'until') if name in flags}
-        poses = lake.objects(source, **around, where='x IS NOT NULL').select('x', 'y').to_pydict()
+        poses = lake.objects(source, findings=left_out, **around, where='x IS NOT NULL').select('x', 'y').to_pydict()
         path = list(zip(poses['x'], poses['y'], strict=True))
         near = wanted(0, near=flags.get('near')).near
         pictures.ground(rows, path[:: len(path) // MOST_POSES + 1], near, words(flags), ground)

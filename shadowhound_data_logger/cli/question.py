@@ -6,13 +6,17 @@ import functools
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
+from shadowhound_data_logger.cli.tables import number
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.options import StoreSettings
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.lake.findings import Findings
 
 EXTRA: Final = {'daft', 'matplotlib', 'obstore', 'pyarrow'}
 _FLAGS: Final = (
@@ -64,6 +68,23 @@ def asking() -> Iterator[None]:
         if error.name not in EXTRA:
             raise
         raise click.UsageError(f"{error.name} is not installed: pip install 'shadowhound_data_logger[lake]'") from error
+
+
+def quietly() -> Findings:
+    """What is left out, to be told at the end."""
+    from shadowhound_data_logger.lake.findings import Findings  # noqa: PLC0415
+
+    return Findings(lambda _: None)
+
+
+def tell_left_out(left_out: Findings) -> int:
+    """Each on standard error; the exit code."""
+    for one in left_out:
+        click.echo(str(one), err=True)
+    if len(left_out):
+        text = f'{number(len(left_out))} of the catalogue are left out. Move them away, and run `shadowhound-data lake reindex`.'
+        click.echo(text, err=True)
+    return 1 if len(left_out) else 0
 
 
 def settings() -> StoreSettings:

@@ -9,19 +9,21 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.errors import LakeError, NameRefused, ObjectRefused
+from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.lake.track import Object
 from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, path_below
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from typing_extensions import Self
 
-Read = Callable[[str, str], bytes]
-"""From bucket and key to content."""
+Read = Callable[[str, str, int], bytes]
+"""From bucket, key and size to content."""
 TRIES: Final = 3
 """Of content that is damaged on its way."""
 
@@ -34,17 +36,24 @@ class Place:
     folder: Path | None = None
     """Of fetched objects (``DIR/KEY``); they count alone."""
 
-    def read(self, bucket: str, key: str) -> bytes:
-        """Raises StoreError."""
+    def read(self, bucket: str, key: str, most: int) -> bytes:
+        """Raises StoreError; ObjectRefused where it is larger than it should be, of which nothing is read then."""
         if self.folder is None and self.settings.endpoint_url:
             from shadowhound_data_logger.stores import s3_get  # noqa: PLC0415 - a folder needs no botocore
 
-            return s3_get.read(self.settings, bucket, key)
-        path = (self.folder or self.settings.directory / bucket) / key
+            return s3_get.read(self.settings, bucket, key, most)
+        where: dict[str, Any] = {'bucket': bucket, 'key': key}
         try:
-            return path.read_bytes()
+            path = path_below(self.folder or self.settings.directory / check_name(bucket, 'the bucket'), key)
+            with path.open('rb') as file:
+                body = file.read(most + 1)
+        except NameRefused as error:
+            raise ObjectRefused(str(error), reason='name', **where) from error
         except OSError as error:
-            raise ObjectRefused(f'{path} cannot be read: {error.strerror}', bucket=bucket, key=key, reason='missing') from error
+            raise ObjectRefused(f'{path} cannot be read: {error.strerror}', reason='missing', **where) from error
+        if len(body) > most:
+            raise ObjectRefused(f'{path} has more than {most:,} bytes', reason='size', **where)
+        return body
 
 
 class Bodies:
@@ -119,8 +128,11 @@ class Bodies:
             self._held_bytes -= len(self._kept.popitem(last=False)[1])
 
     def _verified(self, wanted: Object) -> bytes:
+        if not 0 < wanted.size <= MOST_OBJECT_BYTES:
+            text = f'{wanted.bucket}/{wanted.key} has {wanted.size:,} bytes; more than {MOST_OBJECT_BYTES:,} are not decoded'
+            raise LakeError(text, bucket=wanted.bucket, key=wanted.key)
         for left in reversed(range(TRIES)):
-            body = self._read(wanted.bucket, wanted.key)
+            body = self._read(wanted.bucket, wanted.key, wanted.size)
             if not wanted.sha256 or hashlib.sha256(body).hexdigest() == wanted.sha256:
                 return body
             if not left or self._over.is_set():

@@ -20,18 +20,33 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from shadowhound_data_logger.errors import AccessDenied
+from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.parts import ABOUT
 from shadowhound_data_logger.lake.putting import put_part
-from shadowhound_data_logger.lake.scan import THREADS, read, unrepeated
-from shadowhound_data_logger.lake.schema import arrow_schema, prefix
+from shadowhound_data_logger.lake.reading import THREADS, whole
+from shadowhound_data_logger.lake.scan import unrepeated
+from shadowhound_data_logger.lake.schema import arrow_schema
 from shadowhound_data_logger.lake.source import Entry, Source
-from shadowhound_data_logger.lake.standing import LEAVES, Day, compacted_key, days, encode_leaves, is_compacted, name_of
+from shadowhound_data_logger.lake.standing import (
+    LEAVES,
+    Day,
+    compacted_key,
+    dates_of,
+    days,
+    encode_leaves,
+    folder_of,
+    is_compacted,
+    name_of,
+    robots,
+)
 from shadowhound_data_logger.stores.base import ObjectStore
 
 GRACE: Final = timedelta(hours=1)
 """How long parts stay that a compacted one stands for: who listed them before that may still read them."""
 MOST_S: Final = 1800.0
 """From the list of a day's parts to its compacted part; half of the grace."""
+MOST_DAY_BYTES: Final = 1 << 30
+"""Of a day's rows in memory: of a robot that stores everything all day they take 400 MB."""
 GROUP_ROWS: Final = 4096
 CELL_M: Final = 4.0
 """Rows are ordered by sensor, by squares of this side along a Z-order curve, then by time: what lies together is read at once."""
@@ -55,47 +70,69 @@ class Compacted:
     """The credentials may not delete: that costs room and nothing else."""
 
 
-def compact(
+def compact(  # noqa: PLR0913 - what is handed in
     source: Source, store: ObjectStore, *, robot: str | None = None, before: str = '', grace: timedelta | None = GRACE,
+    findings: Findings | None = None,
     now: Callable[[], datetime] = lambda: datetime.now(timezone.utc), monotonic: Callable[[], float] = time.monotonic,
 ) -> Iterator[Compacted]:  # fmt: skip
     """Merge every day earlier than ``before`` (default: today, UTC), and delete what was merged ``grace`` ago (None: nothing).
 
-    Yields each day that it had to do with. Raises StoreError, LakeError; what was done until then is whole.
+    Yields each day that it had to do with. A part of which something is left out stays as it is; the others are merged.
+    Raises StoreError; what was done until then is whole.
     """
+    findings = Findings() if findings is None else findings
     end = before or f'{now():%Y-%m-%d}'
     with ThreadPoolExecutor(THREADS) as pool:
-        for name in [robot] if robot else source.folders(''):
-            for date in _dates(source, name, end):
+        for name in [robot] if robot else robots(source):
+            for date in (date for date in dates_of(source, name, findings) if date < end):
                 deadline_s = monotonic() + MOST_S
-                for day in days(source, [name], [date], pool):
-                    done = _merge(source, store, day, lambda end_s=deadline_s: monotonic() < end_s)  # type: ignore[misc]
+                for day in days(source, [name], [date], pool, findings):
+                    done = _merge(source, store, day, findings, lambda end_s=deadline_s: monotonic() < end_s)  # type: ignore[misc]
                     done = _tidy(source, day, done, grace, now())
                     if done.merged or done.deleted or done.kept:
                         yield done
 
 
-def _dates(source: Source, robot: str, end: str) -> list[str]:
-    folders = source.folders(prefix(robot))
-    return [name[5:] for name in folders if name.startswith('date=') and name[5:] < end]
-
-
-def _merge(source: Source, store: ObjectStore, day: Day, is_in_time: Callable[[], bool]) -> Compacted:
+def _merge(source: Source, store: ObjectStore, day: Day, findings: Findings, is_in_time: Callable[[], bool]) -> Compacted:
     nothing = Compacted(day.robot, day.date)
     if len(day.entries) < 2:
         return nothing
-    leaves = day.leaves | {name_of(entry.key) for entry in day.entries if not is_compacted(entry.key)}
-    key = compacted_key(day.robot, day.date, leaves, is_mended=day.is_mended)
-    rows = in_order(unrepeated(read(source, [entry.key for entry in day.entries], arrow_schema().names)))
+    try:
+        merged, rows = _rows(source, day, findings)
+        if len(merged) < 2:
+            return nothing
+        leaves = frozenset().union(*(day.leaves.get(entry.key, {name_of(entry.key)}) for entry in merged))
+        key = compacted_key(day.robot, day.date, leaves, is_mended=day.is_mended)
+        body = _encoded(in_order(unrepeated(rows)), leaves)
+    except MemoryError:
+        findings.add(folder_of(day.robot, day.date), 'there is not enough memory to compact it')
+        return nothing
+    if not is_in_time():
+        return nothing
+    put_part(store, key, day.robot, body, len(rows))
+    return replace(nothing, merged=len(merged), rows=len(rows), size=len(body))
+
+
+def _rows(source: Source, day: Day, findings: Findings) -> tuple[list[Entry], pa.Table]:
+    """The parts that can be merged, and what is in them. Raises MemoryError for more than ``MOST_DAY_BYTES``."""
+    merged: list[Entry] = []
+    found: list[pa.Table] = [arrow_schema().empty_table()]
+    size = 0
+    for entry, table in whole(source, day.entries, findings):
+        size += table.nbytes
+        if size > MOST_DAY_BYTES:
+            raise MemoryError
+        merged.append(entry)
+        found.append(table)
+    return merged, pa.concat_tables(found).combine_chunks()
+
+
+def _encoded(rows: pa.Table, leaves: frozenset[str]) -> bytes:
     body = pa.BufferOutputStream()
     with pq.ParquetWriter(body, arrow_schema(), compression='zstd', store_schema=False) as file:
         file.write_table(rows.cast(arrow_schema()), row_group_size=GROUP_ROWS)
         file.add_key_value_metadata({**ABOUT, LEAVES: encode_leaves(leaves)})
-    whole = body.getvalue().to_pybytes()
-    if not is_in_time():
-        return nothing
-    put_part(store, key, day.robot, whole, len(rows))
-    return replace(nothing, merged=len(day.entries), rows=len(rows), size=len(whole))
+    return bytes(body.getvalue().to_pybytes())
 
 
 def _tidy(source: Source, day: Day, done: Compacted, grace: timedelta | None, now: datetime) -> Compacted:

@@ -18,6 +18,7 @@ import numpy as np
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.lake import shards
 from shadowhound_data_logger.lake.bodies import Bodies
+from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.samples import POSE_GAP_NS, Near, Sample, Samples, Window, is_complete
 from shadowhound_data_logger.lake.track import Object, Track
 
@@ -62,7 +63,9 @@ class MissionDataset:
             raise SettingError('sensor', flags['sensor'], 'anchor="camera" instead')
         self.aligned = {name: how if isinstance(how, (Near, Window)) else Near(float(how)) for name, how in (align or {}).items()}
         self._place, asked = selecting.place(source)
-        self._selection = selecting.select(asked, anchor, self.aligned, size, flags)
+        self.left_out = Findings()
+        """What of the catalogue is not in it, since it is no part of one; a child that was forked or spawned has none of it."""
+        self._selection = selecting.select(asked, anchor, self.aligned, size, flags, self.left_out)
         self._drop_incomplete = drop_incomplete
         self._chosen = [self._complete(track) for track in self._selection.anchors]
         counts = [track.count[chosen] for track, chosen in zip(self._selection.anchors, self._chosen, strict=True)]

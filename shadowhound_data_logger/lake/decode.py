@@ -18,6 +18,7 @@ import orjson
 import simplejpeg
 
 from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.untrusted import MOST_MEMBERS, check_pixels, check_size, open_image
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,13 +27,17 @@ IMAGES: Final = frozenset({'jpg', 'jpeg', 'png', 'tif', 'tiff'})
 CLOUDS: Final = frozenset({'pcd'})
 ARCHIVES: Final = frozenset({'tar', 'zip'})
 POINT: Final = ('x', 'y', 'z', 'intensity')
+_ZIP_ENTRY: Final = b'PK\x01\x02'
 _JPEG: Final = b'\xff\xd8'
 _DATA: Final = b'\nDATA '
 _MOST_HEADER: Final = 1 << 16
-_MOST_PIXELS: Final = 1 << 28
+_MOST_POINTS: Final = 1 << 22
+"""Of a cloud; a lidar of the Go2 has some 20,000."""
+_MOST_JSON_BYTES: Final = 32 << 20
+"""A batch is closed after 4 MiB of messages; as objects of Python it is 24 times as large."""
 _BROKEN: Final = (ValueError, KeyError, IndexError, TypeError, OSError, EOFError, tarfile.TarError, zipfile.BadZipFile,
-                  NotImplementedError, RuntimeError, zlib.error)  # fmt: skip
-"""What the readers raise for content that is no such thing; RuntimeError is a zip with a password."""
+                  NotImplementedError, RuntimeError, zlib.error, ArithmeticError, MemoryError, SyntaxError)  # fmt: skip
+"""What the readers raise for content that is no such thing; RuntimeError is a zip with a password, SyntaxError Pillow's."""
 
 
 class Member(NamedTuple):
@@ -62,8 +67,7 @@ def image(body: bytes, size: tuple[int, int] | None = None) -> NDArray[Any]:
 
 def _jpeg(body: bytes, size: tuple[int, int] | None) -> NDArray[Any]:
     height, width, _, _ = simplejpeg.decode_jpeg_header(body)
-    if height * width > _MOST_PIXELS:
-        raise ValueError(f'{width} x {height} pixels')
+    check_pixels(width, height)
     if size is None:
         pixels: NDArray[Any] = simplejpeg.decode_jpeg(body, 'RGB')
         return pixels
@@ -80,9 +84,7 @@ def _resized(pixels: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
 def _pillow(body: bytes, size: tuple[int, int] | None) -> NDArray[Any]:
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')  # of a damaged file Pillow warns before it raises
-        with _opened(body) as opened:
-            if opened.width * opened.height > _MOST_PIXELS:
-                raise ValueError(f'{opened.width} x {opened.height} pixels')
+        with open_image(body) as opened:
             plain = opened.mode in {'I;16', 'I', 'F'}
             pixels = np.array(opened if plain else opened.convert('RGB'))
             if opened.mode == 'I':  # what older Pillows make of 16 bits
@@ -93,15 +95,6 @@ def _pillow(body: bytes, size: tuple[int, int] | None) -> NDArray[Any]:
         return _resized(pixels, size)
     rows, columns = (np.arange(wish) * have // wish for wish, have in zip(size, pixels.shape[:2], strict=True))
     return np.array(pixels[rows][:, columns])  # a mean of depths lies on neither surface
-
-
-def _opened(body: bytes) -> Any:
-    from PIL import Image  # noqa: PLC0415 - 0.1 s, and most cameras send JPEGs
-
-    try:
-        return Image.open(BytesIO(body))
-    except Image.DecompressionBombError as error:  # which is nobody's ValueError
-        raise ValueError(str(error)) from None
 
 
 def cloud(body: bytes) -> NDArray[np.float32]:
@@ -120,6 +113,8 @@ def _cloud(body: bytes) -> NDArray[np.float32]:
     lines = (line.split() for line in body[:at].decode('ascii').splitlines() if not line.startswith('#'))
     header = {line[0]: line[1:] for line in lines if line}
     points = int(header['POINTS'][0])
+    if not 0 <= points <= _MOST_POINTS:
+        raise ValueError(f'it claims {points:,} points')
     fields = zip(
         header['FIELDS'], header['TYPE'], header['SIZE'], header.get('COUNT', ['1'] * len(header['FIELDS'])), strict=True
     )
@@ -136,9 +131,10 @@ def _cloud(body: bytes) -> NDArray[np.float32]:
 def records(body: bytes) -> list[dict[str, Any]]:
     """The samples of a batch, or the one document as a list. Raises LakeError."""
     try:
+        check_size(len(body), _MOST_JSON_BYTES)
         document = orjson.loads(body)
         found = document.get('samples', [document])
-        if not all(isinstance(each['stamp_ns'], int) for each in found):
+        if not all(isinstance(each, dict) and _is_stamp(each['stamp_ns']) for each in found):
             raise ValueError('a sample has no stamp')
         return list(found)
     except (*_BROKEN, AttributeError) as error:
@@ -158,19 +154,35 @@ def _members(files: dict[str, bytes]) -> Iterator[Member]:
     for name, body in files.items():
         if name.endswith('.json'):
             told = orjson.loads(body)
+            if not isinstance(told, dict) or not _is_stamp(told['stamp_ns']):
+                raise ValueError(f'{name} has no stamp')
             holder = told.get('repeat_of') or contents[name[:-5]]
-            yield Member(int(told['stamp_ns']), files[holder], extension_of(holder))
+            yield Member(told['stamp_ns'], files[holder], extension_of(holder))
 
 
 def _tar(body: bytes) -> Iterator[tuple[str, bytes]]:
+    left = len(body)  # a sparse file claims more
     with tarfile.open(fileobj=BytesIO(body), mode='r:') as packed:
-        for entry in packed:
-            content = packed.extractfile(entry)
+        for number, entry in enumerate(packed):
+            left -= entry.size if entry.isreg() else 0
+            if number >= MOST_MEMBERS or left < 0:
+                raise ValueError('it claims more files, or larger ones, than there is room for in it')
+            content = packed.extractfile(entry) if entry.isreg() else None
             if content is not None:
                 yield entry.name, content.read()
 
 
 def _zip(body: bytes) -> Iterator[tuple[str, bytes]]:
+    if body.count(_ZIP_ENTRY) > MOST_MEMBERS:
+        raise ValueError(f'it has more than {MOST_MEMBERS:,} files')
     with zipfile.ZipFile(BytesIO(body)) as packed:
-        for name in packed.namelist():
-            yield name, packed.read(name)
+        entries = packed.infolist()
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise ValueError('its files are packed; those of a robot are stored as they are')
+        check_size(sum(entry.file_size for entry in entries), len(body))
+        for entry in entries:
+            yield entry.filename, packed.read(entry)
+
+
+def _is_stamp(value: object) -> bool:
+    return type(value) is int and -(1 << 63) <= value < 1 << 63

@@ -21,6 +21,7 @@ from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import AccessDenied, BucketMissing, LakeError, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.lake.fetched import FOLDER, Fetched, Verified
 from shadowhound_data_logger.lake.source import Source
+from shadowhound_data_logger.untrusted import is_path
 
 THREADS: Final = 16
 AHEAD: Final = 8
@@ -127,7 +128,7 @@ class _Fetch:
         """Those that are not known to be there."""
         seen: set[str] = set()
         for wish in dict.fromkeys(wishes):  # the rows of repeats name one object
-            if (refusal := _refusal(wish.key)) or wish.key in seen:
+            if (refusal := _refusal(wish)) or wish.key in seen:
                 self._fail(wish, refusal or 'another bucket has the same key: fetch it elsewhere')
                 continue
             seen.add(wish.key)
@@ -209,6 +210,7 @@ class _Fetch:
         moved, digest = 0, hashlib.sha256()
         try:
             content = source.get(wish.key)
+            _check_size(wish, content.size)  # before a byte of it takes room
             with part.open('wb') as file:
                 for piece in content.pieces:
                     self._go_on()
@@ -239,11 +241,11 @@ class _Fetch:
             self._folders.add(folder)
 
 
-def _refusal(key: str) -> str:
-    """Why a key can be no file below the folder; empty when it can. Anybody may have written to the bucket."""
-    if any(part in {'', '.', '..'} for part in key.split('/')) or '\0' in key:
+def _refusal(wish: Wish) -> str:
+    """Why an object can be no file below the folder; empty when it can. Anybody may have written to the bucket."""
+    if not is_path(wish.key):
         return 'its key is no path'
-    return 'its key is ours' if key.split('/', maxsplit=1)[0] == FOLDER else ''
+    return 'its key is ours' if wish.key.split('/', maxsplit=1)[0] == FOLDER else ''
 
 
 def _is(known: Verified, wish: Wish) -> bool:
@@ -256,8 +258,15 @@ def _is(known: Verified, wish: Wish) -> bool:
 
 def _check(wish: Wish, size: int, sha256: str, expected: str | None) -> None:
     """Raises ObjectRefused for content that is not what was stored."""
-    where = {'bucket': wish.bucket, 'key': wish.key, 'reason': _DAMAGED}
-    if size != wish.size:
-        raise ObjectRefused(f'it has {size} bytes instead of {wish.size}', **where)
+    _check_size(wish, size)
     if expected is not None and sha256 != expected:
-        raise ObjectRefused(f'its SHA-256 is {sha256[:12]}... instead of {expected[:12]}...', **where)
+        raise _damaged(wish, f'its SHA-256 is {sha256[:12]}... instead of {expected[:12]}...')
+
+
+def _check_size(wish: Wish, size: int) -> None:
+    if size != wish.size:
+        raise _damaged(wish, f'it has {size} bytes instead of {wish.size}')
+
+
+def _damaged(wish: Wish, why: str) -> ObjectRefused:
+    return ObjectRefused(why, bucket=wish.bucket, key=wish.key, reason=_DAMAGED)

@@ -8,10 +8,10 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
-from shadowhound_data_logger.errors import LakeError, NameRefused
-from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake import parts
 from shadowhound_data_logger.lake.fetched import PARTS
 from shadowhound_data_logger.lake.schema import COLUMNS
@@ -27,7 +27,7 @@ def keep(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         {**{name: row[name] for name in COLUMNS}, **{name: _micros(row, name) for name in ('t_start', 't_end')}} for row in rows
     ]
     for robot, date, found in parts.by_folder(enumerate(plain)):
-        if not _is_name(robot):
+        if robot is None or not is_name(robot):
             continue
         ours = [row for _, row in found]
         path = folder / mended_key(robot, date, [f'{row["bucket"]}/{row["key"]} {row["t_start_ns"]}' for row in ours])
@@ -41,13 +41,6 @@ def keep(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             part.replace(path)
         except OSError as error:
             raise LakeError(f'{path} cannot be written: {error.strerror}', folder=str(folder)) from error
-
-
-def _is_name(robot: str | None) -> TypeGuard[str]:
-    try:
-        return bool(check_name(robot or '', 'the robot name'))
-    except NameRefused:
-        return False
 
 
 def _micros(row: Mapping[str, Any], name: str) -> int | None:

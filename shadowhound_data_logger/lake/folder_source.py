@@ -11,11 +11,13 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreUnavailable
-from shadowhound_data_logger.lake.source import CHUNK_BYTES, Content, Entry
+from shadowhound_data_logger.errors import AccessDenied, NameRefused, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.lake.source import CHUNK_BYTES, Content, Entry, check_read
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores.directory import METADATA
+from shadowhound_data_logger.untrusted import path_below
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,13 +32,13 @@ class FolderSource:
 
     def folders(self, prefix: str) -> list[str]:
         with self._touching(prefix):
-            folder = self.path(prefix)
+            folder = self._folder(prefix)
             return sorted(path.name for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        root = self.path('')
         with self._touching(prefix):
-            for folder, _, names in os.walk(self.path(prefix.rpartition('/')[0])):
+            root = self._folder('')
+            for folder, _, names in os.walk(self._folder(prefix.rpartition('/')[0])):
                 for name in names:
                     path = Path(folder, name)
                     key = str(path.relative_to(root))
@@ -48,9 +50,15 @@ class FolderSource:
                         modified = datetime.fromtimestamp(seen.st_mtime, timezone.utc)
                         yield Entry(key, seen.st_size, str(seen.st_mtime_ns), modified)
 
-    def read(self, key: str) -> bytes:
-        with self._touching(key):
-            return self.path(key).read_bytes()
+    def read(self, key: str, most: int) -> bytes:
+        with self._touching(key), self.path(key).open('rb') as file:
+            body = file.read(most + 1)
+        check_read(self.bucket, key, len(body), most)
+        return body
+
+    def ranges(self, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        with self._touching(key), self.path(key).open('rb') as file:
+            return [os.pread(file.fileno(), end - start, start) for start, end in spans]
 
     def tail(self, key: str, count: int) -> bytes:
         with self._touching(key), self.path(key).open('rb') as file:
@@ -77,10 +85,15 @@ class FolderSource:
                 self.path(key).unlink(missing_ok=True)
 
     def path(self, key: str) -> Path:
-        return self.settings.directory / self.bucket / key
+        """Raises NameRefused for a bucket or key that is none: rows of a catalogue name them, whoever wrote those."""
+        return path_below(self._folder(''), key)
+
+    def _folder(self, prefix: str) -> Path:
+        bucket = self.settings.directory / check_name(self.bucket, 'the bucket')
+        return path_below(bucket, prefix.rstrip('/')) if prefix.rstrip('/') else bucket
 
     def _beside(self, key: str) -> Path:
-        return self.settings.directory / METADATA / self.bucket / f'{key}.json'
+        return path_below(self.settings.directory / METADATA / self.bucket, f'{key}.json')
 
     def _record(self, key: str) -> dict[str, Any]:
         try:
@@ -99,6 +112,8 @@ class FolderSource:
         where = {'bucket': self.bucket, 'key': key}
         try:
             yield
+        except NameRefused as error:
+            raise ObjectRefused(str(error), reason='name', **where) from error
         except FileNotFoundError as error:
             raise ObjectRefused(
                 f'there is no {self.bucket}/{key} in {self.settings.directory}', reason='missing', **where

@@ -52,12 +52,13 @@ class Table:
 
 def table(samples: Sequence[Mapping[str, Any]], kind: str, fields: Sequence[str], offset_ns: int) -> Table:
     """The numbers of these messages of a type. Raises LakeError where one does not have a field, or it is no number."""
-    asked = tuple(fields) or _of_type(samples, kind)
+    asked = tuple(fields)
     stamps = np.array([sample['stamp_ns'] for sample in samples], np.int64) + offset_ns
     try:
+        asked = asked or _of_type(samples, kind)
         columns = [_column(samples, name) for name in asked]
         values = np.hstack(columns) if columns else np.empty((len(samples), 0))
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, RecursionError, ArithmeticError, MemoryError) as error:
         raise LakeError(f'messages of {kind} have no numbers {", ".join(asked)}: {error}') from error
     order = np.argsort(stamps, kind='stable')
     return Table(stamps[order], values[order])

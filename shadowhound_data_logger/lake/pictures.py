@@ -15,10 +15,12 @@ from typing import Any, Final
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake.source import Source
 from shadowhound_data_logger.missions.contact_sheet import MOST, Frame, contact_sheet
+from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
 
 IMAGES: Final = ('.jpg', '.jpeg', '.png')
 THREADS: Final = 8
 PALE: Final = '#c7cfd6'
+FARTHEST_M: Final = 1e6
 LETTERS: Final = 56
 """Of a line of the title."""
 DOTS: Final = 60
@@ -41,7 +43,7 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Source
         number, row = numbered
         path = Path(folder, str(number))
         try:
-            path.write_bytes(open_bucket(row['bucket']).read(row['key']))
+            path.write_bytes(open_bucket(row['bucket']).read(row['key'], MOST_OBJECT_BYTES))
         except ObjectRefused:  # the catalogue outlives what is deleted
             return None
         return Frame(row.get('t_start_ns') or 0, number, path)
@@ -68,7 +70,8 @@ def ground(
 
     from shadowhound_data_logger.missions import plots  # noqa: PLC0415
 
-    placed = [row for row in rows if row.get('x') is not None and row.get('y') is not None]
+    placed = [row for row in rows if _is_place(row.get('x'), row.get('y'))]
+    path = [pair for pair in path if _is_place(*pair)]
     if not placed:
         raise LakeError('nothing that was found has a place', remedy='was there odometry when it was taken?')
     with rc_context(plots.STYLE):
@@ -99,3 +102,8 @@ def ground(
             figure.savefig(target, format='png')
         except OSError as error:
             raise LakeError(f'{target} cannot be made: {error}') from error
+
+
+def _is_place(x: float | None, y: float | None) -> bool:
+    """Whether a robot can have been there: what somebody made up would set the scale for all the others."""
+    return x is not None and y is not None and abs(x) < FARTHEST_M and abs(y) < FARTHEST_M

@@ -5,7 +5,6 @@ A frame is lazy: it looks which parts there are when it is computed, and of othe
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import sys
@@ -13,7 +12,7 @@ import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import and_
 from typing import Any, Final
@@ -24,10 +23,13 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake import schema
-from shadowhound_data_logger.lake.scan import THREADS, Catalogue
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.reading import THREADS
+from shadowhound_data_logger.lake.scan import Catalogue
 from shadowhound_data_logger.lake.select import Wanted, wanted
 from shadowhound_data_logger.lake.source import Source, open_source
 from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.untrusted import MOST_SUMMARY_BYTES, from_json
 
 import daft  # isort: skip - after scan, which turns its telemetry off
 from daft import DataFrame, Expression, col, lit  # isort: skip
@@ -48,28 +50,41 @@ _SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
 """Columns of ``missions`` that come from ``summary.json``, null for a mission that has none yet: name there, type."""
 
 
-def objects(source: Source | None = None, **flags: Any) -> DataFrame:
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What is asked, and where what it leaves out is told."""
+
+    source: Source
+    findings: Findings
+
+    @classmethod
+    def of(cls, source: Source | None, findings: Findings | None) -> _Asked:
+        return cls(source or default_source(), Findings() if findings is None else findings)
+
+
+def objects(source: Source | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
     """One row an object, with the columns of ``lake/schema.py``.
 
     ``flags`` are those of ``select.wanted``: ``sensor topic robot since until near mission mission_type success where``.
-    Without a source, of the store that the environment names. Raises SettingError, LakeError for what is no question.
+    Without a source, of the store that the environment names. Parts that are none are left out: ``findings`` has them once
+    the frame is computed, in this process; without it the log warns. Raises SettingError, LakeError for what is no question.
     """
-    return _objects(source or default_source(), wanted(time.time_ns(), **flags))
+    return _objects(_Asked.of(source, findings), wanted(time.time_ns(), **flags))
 
 
-def missions(source: Source | None = None, **flags: Any) -> DataFrame:
+def missions(source: Source | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
     """One row a mission that has objects among the wanted ones, and how it ended. Reads catalogue and summaries at once."""
-    return _missions(source or default_source(), wanted(time.time_ns(), **flags))
+    return _missions(_Asked.of(source, findings), wanted(time.time_ns(), **flags))
 
 
-def topics(source: Source | None = None, **flags: Any) -> DataFrame:
+def topics(source: Source | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
     """One row a robot and topic: how many objects, bytes and messages, from when to when."""
-    return _topics(_objects(source or default_source(), wanted(time.time_ns(), **flags)))
+    return _topics(_objects(_Asked.of(source, findings), wanted(time.time_ns(), **flags)))
 
 
-def sql(query: str, source: Source | None = None, **flags: Any) -> DataFrame:
+def sql(query: str, source: Source | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
     """SQL over the three views, each restricted by the flags. Raises LakeError for what is no SQL or names no column."""
-    chosen, asked = source or default_source(), wanted(time.time_ns(), **flags)
+    chosen, asked = _Asked.of(source, findings), wanted(time.time_ns(), **flags)
     rows = _objects(chosen, asked)
     views = {'objects': rows, 'topics': _topics(rows)}
     if _MISSIONS.search(query):  # it has to look first
@@ -94,16 +109,16 @@ def answering() -> Iterator[None]:
         raise LakeError(f'the query cannot be answered: {" ".join(str(error).split())}') from error
 
 
-def _objects(source: Source, asked: Wanted) -> DataFrame:
-    rows = Catalogue(source, asked).read()
+def _objects(lake: _Asked, asked: Wanted) -> DataFrame:
+    rows = Catalogue(lake.source, asked, lake.findings).read()
     with answering():
         conditions = list(_conditions(asked))
         if asked.mission is not None:
-            runs = {} if '_' in asked.mission else _runs(source, asked)  # no id of a run has one, every one of a mission
+            runs = {} if '_' in asked.mission else _runs(lake, asked)  # no id of a run has one, every one of a mission
             of_run = [mission for mission, run in runs.items() if run.startswith(asked.mission)]
             conditions.append(col('mission_id').startswith(asked.mission) | col('mission_id').is_in(of_run or ['']))
         if asked.success is not None:
-            ended = _missions(source, replace(asked, success=None)).where(col('success') == lit(asked.success))
+            ended = _missions(lake, replace(asked, success=None)).where(col('success') == lit(asked.success))
             ids = ended.select('mission_id').to_pydict()['mission_id']
             conditions.append(col('mission_id').is_in(ids) if ids else lit(False))
         return rows.where(reduce(and_, conditions)) if conditions else rows
@@ -137,9 +152,9 @@ def _topics(rows: DataFrame) -> DataFrame:
     )  # fmt: skip
 
 
-def _missions(source: Source, asked: Wanted) -> DataFrame:
+def _missions(lake: _Asked, asked: Wanted) -> DataFrame:
     """Which there are by the catalogue; how they ended by their summaries, which lie under the id of the run."""
-    rows = _objects(source, asked).where(col('mission_id').not_null())
+    rows = _objects(lake, asked).where(col('mission_id').not_null())
     with answering():
         found = rows.groupby('robot', 'mission_id').agg(
             col('run_id').max(), col('mission_type').max(), col('key').count().alias('objects'),
@@ -147,11 +162,11 @@ def _missions(source: Source, asked: Wanted) -> DataFrame:
         ).sort('first').to_arrow()  # fmt: skip
     runs = found['run_id'].to_pylist()
     if None in runs:
-        known = _runs(source, asked)
+        known = _runs(lake, asked)
         runs = [run or known.get(mission) for mission, run in zip(found['mission_id'].to_pylist(), runs, strict=True)]
         found = found.set_column(found.column_names.index('run_id'), 'run_id', pa.array(runs, pa.string()))
     with ThreadPoolExecutor(THREADS) as pool:
-        told = list(pool.map(lambda pair: _summary(source, *pair), zip(found['robot'].to_pylist(), runs, strict=True)))
+        told = list(pool.map(lambda pair: _summary(lake.source, *pair), zip(found['robot'].to_pylist(), runs, strict=True)))
     types = found['mission_type'].to_pylist()
     kinds = [kind or _value(one.get('mission_type'), pa.string()) for kind, one in zip(types, told, strict=True)]
     found = found.set_column(found.column_names.index('mission_type'), 'mission_type', pa.array(kinds, pa.string()))
@@ -160,10 +175,10 @@ def _missions(source: Source, asked: Wanted) -> DataFrame:
     return daft.from_arrow(found)
 
 
-def _runs(source: Source, asked: Wanted) -> dict[str, str]:
+def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:
     """The run of each mission of that time, by whichever object knows it: one that came before there was a run does not."""
     until_ns = None if asked.until_ns is None else asked.until_ns + LONGEST_NS
-    rows = Catalogue(source, Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns)).read()
+    rows = Catalogue(lake.source, Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns), lake.findings).read()
     with answering():
         known = rows.where(col('mission_id').not_null() & col('run_id').not_null())
         found = known.groupby('mission_id').agg(col('run_id').max()).to_pydict()
@@ -175,8 +190,8 @@ def _summary(source: Source, robot: str, run_id: str | None) -> dict[str, Any]:
     if run_id is None:
         return {}
     try:
-        told = json.loads(source.read(f'{robot}/missions/{run_id}/summary.json'))
-    except (ObjectRefused, ValueError, RecursionError):
+        told = from_json(source.read(f'{robot}/missions/{run_id}/summary.json', MOST_SUMMARY_BYTES), MOST_SUMMARY_BYTES)
+    except (ObjectRefused, ValueError):
         return {}
     return told if isinstance(told, dict) else {}
 

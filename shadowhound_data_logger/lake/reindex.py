@@ -15,8 +15,10 @@ from typing import Final
 from shadowhound_data_logger.errors import StoreUnavailable
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.lake import parts
+from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.putting import put_part
-from shadowhound_data_logger.lake.scan import KEY, THREADS, folders, read
+from shadowhound_data_logger.lake.reading import THREADS, tables
+from shadowhound_data_logger.lake.scan import KEY, folders
 from shadowhound_data_logger.lake.schema import BUCKET, Row, is_row, row_of
 from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.lake.source import Entry, Source, open_source
@@ -42,12 +44,15 @@ class Reindexed:
 
 def reindex(
     source: Source, store: ObjectStore, robot: str, *, buckets: tuple[str, ...] = BUCKETS,
-    tell: Callable[[Reindexed], None] = lambda _: None,
+    tell: Callable[[Reindexed], None] = lambda _: None, findings: Findings | None = None,
 ) -> Reindexed:  # fmt: skip
-    """Add what is missing of one robot. Raises StoreError, NameRefused; what was added until then stays."""
+    """Add what is missing of one robot, and what stands only in parts that are left out.
+
+    Raises StoreError, NameRefused; what was added until then stays.
+    """
     check_name(robot, 'the robot name')
     found = Reindexed()
-    known = _known(source, robot)
+    known = _known(source, robot, Findings() if findings is None else findings)
     for bucket in buckets:
         place = open_source(source.settings, bucket)
         entries = (entry for entry in place.list(f'{robot}/') if is_row(bucket, entry.key))
@@ -67,10 +72,10 @@ def reindex(
     return found
 
 
-def _known(source: Source, robot: str) -> set[tuple[str, str]]:
-    keys = [entry.key for day in folders(source, Wanted(robot=robot)) for entry in day.entries]
-    rows = read(source, keys, KEY)
-    return set(zip(rows['bucket'].to_pylist(), rows['key'].to_pylist(), strict=True))
+def _known(source: Source, robot: str, findings: Findings) -> set[tuple[str, str]]:
+    entries = [entry for day in folders(source, Wanted(robot=robot), findings) for entry in day.entries]
+    found = tables(source, entries, KEY, findings)
+    return {pair for rows in found for pair in zip(*(rows[name].to_pylist() for name in KEY), strict=True)}
 
 
 def _rows(place: Source, entries: list[Entry]) -> Iterator[Row]:

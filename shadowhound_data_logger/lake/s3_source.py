@@ -23,7 +23,7 @@ from shadowhound_data_logger.errors import (
     StoreUnavailable,
     StoreUntrusted,
 )
-from shadowhound_data_logger.lake.source import CHUNK_BYTES, Content, Entry
+from shadowhound_data_logger.lake.source import CHUNK_BYTES, Content, Entry, check_read
 from shadowhound_data_logger.lake.trust import authorities
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.options import StoreSettings
@@ -70,9 +70,16 @@ class S3Source:
             if found.startswith(prefix):
                 yield from self._all(found)
 
-    def read(self, key: str) -> bytes:
+    def read(self, key: str, most: int) -> bytes:
         with self._asking(key):
-            return bytes(obstore.get(self._store, key).bytes())
+            found = obstore.get(self._store, key)
+            check_read(self.bucket, key, found.meta['size'], most)
+            return bytes(found.bytes())
+
+    def ranges(self, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        with self._asking(key):
+            return [bytes(each) for each in obstore.get_ranges(self._store, key, starts=[start for start, _ in spans],
+                                                               ends=[end for _, end in spans])]  # fmt: skip
 
     def tail(self, key: str, count: int) -> bytes:
         with self._asking(key):

@@ -1,7 +1,7 @@
-"""The catalogue as a source of Daft's: which files a query reads, and how.
+"""The catalogue as a source of Daft's: which files a query reads, and in which tasks.
 
-Folders are listed when a query runs. Small parts are read whole, some hundred at a time, because a request costs more than its
-bytes; compacted ones by Daft's own reader, which leaves out what their statistics rule out.
+Folders are listed when a query runs. Small parts are read some hundred at a time, because a request costs more than its bytes;
+of a large one, which was compacted, only what can hold an answer (lake/reading.py).
 """
 
 from __future__ import annotations
@@ -9,34 +9,29 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Final, TypeVar
+from itertools import groupby
+from typing import Final, TypeVar
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from shadowhound_data_logger.lake import reading
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, THREADS
 from shadowhound_data_logger.lake.schema import arrow_schema
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.lake.source import Source
-from shadowhound_data_logger.lake.standing import Day, days
-from shadowhound_data_logger.lake.trust import authorities
+from shadowhound_data_logger.lake.source import Entry, Source
+from shadowhound_data_logger.lake.standing import Day, days, robots
 
 os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # else it tells its makers of each run, over the network
 os.environ.setdefault('DAFT_PROGRESS_BAR', '0')
 
 import daft
-from daft.daft import StorageConfig
-from daft.io import IOConfig, S3Config
 from daft.io.pushdowns import Pushdowns
 from daft.io.source import DataSource, DataSourceTask
 from daft.recordbatch import RecordBatch
 
-THREADS: Final = 16
-"""Requests on their way at a time; each waits, most of its time, for the server."""
-SMALL_BYTES: Final = 256 << 10
-"""Up to here a file is read whole: of one-minute parts there are thousands, and a compacted day of a robot is larger."""
-PARTS_A_TASK: Final = 180
 _Answer = TypeVar('_Answer')
 KEY: Final = ('bucket', 'key')
 _ROW: Final = (*KEY, 't_start_ns')
@@ -44,11 +39,12 @@ _ROW: Final = (*KEY, 't_start_ns')
 
 
 class Catalogue(DataSource):
-    """The rows of one bucket's catalogue that can be wanted. Stateless: each run lists anew."""
+    """The rows of one bucket's catalogue that can be wanted. Stateless but for what it leaves out: each run lists anew."""
 
-    def __init__(self, source: Source, wanted: Wanted) -> None:
+    def __init__(self, source: Source, wanted: Wanted, findings: Findings) -> None:
         self._source = source
         self._wanted = wanted
+        self._findings = findings
         self._schema = daft.Schema.from_pyarrow_schema(arrow_schema())
 
     @property
@@ -61,52 +57,56 @@ class Catalogue(DataSource):
 
     async def get_tasks(self, pushdowns: Pushdowns) -> AsyncIterator[DataSourceTask]:
         columns = _columns(pushdowns)
-        found = await _apart(lambda: folders(self._source, self._wanted))
+        found = await _apart(lambda: folders(self._source, self._wanted, self._findings))
         for day in found:
             if day.is_mended:
-                yield _Parts(self._source, [entry.key for entry in day.entries], columns, once=True)
-        plain = [entry for day in found if not day.is_mended for entry in day.entries]
-        small = [entry.key for entry in plain if entry.size <= SMALL_BYTES]
-        for start in range(0, len(small), PARTS_A_TASK):
-            yield _Parts(self._source, small[start : start + PARTS_A_TASK], columns)
-        storage = StorageConfig(True, _io(self._source))
-        private = authorities(self._source.settings) is not None  # of which Daft's reader knows nothing
-        for entry in plain:
-            if entry.size > SMALL_BYTES and private:
-                yield _Parts(self._source, [entry.key], columns)
-            elif entry.size > SMALL_BYTES:
-                yield DataSourceTask.parquet(
-                    _path(self._source, entry.key),
-                    self._schema,
-                    pushdowns=pushdowns,
-                    size_bytes=entry.size,
-                    storage_config=storage,
-                )
+                yield self._parts(day.entries, columns, once=True)
+        for _, whole in groupby((day for day in found if not day.is_mended), lambda day: day.robot):
+            plain = [entry for day in whole for entry in day.entries]
+            small = [entry for entry in plain if entry.size <= SMALL_BYTES]
+            for start in range(0, len(small), PARTS_AT_A_TIME):
+                yield self._parts(small[start : start + PARTS_AT_A_TIME], columns)
+            for entry in plain:
+                if entry.size > SMALL_BYTES:
+                    yield self._parts([entry], columns)
+
+    def _parts(self, entries: Sequence[Entry], columns: Sequence[str], *, once: bool = False) -> _Parts:
+        return _Parts(self._source, entries, columns, self._wanted, self._findings, once=once)
 
 
 class _Parts(DataSourceTask):
-    """Parts that are read together, from the store to one batch of the columns that are needed."""
+    """Parts that are read together, from the store to batches of the columns that are needed."""
 
-    def __init__(self, source: Source, keys: Sequence[str], columns: Sequence[str], *, once: bool = False) -> None:
+    def __init__(self, source: Source, entries: Sequence[Entry], columns: Sequence[str], wanted: Wanted, findings: Findings, *,
+                 once: bool) -> None:  # fmt: skip
         """``once``: of rows with the same key and time one is kept."""
         self._source = source
-        self._keys = tuple(keys)
+        self._entries = tuple(entries)
         self._columns = tuple(columns)
+        self._wanted = wanted
+        self._findings = findings
         self._once = once
 
     @property
     def schema(self) -> daft.Schema:
-        return daft.Schema.from_pyarrow_schema(_narrow(self._columns))
+        return daft.Schema.from_pyarrow_schema(reading.narrow(self._columns))
 
     async def read(self) -> AsyncIterator[RecordBatch]:
-        table = await _apart(self._table)
-        for batch in table.to_batches():
-            yield RecordBatch.from_arrow_record_batches([batch], batch.schema)
+        tables = self._tables()
+        try:
+            while (table := await _apart(lambda: next(tables, None))) is not None:
+                for batch in table.to_batches():
+                    yield RecordBatch.from_arrow_record_batches([batch], batch.schema)
+        finally:
+            tables.close()
 
-    def _table(self) -> pa.Table:
+    def _tables(self) -> Generator[pa.Table, None, None]:
         wide = (*self._columns, *(name for name in _ROW if name not in self._columns)) if self._once else self._columns
-        table = read(self._source, self._keys, wide)
-        return (unrepeated(table) if self._once else table).select(self._columns)
+        found = reading.tables(self._source, self._entries, wide, self._findings, self._wanted)
+        if self._once:
+            yield unrepeated(pa.concat_tables([reading.narrow(wide).empty_table(), *found])).select(self._columns)
+        else:
+            yield from found
 
 
 async def _apart(work: Callable[[], _Answer]) -> _Answer:
@@ -115,24 +115,11 @@ async def _apart(work: Callable[[], _Answer]) -> _Answer:
         return await asyncio.get_running_loop().run_in_executor(pool, work)
 
 
-def folders(source: Source, wanted: Wanted) -> list[Day]:
-    """The days whose parts can hold what is wanted. Raises StoreError, LakeError."""
-    robots = [wanted.robot] if wanted.robot else source.folders('')
+def folders(source: Source, wanted: Wanted, findings: Findings) -> list[Day]:
+    """The days whose parts can hold what is wanted. Raises StoreError."""
+    named = [wanted.robot] if wanted.robot else robots(source)
     with ThreadPoolExecutor(THREADS) as pool:
-        return days(source, robots, wanted.dates(time.time_ns()), pool, wanted.has_date)
-
-
-def read(source: Source, keys: Sequence[str], columns: Sequence[str]) -> pa.Table:
-    """The rows of these parts, in one piece; a column that a part does not have yet is null. Raises StoreError."""
-    schema = _narrow(columns)
-
-    def part(body: bytes) -> pa.Table:
-        file = pq.ParquetFile(pa.BufferReader(body))
-        return _fit(file.read([name for name in columns if name in file.schema_arrow.names], use_threads=False), schema)
-
-    with ThreadPoolExecutor(THREADS) as pool:  # threads wait for the server; several that parse get in each other's way
-        tables = [part(body) for body in pool.map(source.read, keys)]
-    return pa.concat_tables(tables).combine_chunks() if tables else schema.empty_table()
+        return days(source, named, wanted.dates(time.time_ns()), pool, findings, wanted.has_date)
 
 
 def unrepeated(table: pa.Table) -> pa.Table:
@@ -142,16 +129,6 @@ def unrepeated(table: pa.Table) -> pa.Table:
     return table if len(first) == len(table) else table.take(first.combine_chunks().sort())
 
 
-def _fit(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    if table.schema.names == schema.names and table.schema.types == schema.types:
-        return pa.Table.from_arrays(table.columns, schema=schema)  # no cast: only what may be null differs
-    columns = [
-        table[field.name].cast(field.type) if field.name in table.column_names else pa.nulls(len(table), field.type)
-        for field in schema
-    ]
-    return pa.table(columns, schema=schema)
-
-
 def _columns(pushdowns: Pushdowns) -> tuple[str, ...]:
     """In the order of the schema: those of the answer, and those that a filter looks at."""
     names = arrow_schema().names
@@ -159,26 +136,3 @@ def _columns(pushdowns: Pushdowns) -> tuple[str, ...]:
         return tuple(names)
     needed = {*pushdowns.columns, *pushdowns.filter_required_column_names()}
     return tuple(name for name in names if name in needed)
-
-
-def _narrow(columns: Sequence[str]) -> pa.Schema:
-    """All may be null: what a file does not have is."""
-    schema = arrow_schema()
-    return pa.schema([schema.field(name).with_nullable(True) for name in columns])
-
-
-def _path(source: Source, key: str) -> str:
-    if source.settings.endpoint_url:
-        return f's3://{source.bucket}/{key}'
-    return str(source.settings.directory / source.bucket / key)
-
-
-def _io(source: Source) -> IOConfig:
-    settings = source.settings
-    if not settings.endpoint_url:
-        return IOConfig()
-    given: dict[str, Any] = {'key_id': settings.access_key_id, 'access_key': settings.secret_access_key}
-    return IOConfig(s3=S3Config(
-        endpoint_url=settings.endpoint_url, region_name=settings.region, session_token=settings.session_token,
-        use_ssl=settings.endpoint_url.startswith('https:'), max_connections=THREADS, num_tries=4, **given,
-    ))  # fmt: skip

@@ -100,7 +100,7 @@ def date_of(row: Row) -> str:
 def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mapping[str, str]) -> Row:
     """The row of an object by its S3 metadata; never raises: what is missing or senseless there is null.
 
-    ``robot`` and ``sensor`` of an object that tells nothing are those of its key.
+    ``robot`` is that of its key, whatever the object says; ``sensor`` of one that tells nothing too.
     """
     parts = key.split('/')
     start_ns, end_ns = _int(metadata, 't_start_ns', 'boot_start_ns'), _int(metadata, 't_end_ns', 'boot_end_ns')
@@ -108,7 +108,7 @@ def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mappin
     x, y, yaw = (_number(value) for value in (pose[:3] if len(pose) == 4 else ('', '', '')))
     known = None not in (x, y, yaw)
     return {
-        'robot': metadata.get('robot') or (parts[0] or None if len(parts) > 1 else None),
+        'robot': (parts[0] if len(parts) > 1 else metadata.get('robot')) or None,
         'sensor': metadata.get('sensor') or (parts[1] if len(parts) > 2 else None),
         'topic': metadata.get('topic') or None,
         'type': metadata.get('type') or None,

@@ -11,12 +11,14 @@ from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import query  # first: it turns Daft's telemetry off
 from shadowhound_data_logger.lake.bodies import Place
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES, extension_of
+from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.folder_source import FolderSource
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
 from shadowhound_data_logger.lake.schema import SENSOR
 from shadowhound_data_logger.lake.source import Source
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.untrusted import MOST_MEMBERS
 
 from daft import col  # isort: skip
 
@@ -43,25 +45,27 @@ def fetched(folder: Path) -> Source:
 
 
 def select(source: Source, anchor: str, aligned: Mapping[str, Near | Window], size: tuple[int, int] | None,
-           flags: Mapping[str, Any]) -> Selection:  # fmt: skip
+           flags: Mapping[str, Any], findings: Findings) -> Selection:  # fmt: skip
     """Raises SettingError for what is no question, LakeError where nothing is known of an aligned sensor, StoreError."""
     for name, how in aligned.items():
         if min(how.reach_ns) < 0 or not sum(how.reach_ns):
             raise SettingError(f'align[{name!r}]', how, 'a time of more than 0 s')
-    found = _rows(query.objects(source, sensor=anchor, **flags))
-    anchors = _tracks(row for row in found if extension_of(row['key']) in IMAGES | CLOUDS | ARCHIVES)
-    sides = _sides(source, list(anchors.values()), aligned) if anchors else {}
+    found = _rows(query.objects(source, findings=findings, sensor=anchor, **flags))
+    decoded = (row for row in found if extension_of(row['key']) in IMAGES | CLOUDS | ARCHIVES)
+    anchors = _tracks(row for row in decoded if _is_possible(row, findings))
+    sides = _sides(source, list(anchors.values()), aligned, findings) if anchors else {}
     return Selection(tuple(anchors.values()), dict(aligned), sides, size)
 
 
-def _sides(source: Source, anchors: list[Track], aligned: Mapping[str, Near | Window]) -> dict[tuple[str, str], Track]:
+def _sides(source: Source, anchors: list[Track], aligned: Mapping[str, Near | Window],
+           findings: Findings) -> dict[tuple[str, str], Track]:  # fmt: skip
     if not aligned:
         return {}
     reach = max(max(how.reach_ns) for how in aligned.values()) + SECOND
     longest_ns = 3600 * SECOND  # a batch that began so long before can reach into the time (sensor.batch_s)
     since = utc(min(int(track.start_ns[0]) for track in anchors) - reach - longest_ns)
     until = utc(max(int(track.latest_ns[-1]) for track in anchors) + reach)
-    rows = query.objects(source, since=since, until=until).where(col('sensor').is_in(list(aligned)))
+    rows = query.objects(source, findings=findings, since=since, until=until).where(col('sensor').is_in(list(aligned)))
     found = _rows(rows)
     for name in aligned:
         kinds = {row['type'] for row in found if row['sensor'] == name}
@@ -85,6 +89,14 @@ def _rows(frame: Any) -> list[Row]:
     with query.answering():
         found: list[Row] = frame.where(col('t_start').not_null()).select(*NEEDED).to_pylist()
     return found
+
+
+def _is_possible(row: Row, findings: Findings) -> bool:
+    """An object counts as many samples as its row says: one that says more than there is room for would be all of them."""
+    if 0 <= (row['count'] or 0) <= MOST_MEMBERS:
+        return True
+    findings.add(row['key'], f'its row claims {row["count"]:,} messages', 1)
+    return False
 
 
 def _tracks(rows: Iterable[Row]) -> dict[tuple[str, str], Track]:

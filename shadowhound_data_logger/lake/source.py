@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Final, Protocol
 
+from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.options import StoreSettings
 
@@ -54,8 +55,11 @@ class Source(Protocol):
     def list(self, prefix: str) -> Iterator[Entry]:
         """The objects whose keys begin so, in no order; none where there is no such bucket."""
 
-    def read(self, key: str) -> bytes:
-        """The whole content. Raises ObjectRefused when there is none."""
+    def read(self, key: str, most: int) -> bytes:
+        """The whole content. Raises ObjectRefused when there is none, or (reason ``size``) more of it, which is not read then."""
+
+    def ranges(self, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        """These parts of the content, each from its first byte to before its last one; shorter where it ends before."""
 
     def tail(self, key: str, count: int) -> bytes:
         """The last bytes, all of them where there are fewer."""
@@ -78,3 +82,9 @@ def open_source(settings: StoreSettings, bucket: str) -> Source:
     from shadowhound_data_logger.lake.folder_source import FolderSource  # noqa: PLC0415
 
     return FolderSource(settings, bucket)
+
+
+def check_read(bucket: str, key: str, size: int, most: int) -> None:
+    """Raises ObjectRefused for an object that is larger than whoever asks for it can take."""
+    if size > most:
+        raise ObjectRefused(f'{bucket}/{key} has more than {most:,} bytes', reason='size', bucket=bucket, key=key)

@@ -8,22 +8,27 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import io
 import json
 import re
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Final
 
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.schema import part_key, prefix
 from shadowhound_data_logger.lake.source import Entry, Source
+from shadowhound_data_logger.untrusted import from_json
 
 LEAVES: Final = 'shadowhound.leaves'
 """Of a compacted part's Parquet metadata: the names of the parts that it was made of, as JSON, zlib, base64."""
-FOOTER_BYTES: Final = 1 << 18
+MOST_LEAVES_BYTES: Final = 8 << 20
+"""Of such a list, as JSON: 100,000 parts."""
+UNLISTED: Final = 'it cannot be listed, since a name in it is none'
+_FOLDER: Final = re.compile(r'date=\d{4}-\d\d-\d\d', re.ASCII)
 _COMPACTED: Final = re.compile(r'_compacted_[0-9a-f]{16}(_mended)?\.parquet$')
 _MENDED: Final = re.compile(r'_mended(_[0-9a-f]{16})?\.parquet$')
 
@@ -38,8 +43,8 @@ class Day:
     """What is to be read: each row stands in one of them."""
     covered: tuple[Entry, ...]
     """What those stand for and is still there."""
-    leaves: frozenset[str]
-    """The names of the parts that a robot wrote and ``entries`` hold, as far as compacted ones say so."""
+    leaves: Mapping[str, frozenset[str]]
+    """Key of a compacted part among ``entries`` -> the names of the robot's parts that it holds; not of one that is alone."""
 
     @property
     def is_mended(self) -> bool:
@@ -79,35 +84,52 @@ def encode_leaves(names: Iterable[str]) -> str:
     return base64.b64encode(zlib.compress(json.dumps(sorted(names)).encode())).decode('ascii')
 
 
-def days(
-    source: Source,
-    robots: Sequence[str],
-    dates: Sequence[str] | None,
-    pool: Executor,
-    has: Callable[[str], bool] = lambda _: True,
-) -> list[Day]:
+def robots(source: Source) -> list[str]:
+    """Those that have a folder. Raises StoreError."""
+    return [name for name in source.folders('') if is_name(name)]
+
+
+def dates_of(source: Source, robot: str, findings: Findings) -> list[str]:
+    """The dates of which a robot has rows. Raises StoreError."""
+    try:
+        return [name[5:] for name in source.folders(prefix(robot)) if _FOLDER.fullmatch(name)]
+    except ObjectRefused as error:
+        findings.add(prefix(robot), f'{UNLISTED}: {error}')
+        return []
+
+
+def days(source: Source, named: Sequence[str], dates: Sequence[str] | None, pool: Executor, findings: Findings,
+         has: Callable[[str], bool] = lambda _: True) -> list[Day]:  # fmt: skip
     """The folders of these robots and dates (None: of all that there are, those it ``has``) that hold something, oldest first.
 
-    No other folder is listed, and a footer is read only of compacted parts that do not stand alone. Raises StoreError, LakeError.
+    No other folder is listed, and a footer is read only of compacted parts that do not stand alone. Raises StoreError.
     """
-    if dates is None:
-        pairs = [
-            (robot, name[5:])
-            for robot in robots
-            for name in source.folders(prefix(robot))
-            if name.startswith('date=') and has(name[5:])
-        ]
-    else:
-        pairs = [(robot, date) for robot in robots for date in dates]
-    found = pool.map(lambda pair: _day(source, *pair), sorted(pairs, key=lambda pair: pair[::-1]))
+    pairs = [(robot, date) for robot in named
+             for date in (filter(has, dates_of(source, robot, findings)) if dates is None else dates)]  # fmt: skip
+    found = pool.map(lambda pair: _day(source, pair[0], pair[1], findings), sorted(pairs, key=lambda pair: pair[::-1]))
     return [day for day in found if day.entries]
 
 
-def _day(source: Source, robot: str, date: str) -> Day:
-    entries = [entry for entry in source.list(folder_of(robot, date)) if entry.key.endswith('.parquet')]
-    made = [entry for entry in entries if is_compacted(entry.key)]
-    leaves = {entry.key: leaves_of(source, entry) for entry in made} if len(entries) > 1 else {}
-    return standing(robot, date, entries, leaves)
+def _day(source: Source, robot: str, date: str, findings: Findings) -> Day:
+    """What a part says that is no good, or contradicts others, is left out: neither read nor stood for."""
+    try:
+        entries = [entry for entry in source.list(folder_of(robot, date)) if entry.key.endswith('.parquet')]
+    except ObjectRefused as error:
+        findings.add(folder_of(robot, date), f'{UNLISTED}: {error}')
+        entries = []
+    leaves: dict[str, frozenset[str]] = {}
+    for entry in [entry for entry in entries if is_compacted(entry.key)] if len(entries) > 1 else []:
+        try:
+            leaves[entry.key] = leaves_of(source, entry)
+        except LakeError as error:
+            findings.add(entry.key, str(error))
+            entries.remove(entry)
+    while True:
+        try:
+            return standing(robot, date, entries, leaves)
+        except LakeError as error:
+            findings.add(error.data['key'], str(error))
+            entries = [entry for entry in entries if entry.key != error.data['key']]
 
 
 def standing(robot: str, date: str, entries: Sequence[Entry], leaves: dict[str, frozenset[str]]) -> Day:
@@ -125,28 +147,25 @@ def standing(robot: str, date: str, entries: Sequence[Entry], leaves: dict[str, 
             held |= inside
         elif not inside <= held | names:
             raise LakeError(
-                f'two compacted parts of {robot} {date} contradict each other, and parts that they were made of are gone',
+                f'it contradicts another compacted part of {robot} {date}, and parts that they were made of are gone',
                 remedy=f'move {entry.key} away and run `shadowhound-data lake reindex`', robot=robot, date=date, key=entry.key,
             )  # fmt: skip
     chosen = {entry.key for entry in stand}
     covered = tuple(entry for entry in entries if entry.key not in chosen)
-    made = frozenset().union(*(leaves.get(entry.key, frozenset()) for entry in stand))
+    made = {entry.key: leaves[entry.key] for entry in stand if entry.key in leaves}
     return Day(robot, date, tuple(sorted(stand, key=lambda entry: entry.key)), covered, made)
 
 
 def leaves_of(source: Source, entry: Entry) -> frozenset[str]:
     """What a compacted part says that it was made of. Raises LakeError for a file that does not say it."""
-    import pyarrow.parquet as pq  # noqa: PLC0415 - only for days that are between two states
+    from shadowhound_data_logger.lake import reading  # noqa: PLC0415 - pyarrow, only for days that are between two states
 
-    count = min(entry.size, FOOTER_BYTES)
-    while True:
-        tail = source.tail(entry.key, count)
-        need = int.from_bytes(tail[-8:-4], 'little') + 8
-        if need <= len(tail) or count >= entry.size:
-            break
-        count = min(entry.size, need)
     try:
-        about = pq.read_metadata(io.BytesIO(tail)).metadata or {}
-        return frozenset(json.loads(zlib.decompress(base64.b64decode(about[LEAVES.encode()]))))
-    except (OSError, ValueError, KeyError, zlib.error) as error:
-        raise LakeError(f'{entry.key} does not say what it was made of', remedy='is it one of ours?', key=entry.key) from error
+        packed = base64.b64decode(reading.footer(source, entry)[LEAVES.encode()], validate=True)
+        names = from_json(zlib.decompressobj().decompress(packed, MOST_LEAVES_BYTES + 1), MOST_LEAVES_BYTES)
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError('that is no list of names')
+    except (*reading.UNREADABLE, zlib.error) as error:
+        text = f'it does not say what it was made of: {error or type(error).__name__}'
+        raise LakeError(text, remedy='is it one of ours?', key=entry.key) from error
+    return frozenset(names)

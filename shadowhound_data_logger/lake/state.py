@@ -8,10 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from shadowhound_data_logger.clock import utc
-from shadowhound_data_logger.lake.scan import THREADS
-from shadowhound_data_logger.lake.schema import prefix
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.reading import THREADS
 from shadowhound_data_logger.lake.source import Source
-from shadowhound_data_logger.lake.standing import Day, days, is_compacted
+from shadowhound_data_logger.lake.standing import Day, days, is_compacted, robots
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +34,12 @@ class State:
     """Files that others stand for: they only take room."""
 
 
-def state(source: Source, robot: str | None = None) -> list[State]:
-    """Of all robots that have a catalogue. Raises StoreError, LakeError."""
-    robots = [robot] if robot else source.folders('')
+def state(source: Source, robot: str | None = None, findings: Findings | None = None) -> list[State]:
+    """Of all robots that have a catalogue. Raises StoreError."""
+    findings = Findings() if findings is None else findings
     today = f'{utc(time.time_ns()):%Y-%m-%d}'
     with ThreadPoolExecutor(THREADS) as pool:
-        found = {name: days(source, [name], None, pool) for name in robots if source.folders(prefix(name))}
+        found = {name: days(source, [name], None, pool, findings) for name in ([robot] if robot else robots(source))}
     return [_state(name, each, today) for name, each in found.items() if each]
 
 

@@ -13,6 +13,7 @@ from typing import Any, Final
 import pyarrow as pa
 
 from shadowhound_data_logger.lake import query
+from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.source import Source, open_source
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.options import StoreSettings
@@ -22,10 +23,10 @@ _KEY: Final = ('bucket', 'key')
 _SAID: Final = (*_KEY, 'bytes', 'sha256')
 
 
-def rows(source: Source, **flags: Any) -> Rows:
+def rows(source: Source, findings: Findings, **flags: Any) -> Rows:
     """Of one catalogue; ``flags`` are those of ``lake.objects``. Raises SettingError, LakeError, StoreError."""
     with query.answering():
-        found: pa.Table = query.objects(source, **flags).select(*_SAID).distinct().to_arrow()
+        found: pa.Table = query.objects(source, findings=findings, **flags).select(*_SAID).distinct().to_arrow()
     return Rows(found)
 
 

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 from PIL import Image, ImageDraw, ImageFont
 
 from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.untrusted import open_image
 
 WIDTH: Final = 800
 MOST: Final = 20
@@ -73,11 +74,11 @@ def _thumbs(frames: Sequence[Frame], width: int) -> tuple[list[_Thumb], int]:
     thumbs: list[_Thumb] = []
     for frame in frames:
         try:
-            with Image.open(frame.path) as image:
+            with open_image(frame.path) as image:
                 image.draft('RGB', (width, width))  # libjpeg scales while it decodes
                 height = min(2 * width, max(1, round(image.height * width / image.width)))
                 thumbs.append(_Thumb(frame, image.convert('RGB').resize((width, height), Image.Resampling.LANCZOS)))
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # all that Pillow calls a broken file
+        except (OSError, ValueError, SyntaxError):  # all that Pillow calls a broken file
             continue
     return thumbs, len(frames) - len(thumbs)
 

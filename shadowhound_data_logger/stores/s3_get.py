@@ -21,7 +21,7 @@ from botocore.httpsession import URLLib3Session
 from botocore.parsers import create_parser
 from botocore.utils import get_environ_proxies
 
-from shadowhound_data_logger.errors import CredentialsRejected, StoreUnavailable
+from shadowhound_data_logger.errors import CredentialsRejected, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted
 from shadowhound_data_logger.stores.s3_errors import REQUEST_ERRORS, Request, classify, public_url
@@ -33,18 +33,23 @@ CONNECTIONS: Final = 32
 TRIES: Final = 5
 PAUSE_S: Final = 0.2
 """Before the second try; it doubles, and half of it is chance."""
+_NOTHING_THERE: Final = 416
+"""Of a range of an empty object."""
 _EMPTY: Final = hashlib.sha256().hexdigest()
 _open_session: Any = URLLib3Session
 _prepared: Any = AWSPreparedRequest
 _create_parser: Any = create_parser
 
 
-def read(settings: StoreSettings, bucket: str, key: str) -> bytes:
-    """The content of an object. Raises ObjectRefused when there is none; what passes is tried again for a second or three."""
+def read(settings: StoreSettings, bucket: str, key: str, most: int) -> bytes:
+    """The content of an object. Raises ObjectRefused when there is none, or it has more than ``most`` bytes, which are not read.
+
+    What passes is tried again for a second or three.
+    """
     getter = _of_this_process(settings, os.getpid())
     for left in reversed(range(TRIES)):
         try:
-            return getter.get(bucket, key)
+            return getter.get(bucket, key, most)
         except StoreUnavailable:
             if not left:
                 raise
@@ -69,27 +74,31 @@ class _Getter:
             timeout=(CONNECT_S, READ_S), max_pool_connections=CONNECTIONS,
         )  # fmt: skip
 
-    def get(self, bucket: str, key: str) -> bytes:
-        """One request. Raises the errors of ``classify``."""
+    def get(self, bucket: str, key: str, most: int) -> bytes:
+        """One request. Raises the errors of ``classify``, ObjectRefused."""
         generation = self._keys.generation
         try:
-            return self._get(bucket, key)
+            return self._get(bucket, key, most)
         except REQUEST_ERRORS as error:
             found = classify(error, Request(self._endpoint, bucket, key, CONNECT_S, READ_S))
             if isinstance(found, CredentialsRejected) and self._keys.renew(generation):
                 raise StoreUnavailable(str(found), **found.data) from None  # there are other keys: with those again
             raise found from None
 
-    def _get(self, bucket: str, key: str) -> bytes:
+    def _get(self, bucket: str, key: str, most: int) -> bytes:
         target = f'{self._root}/{bucket}/{quote(key)}'
         headers = signed('GET', target, {'host': self._host}, _EMPTY, now=datetime.now(timezone.utc),
                          credentials=self._keys.get_frozen_credentials(), region=self._region)  # fmt: skip
-        request = _prepared('GET', f'{self._server}{target}', {**headers, 'user-agent': AGENT}, None, stream_output=False)
-        answer = self._session.send(request)
+        sent = {**headers, 'user-agent': AGENT, 'range': f'bytes=0-{most}'}  # one more than there should be
+        answer = self._session.send(_prepared('GET', f'{self._server}{target}', sent, None, stream_output=False))
+        if answer.status_code == _NOTHING_THERE:
+            return b''
         if answer.status_code >= 300:
             response = {'status_code': answer.status_code, 'headers': answer.headers, 'body': answer.content}
             raise ClientError(self._parser.parse(response, None), 'GetObject')
         content: bytes = answer.content
+        if len(content) > most:
+            raise ObjectRefused(f'{bucket}/{key} has more than {most:,} bytes', reason='size', bucket=bucket, key=key)
         return content
 
 

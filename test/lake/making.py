@@ -127,9 +127,13 @@ class Watched:
         self._ask('list', prefix)
         return self.inner.list(prefix)
 
-    def read(self, key: str) -> bytes:
+    def read(self, key: str, most: int) -> bytes:
         self._ask('read', key)
-        return self.inner.read(key)
+        return self.inner.read(key, most)
+
+    def ranges(self, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        self._ask('ranges', key)
+        return self.inner.ranges(key, spans)
 
     def tail(self, key: str, count: int) -> bytes:
         self._ask('tail', key)

@@ -101,9 +101,9 @@ def test_a_shuffled_stream_mixes_archives_and_reads_each_once(source: Source) ->
     read = frames._place.read
 
     class Place:
-        def read(self, bucket: str, key: str) -> bytes:
+        def read(self, bucket: str, key: str, most: int) -> bytes:
             asked.append(key)
-            return read(bucket, key)
+            return read(bucket, key, most)
 
     frames._place = Place()  # type: ignore[assignment]
     mixed = [stamp // 10**9 for stamp in stamps(frames.stream(shuffle=True))]
@@ -127,7 +127,7 @@ def test_what_is_read_ahead_is_bounded(source: Source, monkeypatch: pytest.Monke
     monkeypatch.setattr(dataset, 'AHEAD_BYTES', 3 * size)
     asked: list[str] = []
     read = frames._place.read
-    frames._place = types.SimpleNamespace(read=lambda bucket, key: (asked.append(key), read(bucket, key))[1])  # type: ignore[assignment]
+    frames._place = types.SimpleNamespace(read=lambda bucket, key, most: (asked.append(key), read(bucket, key, most))[1])  # type: ignore[assignment]
     streamed = iter(frames.stream())
     next(streamed)
     streamed.close()  # type: ignore[attr-defined]

@@ -95,7 +95,7 @@ def test_a_certificate_that_is_not_believed(
     signer, how, words, remedy = WRONG[kind]
     with secured(filled, authorities[signer], kind, **how) as front:
         source = open_source(towards(front.url), 'sensor-data')
-        for ask in (lambda: source.read('x'), lambda: lake.objects(source).to_pydict()):
+        for ask in (lambda: source.read('x', 9), lambda: lake.objects(source).to_pydict()):
             with pytest.raises(StoreUntrusted) as caught:
                 ask()
             assert words in str(caught.value)

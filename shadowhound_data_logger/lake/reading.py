@@ -1,0 +1,528 @@
+"""Parts of the catalogue as tables, whoever wrote them: nothing is unpacked before it is known how much that is.
+
+A part of ours is flat: columns of known types, in pages that are plain or by a dictionary, gzip or zstd. Its footer says where
+the pages are, each page's header how large it is; both are read first, and what is something else, or far larger than its file,
+is no part. Only rows of the robot in whose folder it lies count. What is left out is in the ``Findings``; all else is answered.
+
+The format: https://github.com/apache/parquet-format (Encodings.md, src/main/thrift/parquet.thrift). The headers of pages are in
+Thrift's compact protocol: https://github.com/apache/thrift/blob/master/doc/specs/thrift-compact-protocol.md
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from shadowhound_data_logger.errors import ObjectRefused
+from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.schema import REQUIRED, arrow_schema
+from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.lake.source import Entry, Source
+from shadowhound_data_logger.untrusted import check_size, is_path
+
+THREADS: Final = 16
+"""Requests on their way at a time; each waits, most of its time, for the server."""
+SMALL_BYTES: Final = 256 << 10
+"""Up to here a file is read whole: of one-minute parts there are thousands, and a compacted day of a robot is larger."""
+PARTS_AT_A_TIME: Final = 180
+BATCH_BYTES: Final = 16 << 20
+"""Of rows that are handed on together, and of a large file that is read at a time."""
+MOST_BYTES: Final = 256 << 20
+"""Of a part: a day of a robot that stores everything, compacted, has 60 MB."""
+FOOTER_BYTES: Final = 1 << 18
+"""Of a large file, read first."""
+MOST_FOOTER_BYTES: Final = 4 << 20
+MOST_LIST: Final = 1024
+"""Entries of any list in a footer, row groups or columns: 4 million compacted rows."""
+SLACK_BYTES: Final = 64 << 10
+MOST_RATIO: Final = 100
+"""What a part unpacks to beyond the slack, of its size. Ours reach 30, where a number in the key is all that differs."""
+_MAGIC: Final = b'PAR1'
+_END_BYTES: Final = 8
+"""After a footer: its length and the magic."""
+_CODECS: Final = {'GZIP', 'ZSTD', 'UNCOMPRESSED'}
+_ENCODINGS: Final = {0, 2, 8}
+"""PLAIN, PLAIN_DICTIONARY, RLE_DICTIONARY. Of the others some make long values of few bytes."""
+_DATA_PAGE, _DICTIONARY_PAGE = 0, 2
+_PAGE: Final = re.compile(
+    rb'\x15\x00\x15([\x80-\xff]{0,4}[\x00-\x7f])\x15([\x80-\xff]{0,4}[\x00-\x7f])'
+    rb'\x2c\x15[\x80-\xff]{0,4}[\x00-\x7f]\x15\x00\x15\x06\x15\x06\x00\x00'
+)  # fmt: skip
+"""The header of a plain data page as ``parquet.py`` writes it, its sizes in groups."""
+_YEARS_US: Final = (-62_135_596_800_000_000, 253_402_300_799_999_999)
+"""1 to 9999, those of a date."""
+UNREADABLE: Final = (pa.ArrowException, OSError, MemoryError, ValueError, LookupError, TypeError, OverflowError)
+"""What comes of a file that is no part."""
+
+
+def tables(source: Source, entries: Sequence[Entry], columns: Sequence[str], findings: Findings,
+           wanted: Wanted | None = None) -> Iterator[pa.Table]:  # fmt: skip
+    """The rows of these parts, in their order, some megabytes at a time; a column that a part does not have yet is null.
+
+    Row groups that cannot hold what is ``wanted`` are left out. Raises StoreError.
+    """
+    schema = narrow(_needed(columns))
+    rows = _Rows(schema, findings)
+    for entry, body in _bodies(source, entries):
+        if rows.robot != _robot(entry.key) or rows.nbytes > BATCH_BYTES:
+            yield from rows.taken(columns)
+            rows = _Rows(schema, findings, _robot(entry.key))
+        for table, size in _contents(source, entry, body, schema, findings, wanted):
+            rows.add(entry.key, table, size)
+            if rows.nbytes > BATCH_BYTES:
+                yield from rows.taken(columns)
+                rows = _Rows(schema, findings, rows.robot)
+    yield from rows.taken(columns)
+
+
+def whole(source: Source, entries: Sequence[Entry], findings: Findings) -> Iterator[tuple[Entry, pa.Table]]:
+    """All columns of each of these parts of which nothing is left out. Raises StoreError."""
+    schema = narrow(arrow_schema().names)
+    for entry, body in _bodies(source, entries):
+        found = Findings(lambda _: None)
+        rows = _Rows(schema, found, _robot(entry.key))
+        for table, size in _contents(source, entry, body, schema, found, None):
+            rows.add(entry.key, table, size)
+        made = list(rows.taken(schema.names))
+        if not len(found):
+            yield entry, pa.concat_tables([schema.empty_table(), *made])
+        for one in found:
+            findings.add(one.key, one.why, one.rows)
+
+
+def narrow(columns: Sequence[str]) -> pa.Schema:
+    """These columns."""
+    schema = arrow_schema()
+    return pa.schema([schema.field(name) for name in columns])
+
+
+def footer(source: Source, entry: Entry) -> Mapping[bytes, bytes]:
+    """What a part says of itself beside its rows. Raises ValueError and its kind for a file that is no part, StoreError."""
+    if not is_path(entry.key):
+        raise ValueError('its name is no path')
+    return _opened(_tail(source, entry)).metadata.metadata or {}
+
+
+def _needed(columns: Sequence[str]) -> list[str]:
+    """In the order of the schema; a row's key is always looked at."""
+    return [name for name in arrow_schema().names if name in columns or name == 'key']
+
+
+def _robot(key: str) -> str:
+    return key.partition('/')[0]
+
+
+def _bodies(source: Source, entries: Sequence[Entry]) -> Iterator[tuple[Entry, bytes | ObjectRefused | None]]:
+    """Each with its content where that is small, or why it cannot be had."""
+
+    def body(entry: Entry) -> bytes | ObjectRefused | None:
+        try:
+            return source.read(entry.key, SMALL_BYTES) if entry.size <= SMALL_BYTES and is_path(entry.key) else None
+        except ObjectRefused as error:
+            if error.data.get('reason') == 'missing':
+                raise
+            return error
+
+    with ThreadPoolExecutor(THREADS, 'lake-read') as pool:  # they wait for the server; several that parse hinder each other
+        for start in range(0, len(entries), PARTS_AT_A_TIME):
+            some = entries[start : start + PARTS_AT_A_TIME]
+            yield from zip(some, pool.map(body, some), strict=True)
+
+
+def _contents(source: Source, entry: Entry, body: bytes | ObjectRefused | None, schema: pa.Schema, findings: Findings,
+              wanted: Wanted | None) -> Iterator[tuple[pa.Table, int]]:  # fmt: skip
+    """The rows of one part, as far as it is one, and how many bytes they take."""
+    done, part = 0, None
+    try:
+        if isinstance(body, ObjectRefused) or not is_path(entry.key):
+            raise ValueError('its name is no path, or it is larger than its listing says')
+        part = _Part(source, entry, body)
+        for table, size in part.tables(schema, wanted):
+            yield table, size
+            done += len(table)
+    except UNREADABLE as error:
+        findings.add(entry.key, _why(error), part.count - done if part is not None and done else None)
+
+
+def _why(error: BaseException) -> str:
+    if isinstance(error, MemoryError):
+        return 'there is not enough memory for it'
+    return f'it is no part of a catalogue ({" ".join(str(error).split())[:200] or type(error).__name__})'
+
+
+class _Rows:
+    """Rows of parts of one robot, until there are enough of them to be looked at and handed on."""
+
+    def __init__(self, schema: pa.Schema, findings: Findings, robot: str = '') -> None:
+        self.robot = robot
+        self.nbytes = 0
+        self._schema = schema
+        self._findings = findings
+        self._parts: list[tuple[str, int]] = []
+        self._tables: list[pa.Table] = []
+
+    def add(self, key: str, table: pa.Table, size: int) -> None:
+        self._parts.append((key, len(table)))
+        self._tables.append(table if table.schema.equals(self._schema) else _fit(table, self._schema))
+        self.nbytes += size
+
+    def taken(self, columns: Sequence[str]) -> Iterator[pa.Table]:
+        """The rows that count; nothing where there are none at all."""
+        if not self._parts:
+            return
+        table = self._readable(pa.concat_tables(self._tables).combine_chunks())
+        table = self._only(table, _is_own(table, self.robot), 'are not of its robot')
+        yield self._only(table, _is_sane(table), 'make no sense').select(columns)
+
+    def _readable(self, table: pa.Table) -> pa.Table:
+        """Without parts whose texts are none: what is no UTF-8 would be an error wherever it is read."""
+        try:
+            table.validate(full=True)
+        except pa.ArrowInvalid:
+            good, start = [], 0
+            for key, count in self._parts:
+                piece = table.slice(start, count)
+                start += count
+                try:
+                    piece.validate(full=True)
+                    good.append((key, piece))
+                except pa.ArrowInvalid as error:
+                    self._findings.add(key, _why(error))
+            self._parts = [(key, len(piece)) for key, piece in good]
+            return pa.concat_tables([self._schema.empty_table(), *(piece for _, piece in good)])
+        return table
+
+    def _only(self, table: pa.Table, counts: pa.ChunkedArray, what: str) -> pa.Table:
+        """The rows that count. The others are told, part by part."""
+        if pc.all(counts, min_count=0).as_py():
+            return table
+        kept, start = [], 0
+        for key, count in self._parts:
+            left = count - (pc.sum(counts.slice(start, count)).as_py() or 0)
+            if left:
+                self._findings.add(key, f'{left:,} of its {count:,} rows {what}', left)
+            kept.append((key, count - left))
+            start += count
+        self._parts = kept
+        return table.filter(counts)
+
+
+def _fit(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """With nulls for what it does not have."""
+    held = table.column_names
+    return pa.table(
+        [table[each.name] if each.name in held else pa.nulls(len(table), each.type) for each in schema], schema=schema
+    )
+
+
+def _is_own(table: pa.Table, robot: str) -> pa.ChunkedArray:
+    """Whether a row is one of the robot whose folder it lies in."""
+    own = pc.fill_null(pc.starts_with(table['key'], f'{robot}/'), fill_value=False)
+    if 'robot' in table.column_names:
+        own = pc.and_(own, pc.fill_null(pc.equal(table['robot'], robot), fill_value=True))
+    return own
+
+
+def _is_sane(table: pa.Table) -> pa.ChunkedArray:
+    """Whether what must be there is, and dates are dates; of the columns that were read."""
+    sane = pc.is_valid(table['key'])
+    for name in (name for name in REQUIRED if name in table.column_names):
+        sane = pc.and_(sane, pc.is_valid(table[name]))
+    if 'bucket' in table.column_names:
+        named = [each for each in pc.unique(table['bucket']).to_pylist() if each is not None and is_name(each)]
+        sane = pc.and_(sane, pc.is_in(table['bucket'], value_set=pa.array(named, pa.string())))
+    if 'bytes' in table.column_names:
+        sane = pc.and_(sane, pc.fill_null(pc.greater_equal(table['bytes'], 0), fill_value=False))
+    for name in (name for name in ('t_start', 't_end') if name in table.column_names):
+        micros = table[name].cast(pa.int64())
+        inside = pc.and_(pc.greater_equal(micros, _YEARS_US[0]), pc.less_equal(micros, _YEARS_US[1]))
+        sane = pc.and_(sane, pc.fill_null(inside, fill_value=True))
+    return sane
+
+
+# -- one file ------------------------------------------------------------------------------------------------------------------
+
+
+class _Chunk(NamedTuple):
+    """A column of a row group, and where its pages lie."""
+
+    name: str
+    begin: int
+    end: int
+    values: int
+
+
+class _Part:
+    """A file that should be a part. What it does is on the caller's thread; anything of ``UNREADABLE`` says that it is none."""
+
+    def __init__(self, source: Source, entry: Entry, body: bytes | None) -> None:
+        """``body`` is all of it where it is small."""
+        check_size(entry.size, MOST_BYTES)
+        self._source, self._entry, self._body = source, entry, body
+        self._size = entry.size if body is None else len(body)
+        self._file = _opened(_tail(source, entry) if body is None else body)
+        self._about = self._file.metadata
+        self._left = SLACK_BYTES + MOST_RATIO * self._size
+        """Bytes that it may still unpack to."""
+        self.count: int = self._about.num_rows
+
+    def tables(self, schema: pa.Schema, wanted: Wanted | None) -> Iterator[tuple[pa.Table, int]]:
+        """The columns of the schema that it has, and how many bytes they take."""
+        places = _places(self._file, schema)
+        groups = range(self._about.num_row_groups)
+        if wanted is not None and len(groups) > 1:
+            bounds = _bounds(wanted)
+            groups = [number for number in groups if _may_hold(self._about.row_group(number), places, bounds)]  # type: ignore[assignment]
+        some: list[int] = []
+        chunks: list[_Chunk] = []
+        for number in groups:
+            some.append(number)
+            chunks += self._chunks(number, places)
+            if sum(chunk.end - chunk.begin for chunk in chunks) > BATCH_BYTES:
+                yield self._read(some, chunks, list(places))
+                some, chunks = [], []
+        if some:
+            yield self._read(some, chunks, list(places))
+
+    def _chunks(self, number: int, places: Mapping[str, int]) -> list[_Chunk]:
+        """Raises ValueError for one that does not lie in the file or has not a value a row."""
+        group, found = self._about.row_group(number), []
+        for name, place in places.items():
+            about = group.column(place)
+            begin = about.data_page_offset
+            if about.has_dictionary_page and 0 < about.dictionary_page_offset < begin:
+                begin = about.dictionary_page_offset
+            chunk = _Chunk(name, begin, begin + about.total_compressed_size, about.num_values)
+            if not len(_MAGIC) <= chunk.begin <= chunk.end <= self._size or chunk.values != group.num_rows:
+                raise ValueError(f'its column {name} lies nowhere')
+            if about.compression not in _CODECS:
+                raise ValueError(f'it is compressed with {about.compression}')
+            found.append(chunk)
+        return found
+
+    def _read(self, groups: Sequence[int], chunks: Sequence[_Chunk], columns: Sequence[str]) -> tuple[pa.Table, int]:
+        before = self._left
+        values = sum(chunk.values for chunk in chunks)
+        self._spend(values * 8)
+        if self._body is not None:
+            held = None
+            walked = [(chunk.name, _walk(self._body, chunk.begin, chunk.end)) for chunk in chunks]
+        else:
+            spans = [(chunk.begin, chunk.end) for chunk in chunks]
+            held = dict(zip((begin for begin, _ in spans), self._source.ranges(self._entry.key, spans), strict=True))
+            walked = [(chunk.name, _walk(held[chunk.begin], 0, chunk.end - chunk.begin)) for chunk in chunks]
+        self._spend(sum(size for _, (size, _) in walked))
+        packed = {name for name, (_, has_dictionary) in walked if has_dictionary}
+        table = self._file_of(held, packed).read_row_groups(groups, columns, use_threads=False)
+        return self._plain(table, packed, values // len(columns)), before - self._left
+
+    def _file_of(self, held: Mapping[int, bytes] | None, packed: set[str]) -> pq.ParquetFile:
+        """Texts that stand in dictionaries stay there, until it is known how long they would be altogether."""
+        if held is None and not packed:
+            return self._file
+        place = pa.BufferReader(self._body) if held is None else pa.PythonFile(_Held(held, self._size), 'r')
+        return pq.ParquetFile(place, metadata=self._about, read_dictionary=sorted(packed), pre_buffer=False)
+
+    def _plain(self, table: pa.Table, packed: set[str], rows: int) -> pa.Table:
+        """Raises ValueError for columns of unlike lengths, and for texts of dictionaries that would be too long."""
+        if any(len(column) != rows for column in table.columns):
+            raise ValueError(f'its columns have not {rows:,} values each')
+        for place, name in enumerate(table.column_names):
+            column = table.column(place)
+            if name in packed and pa.types.is_dictionary(column.type):
+                column.validate(full=True)
+                for chunk in column.chunks:
+                    lengths = pc.binary_length(chunk.dictionary).take(chunk.indices)
+                    self._spend(pc.sum(lengths.cast(pa.int64())).as_py() or 0)
+                table = table.set_column(place, table.schema.field(place).with_type(pa.string()), column.cast(pa.string()))
+        return table
+
+    def _spend(self, size: int) -> None:
+        self._left -= size
+        if size < 0 or self._left < 0:
+            raise ValueError(f'it unpacks to more than {MOST_RATIO} times its size')
+
+
+class _Held(io.RawIOBase):
+    """A file of which only some spans are here, each asked for as it is."""
+
+    def __init__(self, spans: Mapping[int, bytes], size: int) -> None:
+        self._spans = spans
+        self._size = size
+        self._at = 0
+
+    def seekable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence] + offset
+        return self._at
+
+    def read(self, size: int = -1) -> bytes:
+        found = self._spans.get(self._at)
+        if found is None or size > len(found):
+            raise OSError(f'{size} bytes at {self._at} belong to none of its columns')
+        self._at += size
+        return found[:size]
+
+
+def _tail(source: Source, entry: Entry) -> bytes:
+    """The end of a file, its footer in it."""
+    tail = source.tail(entry.key, min(entry.size, FOOTER_BYTES))
+    size = _footer_size(tail, entry.size)
+    return tail if size <= len(tail) else source.tail(entry.key, size)
+
+
+def _footer_size(tail: bytes, size: int) -> int:
+    """With what follows it."""
+    found = int.from_bytes(tail[-_END_BYTES:-4], 'little') + _END_BYTES
+    if tail[-4:] != _MAGIC or found + len(_MAGIC) > size:
+        raise ValueError('it has no footer of a Parquet file')
+    check_size(found, MOST_FOOTER_BYTES)
+    return found
+
+
+def _opened(tail: bytes) -> pq.ParquetFile:
+    _footer_size(tail, len(tail) + len(_MAGIC))
+    limits = {'thrift_string_size_limit': MOST_FOOTER_BYTES, 'thrift_container_size_limit': MOST_LIST}
+    return pq.ParquetFile(pa.BufferReader(tail), pre_buffer=False, **limits)
+
+
+@lru_cache(maxsize=1)
+def _ours() -> pa.Schema:
+    return arrow_schema()
+
+
+def _places(file: pq.ParquetFile, schema: pa.Schema) -> dict[str, int]:
+    """The columns of a schema that a file has, and their numbers. Raises ValueError where one is not as ours are."""
+    found, ours = file.schema_arrow, _ours()
+    if found.equals(ours):
+        return {name: ours.get_field_index(name) for name in schema.names}
+    names = found.names
+    for field in (ours.field(name) for name in schema.names if name in names or name in REQUIRED):
+        place = names.index(field.name) if names.count(field.name) == 1 else -1
+        if place < 0 or found.field(place).type != field.type or file.schema.column(place).path != field.name:
+            raise ValueError(f'it has no column {field.name} of type {field.type}')
+    return {name: names.index(name) for name in schema.names if name in names}
+
+
+_Bound = tuple[str, Any, Any]
+"""A column, and the least and the greatest value that is wanted."""
+
+
+def _bounds(wanted: Wanted) -> list[_Bound]:
+    found: list[_Bound] = []
+    if wanted.sensor is not None:
+        found.append(('sensor', wanted.sensor, wanted.sensor))
+    if wanted.since_ns is not None or wanted.until_ns is not None:
+        low = -(1 << 63) if wanted.since_ns is None else wanted.since_ns
+        found.append(('t_start_ns', low, (1 << 63 if wanted.until_ns is None else wanted.until_ns) - 1))
+    if wanted.near is not None:
+        x, y, radius = wanted.near
+        found += [('x', x - radius, x + radius), ('y', y - radius, y + radius)]
+    return found
+
+
+def _may_hold(group: Any, places: Mapping[str, int], bounds: Sequence[_Bound]) -> bool:
+    """By the statistics of a row group; who lies in them hides his own rows alone."""
+    for name, low, high in bounds:
+        told = group.column(places[name]).statistics if name in places else None
+        if told is not None and told.has_min_max and (told.max < low or told.min > high):
+            return False
+    return True
+
+
+# -- the headers of pages ------------------------------------------------------------------------------------------------------
+
+
+def _walk(data: bytes, begin: int, end: int) -> tuple[int, bool]:
+    """What the pages of a column unpack to, and whether one is a dictionary, by their headers. Raises ValueError, IndexError."""
+    total, has_dictionary = 0, False
+    while begin < end:
+        if plain := _PAGE.match(data, begin, end):  # as robots write them: most by far
+            size, packed, at = _zigzag(plain[1], 0)[0], _zigzag(plain[2], 0)[0], plain.end()
+            if _int32(size) < 0 or packed < 0 or at + packed > end:
+                raise ValueError('its pages lie nowhere')
+            total += size
+            begin = at + packed
+            continue
+        page, at = _struct(data, begin)
+        kind, size, packed = (_int32(page.get(number)) for number in (1, 2, 3))
+        about = page.get(5 if kind == _DATA_PAGE else 7)
+        if kind not in {_DATA_PAGE, _DICTIONARY_PAGE} or not isinstance(about, dict) or _int32(about.get(2)) not in _ENCODINGS:
+            raise ValueError('it has pages of another kind than ours')
+        if size < 0 or packed < 0 or at + packed > end:
+            raise ValueError('its pages lie nowhere')
+        has_dictionary |= kind == _DICTIONARY_PAGE
+        total += size
+        begin = at + packed
+    return total, has_dictionary
+
+
+def _int32(value: Any) -> int:
+    """What a reader in C would take it for, or an error where that could be something else."""
+    if type(value) is not int or not -(1 << 31) <= value < 1 << 31:
+        raise ValueError('the header of a page cannot be read')
+    return value
+
+
+def _struct(data: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
+    """A struct of whole numbers, flags, bytes (left out) and structs; where it ends. No number comes twice."""
+    fields: dict[int, Any] = {}
+    number = 0
+    while head := data[at]:
+        at += 1
+        kind, step = head & 15, head >> 4
+        if step:
+            number += step
+        else:
+            number, at = _zigzag(data, at)
+        if number in fields or not 0 < number < 1 << 15 or depth > 3:
+            raise ValueError('the header of a page cannot be read')
+        if kind <= 2:
+            fields[number] = kind == 1
+        elif kind <= 6 and kind != 3:
+            fields[number], at = _zigzag(data, at)
+        elif kind == 8:
+            size, at = _varint(data, at)
+            fields[number], at = None, at + size
+        elif kind == 12:
+            fields[number], at = _struct(data, at, depth + 1)
+        else:
+            raise ValueError('the header of a page cannot be read')
+    return fields, at + 1
+
+
+def _zigzag(data: bytes, at: int) -> tuple[int, int]:
+    value, at = _varint(data, at)
+    return (value >> 1) ^ -(value & 1), at
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    value = data[at]
+    at += 1
+    if value < 0x80:
+        return value, at
+    value &= 0x7F
+    for shift in range(7, 70, 7):
+        byte = data[at]
+        at += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, at
+    raise ValueError('the header of a page cannot be read')

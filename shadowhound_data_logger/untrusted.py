@@ -1,0 +1,202 @@
+"""Names and files that a robot wrote, for machines that ask: nothing in them is believed before it was looked at.
+
+Whoever has a robot's keys can put anything below its prefix. So a key becomes a path, a text is printed, and a file takes
+memory only as far as this module allows. What it refuses is a NameRefused or a ValueError that says why; the caller adds whose.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import unicodedata
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import NameRefused
+from shadowhound_data_logger.keys import MAX_KEY_BYTES, UNSEEN
+
+MAX_FILE_NAME_BYTES: Final = 255
+"""Of Linux' file systems."""
+MOST_DOCUMENT_BYTES: Final = 16 << 20
+"""Of JSON that is read whole: a manifest of a day in slices of a minute has 2 MB. Python needs up to 24 times as much for it."""
+MOST_SUMMARY_BYTES: Final = 1 << 20
+"""Of a mission's ``summary.json``."""
+MOST_YAML_BYTES: Final = 4 << 20
+"""Of a ``metadata.yaml``: that of some 15,000 slices."""
+MOST_YAML_NODES: Final = 250_000
+"""Each takes 50 us."""
+MOST_YAML_DEPTH: Final = 32
+MOST_OBJECT_BYTES: Final = 64 << 20
+"""Of an object that is decoded in memory: an archive is closed after 16 MiB of messages."""
+MOST_CHUNK_BYTES: Final = 128 << 20
+"""Of a bag's chunk, packed and unpacked: rosbag2 makes them of 768 KB, or as large as their largest message."""
+MOST_PIXELS: Final = 1 << 25
+"""Of a picture: 8K."""
+MOST_MEMBERS: Final = 20_000
+"""Files in an archive, two a message: it is closed after 10,000 of them."""
+_FORMULA: Final = frozenset('=+-@＝＋－＠')
+_NUMBER: Final = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?', re.ASCII)
+
+
+# -- names ---------------------------------------------------------------------------------------------------------------------
+
+
+def path_below(folder: Path, key: str) -> Path:
+    """Where the file of a key lies below a folder. Raises NameRefused for a key that is no path below it."""
+    if not is_path(key):
+        raise NameRefused(f'the key {key[:200]!r} is no path below a folder', name=key)
+    return folder / key
+
+
+def is_path(key: str) -> bool:
+    """Whether a key can be a file below any folder: parts with names of their own, no control characters, not too long."""
+    parts = key.split('/')
+    try:
+        sizes = [len(part.encode()) for part in parts]
+    except UnicodeEncodeError:  # half a surrogate pair
+        return False
+    if '' in parts or '.' in parts or '..' in parts or sum(sizes) + len(parts) > MAX_KEY_BYTES + 1:
+        return False
+    return max(sizes) <= MAX_FILE_NAME_BYTES and (key.isprintable() or not any(unicodedata.category(one) == 'Cc' for one in key))
+
+
+# -- what is printed -----------------------------------------------------------------------------------------------------------
+
+
+def visible(text: str) -> str:
+    """The text on one line and without power over a terminal: a control character becomes its escape, as in ``repr``."""
+    if text.isprintable():
+        return text
+    return ''.join(_escape(letter) if unicodedata.category(letter) in UNSEEN else letter for letter in text)
+
+
+def csv_cell(value: object) -> object:
+    """A value for a CSV file: numbers as they are, text on one line, and no text that a spreadsheet takes for a formula."""
+    if value is None or isinstance(value, (bool, int, float)):
+        return value
+    text = visible(str(value))
+    return f"'{text}" if text.lstrip()[:1] in _FORMULA and not _NUMBER.fullmatch(text) else text
+
+
+def _escape(letter: str) -> str:
+    return letter.encode('unicode_escape').decode('ascii')
+
+
+# -- documents -----------------------------------------------------------------------------------------------------------------
+
+
+def from_json(content: bytes, most: int = MOST_DOCUMENT_BYTES) -> Any:
+    """Raises ValueError, also for a document that is too large or too deep."""
+    check_size(len(content), most)
+    try:
+        return json.loads(content)
+    except RecursionError:
+        raise ValueError('it is too deep') from None
+
+
+def from_yaml(content: str) -> Any:
+    """Mappings, sequences and scalars, without aliases: a few bytes of those can stand for any size. Raises ValueError."""
+    from ruamel.yaml import YAML  # noqa: PLC0415 - 0.1 s that most need not
+    from ruamel.yaml.composer import Composer  # noqa: PLC0415
+    from ruamel.yaml.error import YAMLError  # noqa: PLC0415
+    from ruamel.yaml.events import AliasEvent  # noqa: PLC0415
+
+    class Plain(Composer):
+        """Counts what it makes."""
+
+        nodes = depth = 0
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            self.nodes += 1
+            self.depth += 1
+            if self.parser.check_event(AliasEvent):
+                raise ValueError('it has aliases')
+            if self.nodes > MOST_YAML_NODES or self.depth > MOST_YAML_DEPTH:
+                raise ValueError(f'it is deeper than {MOST_YAML_DEPTH}, or has more than {MOST_YAML_NODES:,} values')
+            made = super().compose_node(parent, index)
+            self.depth -= 1
+            return made
+
+    check_size(len(content), MOST_YAML_BYTES)
+    yaml = YAML(typ='safe', pure=True)  # the parser in C neither counts nor ends at a depth
+    yaml.Composer = Plain
+    try:
+        return yaml.load(content)
+    except (YAMLError, RecursionError, TypeError, AttributeError, LookupError) as error:
+        raise ValueError(' '.join(str(error).split())) from error
+
+
+def check_size(size: int, most: int) -> None:
+    """Raises ValueError for what is larger."""
+    if size > most:
+        raise ValueError(f'it has {size:,} bytes; more than {most:,} are not read')
+
+
+# -- content -------------------------------------------------------------------------------------------------------------------
+
+
+def unpacked(compression: str, content: bytes, size: int | None = None) -> bytes:
+    """What was packed by ``zstd`` or ``lz4``: of this size (None: of any that is allowed), and not a byte more in memory.
+
+    It ends at the size: a frame that holds more is wrong, and its rest is never unpacked. Raises ValueError.
+    """
+    most = MOST_CHUNK_BYTES if size is None else size
+    check_size(most, MOST_CHUNK_BYTES)
+    if compression not in {'zstd', 'lz4'}:
+        raise ValueError(f'it is compressed with {compression!r}, which nobody here knows')
+    try:
+        found, is_whole = _zstd(content, most) if compression == 'zstd' else _lz4(content, most)
+    except (RuntimeError, EOFError) as error:  # lz4 raises the former
+        raise ValueError(str(error)) from error
+    if not is_whole or len(found) > most or size not in {None, len(found)}:
+        raise ValueError(f'it does not unpack to {"at most " * (size is None)}{most:,} bytes, as it should')
+    return found
+
+
+def _zstd(content: bytes, size: int) -> tuple[bytes, bool]:
+    if sys.version_info >= (3, 14):
+        from compression import zstd  # noqa: PLC0415 - for bags alone
+    else:
+        from backports import zstd  # noqa: PLC0415
+
+    found, left, is_whole = b'', content, False
+    try:
+        while left and len(found) <= size:  # frames may follow each other
+            reader = zstd.ZstdDecompressor()
+            found += reader.decompress(left, size + 1 - len(found))
+            left, is_whole = reader.unused_data, reader.eof
+    except zstd.ZstdError as error:
+        raise ValueError(str(error)) from error
+    return found, is_whole
+
+
+def _lz4(content: bytes, size: int) -> tuple[bytes, bool]:
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped] # noqa: PLC0415
+
+    reader = LZ4FrameDecompressor()
+    return bytes(reader.decompress(content, size + 1)), bool(reader.eof)
+
+
+def open_image(content: bytes | Path) -> Any:
+    """A picture of Pillow's, not decoded yet: JPEG, PNG or TIFF, of at most ``MOST_PIXELS``. Raises OSError or ValueError."""
+    from PIL import Image  # noqa: PLC0415 - 0.1 s, and most readers see none
+
+    source = content if isinstance(content, Path) else BytesIO(content)
+    try:
+        opened = Image.open(source, formats=('JPEG', 'PNG', 'TIFF'))
+    except (Image.DecompressionBombError, SyntaxError) as error:  # which are nobody's ValueError
+        raise ValueError(str(error)) from None
+    try:
+        check_pixels(opened.width, opened.height)
+    except ValueError:
+        opened.close()
+        raise
+    return opened
+
+
+def check_pixels(width: int, height: int) -> None:
+    """Raises ValueError for more than ``MOST_PIXELS``."""
+    if width * height > MOST_PIXELS:
+        raise ValueError(f'it claims {width:,} x {height:,} pixels')

@@ -1,0 +1,131 @@
+"""Parts of the catalogue as no robot of ours writes them: what is none, what lies about its size, what speaks of others."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import random
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shadowhound_data_logger.lake import parquet, parts, schema
+from shadowhound_data_logger.lake.standing import LEAVES, compacted_key
+from shadowhound_data_logger.options import StoreSettings
+
+DATE: Final = '2026-10-28'
+LONG: Final = 'thor/camera/' + 42_000 * 'a'
+ROWS: Final = 1_000_000
+
+
+def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str = 'thor') -> str:
+    """As a robot that may write below its own prefix puts it; its key."""
+    key = f'{schema.prefix(robot)}date={DATE}/{name}.parquet'
+    path = settings.directory / schema.BUCKET / key
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(body)
+    return key
+
+
+def arrow(rows: Sequence[schema.Row], about: Mapping[str, str] | None = None, **columns: Any) -> bytes:
+    """These rows by pyarrow, with some columns replaced."""
+    table = pa.table({name: columns.get(name, [row[name] for row in rows]) for name in schema.COLUMNS},
+                     schema=None if columns else schema.arrow_schema())  # fmt: skip
+    return written(table, about)
+
+
+def written(table: pa.Table, about: Mapping[str, str] | None = None, **how: Any) -> bytes:
+    body = io.BytesIO()
+    with pq.ParquetWriter(body, table.schema, **{'compression': 'zstd', 'store_schema': False, **how}) as file:
+        file.write_table(table)
+        if about:
+            file.add_key_value_metadata(dict(about))
+    return body.getvalue()
+
+
+def dictionary_bomb(row: schema.Row) -> bytes:
+    """Some kilobytes that are a million rows of one key of 42 KB: 42 GB."""
+    whole = pa.Table.from_pylist([row], schema=schema.arrow_schema())
+    columns = [_repeated(whole[name][0], LONG if name == 'key' else None) for name in schema.COLUMNS if row[name] is not None]
+    table = pa.table(columns, names=[name for name in schema.COLUMNS if row[name] is not None])
+    return written(table)
+
+
+def _repeated(value: pa.Scalar, text: str | None) -> pa.Array:
+    values = pa.array([text]) if text else pa.array([value.as_py()], value.type)
+    return pa.DictionaryArray.from_arrays(pa.array(memoryview(bytes(4 * ROWS)).cast('i'), pa.int32()), values)
+
+
+def zeros_bomb(rows: Sequence[schema.Row]) -> bytes:
+    """A page of a quarter of a gigabyte of zeros, as zstd makes some kilobytes of it."""
+    table = pa.Table.from_pylist(list(rows), schema=schema.arrow_schema())
+    place = table.column_names.index('topic')
+    return written(table.set_column(place, 'topic', pa.array(['\0' * (1 << 26)] * len(table))), use_dictionary=False)
+
+
+def lying_page(rows: Sequence[schema.Row], claim: int = (1 << 31) - 1) -> bytes:
+    """Our own file, but the header of its first page claims another size."""
+    body = parts.encode(rows)
+    place = len(parquet.MAGIC)
+    head = body[place : place + 3]
+    assert head == b'\x15\x00\x15'
+    end = place + 3
+    while body[end] & 0x80:
+        end += 1
+    said = parquet._varint(claim << 1)
+    return body[: place + 3] + said + body[end + 1 :]  # the columns after it lie elsewhere now, which is a lie as well
+
+
+def leaf_bomb(rows: Sequence[schema.Row]) -> tuple[str, bytes]:
+    """The name and content of a compacted part whose list of leaves is half a gigabyte of JSON in some hundred kilobytes."""
+    packer = zlib.compressobj(9)
+    squeezed = packer.compress(b'["')
+    for _ in range(512):
+        squeezed += packer.compress(b'a' * (1 << 20))
+    squeezed += packer.compress(b'"]') + packer.flush()
+    return compacted(rows, base64.b64encode(squeezed).decode())
+
+
+def compacted(rows: Sequence[schema.Row], leaves: str | Sequence[str]) -> tuple[str, bytes]:
+    """A compacted part that says so of its leaves."""
+    said = leaves if isinstance(leaves, str) else base64.b64encode(zlib.compress(json.dumps(list(leaves)).encode())).decode()
+    key = compacted_key('thor', DATE, [said], is_mended=False)
+    table = pa.Table.from_pylist(list(rows), schema=schema.arrow_schema())
+    return Path(key).stem, written(table, {LEAVES: said})
+
+
+def footer_of(body: bytes) -> tuple[int, int]:
+    """Where it begins and ends."""
+    size = struct.unpack('<I', body[-8:-4])[0]
+    return len(body) - 8 - size, len(body) - 8
+
+
+def mutated(body: bytes, rng: random.Random) -> bytes:
+    """With some bytes changed, removed or added, mostly in the footer and in the headers of pages."""
+    found = bytearray(body)
+    begin, end = footer_of(body)
+    for _ in range(rng.choice((1, 1, 2, 4, 16))):
+        low, high = rng.choice(((begin, end), (begin, end), (4, begin), (0, len(body))))
+        place = rng.randrange(low, max(low + 1, min(high, len(found))))
+        change = rng.randrange(5)
+        if change == 0:
+            found[place : place + 1] = bytes((rng.randrange(256),))
+        elif change == 1:
+            found[place : place + 1] = bytes((found[min(place, len(found) - 1)] ^ (1 << rng.randrange(8)),))
+        elif change == 2:
+            found[place : place + 5] = rng.choice((b'\xff\xff\xff\xff\x0f', b'\xfe\xff\xff\xff\x0f', b'\x00' * 5, b'\x80' * 5))
+        elif change == 3:
+            del found[place : place + rng.randrange(1, 9)]
+        else:
+            found[place:place] = rng.randbytes(rng.randrange(1, 9))
+    if rng.random() < 0.8 and len(found) > 12:  # with a footer that is found
+        found[-4:] = parquet.MAGIC
+        if len(found) != len(body):
+            found[-8:-4] = struct.pack('<I', max(0, end - begin + len(found) - len(body)))
+    return bytes(found)

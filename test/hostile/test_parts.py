@@ -1,0 +1,232 @@
+"""One robot's bad part of the catalogue is left out, named and counted; the others are answered by every command."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import random
+import resource
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from click.testing import CliRunner, Result
+from hostile import bad_parts
+from lake.making import NOON_NS, add, add_part, content, fill, folder_store, keys, row
+
+from shadowhound_data_logger import lake
+from shadowhound_data_logger.cli.fetch import fetch
+from shadowhound_data_logger.cli.lake import lake as lake_command
+from shadowhound_data_logger.cli.query import query
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.lake import parts, schema
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.source import open_source
+from shadowhound_data_logger.stores import open_store
+
+LIMIT_BYTES = 2 << 30
+ROWS = [row('camera', NOON_NS + number * 10**9) for number in range(1, 4)]
+THEIRS = [row('camera', NOON_NS + number * 10**9, robot='tachi') for number in range(1, 4)]
+TEXTS = [each['topic'] for each in ROWS]
+BAD: dict[str, Callable[[], bytes]] = {
+    'empty': lambda: b'',
+    'garbage': lambda: random.Random(1).randbytes(5000),
+    'only the magic': lambda: b'PAR1' + b'\0' * 40 + b'PAR1',
+    'a footer of 2 GB': lambda: b'PAR1' + b'\0' * 40 + b'\xff\xff\xff\x7fPAR1',
+    'a text for a number': lambda: bad_parts.arrow(ROWS, bytes=['many'] * 3),
+    'a number for a key': lambda: bad_parts.arrow(ROWS, key=[1, 2, 3]),
+    'a list for a robot': lambda: bad_parts.arrow(ROWS, robot=[['thor']] * 3),
+    'no key': lambda: bad_parts.written(pa.table({'robot': ['thor']})),
+    'of tachi': lambda: parts.encode(THEIRS),
+    'of nobody': lambda: parts.encode([{**each, 'key': 'x.jpg'} for each in ROWS]),
+    'thor who says that he is tachi': lambda: parts.encode([{**each, 'robot': 'tachi'} for each in ROWS]),
+    'a bucket that is a path': lambda: parts.encode([{**each, 'bucket': '../../etc'} for each in ROWS]),
+    'a year of six digits': lambda: parts.encode([{**each, 't_start': (1 << 62)} for each in ROWS]),
+    'a size below nothing': lambda: parts.encode([{**each, 'bytes': -5} for each in ROWS]),
+    'a dictionary bomb': lambda: bad_parts.dictionary_bomb(ROWS[0]),
+    'a bomb of zeros': lambda: bad_parts.zeros_bomb(ROWS),
+    'a page that claims 2 GB': lambda: bad_parts.lying_page(ROWS),
+    'brotli': lambda: bad_parts.written(pa.Table.from_pylist(ROWS, schema=schema.arrow_schema()), compression='brotli'),
+    'delta encoding': lambda: bad_parts.written(
+        pa.Table.from_pylist(ROWS, schema=schema.arrow_schema()), use_dictionary=False,
+        column_encoding={'key': 'DELTA_BYTE_ARRAY'},
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An hour of thor and some parts of tachi, all sound, and what their rows speak of."""
+    root = tmp_path_factory.mktemp('sound')
+    settings = folder_store(root)
+    rows = fill(settings, root / 'tmp', days=(0,), hours=(12,))
+    with closing(open_store(settings, UploadSettings())) as store:
+        for number, each in enumerate(THEIRS):
+            add_part(store, [each], f'part{number}', root / 'tmp')
+        for each in (*rows, *THEIRS):
+            told = {'sha256': str(each['sha256'])}
+            add(store, root / 'tmp', each['key'], content(each['sensor'], each['t_start_ns']), told)
+    return root
+
+
+@pytest.fixture
+def home(sound: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(sound, tmp_path / 'home'))
+
+
+def good(home: Path) -> list[str]:
+    """The keys of all rows that count."""
+    return sorted(lake.objects(open_source(folder_store(home), schema.BUCKET)).select('key').to_pydict()['key'])
+
+
+def run(command: Callable[..., object], home: Path, *arguments: str) -> Result:
+    env = {'SHADOWHOUND_HOME': str(home), 'COLUMNS': '200', 'AWS_ENDPOINT_URL': ''}
+    found = CliRunner().invoke(command, arguments, env=env, standalone_mode=False)  # type: ignore[arg-type]
+    assert found.exception is None, found.exception
+    return found
+
+
+@pytest.mark.parametrize('kind', BAD)
+def test_a_bad_part_costs_nobody_else_an_answer(home: Path, kind: str) -> None:
+    """``query`` answers with all other rows, names the part, and its exit code says that there is one."""
+    before = good(home)
+    assert run(query, home).return_value == 0
+    key = bad_parts.put(folder_store(home), BAD[kind]())
+    found = run(query, home, '--format', 'keys')
+    assert sorted(line.removeprefix('sensor-data/') for line in found.stdout.splitlines()) == before
+    assert found.return_value == 1
+    assert f'{key} is left out: ' in found.stderr
+    assert '1 of the catalogue are left out' in found.stderr
+    assert run(query, home, '--robot', 'tachi').return_value == 0
+
+
+@pytest.mark.parametrize('kind', ['empty', 'garbage', 'a text for a number', 'of tachi', 'a dictionary bomb'])
+def test_every_command_goes_on_without_it(home: Path, tmp_path: Path, kind: str) -> None:
+    """``lake verify``, ``fetch``, ``lake compact`` and ``lake reindex``: the others are verified, fetched, merged and known."""
+    before = good(home)
+    key = bad_parts.put(folder_store(home), BAD[kind]())
+    verified = run(lake_command, home, 'verify', '--json')
+    told = json.loads(verified.stdout)
+    assert (verified.return_value, told['sound'], told['findings'], [one['key'] for one in told['left_out']]) == (
+        1, len(before), {}, [key],
+    )  # fmt: skip
+    fetched = run(fetch, home, '--since', '2026-10-28', '--to', str(tmp_path / 'data'), '--json')
+    told = json.loads(fetched.stdout)
+    assert (fetched.return_value, told['moved'], told['failed'], len(told['left_out'])) == (1, len(before), {}, 1)
+    known = json.loads(run(lake_command, home, 'reindex', '--robot', 'thor', '--json').stdout)
+    assert known['added'] == 2, 'the two summaries have no rows'
+    before = good(home)
+    compacted = run(lake_command, home, 'compact', '--before', '2026-10-29')
+    assert compacted.return_value == 1
+    assert f'{key} is left out: ' in compacted.stderr
+    assert good(home) == before
+    run(lake_command, home, 'compact', '--before', '2026-10-29', '--grace', '0')
+    left = {path.name for path in (home / 'store' / schema.BUCKET / 'thor/_catalog' / f'date={bad_parts.DATE}').iterdir()}
+    assert Path(key).name in left, 'what is left out stays as it is'
+    assert len(left) == 2
+    assert good(home) == before
+
+
+def test_rows_of_others_are_refused_and_counted_and_the_rest_of_the_part_is_answered(home: Path) -> None:
+    """A robot's part may only speak of that robot's keys, in whatever bucket."""
+    mine = [{**ROWS[0], 'key': 'thor/rosbags/a/a_0.mcap'}, {**ROWS[0], 'key': 'thor/patrol.csv', 'bucket': 'trajectories'}]
+    before = good(home)
+    key = bad_parts.put(folder_store(home), parts.encode([*mine, *THEIRS]))
+    findings = Findings(lambda _: None)
+    source = open_source(folder_store(home), schema.BUCKET)
+    found = lake.objects(source, findings=findings).select('key').to_pydict()['key']
+    assert sorted(found) == sorted([*before, *(str(each['key']) for each in mine)])
+    assert [(one.key, one.rows) for one in findings] == [(key, 3)]
+    assert '3 of its 5 rows are not of its robot' in str(next(iter(findings)))
+
+
+def test_a_data_set_says_what_it_leaves_out(home: Path) -> None:
+    """And has all the rest."""
+    source = open_source(folder_store(home), schema.BUCKET)
+    count = len(lake.MissionDataset(source))
+    key = bad_parts.put(folder_store(home), b'')
+    frames = lake.MissionDataset(source)
+    assert len(frames) == count > 0
+    assert [one.key for one in frames.left_out] == [key]
+    assert not len(pickle.loads(pickle.dumps(frames)).left_out)  # noqa: S301 - our own
+
+
+def test_a_compacted_part_that_lies_about_its_leaves_costs_itself_alone(home: Path) -> None:
+    """A list that is none, one that unpacks to half a gigabyte, and two that contradict each other."""
+    before = good(home)
+    settings = folder_store(home)
+    made = [
+        bad_parts.leaf_bomb(ROWS), bad_parts.compacted(ROWS, 'no base64'), bad_parts.compacted(ROWS, ''),
+        bad_parts.compacted(ROWS, ['gone', 'a']), bad_parts.compacted(ROWS, ['gone', 'b', 'c']),
+    ]  # fmt: skip
+    told = [bad_parts.put(settings, body, name) for name, body in made]
+    findings = Findings(lambda _: None)
+    found = sorted(lake.objects(open_source(settings, schema.BUCKET), findings=findings).select('key').to_pydict()['key'])
+    assert {one.key for one in findings} == set(told[:-1]), 'of those that contradict each other the fuller one counts'
+    assert found == sorted([*before, *keys(ROWS)])
+
+
+def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None:
+    """Folders that are no dates, and names that are no robots, are no part of the catalogue."""
+    before = good(home)
+    root = home / 'store' / schema.BUCKET
+    for folder in (
+        'thor/_catalog/date=\x1b[31m',
+        'thor/_catalog/date=..',
+        '\x1b[31m/_catalog/date=2026-10-28',
+        '-x/_catalog/date=2026-10-28',
+    ):
+        (root / folder).mkdir(parents=True)
+        (root / folder / 'x.parquet').write_bytes(parts.encode(ROWS))
+    assert good(home) == before
+    (root / 'thor/_catalog/date=2026-10-28/\x1b[31m.parquet').write_bytes(parts.encode(ROWS))
+    findings = Findings(lambda _: None)
+    lake.objects(open_source(folder_store(home), schema.BUCKET), findings=findings).collect()
+    assert [(one.key.rpartition('/')[2], '\x1b' in str(one)) for one in findings] == [('\x1b[31m.parquet', False)]
+
+
+@pytest.mark.parametrize('kind', ['a dictionary bomb', 'a bomb of zeros', 'a page that claims 2 GB', 'a list of leaves'])
+def test_a_bomb_is_left_out_in_2_gb(home: Path, kind: str) -> None:
+    """With no more memory than that, ``query`` and ``lake compact`` end by themselves and say which part it is."""
+    if kind == 'a list of leaves':
+        name, body = bad_parts.leaf_bomb(ROWS)
+        key = bad_parts.put(folder_store(home), body, name)
+    else:
+        key = bad_parts.put(folder_store(home), BAD[kind]())
+    for arguments in (('query', '--format', 'keys'), ('lake', 'compact', '--before', '2026-10-29')):
+        ran = in_2_gb(home, *arguments)
+        assert (ran.returncode, 'Traceback' in ran.stderr) == (1, False), ran.stderr
+        assert f'{key} is left out: ' in ran.stderr
+
+
+def in_2_gb(home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environ = {**os.environ, 'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': ''}
+    command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', *arguments]
+    return subprocess.run(
+        command, env=environ, capture_output=True, text=True, check=False, timeout=120,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (LIMIT_BYTES, LIMIT_BYTES)),
+    )  # fmt: skip
+
+
+def test_large_parts_are_read_in_pieces_and_ruled_out_by_their_statistics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that is not read whole gives the same rows, and what cannot hold an answer is not asked for."""
+    settings = folder_store(tmp_path)
+    rows = [row(sensor, NOON_NS + number * 10**9) for sensor in ('camera', 'odom') for number in range(6000)]
+    table = pa.Table.from_pylist(rows, schema=schema.arrow_schema())
+    bad_parts.put(settings, bad_parts.written(table, write_batch_size=4096), 'thor_large')
+    from lake.making import watched
+
+    monkeypatch.setattr(lake.scan, 'SMALL_BYTES', 1000)
+    monkeypatch.setattr(lake.reading, 'SMALL_BYTES', 1000)
+    source = watched(settings)
+    assert sorted(lake.objects(source).select('key').to_pydict()['key']) == keys(rows)
+    assert {verb for verb, _ in source.asked} == {'folders', 'list', 'tail', 'ranges'}
