@@ -29,7 +29,7 @@ def plain_table(title: str, columns: Iterable[str], left: Iterable[str] = ('topi
     table = Table(title=title, title_justify='left', title_style='bold', header_style='dim', box=None, pad_edge=False)
     for name in columns:
         is_left = name in left
-        table.add_column(name, justify='left' if is_left else 'right', overflow='fold', no_wrap=not is_left)
+        table.add_column(plain(name), justify='left' if is_left else 'right', overflow='fold', no_wrap=not is_left)
     return table
 
 
