@@ -1,23 +1,34 @@
-"""One subscription, drained instead of called back (D1). The seam to what rclpy of each distribution offers."""
+"""One subscription, drained instead of called back (D1). The seam to what rclpy of each distribution offers.
+
+Where rclpy tells less of a message than its RMW knows (Humble: neither number nor publisher; Jazzy: not the publisher), messages
+are taken through librcl, if that proves right for messages of the node's own.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import logging
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import lru_cache
-from importlib import import_module
+from importlib import import_module, metadata
 from importlib.machinery import PathFinder
 from importlib.util import find_spec
-from typing import Any, Final
+from itertools import islice
+from typing import Any, Final, TypeVar
+from uuid import uuid4
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from rclpy.type_support import NoTypeSupportImportedException, check_for_type_support
+from rclpy.utilities import get_rmw_implementation_identifier
 from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
+from std_msgs.msg import String
 
 from shadowhound_data_logger.capture import librcl
 from shadowhound_data_logger.capture.endpoints import Endpoint, Plan
@@ -26,12 +37,23 @@ from shadowhound_data_logger.keys import printable
 from shadowhound_data_logger.model import Taken
 
 try:
-    from rclpy.event_handler import SubscriptionEventCallbacks
+    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 except ImportError:  # Humble
-    from rclpy.qos_event import SubscriptionEventCallbacks
+    from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks
+
+log = logging.getLogger(__name__)
+T = TypeVar('T')
 
 MAX_TAKES: Final = 20_000
 """Takes of one drain: beyond it the other topics have their turn first."""
+FAST_DDS: Final = ('rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp')
+"""The RMWs that know the number and the publisher of each message (the number since rmw_fastrtps 6.2.1)."""
+TELLS_PUBLISHERS: Final = (8, 0)
+"""The first rclpy that tells all that is wanted of a message; numbers came with 4.0."""
+PROOF_S: Final = 3.0
+"""For messages of the node to itself to arrive; it takes milliseconds."""
+_PROVED: Final[dict[str, bool]] = {}
+"""By RMW, whether takes through librcl were right in this process."""
 
 
 class PolledGroup(CallbackGroup):  # type: ignore[misc]  # rclpy has no types
@@ -118,7 +140,7 @@ def endpoints(node: Node, topic: str) -> list[Endpoint]:
     """The publishers of a resolved topic as the graph knows them."""
     return [
         Endpoint(
-            gid=bytes(info.endpoint_gid).hex(),
+            gid=bytes(info.endpoint_gid[: librcl.GID_BYTES]).hex(),
             type=printable(info.topic_type),
             reliable=info.qos_profile.reliability is ReliabilityPolicy.RELIABLE,
             transient_local=info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL,
@@ -150,6 +172,7 @@ class Reader:
             )  # fmt: skip
         except (rclpy_implementation.RCLError, InvalidTopicNameException) as error:
             raise SubscriptionRefused(f'no subscription of type {plan.type} can be made ({error})') from error
+        self._taker = librcl.Taker() if takes_through_librcl(node) else None
 
     def matched(self) -> int:
         """Number of publishers it is matched with."""
@@ -159,36 +182,120 @@ class Reader:
                 return int(handle.get_publisher_count())
             return librcl.publisher_count(handle.pointer)  # Humble
 
-    def drain(self) -> Iterator[Taken]:
+    def drain(self) -> list[Taken]:
         """Everything that waits, oldest first."""
         handle = self._subscription.handle
         with handle:
-            take, message_type = handle.take_message, self._class
-            for _ in range(MAX_TAKES):
-                taken = take(message_type, True)
-                if taken is None:
-                    return
-                cdr, info = taken
-                yield Taken(
-                    cdr, info['source_timestamp'], self._publisher(info), info.get('publication_sequence_number'),
-                    info['received_timestamp'] or _came_ns(info['source_timestamp']),
-                )  # fmt: skip
+            waiting = self._through_rclpy(handle) if self._taker is None else self._through_librcl(handle, self._taker)
+            return list(islice(waiting, MAX_TAKES))
+
+    def _through_rclpy(self, handle: Any) -> Iterator[Taken]:
+        take, message_type = handle.take_message, self._class
+        while (taken := take(message_type, True)) is not None:
+            cdr, info = taken
+            gid = info.get('publisher_gid')  # Jazzy and older do not tell it
+            yield Taken(
+                cdr, info['source_timestamp'], None if gid is None else self._name(gid['data']),
+                info.get('publication_sequence_number'), info['received_timestamp'] or _came_ns(info['source_timestamp']),
+            )  # fmt: skip
+
+    def _through_librcl(self, handle: Any, taker: librcl.Taker) -> Iterator[Taken]:
+        take, pointer = taker.take, ctypes.c_void_p(handle.pointer)
+        while (taken := take(pointer)) is not None:
+            cdr, source_ns, received_ns, number, gid, _ = taken
+            yield Taken(cdr, source_ns, self._name(gid), number, received_ns or _came_ns(source_ns))
 
     def close(self) -> None:
         self._node.destroy_subscription(self._subscription)
+        if self._taker is not None:
+            self._taker.close()
+            self._taker = None
 
-    def _publisher(self, info: Mapping[str, Any]) -> str | None:
-        """The sender's gid in hex; Jazzy and older do not give it."""
-        gid = info.get('publisher_gid')
-        if gid is None:
-            return None
-        data = gid['data']
-        name = self._names.get(data)
+    def _name(self, gid: bytes) -> str:
+        """The sender's gid in hex, as the graph has it."""
+        name = self._names.get(gid)
         if name is None:
             if len(self._names) >= MAX_PUBLISHERS:
                 self._names.clear()
-            name = self._names[data] = bytes(data).hex()
+            name = self._names[gid] = bytes(gid[: librcl.GID_BYTES]).hex()
         return name
+
+
+def takes_through_librcl(node: Node) -> bool:
+    """Whether readers take so: where the RMW knows more of a message than rclpy tells, and that proved right; tried once."""
+    rmw = get_rmw_implementation_identifier()
+    if rmw not in FAST_DDS or rclpy_version() >= TELLS_PUBLISHERS:
+        return False
+    if rmw not in _PROVED:
+        problem = disproof(node)
+        _PROVED[rmw] = not problem
+        if problem:
+            log.warning('messages are taken through rclpy, which does not tell whose they are: through librcl %s', problem)
+        else:
+            log.info('messages are taken through librcl, which tells their numbers and publishers as rclpy does not')
+    return _PROVED[rmw]
+
+
+def rclpy_version() -> tuple[int, ...]:
+    """Of the installed rclpy; () where its metadata are missing."""
+    for name in ('rclpy', 'ros-rclpy'):  # as part of a distribution, and as a wheel
+        try:
+            return tuple(int(part) for part in metadata.version(name).split('.') if part.isdecimal())
+        except metadata.PackageNotFoundError:
+            continue
+    return ()
+
+
+def disproof(node: Node) -> str:
+    """What is wrong of messages that the node sends itself on a topic of its own, as librcl tells them; empty if nothing is.
+
+    Bytes, number, time of sending and publisher of each are known here otherwise.
+    """
+    topic = f'{node.get_fully_qualified_name()}/_take_{uuid4().hex}'
+    publisher = node.create_publisher(String, topic, 10, event_callbacks=PublisherEventCallbacks(use_default_callbacks=False))
+    subscription = node.create_subscription(
+        String, topic, _never_called, 10, callback_group=PolledGroup(), raw=True,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+    )  # fmt: skip
+    try:
+        with subscription.handle:
+            return _disproof(node, topic, publisher, ctypes.c_void_p(subscription.handle.pointer))
+    except (OSError, AttributeError) as error:
+        return f'they cannot be taken: {error}'
+    finally:
+        node.destroy_subscription(subscription)
+        node.destroy_publisher(publisher)
+
+
+def _disproof(node: Node, topic: str, publisher: Any, pointer: ctypes.c_void_p) -> str:
+    rmw, taker = librcl.implementation(), librcl.Taker()
+    try:
+        if not _within(PROOF_S, lambda: librcl.publisher_count(pointer.value or 0) and endpoints(node, topic)):
+            return 'nothing is heard of what this node sends to itself'
+        gid = bytes.fromhex(endpoints(node, topic)[0].gid)
+        for number, size in enumerate((1, librcl.FIRST_BYTES, 2), start=1):
+            cdr = serialize_message(String(data='x' * size))
+            before_ns = time.time_ns()
+            publisher.publish(cdr)
+            first_ns, last_ns = sorted((before_ns, time.time_ns()))  # the clock may have stepped
+            found = _within(PROOF_S, lambda: taker.take(pointer))
+            if found is None:
+                return 'a message of this node to itself does not come'
+            known = librcl.Message(cdr, found.source_ns, found.received_ns, number, gid, rmw)
+            if found != known or not first_ns <= found.source_ns <= last_ns:
+                said = found._replace(cdr=found.cdr[:16])
+                return f'message {number} of {gid.hex()}, {len(cdr)} bytes, sent from {first_ns} to {last_ns}, is told as {said}'
+        return ''
+    finally:
+        taker.close()
+
+
+def _within(seconds: float, ask: Callable[[], T]) -> T:
+    """The first true answer, or the last one."""
+    end_s = time.monotonic() + seconds
+    while not (answer := ask()) and time.monotonic() < end_s:
+        time.sleep(0.001)
+    return answer
 
 
 def _came_ns(sent_ns: int) -> int:

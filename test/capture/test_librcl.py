@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator
+from operator import attrgetter
 from typing import Any
 
 import pytest
 import rclpy
 from e2e.processes import until
 from rclpy.context import Context
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
+from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import String
 
-from shadowhound_data_logger.capture import librcl
+from shadowhound_data_logger.capture import librcl, reader
 from shadowhound_data_logger.capture.endpoints import Plan
 from shadowhound_data_logger.capture.reader import PolledGroup, Reader
+from shadowhound_data_logger.model import Taken
 
 pytestmark = pytest.mark.ros
 
@@ -31,15 +36,147 @@ def node(domain: int) -> Iterator[Any]:
 
 def test_the_publishers_of_a_subscription_are_counted(node: Any) -> None:
     """As they come and go, also where rclpy does not count them."""
-    reader = Reader(node, Plan('/counted', 'std_msgs/msg/String', reliable=True, transient_local=False, depth=10), PolledGroup())
-    handle = reader._subscription.handle
-    assert reader.matched() == librcl.publisher_count(handle.pointer) == 0
+    found = read(node, '/counted')
+    handle = found._subscription.handle
+    assert found.matched() == librcl.publisher_count(handle.pointer) == 0
     publishers = [node.create_publisher(String, '/counted', 10) for _ in range(2)]
     until(lambda: librcl.publisher_count(handle.pointer) == 2, 'both publishers are matched')
-    assert reader.matched() == 2
+    assert found.matched() == 2
     node.destroy_publisher(publishers.pop())
     until(lambda: librcl.publisher_count(handle.pointer) == 1, 'one of them is left')
-    reader.close()
+    found.close()
+
+
+SIZES = (0, 1, 100, 3_000, 500_000, 7, 2_000_000, 20_000, 3)
+"""Of messages one after the other: the buffer has to grow, and not to tell what a longer one left in it."""
+needs_fast_dds = pytest.mark.skipif(get_rmw_implementation_identifier() not in reader.FAST_DDS, reason='needs numbers')
+
+
+@pytest.fixture
+def through_librcl(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever this rclpy tells."""
+    monkeypatch.setattr(reader, 'TELLS_PUBLISHERS', (99,))
+    monkeypatch.setattr(reader, '_PROVED', {})
+
+
+def read(node: Any, topic: str, depth: int = 100, *, latched: bool = False) -> Reader:
+    return Reader(node, Plan(topic, 'std_msgs/msg/String', reliable=True, transient_local=latched, depth=depth), PolledGroup())
+
+
+def drained(found: Reader, count: int) -> list[Taken]:
+    taken: list[Taken] = []
+    until(lambda: taken.extend(found.drain()) or len(taken) >= count, lambda: f'{count} messages, here {len(taken)}')
+    return taken
+
+
+@needs_fast_dds
+@pytest.mark.parametrize('latched', [False, True])
+def test_librcl_and_rclpy_tell_the_same(node: Any, monkeypatch: pytest.MonkeyPatch, *, latched: bool) -> None:
+    """Of each message of two publishers, small, large and small again: bytes, times, and what rclpy tells of who sent it."""
+    monkeypatch.setattr(reader, 'TELLS_PUBLISHERS', ())
+    by_rclpy = read(node, '/both', latched=latched)
+    monkeypatch.setattr(reader, 'TELLS_PUBLISHERS', (99,))
+    by_librcl = read(node, '/both', latched=latched)
+    assert (by_rclpy._taker, by_librcl._taker is None) == (None, False)
+    quality = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
+    publishers = [node.create_publisher(String, '/both', quality) for _ in range(2)]
+    until(lambda: by_rclpy.matched() == by_librcl.matched() == 2, 'both are matched')
+    until(lambda: len(reader.endpoints(node, '/both')) == 2, 'both are in the graph')
+    gids = [endpoint.gid for endpoint in reader.endpoints(node, '/both')]
+    sent = []
+    for number, size in enumerate(SIZES, start=1):
+        for place, publisher in enumerate(publishers):
+            sent.append((cdr := serialize_message(String(data=f'{place}' * size)), number))
+            publisher.publish(cdr)
+    both = (sorted(drained(each, len(sent)), key=attrgetter('source_ns')) for each in (by_rclpy, by_librcl))
+    pairs = list(zip(*both, strict=True))
+    assert [(told.cdr, told.number) for _, told in pairs] == sent
+    assert {told.publisher for _, told in pairs} == set(gids)
+    for known, told in pairs:
+        assert told.cdr == known.cdr
+        assert told.source_ns == known.source_ns
+        assert known.number in {None, told.number}
+        assert known.publisher in {None, told.publisher}
+        assert abs(told.received_ns - known.received_ns) < 10 * 10**9
+    for each in (by_rclpy, by_librcl):
+        each.close()
+
+
+@needs_fast_dds
+@pytest.mark.usefixtures('through_librcl')
+def test_takes_through_librcl_are_proved_once(node: Any, caplog: pytest.LogCaptureFixture) -> None:
+    """With messages of the node to itself, on a topic that is gone afterwards, and one line says so."""
+    caplog.set_level('INFO')
+    readers = [read(node, f'/proved{number}') for number in range(3)]
+    assert all(each._taker is not None for each in readers)
+    assert [record.levelname for record in caplog.records] == ['INFO']
+    until(lambda: not [name for name, _ in node.get_topic_names_and_types() if '_take_' in name], 'the topic is gone')
+    for each in readers:
+        each.close()
+
+
+WRONG = {
+    'number': lambda told: told._replace(number=(told.number or 0) + 1),
+    'no number': lambda told: told._replace(number=None),
+    'publisher': lambda told: told._replace(gid=bytes(16)),
+    'time of sending': lambda told: told._replace(source_ns=told.source_ns + 10**12),
+    'bytes': lambda told: told._replace(cdr=told.cdr[:-1]),
+    'layout': lambda told: told._replace(implementation=told.implementation + 8),
+}
+
+
+@needs_fast_dds
+@pytest.mark.usefixtures('through_librcl')
+@pytest.mark.parametrize('what', WRONG)
+def test_what_is_told_wrong_is_not_trusted(
+    node: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """Messages are taken through rclpy then, and one warning says why."""
+    take = librcl.Taker.take
+    monkeypatch.setattr(librcl.Taker, 'take', lambda *given: (told := take(*given)) and WRONG[what](told))
+    readers = [read(node, f'/wrong{number}') for number in range(2)]
+    assert [each._taker for each in readers] == [None, None]
+    (record,) = caplog.records
+    assert record.levelname == 'WARNING'
+    assert 'is told as Message(' in record.getMessage()
+    publisher = node.create_publisher(String, '/wrong0', 10)
+    until(lambda: readers[0].matched() == 1, 'it is matched')
+    publisher.publish(String(data='still'))
+    assert drained(readers[0], 1)[0].cdr == serialize_message(String(data='still'))
+    for each in readers:
+        each.close()
+
+
+@pytest.mark.usefixtures('through_librcl')
+def test_a_librcl_without_what_is_asked_is_left_alone(
+    node: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one of a distribution to come might be; with Cyclone DDS nothing is asked at all, as it has no numbers."""
+
+    def missing() -> None:
+        raise AttributeError('undefined symbol: rcutils_get_default_allocator')
+
+    monkeypatch.setattr(librcl, 'Taker', missing)
+    found = read(node, '/missing')
+    assert found._taker is None
+    has_numbers = get_rmw_implementation_identifier() in reader.FAST_DDS
+    assert [record.levelname for record in caplog.records] == ['WARNING'] * has_numbers
+    found.close()
+
+
+@needs_fast_dds
+@pytest.mark.usefixtures('through_librcl')
+def test_what_the_history_overwrote_is_a_gap_in_the_numbers(node: Any) -> None:
+    """Of what was published while nobody took, the last messages come, with their own numbers."""
+    found = read(node, '/full', depth=5)
+    publisher = node.create_publisher(String, '/full', 100)
+    until(lambda: found.matched() == 1, 'it is matched')
+    for number in range(20):
+        publisher.publish(String(data=f'{number}'))
+    numbers = [taken.number for taken in drained(found, 5)]
+    assert numbers[-1] == 20
+    assert numbers == sorted(set(numbers))
+    found.close()
 
 
 def test_a_subscription_that_is_none_is_an_error() -> None:

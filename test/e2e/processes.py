@@ -79,6 +79,11 @@ class Node(Process):
     home: Path
     robot: str
 
+    @property
+    def hears_numbers(self) -> bool:
+        """Whether it listens through a middleware that numbers messages: what is missed is known exactly then."""
+        return 'listening by rmw_fastrtps' in self.log
+
     def ledger(self) -> dict[str, Any]:
         """As ``shadowhound-data ledger --json`` prints it; it balances at any time."""
         found = ledger.read(self.home / 'spool', self.robot)
