@@ -1,54 +1,145 @@
-"""What Humble's rclpy lacks, taken away from a newer one: copied as sitecustomize.py to where a Python finds it at its start.
+"""What Humble's rclpy lacks, hidden from our package in a newer one: copied as sitecustomize.py to where a Python finds it.
 
-Source: rclpy 3.3 (Humble), src/rclpy/subscription.cpp, rclpy/qos_event.py, rclpy/node.py, and rmw 6.1, RMW_GID_STORAGE_SIZE.
+What there is in Humble is in ``rclpy_humble.json``, which ``rclpy_names.py`` makes from rclpy's source. Any other module,
+function, class or member of a class raises AttributeError (ImportError) for whoever is of our package; rclpy goes on using it.
+``HUMBLE_RMW`` is the RMW to stand in for: rmw_cyclonedds_cpp tells less than rmw_fastrtps_cpp.
+
+Sources of what is no name: rmw 6.1 (RMW_GID_STORAGE_SIZE), rmw_cyclonedds_cpp 1.3 (received_timestamp).
 """
 
+from __future__ import annotations
+
+import importlib
+import json
 import os
+import pkgutil
 import sys
+from contextlib import suppress
+from enum import Enum
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-import rclpy.event_handler
-from rclpy.impl import implementation_singleton
-from rclpy.node import Node
+import rclpy
 
-rclpy_ = implementation_singleton.rclpy_implementation
-take_message, publishers = rclpy_.Subscription.take_message, Node.get_publishers_info_by_topic
-
-
-def take_without_numbers(subscription: Any, kind: Any, raw: bool) -> Any:
-    """A message's info has its times only, with Cyclone DDS that of sending alone."""
-    taken = take_message(subscription, kind, raw)
-    return taken and (taken[0], {'source_timestamp': taken[1]['source_timestamp'], 'received_timestamp': 0})
+OURS = 'shadowhound_data_logger'
+FACTS = json.loads(Path(os.environ['RCLPY_NAMES']).read_text(encoding='utf-8'))
+RENAMED = {'rclpy.qos_event': 'rclpy.event_handler', 'QoSEvent': 'EventHandle'}
+"""What is in Humble and has another name now."""
+GID_BYTES = 24
+CYCLONE_DDS = os.environ['HUMBLE_RMW'] == 'rmw_cyclonedds_cpp'
 
 
-def publishers_with_long_gids(node: Node, *arguments: Any) -> Any:
-    """A gid has 24 bytes."""
-    found = publishers(node, *arguments)
-    for info in found:
-        info.endpoint_gid = [*info.endpoint_gid, *[0] * (24 - len(info.endpoint_gid))]
-    return found
+def asked_by_us(depth: int = 2) -> bool:
+    """Whether the caller of our caller is of our package."""
+    return str(sys._getframe(depth).f_globals.get('__name__', '')).startswith(OURS)
 
 
-class Implementation:
-    """The events of a subscription have another name, and there are none where the middleware does not know their kind."""
+class Hidden:
+    """A member of a class that Humble does not have."""
 
-    def __getattr__(self, name: str) -> Any:
-        if name == 'EventHandle':
-            raise AttributeError(name)
-        if name == 'QoSEvent':
-            return rclpy_.EventHandle if os.environ['MESSAGE_LOST_EVENTS'] == 'yes' else no_events
-        return getattr(rclpy_, name)
+    def __init__(self, name: str, hidden: Any) -> None:
+        self.name, self.hidden = name, hidden
 
-
-def no_events(*_: Any) -> None:
-    raise rclpy_.UnsupportedEventTypeError('not supported by this middleware')
+    def __get__(self, instance: Any, owner: Any = None) -> Any:
+        if asked_by_us():
+            raise AttributeError(f'{self.name} is not in rclpy {FACTS["version"]}')
+        get = getattr(type(self.hidden), '__get__', None)
+        return get(self.hidden, instance, owner) if get else self.hidden
 
 
-rclpy_.Subscription.take_message = take_without_numbers
-Node.get_publishers_info_by_topic = publishers_with_long_gids
-for later in ('add_post_set_parameters_callback', 'add_pre_set_parameters_callback'):
-    if hasattr(Node, later):
-        delattr(Node, later)
-implementation_singleton.rclpy_implementation = Implementation()
-sys.modules['rclpy.qos_event'] = rclpy.event_handler
-sys.modules['rclpy.event_handler'] = None  # type: ignore[assignment]  # importing it fails
+class HiddenProperty(Hidden):
+    """One that can be assigned to."""
+
+    def __set__(self, instance: Any, value: Any) -> None:
+        type(self.hidden).__set__(self.hidden, instance, value)
+
+
+class Guarded(ModuleType):
+    """A module of which we see what Humble has."""
+
+    def __getattribute__(self, name: str) -> Any:
+        get = super().__getattribute__
+        if name.startswith('__') or not asked_by_us():
+            return get(name)
+        module = get('__name__')
+        here = FACTS['modules'].get(module, {'names': ()})
+        if name not in here['names'] and f'{module}.{name}' not in FACTS['modules']:
+            raise AttributeError(f'{module}.{name} is not in rclpy {FACTS["version"]}')
+        return get(RENAMED.get(name, name))
+
+
+def members(cls: type) -> set[str]:
+    """What a class has in Humble, where it may be in another module; nothing where it is not there."""
+    modules = FACTS['modules']
+    places = (
+        [modules[cls.__module__]] if cls.__name__ in modules.get(cls.__module__, {'classes': ()})['classes'] else modules.values()
+    )
+    return {name for each in places if cls.__name__ in each['classes'] for name in each['classes'][cls.__name__]['members']}
+
+
+def hide_members(cls: type) -> None:
+    """Those of a class that it does not have in Humble, nor one that it inherits from."""
+    known = {name for each in cls.__mro__ for name in members(each)}
+    for name, member in list(vars(cls).items()):
+        if not name.startswith('__') and name not in known and not isinstance(member, type):
+            kind = HiddenProperty if hasattr(type(member), '__set__') else Hidden
+            setattr(cls, name, kind(f'{cls.__name__}.{name}', member))
+
+
+def hide() -> None:
+    """All of it, once everything of rclpy is loaded."""
+    for found in pkgutil.walk_packages(rclpy.__path__, 'rclpy.'):
+        with suppress(ImportError):  # some are for rclpy's own tests
+            importlib.import_module(found.name)
+    for name, module in list(sys.modules.items()):
+        if name.partition('.')[0] != 'rclpy' or not isinstance(module, ModuleType):
+            continue
+        for cls in vars(module).values():
+            if isinstance(cls, type) and cls.__module__ == name and members(cls) and not special(cls):
+                hide_members(cls)
+    for name, module in list(sys.modules.items()):
+        if name.partition('.')[0] == 'rclpy' and isinstance(module, ModuleType):
+            module.__class__ = Guarded
+    for name in FACTS['modules'].keys() - sys.modules.keys():
+        if name in RENAMED:
+            stand_in = sys.modules[name] = Guarded(name)
+            vars(stand_in).update(vars(sys.modules[RENAMED[name]]) | {'__name__': name})
+
+
+def special(cls: type) -> bool:
+    """Enumerations and tuples have members of their own making."""
+    return issubclass(cls, (Enum, tuple, BaseException)) or hasattr(cls, '__members__')
+
+
+def behave() -> None:
+    """What rclpy and the RMW tell in Humble."""
+    from rclpy import utilities
+    from rclpy.impl.implementation_singleton import rclpy_implementation as compiled
+    from rclpy.node import Node
+
+    take, publishers, version = compiled.Subscription.take_message, Node.get_publishers_info_by_topic, metadata.version
+
+    def take_message(subscription: Any, kind: Any, raw: bool) -> Any:
+        taken = take(subscription, kind, raw)
+        if taken is None:
+            return None
+        info = {name: taken[1][name] for name in FACTS['message_info']}
+        return taken[0], info | {'received_timestamp': 0} if CYCLONE_DDS else info
+
+    def publishers_info(node: Node, *arguments: Any) -> Any:
+        found = publishers(node, *arguments)
+        for info in found:
+            info.endpoint_gid = [*info.endpoint_gid, *[0] * (GID_BYTES - len(info.endpoint_gid))]
+        return found
+
+    compiled.Subscription.take_message = take_message
+    Node.get_publishers_info_by_topic = publishers_info
+    metadata.version = lambda name: FACTS['version'] if name == 'rclpy' else version(name)
+    if CYCLONE_DDS:
+        utilities.get_rmw_implementation_identifier = lambda: 'rmw_cyclonedds_cpp'
+
+
+behave()
+hide()
