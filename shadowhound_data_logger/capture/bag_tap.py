@@ -7,6 +7,7 @@ While nothing is recorded it costs a look at an empty set for each drain.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 from rclpy.node import Node
 
@@ -18,6 +19,9 @@ from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.spool.accounts import BAG, PAUSED, Accounts, Losses, TopicAccount
 from shadowhound_data_logger.spool.estimator import TopicEstimate
+
+MAX_AGAIN: Final = 10_000
+"""Latched messages that a recording has again, of all publishers; each of these sends what it kept, some at most."""
 
 
 class BagTap:
@@ -73,7 +77,7 @@ class BagTap:
         if last is None or message.number is None or message.number > last:
             return False
         mark = topic, message.publisher or '', message.number
-        if mark in self._again:
+        if mark in self._again or len(self._again) >= MAX_AGAIN:
             return False
         self._again.add(mark)
         account.receive_again(mark[1], message.number)

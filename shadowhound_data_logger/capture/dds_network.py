@@ -248,12 +248,27 @@ TEMPLATE: Final = """\
             <initialAnnouncements><count>30</count><period><sec>0</sec><nanosec>100000000</nanosec></period></initialAnnouncements>
           </discovery_config>
           {builtin}
+          <readerHistoryMemoryPolicy>PREALLOCATED_WITH_REALLOC</readerHistoryMemoryPolicy>
+          <writerHistoryMemoryPolicy>PREALLOCATED_WITH_REALLOC</writerHistoryMemoryPolicy>
         </builtin>
         <userTransports>{used}</userTransports>
         <useBuiltinTransports>false</useBuiltinTransports>{properties}
       </rtps>
     </participant>
+    <data_writer profile_name="shadowhound_writer" is_default_profile="true">
+      <historyMemoryPolicy>PREALLOCATED_WITH_REALLOC</historyMemoryPolicy>
+      <qos><data_sharing><kind>OFF</kind></data_sharing></qos>
+    </data_writer>
+    <data_reader profile_name="shadowhound_reader" is_default_profile="true">
+      <topic><resourceLimitsQos><allocated_samples>1</allocated_samples></resourceLimitsQos></topic>
+      <historyMemoryPolicy>DYNAMIC</historyMemoryPolicy>
+      <qos><data_sharing><kind>OFF</kind></data_sharing></qos>
+    </data_reader>
   </profiles>
 </dds>
 """
-"""Announcements: docs/decisions/0004-announce-often.md; where each goes to many ports there are fewer of them."""
+"""Announcements: docs/decisions/0004-announce-often.md; where each goes to many ports there are fewer of them.
+
+What a reader holds is allocated with each message and freed when it is taken: as rmw_fastrtps has it, each reader takes 88 KB
+before its first message and keeps room of the size of the largest for all that it ever held at once (docs/reliability.md).
+The other policies are those of rmw_fastrtps itself, which leaves them to the profile where it is told to read it for readers."""

@@ -28,6 +28,8 @@ SEEN: Final = 10
 """Messages of one drain that conditions look at, evenly chosen: 50 a second."""
 LARGE_BYTES: Final = 64 << 10
 """Of a topic with larger messages they look at the newest alone."""
+MAX_QOS: Final = 1000
+"""Publishers whose offers are remembered."""
 LATCHED: Final = f'durability: {int(DurabilityPolicy.TRANSIENT_LOCAL)}\n'
 """In what rosbag2 writes of a topic with such a publisher (``bags.metadata``)."""
 
@@ -98,6 +100,8 @@ class EventTap:
         """What the publishers of the topic offered when this one was first heard."""
         key = topic, type_name, publisher
         if key not in self._qos:
+            if len(self._qos) >= MAX_QOS:
+                self._qos.clear()
             self._qos[key] = qos_offered(self._node, topic, type_name)
         return self._qos[key]
 

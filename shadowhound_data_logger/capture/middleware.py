@@ -29,6 +29,8 @@ SETTING: Final = 'capture.rmw'
 PROFILE_FILES: Final = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 """What names a profile for Fast DDS 2, and for Fast DDS 3; neither reads the other's."""
 TRANSPORTS: Final = 'FASTDDS_BUILTIN_TRANSPORTS'
+FROM_PROFILE: Final = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
+"""Has rmw_fastrtps leave to the profile how readers and writers keep memory."""
 SHIPPED: Final = 'fastdds_shm.xml'
 """The profile for drivers, in launch_configs; ours has what is in it, and more."""
 MEASURED: Final = {(9, 3): 'Kilted'}
@@ -139,7 +141,9 @@ def choose(asked: str, environ: Mapping[str, str]) -> Middleware:
     version = versions.get(FAST_DDS, (0, 0))
     domain = int(given) if (given := environ.get('ROS_DOMAIN_ID', '')).isdecimal() else 0
     if robot.startswith('rmw_fastrtps'):
-        return Middleware(asked, robot, robot, "the robot's own", profile_variable=_ours(environ, version))
+        ours = _ours(environ, version)
+        variables: dict[str, str | None] = _of_memory(version) if ours else {}
+        return Middleware(asked, robot, robot, "the robot's own", variables=variables, profile_variable=ours)
     if asked == RMW_ROBOT:
         return Middleware(asked, robot, robot, f"the robot's own, by {SETTING}")
     network = robot_network(environ, domain, has_range=version >= HAS_RANGE)
@@ -151,10 +155,10 @@ def choose(asked: str, environ: Mapping[str, str]) -> Middleware:
         problem = f'{FAST_DDS} {version[0]}.{version[1]} has not been measured beside it'
     if asked != RMW_FASTRTPS and problem:
         return Middleware(asked, robot, robot, f"the robot's own: {problem}")
-    variables: dict[str, str | None] = {RMW: FAST_DDS}
+    variables = {RMW: FAST_DDS}
     ours = _ours(environ, version)
     if ours:
-        variables |= {LOCALHOST_ONLY: None, PEERS: None, RANGE: 'OFF' if network.is_off else 'SYSTEM_DEFAULT'}
+        variables |= _of_memory(version) | {LOCALHOST_ONLY: None, PEERS: None, RANGE: 'OFF' if network.is_off else 'SYSTEM_DEFAULT'}
     why = 'Fast DDS hands on the numbers of its messages' + (f', by {SETTING}, though {problem}' if problem else '')
     return Middleware(asked, robot, FAST_DDS, why, network if ours else None, domain, variables, ours)
 
@@ -210,6 +214,11 @@ def _ours(environ: Mapping[str, str], version: tuple[int, int]) -> str:
     name = PROFILE_FILES[version >= FAST_DDS_3]
     theirs = environ.get(name)
     return '' if environ.get(TRANSPORTS) or (theirs and Path(theirs).name != SHIPPED) else name
+
+
+def _of_memory(version: tuple[int, int]) -> dict[str, str | None]:
+    """What has the profile decide of memory; measured with Fast DDS 3 alone."""
+    return {FROM_PROFILE: '1'} if version >= FAST_DDS_3 else {}
 
 
 def _impossible(robot: str, versions: Mapping[str, tuple[int, int]], environ: Mapping[str, str]) -> str:

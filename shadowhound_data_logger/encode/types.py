@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
 
 HEADER: Final = 'std_msgs/msg/Header'
+MAX_UNKNOWN: Final = 1000
+"""Names of types that were not found and are remembered, whoever invents how many."""
 PLACEHOLDER: Final = 'structure_needs_at_least_one_member'
 """The field that rosidl puts into a message without any; it carries nothing."""
 
@@ -179,6 +181,8 @@ class MessageTypes:
                 self._store.register(definitions)
                 self._store.get_msgdef(type_name)  # compiled here, under the lock, with all that is nested in it
             except (LookupError, TypesysError, OSError, UnicodeDecodeError) as error:
+                if len(self._unknown) >= MAX_UNKNOWN:
+                    self._unknown.clear()
                 self._unknown[type_name] = str(error.args[0] if isinstance(error, LookupError) else error)
                 raise Rejected('unknown_type', self._unknown[type_name]) from error
             self._known[type_name] = self._store.fielddefs[type_name][1]

@@ -106,3 +106,5 @@ class Snapshot:
     publishers: tuple[PublisherRow, ...]
     other_types: tuple[OtherTypeRow, ...] = ()
     rhythms: tuple[RhythmRow, ...] = ()
+    gone: tuple[tuple[str, str], ...] = ()
+    """(account, publisher) whose rows of this session are in the sums of a row of their own now."""

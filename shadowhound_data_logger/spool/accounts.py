@@ -30,6 +30,14 @@ SINKS: Final = (BAG, EVENT)
 """What is open there is in files, which the next start finds."""
 WRONG_TYPE: Final = 'wrong_type'
 """Why messages are rejected that a topic carries besides those that are logged. They have one span, of this name: no gaps."""
+MAX_PUBLISHERS: Final = 256
+"""Publishers of a topic with accounts of their own. Where there are more, those that were silent for longest are added up."""
+MAX_NUMBER: Final = 1 << 62
+"""A message with a higher number has none: it comes from the network, and SQLite's end at 63 bits."""
+GONE: Final = '(gone)'
+"""Whose account that is."""
+MAX_GONE: Final = 500
+"""Such publishers of a topic whose last numbers are remembered, in case they publish again; so a gap of theirs is none less."""
 MAX_OTHER_TYPES: Final = 8
 """Of one topic, by name; all further ones are one: MORE_TYPES."""
 MORE_TYPES: Final = '(more)'
@@ -82,6 +90,10 @@ class TopicAccount:
     last_kept_ns: int = 0
     """Stamp of the newest sample that is durable: a restarted node goes on sampling after it."""
     other_types: dict[str, OtherType] = field(default_factory=dict)
+    gone: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """First and last number of publishers whose accounts were added up."""
+    removed: dict[str, Span | None] = field(default_factory=dict)
+    """Those among them that the last commit has by name still; with a span without counts where earlier sessions knew it."""
     is_doubtful: bool = False
     """Whether nobody knows which of its messages are the topic's own: their numbers tell nothing then."""
 
@@ -106,9 +118,13 @@ class TopicAccount:
 
     def receive(self, publisher: str | None, number: int | None) -> bool:
         """Count one taken message; False for a repeat. One without publisher or number is unknown until ``appraise``."""
+        if number is not None and number > MAX_NUMBER:
+            number = None
         if publisher is not None and number is not None and (self.accounting == EXACT or self._begin_numbers()):
-            if not self._span(publisher).observe(number):
+            span = self._span(publisher)
+            if not span.observe(number):
                 return False
+            span.used = self.received
         else:
             if self.accounting != ESTIMATED:
                 self.accounting = RECEIVED_ONLY
@@ -202,8 +218,22 @@ class TopicAccount:
     def _span(self, publisher: str) -> Span:
         span = self.publishers.get(publisher)
         if span is None:
-            span = self.publishers[publisher] = Span()
+            if len(self.publishers) >= MAX_PUBLISHERS:
+                self._add_up()
+            span = self.publishers[publisher] = Span(*self.gone.pop(publisher, ()))
         return span
+
+    def _add_up(self) -> None:
+        """Of the publishers that have been silent for longest, half of all, only the sums are kept, and their last numbers."""
+        own = [name for name in self.publishers if name not in {GONE, WRONG_TYPE}]
+        for name in sorted(own, key=lambda name: self.publishers[name].used)[: len(own) // 2]:
+            span = self.publishers.pop(name)
+            self.publishers.setdefault(GONE, Span()).absorb(span)
+            self.removed[name] = Span(span.first, span.last) if span.older else None
+            if span.first is not None and span.last is not None:
+                self.gone[name] = span.first, span.last
+        for name in list(self.gone)[:-MAX_GONE]:
+            del self.gone[name]
 
 
 class Accounts:
@@ -216,6 +246,7 @@ class Accounts:
         self._topics: dict[str, TopicAccount] = {}
         self._dirty = False
         self._written: list[Span] = []
+        self._removed: dict[str, dict[str, Span | None]] = {}
         self._inherited: dict[str, dict[str, Span]] = {}
         self._grades = dict(grades or {})
         self._rhythms = {
@@ -226,6 +257,8 @@ class Accounts:
         for row in inherited:
             spans = self._inherited.setdefault(row.topic, {})
             spans[row.publisher] = Span(row.first, row.last, inherited=True)
+            if len(spans) >= MAX_PUBLISHERS:
+                del spans[next(iter(spans))]
 
     @contextmanager
     def entry(self, topic: str) -> Iterator[TopicAccount]:
@@ -361,6 +394,11 @@ class Accounts:
             self._written = [span for _, _, span in spans]
             for span in self._written:
                 span.changed = False
+            self._removed = {topic: account.removed for topic, account in self._topics.items() if account.removed}
+            for topic, removed in self._removed.items():
+                self._topics[topic].removed = {}
+                spans += [(topic, name, span) for name, span in removed.items()
+                          if span is not None and name not in self._topics[topic].publishers]  # fmt: skip
             rhythms = (account.estimate.row(topic) for topic, account in self._topics.items())
             return Snapshot(
                 tuple(self._row(topic, account, *stored.get(topic, (0, 0))) for topic, account in self._topics.items()),
@@ -374,6 +412,7 @@ class Accounts:
                     for name, other in account.other_types.items()
                 ),
                 tuple(row for row in rhythms if row is not None),
+                tuple((topic, name) for topic, removed in self._removed.items() for name in removed),
             )
 
     def mark_dirty(self) -> None:
@@ -382,6 +421,8 @@ class Accounts:
             self._dirty = True
             for span in self._written:
                 span.changed = True
+            for topic, removed in self._removed.items():
+                self._topics[topic].removed = {**removed, **self._topics[topic].removed}
 
     def _rebase(self, topic: str) -> None:
         if account := self._topics.get(topic):

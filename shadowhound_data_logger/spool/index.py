@@ -225,6 +225,9 @@ class Index:
               json.dumps(row.rejected), json.dumps(row.dropped), row.last_kept_ns) for row in snapshot.topics),
         )  # fmt: skip
         self.db.executemany(
+            'DELETE FROM publishers WHERE session = ? AND topic = ? AND publisher = ?', ((session, *row) for row in snapshot.gone)
+        )
+        self.db.executemany(
             'INSERT OR REPLACE INTO publishers VALUES (?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.publisher, row.first, row.last, row.published, row.received, json.dumps(row.missed))
              for row in snapshot.publishers),

@@ -2,12 +2,64 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Final
 
-MAX_REMEMBERED: Final = 4096
-"""Single numbers remembered per publisher (the newest that may still come late): a bound, far above any history depth."""
+MAX_RANGES: Final = 512
+"""Ranges of numbers that are remembered per publisher (the newest, which may still come late): every second message lost of
+2,000 a second, between two drains. A publisher chooses its numbers, so they are never remembered one by one."""
+
+MAX_MISSED: Final = 1 << 40
+"""More than anybody publishes. Numbers that leap further lie, and that is believed to be no loss: sums stay within SQLite."""
+
+
+class Ranges:
+    """Numbers in sorted ranges that do not touch, each with a word; at most ``MAX_RANGES``, of which the lowest are forgotten."""
+
+    __slots__ = ('_rows',)
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[int, int, str]] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __contains__(self, number: int) -> bool:
+        return self._find(number) is not None
+
+    def append(self, start: int, stop: int, word: str) -> None:
+        """A range above all others, ``stop`` not in it."""
+        self._rows.append((start, stop, word))
+        del self._rows[:-MAX_RANGES]
+
+    def take(self, number: int) -> str | None:
+        """Take the number out; the word of its range, None where it is in none."""
+        at = self._find(number)
+        if at is None:
+            return None
+        start, stop, word = self._rows[at]
+        rest = [(start, number, word), (number + 1, stop, word)]
+        self._rows[at : at + 1] = [row for row in rest if row[0] < row[1]]
+        del self._rows[:-MAX_RANGES]
+        return word
+
+    def add(self, number: int) -> bool:
+        """Put in one number that is not in it; False where that would be a range too many."""
+        at = bisect_right(self._rows, (number,))
+        below = at > 0 and self._rows[at - 1][1] == number
+        above = at < len(self._rows) and self._rows[at][0] == number + 1
+        if not (below or above) and len(self._rows) >= MAX_RANGES:
+            return False
+        start = self._rows[at - 1][0] if below else number
+        stop = self._rows[at][1] if above else number + 1
+        self._rows[at - below : at + above] = [(start, stop, '')]
+        return True
+
+    def _find(self, number: int) -> int | None:
+        at = bisect_right(self._rows, (number + 1,)) - 1
+        return at if at >= 0 and self._rows[at][0] <= number < self._rows[at][1] else None
 
 
 @dataclass(slots=True)
@@ -24,9 +76,13 @@ class Span:
     published: int = 0
     received: int = 0
     missed: Counter[str] = field(default_factory=Counter)
-    _holes: dict[int, str] = field(default_factory=dict)
-    """Number below ``last`` that was not taken -> the cause it is missed by; '' where it was not listened to."""
-    _early: set[int] = field(default_factory=set)
+    older: bool = False
+    """Whether rows of earlier sessions have it."""
+    used: int = 0
+    """When it was last observed, by the count of its topic."""
+    _holes: Ranges = field(default_factory=Ranges)
+    """Numbers below ``last`` that were not taken, with the cause they are missed by; '' where they were not listened to."""
+    _early: Ranges = field(default_factory=Ranges)
     _base: int | None = None
     _rebased: bool = False
     changed: bool = False
@@ -36,6 +92,7 @@ class Span:
 
     def __post_init__(self) -> None:
         self._base = self.first
+        self.older = self.inherited
 
     def observe(self, number: int) -> bool:
         """Count a message by its sequence number; False if it was counted before (a repeat)."""
@@ -46,16 +103,14 @@ class Span:
                 self._skip(self.last + 1, number)
             self.last = number
             self.inherited = self._rebased = False
-        elif number in self._holes:
-            cause = self._holes.pop(number)
+        elif (cause := self._holes.take(number)) is not None:
             if cause and self.missed[cause] > 0:
                 self.missed[cause] -= 1
                 self.published -= 1
         elif number < self._base and number not in self._early:
             # TRANSIENT_LOCAL delivers history from before the first number taken.
-            if len(self._early) >= MAX_REMEMBERED:
+            if not self._early.add(number):
                 return False
-            self._early.add(number)
             self.first = min(self.first, number)
         else:
             return False
@@ -96,6 +151,15 @@ class Span:
                 self._late += count
             self.changed = True
 
+    def absorb(self, other: Span) -> None:
+        """Take over the counts of a publisher that is not followed any more; their numbers are nobody's then."""
+        self.published += other.received
+        self.received += other.received
+        if self.missed.total() + other.missed.total() <= MAX_MISSED:
+            self.published += other.missed.total()
+            self.missed.update(other.missed)
+        self.changed = True
+
     def rebase(self) -> None:
         """What is published until the next new message was not listened to on purpose: that gap is not missed."""
         self._rebased = True
@@ -103,11 +167,11 @@ class Span:
     def _skip(self, start: int, stop: int) -> None:
         """Count the numbers of a gap as missed, unless nobody listened, and remember them: they may come late."""
         cause = '' if self._rebased else 'restart' if self.inherited else 'transport'
+        if self.missed.total() + stop - start > MAX_MISSED:
+            cause = ''
         if cause:
             known = min(self._late, stop - start)
             self._late -= known
             self.missed[cause] += stop - start - known
             self.published += stop - start - known
-        self._holes.update(dict.fromkeys(range(max(start, stop - MAX_REMEMBERED), stop), cause))
-        while len(self._holes) > MAX_REMEMBERED:
-            del self._holes[next(iter(self._holes))]
+        self._holes.append(start, stop, cause)

@@ -20,6 +20,7 @@ from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.spool import binding, carrying
+from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.adding import Adding
 from shadowhound_data_logger.spool.adoption import Recovery
@@ -277,13 +278,16 @@ class Spool:
 
 def _continued(index: Index) -> Accounts:
     """Accounts of a session that goes on where the earlier ones ended."""
-    last = {(row.topic, row.publisher): row for row in index.publishers()}
+    last: dict[tuple[str, str], PublisherRow] = {}
+    for row in index.publishers():
+        last.pop((row.topic, row.publisher), None)  # so that the newest are the last
+        last[row.topic, row.publisher] = row
     kept: dict[str, int] = {}
     grades: dict[str, str] = {}
-    for row in index.topics():
-        kept[row.topic] = max(kept.get(row.topic, 0), row.last_kept_ns)
-        if row.received:
-            grades[row.topic] = row.accounting
+    for account in index.topics():
+        kept[account.topic] = max(kept.get(account.topic, 0), account.last_kept_ns)
+        if account.received:
+            grades[account.topic] = account.accounting
     return Accounts(last.values(), kept, index.rhythms(), grades)
 
 

@@ -8,7 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.capture.middleware import MOST_BUFFER, Middleware, asked_for, choose, possible_buffer, sockets
+from shadowhound_data_logger.capture.middleware import (
+    FROM_PROFILE,
+    MOST_BUFFER,
+    Middleware,
+    asked_for,
+    choose,
+    possible_buffer,
+    sockets,
+)
 from shadowhound_data_logger.errors import SettingError
 
 KILTED = {'rmw_fastrtps_cpp': '9.3.3', 'rmw_cyclonedds_cpp': '4.0.2'}
@@ -39,7 +47,8 @@ def test_a_cyclone_robot_is_heard_through_fast_dds(installed: dict[str, str]) ->
     assert (found.rmw, found.robot, found.is_foreign) == ('rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp', True)
     environ = dict(robot)
     found.enter(environ)
-    assert environ == {**installed, 'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT'}
+    assert environ == {**installed, 'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
+                       FROM_PROFILE: '1'}  # fmt: skip
     with found.profiled(environ):
         file = Path(environ['FASTDDS_DEFAULT_PROFILES_FILE'])
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -63,7 +72,7 @@ def test_a_fast_dds_robot_keeps_its_own(installed: dict[str, str], rmw: str) -> 
         assert '<segment_size>' in text
         assert '<receiveBufferSize>' in text
         assert 'interfaceWhiteList' not in text
-    assert environ == before
+    assert environ == before | {FROM_PROFILE: '1'}
 
 
 @pytest.mark.parametrize(

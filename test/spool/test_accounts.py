@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import copy
+import sqlite3
+import tracemalloc
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -13,14 +17,16 @@ from shadowhound_data_logger.spool import span as module
 from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import (
     EXACT,
+    GONE,
     MAX_NODES,
     MAX_OTHER_TYPES,
+    MAX_PUBLISHERS,
     MORE_TYPES,
     RECEIVED_ONLY,
     Accounts,
     TopicAccount,
 )
-from shadowhound_data_logger.spool.span import Span
+from shadowhound_data_logger.spool.span import Ranges, Span
 
 
 def taken(span: Span, *numbers: int) -> list[bool]:
@@ -121,11 +127,122 @@ def test_a_rebase_makes_no_repeat_new() -> None:
 
 def test_the_newest_holes_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory of holes is bounded, and old holes, which nothing fills any more, make way for new ones."""
-    monkeypatch.setattr(module, 'MAX_REMEMBERED', 4)
+    monkeypatch.setattr(module, 'MAX_RANGES', 2)
     span = Span()
-    taken(span, 0, 6, 8)  # holes 1..5, then 7
+    taken(span, 0, 2, 6, 8)  # holes 1, 3..5, then 7
     assert taken(span, 7, 5, 1) == [True, True, False]
-    assert figures(span) == (9, 5, {'transport': 4})
+    assert figures(span) == (9, 6, {'transport': 3})
+
+
+@given(st.lists(st.tuples(st.sampled_from('atx'), st.integers(0, 40)), max_size=60))
+def test_ranges_are_sets_of_numbers(steps: list[tuple[str, int]]) -> None:
+    """Whatever is appended, added and taken out, in any order."""
+    ranges, numbers = Ranges(), set[int]()
+    for what, number in steps:
+        if what == 'a':
+            start = max(numbers, default=0) + 2
+            ranges.append(start, start + number % 5 + 1, '')
+            numbers |= set(range(start, start + number % 5 + 1))
+        elif what == 't':
+            assert (ranges.take(number) is not None) == (number in numbers)
+            numbers.discard(number)
+        elif number not in numbers:
+            assert ranges.add(number)
+            numbers.add(number)
+        assert [number for number in range(300) if number in ranges] == sorted(number for number in numbers if number < 300)
+
+
+def test_a_publisher_that_leaps_takes_little_memory() -> None:
+    """It chooses its numbers, in the network: neither a gap of billions nor many small ones are remembered one by one."""
+    span = Span()
+    taken(span, *range(0, 100_000, 2), 1 << 62)
+    taken(span, *range(-1, -100_000, -2))
+    tracemalloc.start()
+    other = copy.deepcopy(span)
+    size = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert figures(other) == figures(span)
+    assert size < 300_000
+
+
+def test_numbers_that_lie_stop_no_commit(opened: Open, root: Path) -> None:
+    """They come from the network: sums of them that SQLite could not hold, or a start would take for damage, are not believed."""
+    spool = opened()
+    for publisher in range(2 * MAX_PUBLISHERS):
+        with spool.accounts.entry('/odom') as account:
+            for number in (1, 1 << 39, 1 << 53, (1 << 62) - 1, 1 << 62, (1 << 64) - 2):
+                account.receive(f'stranger{publisher}', number)
+    spool.commit([])
+    spool.close()
+    assert not opened().recovery.found_anything
+    found = ledger.read(root, 'thor')
+    assert ledger.imbalances(found) == []
+    assert found['topics']['/odom']['received'] == 12 * MAX_PUBLISHERS
+
+
+def test_publishers_that_come_and_go_are_added_up(opened: Open, root: Path) -> None:
+    """Only some have accounts of their own, in memory and in the index; both identities hold exactly, and no gap is lost."""
+    spool = opened()
+    for number in range(3000):
+        with spool.accounts.entry('/odom') as account:
+            assert account.receive(f'stranger{number}', 1)
+            assert account.receive(f'stranger{number}', 4)
+            if number % 100 == 0:
+                assert account.receive('robot', number + 1)
+        if number % 500 == 0:
+            spool.commit([])
+    with spool.accounts.entry('/odom') as account:
+        assert len(account.publishers) <= MAX_PUBLISHERS
+    spool.close()
+    found = ledger.read(root, 'thor')
+    assert ledger.imbalances(found) == []
+    row = found['topics']['/odom']
+    assert (row['accounting'], row['received'], row['missed']) == ('exact', 6030, 6000 + 2900 - 29)
+    with closing(sqlite3.connect(root / 'index.db')) as db:
+        assert db.execute('SELECT count(*) FROM publishers').fetchone()[0] <= MAX_PUBLISHERS
+        assert db.execute('SELECT published FROM publishers WHERE publisher = ?', (GONE,)).fetchone()[0] > 10_000
+
+
+def test_one_that_was_added_up_and_is_back(opened: Open, root: Path) -> None:
+    """What it published meanwhile is missed, what it sends again is a repeat; in the next session it is where it was."""
+    spool = opened()
+    receive(spool, 10, '/odom', 'robot')
+    spool.close()
+    spool = opened()
+    with spool.accounts.entry('/odom') as account:
+        for number in (11, 12):
+            assert account.receive('robot', number)
+        for number in range(MAX_PUBLISHERS):
+            assert account.receive(f'stranger{number}', 1)
+        assert 'robot' not in account.publishers
+    spool.commit([])
+    spool.close()
+    spool = opened()
+    with spool.accounts.entry('/odom') as account:
+        assert [account.receive('robot', number) for number in (12, 13, 15)] == [False, True, True]
+        for number in range(MAX_PUBLISHERS):
+            assert account.receive(f'stranger{number}', 2)
+        assert 'robot' not in account.publishers
+        assert [account.receive('robot', number) for number in (15, 17)] == [False, True]
+    spool.close()
+    found = ledger.read(root, 'thor')
+    assert ledger.imbalances(found) == []
+    assert found['topics']['/odom']['missed_by'] == {'transport': 2}
+
+
+def test_what_was_added_up_and_not_committed_is_tried_again() -> None:
+    """Rows that a failed commit should have removed are removed by the next one."""
+    accounts = Accounts()
+    with accounts.entry('/odom') as account:
+        for number in range(MAX_PUBLISHERS + 1):
+            account.receive(f'stranger{number}', 1)
+    first = accounts.snapshot({})
+    accounts.mark_dirty()
+    second = accounts.snapshot({})
+    assert first is not None
+    assert second is not None
+    assert first.gone == second.gone
+    assert len(first.gone) == MAX_PUBLISHERS // 2
 
 
 NUMBERS = st.lists(st.integers(0, 60), max_size=80)
