@@ -158,7 +158,11 @@ def choose(asked: str, environ: Mapping[str, str]) -> Middleware:
     variables = {RMW: FAST_DDS}
     ours = _ours(environ, version)
     if ours:
-        variables |= _of_memory(version) | {LOCALHOST_ONLY: None, PEERS: None, RANGE: 'OFF' if network.is_off else 'SYSTEM_DEFAULT'}
+        variables |= _of_memory(version) | {
+            LOCALHOST_ONLY: None,
+            PEERS: None,
+            RANGE: 'OFF' if network.is_off else 'SYSTEM_DEFAULT',
+        }
     why = 'Fast DDS hands on the numbers of its messages' + (f', by {SETTING}, though {problem}' if problem else '')
     return Middleware(asked, robot, FAST_DDS, why, network if ours else None, domain, variables, ours)
 
