@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from typing import Final
 
 from shadowhound_data_logger.options import BagSettings, EventSettings
+
+_FULL_NAME: Final = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+', re.ASCII)
+MAX_NAME: Final = 247
+"""rmw/types.h, and https://design.ros2.org/articles/topic_and_service_names.html"""
 
 
 class Choice:
@@ -32,8 +37,11 @@ class Choice:
         return self._named | {topic for topic in graph if self._matches(topic)}
 
     def _matches(self, topic: str) -> bool:
-        """As rosbag2: any part of the name has to match; hidden topics (a part begins with ``_``) are left out."""
+        """As rosbag2: any part of the name has to match; hidden topics (a part begins with ``_``) are left out.
+
+        So are names that are none of ROS, which another DDS program may well have: nobody can subscribe to them in ROS.
+        """
         assert self._regex is not None
-        if '/_' in topic or not self._regex.search(topic):
+        if '/_' in topic or not _FULL_NAME.fullmatch(topic) or len(topic) > MAX_NAME or not self._regex.search(topic):
             return False
         return self._exclude is None or not self._exclude.search(topic)

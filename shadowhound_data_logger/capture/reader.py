@@ -82,7 +82,7 @@ _TYPE: Final = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', re.ASCII
 """https://design.ros2.org/articles/interface_definition.html"""
 MAX_PUBLISHERS: Final = 1000
 """Senders that a subscription knows by name at once."""
-UNKNOWN_NODE: Final = '_NODE_NAME_UNKNOWN_'
+UNKNOWN_NODES: Final = frozenset({'_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_'})
 """What rmw calls the node of a publisher that is no ROS node, or of which it does not know yet."""
 
 
@@ -144,7 +144,7 @@ def endpoints(node: Node, topic: str) -> list[Endpoint]:
             type=printable(info.topic_type),
             reliable=info.qos_profile.reliability is ReliabilityPolicy.RELIABLE,
             transient_local=info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL,
-            node='' if info.node_name == UNKNOWN_NODE else printable(f'{info.node_namespace.rstrip("/")}/{info.node_name}'),
+            node='' if info.node_name in UNKNOWN_NODES else printable(f'{info.node_namespace.rstrip("/")}/{info.node_name}'),
         )
         for info in node.get_publishers_info_by_topic(topic)
     ]

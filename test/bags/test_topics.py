@@ -85,3 +85,11 @@ def test_a_folder_without_notes_is_a_bag_of_which_nothing_is_known(tmp_path: Pat
     """Its slices tell the rest."""
     (tmp_path / 'b').mkdir()
     assert Notes.read(tmp_path / 'b', 'thor') == Notes(tmp_path / 'b', 'b', 'thor', None)
+
+
+@pytest.mark.parametrize(
+    'name', ['/%s%n', '/1digit', '//double', '/{curly}~', '/a b', '/a\x1b]0;owned\x07', '/ä', 'relative', '/a' * 150]
+)
+def test_names_that_are_none_of_ros(name: str) -> None:
+    """A program without ROS may have any; an expression that matches it takes the other topics."""
+    assert Choice(BagSettings(regex='.*'), ()).wanted((), [name, '/good']) == {'/good'}
