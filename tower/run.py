@@ -27,6 +27,7 @@ from typing import Final
 
 import make_secrets
 
+from shadowhound_data_logger.doctor import seaweedfs
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.sim import mlflow_access
 from shadowhound_data_logger.sim.servers import GRPC, Server, ServerFailed, find_program, seaweed_sockets
@@ -65,6 +66,7 @@ class Runner:
                 (self._folder / 'data' / name).mkdir(mode=0o700, parents=True, exist_ok=True)
             self._start_s3(running)
             self._prepare(robots)
+            self._knock()
             uri = self._start_postgres(running)
             self._start_mlflow(running, uri, robots)
             self._running = running.pop_all()
@@ -127,6 +129,17 @@ class Runner:
         told = [word for robot in robots for word in ('--robot', robot)]
         if subprocess.run([sys.executable, str(HERE / 'prepare.py'), *told], env=environ, check=False).returncode:
             raise ServerFailed('the S3 server could not be prepared', remedy='the lines above say why')
+
+    def _knock(self) -> None:
+        """A SeaweedFS that does not know what it was given serves everybody and says nothing: then the Tower ends."""
+        for server, standard, method in (seaweedfs.S3, *seaweedfs.OTHERS):
+            port = standard + self._offset  # ours alone: another Tower may run beside this one
+            for host in {LOOPBACK, LOOPBACK if self._bind in EVERY_ADDRESS else self._bind}:
+                if seaweedfs.answers_anybody(host, port, method):
+                    raise ServerFailed(
+                        f'the {server} of SeaweedFS serves everybody at {host}:{port}',
+                        remedy='it asks for no certificate (secrets/seaweedfs.env): install the version of docs/tower.md',
+                    )
 
     def _start_postgres(self, running: ExitStack) -> str:
         """The URI of MLflow's database: PostgreSQL on a socket in the data folder that this user alone may enter, else SQLite."""

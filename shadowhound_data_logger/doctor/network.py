@@ -22,6 +22,12 @@ CA_FILES: Final = {
 }
 """Who names the file of trusted authorities, for botocore and for MLflow's client."""
 
+SENT: Final = {
+    's3': 'the data (the secret key is not sent)',
+    'mlflow': 'the password, which each request carries, and the data',
+}
+"""What goes over the network as it is where nothing is encrypted."""
+
 
 def check_s3(context: Context) -> Iterator[Result]:
     """See the module."""
@@ -61,7 +67,7 @@ def _check(service: Service | None, check: str, context: Context) -> Iterator[Re
         yield info(
             f'{check}.tls',
             f'{service.url} is not encrypted',
-            'keys are not sent, but whoever is in this network can read the data',
+            f'{SENT[service.name]} can be read by whoever is in this network',
             'on a network that is not yours: https',
         )
 

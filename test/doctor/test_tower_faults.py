@@ -7,6 +7,7 @@ import json
 import socket
 import sqlite3
 import threading
+import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -18,10 +19,11 @@ import pytest
 from doctor.scene import Scene, expect
 from faults.front import Front
 from faults.kinds import Condition, Fault
+from open_seaweed import open_seaweed
 from stores.fake_s3 import FakeS3, hung, refused, served
 
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.doctor import mlflow, mlflow_rest, network, s3, s3_put
+from shadowhound_data_logger.doctor import mlflow, mlflow_rest, network, s3, s3_put, seaweedfs
 from shadowhound_data_logger.doctor.model import Result, Role, Severity
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3_requests import S3Requests
@@ -34,7 +36,7 @@ OWN = tuple(f'{action}:{bucket}/thor/*' for action in ('Read', 'Write') for buck
 READING = tuple(f'{action}:{bucket}' for action in ('Read', 'List') for bucket in BUCKETS)
 Inject = Callable[[Scene], None]
 NETWORK = ('network.s3', 'network.mlflow')
-SERVICES = ('s3', 'mlflow')
+SERVICES = ('s3', 'mlflow', 'seaweedfs')
 
 
 @pytest.fixture(scope='module')
@@ -105,6 +107,30 @@ def test_probe_objects_do_not_pile_up(robot: Scene, servers: Tower) -> None:
     requests.open()
     assert [item.key for bucket in BUCKETS for item in requests.list(bucket, '')] == ['thor/_doctor/probe'] * 2
     requests.close()
+
+
+def test_a_seaweedfs_without_keys_is_named(robot: Scene, tmp_path: Path) -> None:
+    """Each server that answers a stranger, once, with the way to close it; with the signing keys alone, those that still do."""
+    with open_seaweed(tmp_path / 'open') as ports:
+        robot.environ['AWS_ENDPOINT_URL'] = f'http://127.0.0.1:{ports["s3"]}'
+        found = robot.findings('network.s3', 'seaweedfs')
+        expect(found, 'seaweedfs.open', 'make tower-secrets', 'docs/tower.md')
+        assert set(found[0].data['ports']) >= {ports[name] + 10_000 for name in ('s3', 'filer', 'master', 'volume')}
+    with open_seaweed(tmp_path / 'signed', WEED_JWT_FILER_SIGNING_KEY='a-key') as ports:
+        robot.environ['AWS_ENDPOINT_URL'] = f'http://127.0.0.1:{ports["s3"]}'
+        (found_again,) = robot.findings('network.s3', 'seaweedfs')
+        assert ports['s3'] + 10_000 not in found_again.data['ports']
+        assert ports['filer'] + 10_000 in found_again.data['ports']
+
+
+def test_ports_of_something_else_are_no_finding(robot: Scene) -> None:
+    """One that hangs, one that speaks plain HTTP and none at all: a robot waits for none of them."""
+    began = time.monotonic()
+    with hung() as mute, served(FakeS3()) as other, refused() as nothing:
+        for url in (mute, other.url, nothing):
+            port = int(url.rpartition(':')[2])
+            assert not seaweedfs.answers_anybody('127.0.0.1', port, seaweedfs.S3.method)
+    assert time.monotonic() - began < 3 * seaweedfs.ANSWER_S
 
 
 def keys(**changes: str) -> Inject:

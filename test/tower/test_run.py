@@ -18,7 +18,10 @@ from typing import Any, Final
 import boto3
 import pytest
 from botocore.exceptions import ClientError
-from tower_scripts import TOWER, make_secrets, processes_of, reload_s3, remove_database
+from open_seaweed import free_offset
+from tower_scripts import TOWER, make_secrets, processes_of, reload_s3, remove_database, run
+
+from shadowhound_data_logger.sim.servers import ServerFailed
 
 pytestmark = [
     pytest.mark.seaweedfs,
@@ -144,3 +147,13 @@ def test_a_key_is_changed_while_it_runs(folder: Path, offset: int) -> None:
     reload_s3(folder)
     _until(lambda: not _works(folder, offset, old), 20)
     assert _works(folder, offset, new)
+
+
+def test_a_seaweedfs_that_serves_everybody_is_no_tower(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that does not ask for the certificate is found out and ended, before robots send to it."""
+    make_secrets.make(tmp_path, '127.0.0.1', ['thor'])
+    monkeypatch.setattr(run.Runner, '_seaweed_environ', run.Runner._environ)
+    tower = run.Runner(tmp_path, '127.0.0.1', free_offset())
+    with pytest.raises(ServerFailed, match='serves everybody at 127'):
+        tower.start(['thor'])
+    _until(lambda: not processes_of(tmp_path), 10)
