@@ -23,16 +23,24 @@ import subprocess
 import sys
 import time
 from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.error import HTTPError
 from urllib.parse import urlencode
-from urllib.request import Request, urlopen
+from urllib.request import Request as Question
+from urllib.request import urlopen
 
 if TYPE_CHECKING:
-    from flask import Response
+    from asyncio import Protocol
+
+    from flask import Request, Response
     from werkzeug.datastructures import Authorization
+
+    Message = MutableMapping[str, Any]
+    Receive = Callable[[], Awaitable[Message]]
+    Send = Callable[[Message], Awaitable[None]]
+    Served = Callable[[Message, Receive, Send], Awaitable[None]]
 
 ADMIN: Final = 'tower'
 READER: Final = 'spark'
@@ -44,6 +52,10 @@ APP: Final = ('--app-name', 'basic-auth')
 """What ``mlflow server`` has to be told besides."""
 SOURCES: Final = r'\A(runs|models|mlflow-artifacts):/[^\r\n]*\Z'
 """Where a model's files may come from: from what the server stores itself."""
+BODY_BYTES: Final = 32 << 20
+"""The longest body of a request that MLflow keeps in memory whole; the inputs of a run
+may have 17 MB. Artifacts are streamed."""
+NO_USER: Final = 'MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD are no user of this Tower'
 ANSWER_S: Final = 30.0
 START_S: Final = 180.0
 POLL_S: Final = 0.5
@@ -69,6 +81,8 @@ _READER: Final = (
     ('GET', r'/(?:(?:model-versions/)?get-artifact)?'),
 )  # fmt: skip
 """Training besides: experiments and models of one's own, and the pages."""
+_FREE_BODY: Final = r'/(?:ajax-api/2\.0/mlflow/)?graphql|' + _API + r'upload-artifact|' + _ARTIFACTS
+"""Whose bodies are none of the protocol's messages."""
 
 
 class NotPrepared(Exception):
@@ -93,15 +107,85 @@ def authenticate() -> Authorization | Response:
     from flask import request  # noqa: PLC0415 - those who only start the server do not need it
 
     given = request.authorization
+    user = _user(given)
+    if given is None or not user:
+        return _refusal(401, 'UNAUTHENTICATED', NO_USER)
+    if not may(user, request.method, request.path):
+        return _refusal(403, 'PERMISSION_DENIED', f'the user {user} may not do this on this Tower')
+    if user != ADMIN and request.get_data() and not re.fullmatch(_FREE_BODY, request.path) and not _is_plain(request):
+        return _refusal(400, 'INVALID_PARAMETER_VALUE', 'a body has to be a JSON object, whose names are as run_id, not as runId')
+    return given
+
+
+def _is_plain(request: Request) -> bool:
+    """Whether MLflow's check and MLflow's handler read the same from a body.
+
+    The check knows neither the names of protobuf's JSON (runId), nor JSON in a string, nor in a DELETE or PATCH JSON that says it
+    is something else. The handler takes all of these: a request could be checked for one run, and change another.
+    """
+    body = request.get_json(silent=True) if request.mimetype == 'application/json' else None
+    return isinstance(body, dict) and not any(name != name.lower() for name in _names(body))
+
+
+def _names(value: Any) -> Iterator[str]:
+    """Of all fields in a JSON value."""
+    if isinstance(value, dict):
+        yield from value
+    for one in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from _names(one)
+
+
+def _user(given: Authorization | None) -> str:
+    """Whose login this is; empty when it is nobody's."""
     user, password = (given.username or '', given.password or '') if given and given.type == 'basic' else ('', '')
     with open(os.environ[USERS], encoding='utf-8') as file:  # noqa: PTH123 - each time: a change counts at once
         known: list[str] = json.load(file).get(user, [])
     told = digest(password)
-    if given is None or not any(hmac.compare_digest(told, one) for one in known):
-        return _refusal(401, 'UNAUTHENTICATED', 'MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD are no user of this Tower')
-    if not may(user, request.method, request.path):
-        return _refusal(403, 'PERMISSION_DENIED', f'the user {user} may not do this on this Tower')
-    return given
+    return user if any(hmac.compare_digest(told, one) for one in known) else ''
+
+
+def connection(**given: Any) -> Protocol:
+    """The protocol of uvicorn, whose app gets no body of a stranger and none without a bound.
+
+    MLflow's app reads each body into memory, and only then asks ``authenticate``. Artifacts are streamed, after it.
+    """
+    from uvicorn.protocols.http.h11_impl import H11Protocol  # noqa: PLC0415 - see authenticate
+
+    made = H11Protocol(**given)
+    made.app = _with_bound(made.app)
+    return made
+
+
+def _with_bound(served: Served) -> Served:
+    async def app(scope: Message, receive: Receive, send: Send) -> None:
+        refused = _body_refused(scope) if scope['type'] == 'http' else None
+        if refused is None:
+            await served(scope, receive, send)
+            return
+        status, code, message = refused
+        headers = [(b'content-type', b'application/json'), (b'connection', b'close')]
+        headers += [(b'www-authenticate', b'Basic realm="Tower"')] if status == 401 else []
+        await send({'type': 'http.response.start', 'status': status, 'headers': headers})
+        await send({'type': 'http.response.body', 'body': json.dumps({'error_code': code, 'message': message}).encode()})
+
+    return app
+
+
+def _body_refused(scope: Mapping[str, Any]) -> tuple[int, str, str] | None:
+    """Why the body of a request is not read: status, code and text; None when it is, or when there is none."""
+    from werkzeug.datastructures import Authorization  # noqa: PLC0415 - see authenticate
+
+    headers = {name: value.decode('latin-1') for name, value in scope['headers']}
+    is_chunked, length = b'transfer-encoding' in headers, int(headers.get(b'content-length', 0))
+    if not is_chunked and not length:
+        return None
+    if not _user(Authorization.from_header(headers.get(b'authorization'))):
+        return 401, 'UNAUTHENTICATED', NO_USER
+    if scope['method'] == 'PUT' and re.fullmatch(_ARTIFACTS, scope['path']):
+        return None
+    if is_chunked:
+        return 411, 'BAD_REQUEST', 'a request with a body has to tell its length (Content-Length)'
+    return (413, 'BAD_REQUEST', f'a body of more than {BODY_BYTES} bytes is not taken') if length > BODY_BYTES else None
 
 
 def _refusal(status: int, code: str, message: str) -> Response:
@@ -140,6 +224,7 @@ def environment(folder: Path, users: Path, database: str) -> dict[str, str]:
         'MLFLOW_ARTIFACT_LOCATION_MAX_LENGTH': '0',  # an experiment that names one is refused
         'MLFLOW_CREATE_MODEL_VERSION_SOURCE_VALIDATION_REGEX': SOURCES,
         'MLFLOW_DISABLE_TELEMETRY': 'true', 'MLFLOW_SERVER_ENABLE_JOB_EXECUTION': 'false',
+        'UVICORN_HTTP': f'{module}:{connection.__name__}',
         'PYTHONPATH': os.pathsep.join(filter(None, (str(root), os.environ.get('PYTHONPATH')))),
     }  # fmt: skip
 
@@ -195,7 +280,7 @@ class _Server:
         """What is there already is fine, and answered by nothing."""
         data = json.dumps(body).encode() if body is not None else None
         try:
-            request = Request(f'{self._url}/api/{path}', data, self._headers, method=method)  # noqa: S310 - http(s), by us
+            request = Question(f'{self._url}/api/{path}', data, self._headers, method=method)  # noqa: S310 - http(s), by us
             with urlopen(request, timeout=ANSWER_S, context=self._trust) as answer:  # noqa: S310
                 found: dict[str, Any] = json.loads(answer.read() or b'{}')
                 return found

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -34,12 +35,15 @@ class User:
     def send(self, method: str, path: str, body: Any = None) -> urllib3.BaseHTTPResponse:
         headers = {'Content-Type': 'application/json'}
         if self.name:
-            password = self.password or self.tower.tracking(self.name)['MLFLOW_TRACKING_PASSWORD']
-            headers['Authorization'] = 'Basic ' + base64.b64encode(f'{self.name}:{password}'.encode()).decode()
+            headers['Authorization'] = self.authorization()
         content = body if isinstance(body, bytes) or body is None else json.dumps(body).encode()
         return self.http.request(
             method, self.tower.tracking_uri + path, body=content, headers=headers, redirect=False, timeout=60
         )
+
+    def authorization(self) -> str:
+        password = self.password or self.tower.tracking(self.name)['MLFLOW_TRACKING_PASSWORD']
+        return 'Basic ' + base64.b64encode(f'{self.name}:{password}'.encode()).decode()
 
     def status(self, method: str, path: str, body: Any = None) -> int:
         return int(self.send(method, path, body).status)
@@ -126,6 +130,46 @@ def test_half_a_login_is_none(tower: Tower, users: dict[str, User], method: str)
         assert answer.status == 401, path
 
 
+@pytest.mark.parametrize('told', [('Content-Length', str(1 << 40)), ('Transfer-Encoding', 'chunked')])
+@pytest.mark.parametrize('path', ['/api/2.0/mlflow/runs/create', '/health', '/', '/static-files/x', '/nowhere', '/v1/traces',
+                                  '/api/2.0/mlflow-artifacts/artifacts/1/x'])  # fmt: skip
+def test_the_body_of_a_stranger_is_not_read(tower: Tower, path: str, told: tuple[str, str]) -> None:
+    """It would fill the memory of the server: the answer comes before anything of the body is sent."""
+    for method in ('POST', 'PUT'):
+        answer = _without_body(tower, method, path, dict([told]))
+        assert (answer.status, answer.headers['WWW-Authenticate']) == (401, 'Basic realm="Tower"'), method
+
+
+def test_the_body_of_a_user_has_a_bound(users: dict[str, User], run: dict[str, Any], tower: Tower) -> None:
+    """But for artifacts, which are streamed."""
+    login = {'Authorization': users['thor'].authorization()}
+    path = '/api/2.0/mlflow/runs/log-batch'
+    long = {'Content-Length': str(mlflow_access.BODY_BYTES + 1)}
+    assert _without_body(tower, 'POST', path, login | long).status == 413
+    assert _without_body(tower, 'POST', path, login | {'Transfer-Encoding': 'chunked'}).status == 411
+    assert _without_body(tower, 'PUT', _artifact(run, 'a\n').replace('\n', '%0A'), login | long).status == 413
+    sent = users['thor'].http.request(
+        'PUT', tower.tracking_uri + _artifact(run, 'streamed'), body=iter([b'fra', b'me']), headers=login, timeout=60
+    )
+    assert sent.status == 200
+    assert users['thor'].send('GET', _artifact(run, 'streamed')).data == b'frame'
+
+
+def _without_body(tower: Tower, method: str, path: str, headers: dict[str, str]) -> HTTPResponse:
+    """What is answered to a request that says that it has a body, before it sends any."""
+    asked = HTTPConnection(tower.tracking_uri.removeprefix('http://'), timeout=20)
+    try:
+        asked.putrequest(method, path)
+        for name, value in headers.items():
+            asked.putheader(name, value)
+        asked.endheaders()
+        answer = asked.getresponse()
+        answer.read()
+        return answer
+    finally:
+        asked.close()
+
+
 def test_a_robot_logs_its_own_missions(users: dict[str, User], run: dict[str, Any]) -> None:
     """All that the sender of missions asks for."""
     thor = users['thor']
@@ -201,6 +245,37 @@ def test_a_robot_is_nobody_in_anothers_experiment(users: dict[str, User], run: d
     found = users['tower'].call('GET', f'runs/get?run_id={run_id}')['run']
     assert [one['value'] for one in found['data'].get('metrics', [])] in ([], [1])
     assert users['thor'].send('GET', _artifact(run)).data == b'frame'
+
+
+@pytest.mark.parametrize('name', ['tachi', 'spark'])
+def test_no_other_spelling_of_a_run_passes(users: dict[str, User], run: dict[str, Any], name: str) -> None:
+    """Who names a run of his own, and another one in the words that MLflow's check does not read, changes neither."""
+    user, run_id = users[name], run['run_id']
+    experiment = user.experiment('tachi_missions') if name == 'tachi' else str(
+        user.call('POST', 'experiments/create', {'name': 'spelling'})['experiment_id'])  # fmt: skip
+    mine = user.run(experiment)['run_id']
+    before = users['tower'].call('GET', f'runs/get?run_id={run_id}')
+    for path, more in (
+        ('log-batch', {'metrics': [{'key': 'spelt', 'value': 9, 'timestamp': 1, 'step': 0}]}),
+        ('set-tag', {'key': 'spelt', 'value': 'b'}), ('log-parameter', {'key': 'spelt', 'value': 'v'}),
+        ('update', {'status': 'FAILED'}), ('delete', {}),
+    ):  # fmt: skip
+        for body in ({'run_uuid': mine, 'runId': run_id, **more}, json.dumps({'run_uuid': mine, 'runId': run_id, **more})):
+            assert user.status('POST', f'/api/2.0/mlflow/runs/{path}', body) in {400, 403}, path
+    assert users['tower'].call('GET', f'runs/get?run_id={run_id}') == before
+
+
+def test_a_model_of_another_is_not_deleted_by_a_body_that_is_not_checked(users: dict[str, User]) -> None:
+    """MLflow's check reads the address of a DELETE whose body says that it is no JSON; its handler reads the body."""
+    spark, api = users['spark'], '/api/2.0/mlflow/registered-models'
+    spark.send('POST', f'{api}/create', {'name': 'decoy'})
+    users['tower'].send('POST', f'{api}/create', {'name': 'kept'})
+    headers = {'Authorization': spark.authorization(), 'Content-Type': 'text/plain'}
+    answer = spark.http.request(
+        'DELETE', f'{spark.tower.tracking_uri}{api}/delete?name=decoy', body=b'{"name": "kept"}', headers=headers, timeout=60
+    )
+    assert answer.status == 400
+    assert users['tower'].status('GET', f'{api}/get?name=kept') == 200
 
 
 PLACES = ['file:///etc', '/etc', 'file:/etc', 'FILE:///etc', 'sftp://localhost/etc', 'http://localhost:1',
