@@ -117,7 +117,9 @@ def seaweed(tmp_path_factory: pytest.TempPathFactory) -> Tower:
 @pytest.fixture(scope='session')
 def tower(tmp_path_factory: pytest.TempPathFactory) -> Tower:
     """A running Tower with S3 and MLflow; the latter takes some ten seconds to start."""
-    return of_this_run(tmp_path_factory, 'tower', {}, mlflow=True)
+    from shared_tower import USERS
+
+    return of_this_run(tmp_path_factory, 'tower', USERS, mlflow=True)
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from doctor.scene import Scene, expect
 from faults.front import Front
 from faults.kinds import Condition, Fault
 from open_seaweed import open_seaweed
+from shared_tower import BUCKETS
 from stores.fake_s3 import FakeS3, hung, refused, served
 
 from shadowhound_data_logger.config import UploadSettings
@@ -30,26 +31,20 @@ from shadowhound_data_logger.stores.s3_requests import S3Requests
 
 pytestmark = pytest.mark.seaweedfs
 
-BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
-OWN = tuple(f'{action}:{bucket}/thor/*' for action in ('Read', 'Write') for bucket in ('sensor-data', 'trajectories', 'imu-data'))
-"""Thor's keys may put and get what is its own, and neither list nor delete."""
-READING = tuple(f'{action}:{bucket}' for action in ('Read', 'List') for bucket in BUCKETS)
 Inject = Callable[[Scene], None]
 NETWORK = ('network.s3', 'network.mlflow')
 SERVICES = ('s3', 'mlflow', 'seaweedfs')
 
 
 @pytest.fixture(scope='module')
-def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tower]:
+def servers(tower: Tower) -> Tower:
     """A Tower as it should be: the guide's buckets, a key pair of the least rights for Thor, one that reads for Spark."""
-    users = {'thor': OWN, 'spark': READING, 'stranger': ('Read:other',)}
-    with Tower(tmp_path_factory.mktemp('doctor'), mlflow=True, users=users) as tower:
-        requests = S3Requests(tower.store_settings(), UploadSettings())
-        requests.open()
-        for bucket in BUCKETS:
-            requests.create_bucket(bucket)
-        requests.close()
-        yield tower
+    requests = S3Requests(tower.store_settings(), UploadSettings())
+    requests.open()
+    for bucket in BUCKETS:
+        requests.create_bucket(bucket)
+    requests.close()
+    return tower
 
 
 @pytest.fixture
@@ -105,7 +100,8 @@ def test_probe_objects_do_not_pile_up(robot: Scene, servers: Tower) -> None:
         assert robot.findings('s3') == []
     requests = S3Requests(servers.store_settings(), UploadSettings())
     requests.open()
-    assert [item.key for bucket in BUCKETS for item in requests.list(bucket, '')] == ['thor/_doctor/probe'] * 2
+    assert [item.key for bucket in BUCKETS for item in requests.list(bucket, '') if '_doctor/' in item.key] == [
+        'thor/_doctor/probe'] * 2  # fmt: skip
     requests.close()
 
 
