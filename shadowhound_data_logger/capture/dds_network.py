@@ -163,6 +163,12 @@ def addresses() -> list[tuple[str, str]]:
     return [(row[:16].split(b'\0', 1)[0].decode(errors='replace'), socket.inet_ntoa(row[20:24])) for row in rows]
 
 
+def _outward() -> list[str]:
+    """The addresses by which other participants, of this machine too, know this machine; loopback where there is no other."""
+    own = [address for _, address in addresses()]
+    return [address for address in own if not address.startswith('127.')] or own
+
+
 def _of(given: str, here: Sequence[tuple[str, str]]) -> list[str]:
     """The addresses of this machine that the name of an interface, or an address, stands for."""
     wanted = LOOPBACK if given == 'localhost' else given
@@ -199,9 +205,10 @@ def profile(receive_bytes: int, network: Network | None = None, domain: int = 0,
     udp = [f'<receiveBufferSize>{receive_bytes}</receiveBufferSize>']
     builtin: list[str] = []
     if network is not None:
-        if network.interfaces:
-            udp.append(_wrap('interfaceWhiteList', (f'<address>{address}</address>' for address in network.interfaces)))
-        if not network.multicast:  # a unicast locator of its own keeps it from opening the default one of multicast
+        allowed = network.interfaces or ([] if network.multicast else _outward())
+        if allowed:
+            udp.append(_wrap('interfaceWhiteList', (f'<address>{address}</address>' for address in allowed)))
+        if not network.multicast:  # keeps it from listening to multicast; Fast DDS 2 completes it by the white list
             builtin.append('<metatrafficUnicastLocatorList><locator><udpv4/></locator></metatrafficUnicastLocatorList>')
         peers = announced_to(network, domain)
         if peers:

@@ -33,7 +33,7 @@ FROM_PROFILE: Final = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
 """Has rmw_fastrtps leave to the profile how readers and writers keep memory."""
 SHIPPED: Final = 'fastdds_shm.xml'
 """The profile for drivers, in launch_configs; ours has what is in it, and more."""
-MEASURED: Final = {(9, 3): 'Kilted'}
+MEASURED: Final = {(6, 2): 'Humble', (8, 4): 'Jazzy', (9, 3): 'Kilted'}
 """Versions of rmw_fastrtps_cpp through which all was heard of a robot with Cyclone DDS that its own RMW hears."""
 FAST_DDS_3: Final = (9, 0)
 HAS_RANGE: Final = (7, 0)

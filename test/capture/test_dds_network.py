@@ -150,6 +150,8 @@ def test_the_profile() -> None:
     assert [each.text for each in root.findall('.//interfaceWhiteList/address')] == ['10.0.0.2']
     assert [int(each.text or 0) for each in root.findall('.//initialPeersList//port')] == LOCAL
     assert root.find('.//metatrafficUnicastLocatorList') is not None, 'else it listens to multicast'
+    root = parsed(profile(4 << 20, Network(multicast=False), 5))
+    assert [each.text for each in root.findall('.//interfaceWhiteList/address')] == ['10.0.0.2', '192.168.1.7']
     root = parsed(profile(4 << 20, segment_bytes=1 << 25))
     assert [each.text for each in root.iter('type')] == ['UDPv4', 'SHM']
     assert [each.text for each in root.iter('segment_size')] == [str(1 << 25)]

@@ -245,7 +245,9 @@ class Processes:
         """A process with publishers, of rclpy or as a robot with Cyclone DDS has them."""
         name = self._name('publisher')
         command = [sys.executable, str(HERE / ('cyclone_driver.py' if cyclone else 'publisher.py'))]
-        process = Publisher(name, command, self.folder / f'{name}.log', {**self.environ, **(environ or {})}, piped=True)
+        humble = {'AS_HUMBLE': 'yes'} if os.environ.get('ROS_DISTRO') == 'humble' else {}
+        own = {**self.environ, **humble, **(environ or {})}
+        process = Publisher(name, command, self.folder / f'{name}.log', own, piped=True)
         self.started.append(process)
         return process
 
