@@ -218,11 +218,11 @@ class LossEstimator:
             self._long += 1
             self._counted[cause] += periods - 1
             missed[cause] += periods - 1
+        elif periods == 0 and self._counted[TRANSPORT] > 0:  # what made an interval long was late, and not lost
+            self._counted[TRANSPORT] -= 1
+            missed[TRANSPORT] -= 1
         elif periods == 0:
             self._short += 1
-            if self._counted[TRANSPORT] > 0:
-                self._counted[TRANSPORT] -= 1
-                missed[TRANSPORT] -= 1
 
     # -- whether it holds ------------------------------------------------------------------------------------------
 

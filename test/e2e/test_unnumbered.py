@@ -8,7 +8,7 @@ import signal
 import time
 from pathlib import Path
 
-from e2e.processes import Node, Processes, until
+from e2e.processes import Node, Processes
 from e2e.reading import STRING, texts
 
 LEAVE_OUT = """
@@ -23,8 +23,8 @@ PERIOD_S = 0.01
 SIZE = 30_000
 
 
-def started(processes: Processes, folder: Path, sensors: list[str]) -> Node:
-    """A node that is told no numbers."""
+def started(processes: Processes, folder: Path, sensors: list[str], expected_hz: float = 1 / PERIOD_S) -> Node:
+    """A node that is told no numbers, and a rate: on a busy machine no rhythm is even enough to be learned."""
     hidden = folder / 'hidden'
     hidden.mkdir(exist_ok=True)
     (hidden / 'sitecustomize.py').write_text(LEAVE_OUT)
@@ -32,12 +32,13 @@ def started(processes: Processes, folder: Path, sensors: list[str]) -> Node:
     parameters: dict[str, object] = {'sensors': sensors}
     for name in sensors:
         parameters |= {f'{name}.topics': [name], f'{name}.rate_hz': 0.0, f'{name}.batch_s': 0.5}
+        parameters |= {f'{name}.expected_hz': expected_hz}
     return processes.node(None, parameters, environ={'PYTHONPATH': path})
 
 
 def test_without_a_rhythm_nothing_is_claimed(processes: Processes, tmp_path: Path) -> None:
     """Each message is counted once, also where a history is delivered that two subscriptions hear; what was missed is null."""
-    node, publisher = started(processes, tmp_path, ['plain', 'latched']), processes.publisher()
+    node, publisher = started(processes, tmp_path, ['plain', 'latched'], 0.0), processes.publisher()
     publisher.create('/plain', STRING)
     publisher.create('/latched', STRING, latched=True)
     publisher.publish('/latched', texts(range(COUNT)))
@@ -51,7 +52,7 @@ def test_without_a_rhythm_nothing_is_claimed(processes: Processes, tmp_path: Pat
 
 
 def test_what_is_lost_is_estimated(processes: Processes, tmp_path: Path) -> None:
-    """By the rhythm of a publisher that goes on while the node is stopped, and while it is dead: to 5 %, and marked as such."""
+    """By the rate of a publisher that goes on while the node is stopped, and while it is dead: to 5 %, and marked as such."""
     for name in ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE'):
         processes.environ.pop(name, None)
     processes.environ |= UDP
@@ -59,7 +60,7 @@ def test_what_is_lost_is_estimated(processes: Processes, tmp_path: Path) -> None
     publisher.create('/lossy', STRING, reliable=False, depth=1)
     publisher.matched('/lossy')
     publisher.begin('/lossy', STRING, PERIOD_S, SIZE)
-    until(lambda: node.topic('/lossy').get('accounting') == 'estimated', 'the rhythm is known')
+    node.received('/lossy', COUNT)
     node.signal(signal.SIGSTOP)
     time.sleep(2.0)
     node.signal(signal.SIGCONT)
@@ -77,22 +78,19 @@ def test_what_is_lost_is_estimated(processes: Processes, tmp_path: Path) -> None
     assert abs(row['missed_estimated'] - lost) <= 0.05 * lost, row
     assert row['published_estimated'] == row['received'] + row['missed_estimated']
     assert row['missed_by']['restart'] > 0
-    assert set(row['missed_by']) <= {'restart', 'transport'}
+    assert row['missed_by']['transport'] > 0
 
 
 def test_what_a_dead_publisher_did_not_publish_is_not_lost(processes: Processes, tmp_path: Path) -> None:
     """One that is killed, and another one in its place two seconds later: the gap between them is nobody's loss."""
     node = started(processes, tmp_path, ['calm'])
-    for turn in range(2):
+    for _ in range(2):
         publisher = processes.publisher()
         publisher.create('/calm', STRING)
         publisher.matched('/calm')
         before = node.topic('/calm').get('received', 0)
         publisher.begin('/calm', STRING, PERIOD_S)
-        if turn == 0:
-            until(lambda: node.topic('/calm').get('accounting') == 'estimated', 'the rhythm is known')
-        else:
-            node.received('/calm', before + COUNT)
+        node.received('/calm', before + COUNT)
         publisher.kill()
         time.sleep(2.0)
     row = node.stop()['topics']['/calm']

@@ -129,6 +129,14 @@ def test_a_late_message_is_no_loss() -> None:
     assert ear.lost <= 3
 
 
+def test_a_publisher_that_is_starved_and_catches_up_loses_nothing() -> None:
+    """What it sends at once, when it has its turn again, is what it could not send in time: a declared rate is not refuted."""
+    held = [max(stamp, (stamp // SECOND) * SECOND + 4 * SECOND // 10) for stamp in even(3000, jitter=0.0)]
+    ear = Ear(LossEstimator(Expectation(period=PERIOD))).hear(held)
+    assert (ear.covered, ear.estimator.refuted) == (3000, False)
+    assert ear.lost <= 1
+
+
 def test_a_node_that_stands_still() -> None:
     """What a full history overwrote meanwhile is lost by transport: nobody asked for it."""
     sent = even(1000)
