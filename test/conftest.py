@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 from domains import free_domain
 
+from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE
+
 if TYPE_CHECKING:
     from stores.certificates import Authority
 
@@ -37,7 +39,11 @@ MAKE_WAY = 10
 
 
 def pytest_configure() -> None:
-    """What is started in the background of a shell ignores SIGINT, and so would the programs that tests end by it."""
+    """What is started in the background of a shell ignores SIGINT, and so would the programs that tests end by it.
+
+    Nodes of the tests, in this process and in others, are among themselves.
+    """
+    os.environ.update(THIS_MACHINE)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

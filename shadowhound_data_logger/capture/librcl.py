@@ -91,8 +91,8 @@ class Taker:
         _check('rcutils_uint8_array_init', ctypes.byref(self._message), ctypes.c_size_t(FIRST_BYTES), ctypes.byref(allocator))
         self._places = ctypes.c_void_p(ctypes.addressof(self._message)), ctypes.c_void_p(ctypes.addressof(self._info))
 
-    def take(self, pointer: ctypes.c_void_p) -> Message | None:
-        """The oldest message that waits; None where there is none. Raises OSError."""
+    def take(self, pointer: ctypes.c_void_p) -> tuple[bytes, int, int, int | None, bytes, int] | None:
+        """The oldest message that waits, as the fields of a ``Message``; None where there is none. Raises OSError."""
         message, info = self._places
         code = self._take(pointer, message, info, None)
         if code == TAKE_FAILED:
@@ -102,7 +102,7 @@ class Taker:
         source_ns, received_ns, number, _, implementation, gid = _INFO.unpack_from(self._info)
         taken = self._message
         cdr = ctypes.string_at(taken.buffer, taken.buffer_length)
-        return Message(cdr, source_ns, received_ns, None if number == UNSUPPORTED else number, gid, implementation)
+        return cdr, source_ns, received_ns, None if number == UNSUPPORTED else number, gid, implementation
 
     def close(self) -> None:
         """Free the buffer."""

@@ -278,9 +278,10 @@ def _disproof(node: Node, topic: str, publisher: Any, pointer: ctypes.c_void_p) 
             before_ns = time.time_ns()
             publisher.publish(cdr)
             first_ns, last_ns = sorted((before_ns, time.time_ns()))  # the clock may have stepped
-            found = _within(PROOF_S, lambda: taker.take(pointer))
-            if found is None:
+            taken = _within(PROOF_S, lambda: taker.take(pointer))
+            if taken is None:
                 return 'a message of this node to itself does not come'
+            found = librcl.Message(*taken)
             known = librcl.Message(cdr, found.source_ns, found.received_ns, number, gid, rmw)
             if found != known or not first_ns <= found.source_ns <= last_ns:
                 said = found._replace(cdr=found.cdr[:16])

@@ -17,7 +17,6 @@ from shadowhound_data_logger.bags import record_and_upload_rosbag
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.record import record
 from shadowhound_data_logger.errors import BagError
-from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE
 
 pytestmark = pytest.mark.ros
 long = pytest.mark.long('starts more processes')
@@ -38,7 +37,7 @@ while True:
 @pytest.fixture
 def home(domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """With somebody who publishes odometry and text at 50 Hz."""
-    environ = {'ROS_DOMAIN_ID': str(domain), **THIS_MACHINE,
+    environ = {'ROS_DOMAIN_ID': str(domain),
                'SHADOWHOUND_HOME': str(tmp_path / 'home'), 'AWS_ENDPOINT_URL': ''}  # fmt: skip
     for name, value in environ.items():
         monkeypatch.setenv(name, value)

@@ -133,7 +133,7 @@ def test_what_is_told_wrong_is_not_trusted(
 ) -> None:
     """Messages are taken through rclpy then, and one warning says why."""
     take = librcl.Taker.take
-    monkeypatch.setattr(librcl.Taker, 'take', lambda *given: (told := take(*given)) and WRONG[what](told))
+    monkeypatch.setattr(librcl.Taker, 'take', lambda *given: (told := take(*given)) and WRONG[what](librcl.Message(*told)))
     readers = [read(node, f'/wrong{number}') for number in range(2)]
     assert [each._taker for each in readers] == [None, None]
     (record,) = caplog.records

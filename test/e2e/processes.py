@@ -84,6 +84,10 @@ class Node(Process):
         """Whether it listens through a middleware that numbers messages: what is missed is known exactly then."""
         return 'listening by rmw_fastrtps' in self.log
 
+    def known(self, count: int) -> int | None:
+        """As the ledger tells a figure that only numbers let it know: None without them."""
+        return count if self.hears_numbers else None
+
     def ledger(self) -> dict[str, Any]:
         """As ``shadowhound-data ledger --json`` prints it; it balances at any time."""
         found = ledger.read(self.home / 'spool', self.robot)

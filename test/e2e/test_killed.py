@@ -91,11 +91,13 @@ def test_kill_and_restart_under_load(processes: Processes, seaweed: Tower, store
     away_s = sum(heard - killed + loss_s for killed, heard in restarts)
     assert set(ledger['topics']) == set(TYPES)
     for topic, row in ledger['topics'].items():
-        assert (topic, row['accounting'], row['published'], row['open']) == (topic, 'exact', said[topic], 0)
+        assert (topic, row['published'], row['open']) == (topic, node.known(said[topic]), 0)
+        assert (row['accounting'] == 'exact') is node.hears_numbers
         assert set(row['missed_by']) | set(row['dropped']) <= causes, topic
-        assert row['missed'] <= RATES_HZ[topic] * away_s, topic
+        assert row['missed'] is None or row['missed'] <= RATES_HZ[topic] * away_s, topic
         assert row['rejected'] == {}
-    assert ledger['topics']['/imu']['missed_by']['restart'] > 0
+    if node.hears_numbers:
+        assert ledger['topics']['/imu']['missed_by']['restart'] > 0
 
     objects = stored(processes.robot)
     assert objects.counted() == {topic: row['stored'] for topic, row in ledger['topics'].items()}

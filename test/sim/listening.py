@@ -18,8 +18,6 @@ from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, PointCloud2
 
-from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE
-
 MODULE = 'shadowhound_data_logger.sim.sim_go2_node'
 COMMON = {
     'odom': 50, 'joint_states': 50, 'camera/image_raw': 30, 'camera/camera_info': 30, 'camera/compressed': 30, 'point_cloud2': 10,
@@ -32,7 +30,7 @@ SECONDS = 5
 
 
 def environment(domain: int, **more: str) -> dict[str, str]:
-    return {**os.environ, 'ROS_DOMAIN_ID': str(domain), **THIS_MACHINE, **more}
+    return {**os.environ, 'ROS_DOMAIN_ID': str(domain), **more}
 
 
 def command(*parameters: str) -> list[str]:

@@ -31,16 +31,12 @@ from sim.listening import (
     published,
 )
 
-from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE
-
 pytestmark = pytest.mark.ros
 
 
 @pytest.fixture(scope='module')
 def some_seconds() -> Iterator[Run]:
-    with free_domain() as domain, pytest.MonkeyPatch.context() as patch:
-        for name, value in THIS_MACHINE.items():
-            patch.setenv(name, value)
+    with free_domain() as domain:
         yield Run(domain)
 
 
