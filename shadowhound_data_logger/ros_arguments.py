@@ -39,6 +39,12 @@ def parameter(arguments: Sequence[str], name: str) -> Any:
     return found
 
 
+def rules_for(arguments: Sequence[str], node: str) -> list[str]:
+    """The remap rules that are for the node of this name alone, without its name: ``odom:=/x`` of ``NODE:odom:=/x``."""
+    rules = (value for flag, value in _of_ros(arguments) if flag in {'-r', '--remap'})
+    return [rule.removeprefix(f'{node}:') for rule in rules if rule.startswith(f'{node}:') and not rule.startswith(f'{node}:=')]
+
+
 def read_parameters(path: Path, node: str | None = None) -> dict[str, Any]:
     """The parameters of a ROS 2 parameter file for a node, flat. Raises ParametersUnreadable.
 

@@ -49,8 +49,11 @@ class Worker:
     """
 
     def __init__(self, name: str, step: Callable[[], None], *, patience_s: float | None = None,
-                 told: set[str] | None = None) -> None:  # fmt: skip
-        """Workers that share ``told`` say each failure once among them, by its place in the code, and no recovery."""
+                 told: set[str] | None = None, longest_pause_s: float = LONGEST_PAUSE_S) -> None:  # fmt: skip
+        """Workers that share ``told`` say each failure once among them, by its place in the code, and no recovery.
+
+        ``longest_pause_s`` is between two tries of one that fails again and again.
+        """
         self.name = name
         self.failures = 0
         self.deaths = 0
@@ -59,6 +62,7 @@ class Worker:
         self._step = step
         self._patience_s = patience_s
         self._told = told
+        self._longest_pause_s = longest_pause_s
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._started = False
@@ -146,7 +150,7 @@ class Worker:
         self.failing, self._pause_s, self._failed_before = False, 0.0, self.failures
 
     def _longer_pause(self) -> float:
-        self._pause_s = min(2 * self._pause_s or FIRST_PAUSE_S, LONGEST_PAUSE_S)
+        self._pause_s = min(2 * self._pause_s or FIRST_PAUSE_S, self._longest_pause_s)
         return self._pause_s
 
     def _fail(self, error: BaseException, what: str) -> None:

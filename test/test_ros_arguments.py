@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.ros_arguments import ParametersUnreadable, parameter, read_parameters
+from shadowhound_data_logger.ros_arguments import ParametersUnreadable, parameter, read_parameters, rules_for
 
 NAME = 'capture.rmw'
 
@@ -59,3 +59,23 @@ def test_what_is_no_parameter_file(text: str, tmp_path: Path) -> None:
     file.write_text(text)
     with pytest.raises(ParametersUnreadable, match=r'a\.yaml is no parameter file'):
         parameter(['--ros-args', '--params-file', str(file)], NAME)
+
+
+def test_rules_for_one_node_alone() -> None:
+    """Without its name; those for all nodes or for another one are not among them, nor one for a topic of that name."""
+    arguments = [
+        '-r',
+        'a:x:=/no',
+        '--ros-args',
+        '-r',
+        'a:x:=/y',
+        '-r',
+        'x:=/z',
+        '--remap',
+        'b:x:=/z',
+        '-r',
+        'a:=c',
+        '-r',
+        'a:__ns:=/n',
+    ]
+    assert rules_for(arguments, 'a') == ['x:=/y', '__ns:=/n']

@@ -200,3 +200,9 @@ def test_workers_that_share_what_was_told(caplog: pytest.LogCaptureFixture) -> N
 
 def _raise(error: BaseException) -> None:
     raise error
+
+
+def test_one_that_fails_again_and_again_may_be_tried_rarely() -> None:
+    """The pause doubles up to its own longest one."""
+    worker = Worker('rare', lambda: None, longest_pause_s=0.003)
+    assert [worker._longer_pause() for _ in range(4)] == [0.001, 0.002, 0.003, 0.003]

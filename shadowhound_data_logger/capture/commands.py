@@ -1,7 +1,7 @@
 """What a running node can be asked to do, each thing once: services, parameters and the control socket all stand on it.
 
 A request and its answer are plain values, as JSON has them: ``{"do": "flush"}`` is answered by ``{"ok": true, "robot": "thor",
-"message": "..."}`` or ``{"ok": false, "robot": "thor", "error": "..."}``. ``TRIGGERS`` and ``SWITCHES`` say which are services.
+"message": "..."}`` or ``{"ok": false, "robot": "thor", "error": "..."}``.
 """
 
 from __future__ import annotations
@@ -31,19 +31,6 @@ MOST_NOTE: Final = 1000
 """Letters of what is said of it."""
 Answer = tuple[bool, str]
 """Whether it was done, and what, in words."""
-TRIGGERS: Final[Mapping[str, Mapping[str, str]]] = {
-    '~/flush': {'do': 'flush'},
-    '~/bag/start': {'do': 'bag start'},
-    '~/bag/stop': {'do': 'bag stop'},
-    '~/bag/split': {'do': 'bag split'},
-    '~/event/trigger': {'do': 'event', 'by': 'service'},
-}
-"""Services of type std_srvs/srv/Trigger, and what they ask."""
-SWITCHES: Final[Mapping[str, tuple[Mapping[str, str], Mapping[str, str]]]] = {
-    '~/pause': ({'do': 'resume'}, {'do': 'pause'}),
-    '~/bag/pause': ({'do': 'bag resume'}, {'do': 'bag pause'}),
-}
-"""Services of type std_srvs/srv/SetBool, and what they ask with false and with true."""
 
 
 class Settable(Protocol):

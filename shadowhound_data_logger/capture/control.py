@@ -70,6 +70,11 @@ class ControlSocket:
         if not self._listening.wait(OPEN_S):
             log.warning('the control socket %s is not there yet', self._spool / self._name)
 
+    @property
+    def path(self) -> Path:
+        """Where it is, once it is open."""
+        return self._spool / self._name
+
     def obey(self, do: Callable[[Request], dict[str, Any]]) -> None:
         """Have all that is asked for done, one after the other; ``do`` returns what to answer."""
         while self._waiting:

@@ -15,9 +15,20 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from shadowhound_data_logger.capture.commands import SWITCHES, TRIGGERS
-
 DIAGNOSTICS: Final = '/diagnostics'
+TRIGGERS: Final[Mapping[str, Mapping[str, str]]] = {
+    '~/flush': {'do': 'flush'},
+    '~/bag/start': {'do': 'bag start'},
+    '~/bag/stop': {'do': 'bag stop'},
+    '~/bag/split': {'do': 'bag split'},
+    '~/event/trigger': {'do': 'event', 'by': 'service'},
+}
+"""Services of type std_srvs/srv/Trigger, and what they ask."""
+SWITCHES: Final[Mapping[str, tuple[Mapping[str, str], Mapping[str, str]]]] = {
+    '~/pause': ({'do': 'resume'}, {'do': 'pause'}),
+    '~/bag/pause': ({'do': 'bag resume'}, {'do': 'bag pause'}),
+}
+"""Services of type std_srvs/srv/SetBool, and what they ask with false and with true."""
 Ask = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 """Has a request done and returns its answer (``commands``)."""
 

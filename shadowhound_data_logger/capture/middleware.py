@@ -67,6 +67,8 @@ class Middleware:
     """What differs for the node from the robot's environment; None is not set."""
     profile_variable: str = ''
     """What names our profile; empty where there is none of ours."""
+    has_robot: bool = True
+    """Whether the RMW of the robot is installed here as well, so that a front can speak it."""
 
     @property
     def is_foreign(self) -> bool:
@@ -164,7 +166,7 @@ def choose(asked: str, environ: Mapping[str, str]) -> Middleware:
             RANGE: 'OFF' if network.is_off else 'SYSTEM_DEFAULT',
         }
     why = 'Fast DDS hands on the numbers of its messages' + (f', by {SETTING}, though {problem}' if problem else '')
-    return Middleware(asked, robot, FAST_DDS, why, network if ours else None, domain, variables, ours)
+    return Middleware(asked, robot, FAST_DDS, why, network if ours else None, domain, variables, ours, robot in versions)
 
 
 def possible_buffer() -> int:

@@ -8,25 +8,37 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from types import FrameType
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
+from shadowhound_data_logger.capture.front import Front
 from shadowhound_data_logger.capture.log_bridge import RosHandler
 from shadowhound_data_logger.capture.middleware import SETTING, Middleware
 from shadowhound_data_logger.capture.parameters import Parameters
-from shadowhound_data_logger.capture.pipeline import Pipeline
+from shadowhound_data_logger.capture.pipeline import Pipeline, Ros
 from shadowhound_data_logger.capture.service import Service
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
+from shadowhound_data_logger.ros_arguments import NODE, rules_for
 
 USAGE = """\
 usage: sensor_logger_node [--ros-args [--params-file FILE] [-p NAME:=VALUE ...] [-r __ns:=/NAMESPACE] ...]
 What it is doing: shadowhound-data status. Without AWS_ENDPOINT_URL it stores to a folder, $SHADOWHOUND_HOME/store."""
+LISTENER = '_sensor_logger_intake'
+"""Name of the node where the front has the public one; `ros2 node list` hides what begins so."""
+NO_SERVICE = 'start_type_description_service'
+"""A parameter of rclpy since Jazzy."""
 UNHEARD = 'the parameter file has nothing for {name}, so the defaults hold: begin its section with /**, or with that name'
+NO_FRONT = (
+    '{rmw} is not installed here, so nobody offers services, parameters and /diagnostics to the robot: install it, '
+    'or use `shadowhound-data node`'
+)
 SPIN_S = 0.5
 """How long a signal may wait to be seen; two of them are the second that is between two statuses."""
 ARENAS, MMAP_THRESHOLD = (-8, 2), (-3, 1 << 20)
@@ -81,8 +93,11 @@ def refuse(rest: list[str]) -> int:
     return 2
 
 
-def run(arguments: list[str], middleware: Middleware) -> int:
-    """From the start of ROS to its end; the exit code. ``arguments`` are those of ROS, without the program's name."""
+def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) -> int:
+    """From the start of ROS to its end; the exit code.
+
+    ``arguments`` are those of ROS, without the program's name; ``robot`` is the environment before we changed it.
+    """
     bound_heap()
     try:
         if rest := remove_ros_args(arguments):  # a --params-file without --ros-args, say: rcl would ignore it
@@ -93,13 +108,16 @@ def run(arguments: list[str], middleware: Middleware) -> int:
         return 2
     stop = StopSignals()
     with middleware.profiled(os.environ):
-        node = Node('sensor_logger_node', automatically_declare_parameters_from_overrides=True)
+        node, name = make_node(arguments, is_public=not middleware.is_foreign)
     logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
     node.get_logger().info(f'listening by {middleware.describe()}')
     if '--params-file' in arguments and not Parameters(node).given():  # which is no error to rcl
-        node.get_logger().warning(UNHEARD.format(name=node.get_fully_qualified_name()))
+        node.get_logger().warning(UNHEARD.format(name=name))
+    front = Front(arguments, robot) if middleware.is_foreign and middleware.has_robot else None
+    if middleware.is_foreign and front is None:
+        node.get_logger().warning(NO_FRONT.format(rmw=middleware.robot))
     try:
-        log_until(stop, node, middleware)
+        log_until(stop, Ros(node, name, middleware, front))
     except SettingError as error:
         node.get_logger().fatal(f'{error}')
         return 2
@@ -115,15 +133,37 @@ def run(arguments: list[str], middleware: Middleware) -> int:
     return 0
 
 
-def log_until(stop: StopSignals, node: Node, middleware: Middleware) -> None:
+def make_node(arguments: Sequence[str], *, is_public: bool) -> tuple[Node, str]:
+    """The node that listens, and the full name under which ROS knows the logger.
+
+    Where the front has that name, the node that listens has another one, no services, and all else that the arguments say of it.
+    """
+    if is_public:
+        node = Node(NODE, automatically_declare_parameters_from_overrides=True)
+        return node, node.get_fully_qualified_name()
+    named = Node(NODE, start_parameter_services=False, enable_rosout=False, automatically_declare_parameters_from_overrides=True)
+    given = {**named.get_parameters_by_prefix(''), NO_SERVICE: Parameter(NO_SERVICE, value=False)}
+    rules = [f'__node:={LISTENER}', *rules_for(arguments, named.get_name())]
+    node = Node(
+        LISTENER, namespace=named.get_namespace(), cli_args=['--ros-args', *(word for rule in rules for word in ('-r', rule))],
+        start_parameter_services=False, parameter_overrides=list(given.values()),
+        automatically_declare_parameters_from_overrides=True,
+    )  # fmt: skip
+    name = named.get_fully_qualified_name()
+    named.destroy_node()
+    return node, name
+
+
+def log_until(stop: StopSignals, ros: Ros) -> None:
     """Until a signal comes."""
     service = Service(os.environ)
+    node, middleware = ros.node, ros.middleware
     parameters = Parameters(node)
     given = parameters.load()
     if given.capture.rmw != middleware.asked:
         allowed = f'{middleware.asked!r}, which is what the command line says to those who read it before ROS is loaded'
         raise SettingError(SETTING, given.capture.rmw, allowed)
-    pipeline = Pipeline(node, given, parameters, middleware)
+    pipeline = Pipeline(ros, given, parameters)
     pipeline.open()
     service.ready(pipeline.describe())
     executor = SingleThreadedExecutor()

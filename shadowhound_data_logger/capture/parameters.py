@@ -21,6 +21,9 @@ FIXED: Final = 'Read at the start: change the parameter file and start the node 
 MAX_INT: Final = (1 << 63) - 1
 ROBOT: Final = "Leads every key; where it is empty, SHADOWHOUND_ROBOT, else the node's namespace, else thor."
 SENSORS: Final = 'The sensors there are, by name.'
+Described = dict[str, Any]
+"""A parameter: name, value, description, constraints, read_only, and low and high, which are None where it has no range."""
+_OPEN: Final[Mapping[str, None]] = {'low': None, 'high': None}
 
 
 class Parameters:
@@ -32,6 +35,7 @@ class Parameters:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._changed = False
+        self._described: list[Described] = []
 
     def given(self) -> bool:
         """Whether file or command line set anything of ours; to be asked before ``load`` declares the rest."""
@@ -41,11 +45,9 @@ class Parameters:
         """The settings; every parameter is declared then, so that ``ros2 param list`` shows it. Raises SettingError."""
         settings = self._read()
         _check_topics(self._node, settings)
-        for name, value, descriptor in _declarations(settings):
-            if self._node.has_parameter(name):
-                self._node.set_descriptor(name, descriptor)
-            else:
-                self._node.declare_parameter(name, value, descriptor)
+        self._described = sorted(_declarations(settings), key=lambda each: str(each['name']))
+        for each in self._described:
+            declare(self._node, each)
         self._node.add_on_set_parameters_callback(self._judge)
         return settings
 
@@ -62,24 +64,23 @@ class Parameters:
         """Values by name; raises DataLoggerError for a name that there is not."""
         for name in names:
             self._check_known(name)
-        return {name: _plain(self._node.get_parameter(name).value) for name in names}
+        return {name: plain(self._node.get_parameter(name).value) for name in names}
 
     def set(self, values: Mapping[str, Any]) -> tuple[bool, str]:
         """All of them or none, as ``ros2 param set`` does it; whether that was done, and why not. Raises DataLoggerError."""
         for name, value in values.items():
             self._check_known(name)
-            if not _is_parameter(value):
+            if value is not None and not _is_parameter(value):
                 raise SettingError(name, value, 'true or false, a number of 64 bits, a string, or a list of one of these')
-        result = self._node.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
+        result = self._node.set_parameters_atomically([parameter(name, value) for name, value in values.items()])
         if not result.successful:
             is_fixed = any(self._node.describe_parameter(name).read_only for name in values)
             return False, f'{result.reason} {FIXED}' if is_fixed else result.reason
         return True, ', '.join(f'{name} = {value}' for name, value in values.items())
 
-    def described(self) -> list[dict[str, Any]]:
-        """Each of our own with its value and what its descriptor says; ``low`` and ``high`` are None where it has no range."""
-        names = sorted(name for name in self._node.get_parameters_by_prefix('') if name.partition('.')[0] not in FOREIGN)
-        return [_described(self._node.describe_parameter(name), self._node.get_parameter(name)) for name in names]
+    def described(self) -> list[Described]:
+        """Each of our own, as it is now."""
+        return [{**each, 'value': plain(self._node.get_parameter(each['name']).value)} for each in self._described]
 
     def _check_known(self, name: str) -> None:
         if not self._node.has_parameter(name):
@@ -99,7 +100,7 @@ class Parameters:
 
     def _read(self, instead: Sequence[Parameter] = ()) -> Settings:
         parameters = {**self._node.get_parameters_by_prefix(''), **{parameter.name: parameter for parameter in instead}}
-        given = {name: _plain(parameter.value) for name, parameter in parameters.items()}
+        given = {name: plain(parameter.value) for name, parameter in parameters.items()}
         return Settings.load(given, os.environ, self._node.get_namespace())
 
 
@@ -116,40 +117,46 @@ def _flat(settings: Settings) -> Iterator[tuple[str, Any, Field[Any]]]:
         yield from ((f'{prefix}.{spec.name}', getattr(owner, spec.name), spec) for spec in fields(owner) if spec.metadata)
 
 
-def _declarations(settings: Settings) -> Iterator[tuple[str, Any, ParameterDescriptor]]:
-    """Name, value and descriptor of every parameter."""
+def _declarations(settings: Settings) -> Iterator[Described]:
+    """Every parameter."""
     for name, value, text in (('robot', '', ROBOT), ('sensors', [sensor.name for sensor in settings.sensors], SENSORS)):
-        yield (
-            name,
-            value,
-            ParameterDescriptor(description=text, additional_constraints=FIXED, read_only=True, dynamic_typing=True),
-        )
+        yield {'name': name, 'value': value, 'description': text, 'constraints': FIXED, 'read_only': True, **_OPEN}
     for name, value, spec in _flat(settings):
-        yield name, list(value) if isinstance(value, tuple) else value, _descriptor(spec)
+        choices, is_live = spec.metadata['choices'], spec.metadata['live']
+        constraints = [f'One of {", ".join(choices)}.'] if choices else []
+        low, high = _span(spec)
+        yield {
+            'name': name, 'value': list(value) if isinstance(value, tuple) else value, 'description': spec.metadata['help'],
+            'constraints': ' '.join(constraints if is_live else [*constraints, FIXED]), 'read_only': not is_live,
+            'low': low, 'high': high,
+        }  # fmt: skip
 
 
-def _descriptor(spec: Field[Any]) -> ParameterDescriptor:
-    """What ``ros2 param describe`` shows. The type is left open, so that 5 is taken for 5.0."""
-    low, high, choices, is_live = (spec.metadata[name] for name in ('low', 'high', 'choices', 'live'))
-    descriptor = ParameterDescriptor(description=spec.metadata['help'], read_only=not is_live, dynamic_typing=True)
-    if isinstance(spec.default, float) and low is not None:
-        descriptor.floating_point_range = [
-            FloatingPointRange(from_value=low, to_value=sys.float_info.max if high is None else high)
-        ]
-    elif isinstance(spec.default, int) and low is not None:
-        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=MAX_INT if high is None else int(high))]
-    constraints = [f'One of {", ".join(choices)}.'] if choices else []
-    descriptor.additional_constraints = ' '.join(constraints if is_live else [*constraints, FIXED])
-    return descriptor
+def _span(spec: Field[Any]) -> tuple[float | None, float | None]:
+    """The bounds of a number, in its own type; an open end is the largest one there is."""
+    low, high = spec.metadata['low'], spec.metadata['high']
+    if low is None or not isinstance(spec.default, (int, float)):
+        return None, None
+    if isinstance(spec.default, float):
+        return float(low), sys.float_info.max if high is None else float(high)
+    return int(low), MAX_INT if high is None else int(high)
 
 
-def _described(descriptor: ParameterDescriptor, parameter: Parameter) -> dict[str, Any]:
-    (span,) = (*descriptor.floating_point_range, *descriptor.integer_range) or (None,)
-    return {
-        'name': parameter.name, 'value': _plain(parameter.value), 'description': descriptor.description,
-        'constraints': descriptor.additional_constraints, 'read_only': descriptor.read_only,
-        'low': None if span is None else span.from_value, 'high': None if span is None else span.to_value,
-    }  # fmt: skip
+def declare(node: Node, each: Described) -> None:
+    """So that ROS shows the parameter as it is described. The type is left open, so that 5 is taken for 5.0."""
+    descriptor = ParameterDescriptor(
+        description=each['description'], additional_constraints=each['constraints'], read_only=each['read_only'],
+        dynamic_typing=True,
+    )  # fmt: skip
+    low, high = each['low'], each['high']
+    if isinstance(low, float):
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    elif low is not None:
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+    if node.has_parameter(each['name']):
+        node.set_descriptor(each['name'], descriptor)
+    else:
+        node.declare_parameter(each['name'], each['value'], descriptor, ignore_override=True)
 
 
 def _is_parameter(value: object) -> bool:
@@ -191,6 +198,11 @@ def _resolve(node: Node, name: str, topic: str, given: object) -> str:
         raise SettingError(name, given, f'valid topic names, not {topic!r} ({reason})') from error
 
 
-def _plain(value: Any) -> Any:
+def parameter(name: str, value: Any) -> Parameter:
+    """None stands for no value."""
+    return Parameter(name, value=value) if value is not None else Parameter(name, Parameter.Type.NOT_SET)
+
+
+def plain(value: Any) -> Any:
     """A parameter's value as plain Python: arrays as lists."""
     return list(value) if hasattr(value, '__iter__') and not isinstance(value, (str, bytes)) else value

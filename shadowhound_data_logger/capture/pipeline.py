@@ -9,6 +9,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Any
 
 from rclpy.node import Node
@@ -23,6 +24,7 @@ from shadowhound_data_logger.capture.bag_tap import BagTap
 from shadowhound_data_logger.capture.commands import Commands
 from shadowhound_data_logger.capture.control import ControlSocket
 from shadowhound_data_logger.capture.event_buffer import EventBuffer
+from shadowhound_data_logger.capture.front import Front
 from shadowhound_data_logger.capture.intake import Intake, offer_to
 from shadowhound_data_logger.capture.interface import Interface
 from shadowhound_data_logger.capture.middleware import Middleware
@@ -58,19 +60,32 @@ CLOSE_S = 5.0
 LEDGER_BUCKET = 'sensor-data'
 
 
+@dataclass(frozen=True, slots=True)
+class Ros:
+    """How the logger takes part in ROS."""
+
+    node: Node
+    """That listens."""
+    name: str
+    """The full name under which ROS knows the logger."""
+    middleware: Middleware
+    front: Front | None
+    """Offers all else in the robot's RMW; None where the node itself does, or nobody can."""
+
+
 class Pipeline:
     """New; open once; close once."""
 
-    def __init__(self, node: Node, settings: Settings, parameters: Parameters, middleware: Middleware) -> None:
+    def __init__(self, ros: Ros, settings: Settings, parameters: Parameters) -> None:
         self._settings = settings
         self._parameters = parameters
-        self._middleware = middleware
+        self._ros = ros
         self._record = record = ClockRecord(settings.spool_path, settings.robot)
         self._clock = ClockWatch(SystemClock.of_this_machine(), settings.clock.hold_s, record.steps)
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
         self._catalogue = Catalogue(settings.spool_path, settings.catalogue, settings.robot, self._clock)
         self._redating = Redating(self.spool, self._clock, record, settings.robot)
-        self._node = node
+        self._node = ros.node
         self._day = self._today()
         self._due_s = 0.0
         self._failures = 0
@@ -117,14 +132,17 @@ class Pipeline:
         self.pool.observe = self.mission.observe
         self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
-                                       self.recorder, self.event_buffer, self._control, self._middleware)  # fmt: skip
+                                       self.recorder, self.event_buffer, self._control, self._ros.middleware,
+                                       self._ros.front)  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
-        node = self._node.get_fully_qualified_name()
-        self._commands = Commands(stages, self._parameters, self._status, settings.robot, node)
-        self._interface = Interface(self._node, self._commands.answer)
+        self._commands = Commands(stages, self._parameters, self._status, settings.robot, self._ros.name)
+        self._interface = Interface(self._node, self._commands.answer) if not self._ros.middleware.is_foreign else None
 
     def _open_stages(self, opened: ExitStack) -> None:
         """Start them, who is handed work before who hands it on; ``opened`` closes them in the opposite order, come what may."""
+        front = self._ros.front
+        if front is not None:
+            opened.callback(front.close)
         opened.callback(self._tell, ended=True)
         self.writer.open()
         opened.callback(self.writer.close, 1.0)
@@ -133,8 +151,9 @@ class Pipeline:
         opened.callback(self.uploader.close, 0.5)
         opened.callback(self.mission.close)
         opened.callback(self._finish)
-        self._interface.open()
-        opened.callback(self._interface.close)
+        if self._interface is not None:
+            self._interface.open()
+            opened.callback(self._interface.close)
         self.mission.open()
         opened.callback(self.mission.stop)
         self.intake.open()
@@ -142,6 +161,9 @@ class Pipeline:
         self.event_buffer.open()
         self._control.open()
         opened.callback(self._control.close)
+        if front is not None:
+            front.open(self._control.path)
+            opened.callback(front.stop)
         log.info(self.describe())
 
     def describe(self) -> str:
@@ -237,7 +259,8 @@ class Pipeline:
                                  lambda on, deadline_s: self.intake.record(deadline_s, on=on))  # fmt: skip
 
     def _tell_mission(self, mission: Mapping[str, Any]) -> None:
-        self._interface.tell_mission(mission)
+        if self._interface is not None:
+            self._interface.tell_mission(mission)
         self.recorder.on_mission(mission)
         self.event_buffer.on_mission(mission)
 
@@ -245,7 +268,8 @@ class Pipeline:
         status = self._status.look(ended=ended)
         if status is not None:
             self._status.write(status)
-            self._interface.publish_diagnostics()
+            if self._interface is not None:
+                self._interface.publish_diagnostics()
 
     def _today(self) -> str:
         return f'{utc(self._clock.wall_ns()):%Y%m%d}'

@@ -22,10 +22,11 @@ def main(args: list[str] | None = None) -> int:
     except SettingError as error:
         print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201 - there is no logger yet
         return 2
+    robot = dict(os.environ)
     middleware.enter(os.environ)
     from shadowhound_data_logger.capture.node import run  # noqa: PLC0415 - loads the RMW that the environment names
 
-    return run(arguments, middleware)
+    return run(arguments, middleware, robot)
 
 
 if __name__ == '__main__':

@@ -19,6 +19,7 @@ from typing import Any, Final
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.capture.control import ControlSocket
 from shadowhound_data_logger.capture.event_buffer import EventBuffer
+from shadowhound_data_logger.capture.front import Front
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.middleware import Middleware
 from shadowhound_data_logger.capture.mission import MissionWatch
@@ -60,11 +61,13 @@ class Stages:
     event_buffer: EventBuffer
     control: ControlSocket
     middleware: Middleware
+    front: Front | None = None
 
     @property
     def workers(self) -> Sequence[Worker]:
         """All threads of the node but the main one."""
-        own = self.intake.worker, self.writer.worker, self.mission.worker, self.control.worker
+        own = [self.intake.worker, self.writer.worker, self.mission.worker, self.control.worker]
+        own += [self.front.worker] if self.front is not None else []
         return *own, *self.pool.workers, *self.uploader.workers, *self.recorder.workers, *self.event_buffer.workers
 
 

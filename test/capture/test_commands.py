@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from shadowhound_data_logger.capture.commands import SWITCHES, TRIGGERS, Commands
+from shadowhound_data_logger.capture.commands import Commands
 from shadowhound_data_logger.capture.intake import _each
+from shadowhound_data_logger.capture.interface import SWITCHES, TRIGGERS
 from shadowhound_data_logger.errors import DataLoggerError
 
 STAGES = ['intake', 'encode pool', 'spool writer']

@@ -45,6 +45,7 @@ def test_a_cyclone_robot_is_heard_through_fast_dds(installed: dict[str, str]) ->
     robot = {**installed, **CYCLONE, 'ROS_LOCALHOST_ONLY': '1', 'ROS_STATIC_PEERS': '10.0.0.9'}
     found = choose('auto', robot)
     assert (found.rmw, found.robot, found.is_foreign) == ('rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp', True)
+    assert found.has_robot
     environ = dict(robot)
     found.enter(environ)
     assert environ == {**installed, 'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
@@ -56,6 +57,12 @@ def test_a_cyclone_robot_is_heard_through_fast_dds(installed: dict[str, str]) ->
         assert 'SHM' not in file.read_text(), 'memory of another user would be offered, and nothing come through it'
     assert not file.exists()
     assert 'FASTDDS_DEFAULT_PROFILES_FILE' not in environ
+
+
+def test_the_rmw_of_the_robot_may_be_missing_here(tmp_path: Path) -> None:
+    """It is listened to all the same, and no front can speak it."""
+    found = choose('auto', {**prefix(tmp_path, {'rmw_fastrtps_cpp': '9.3.3'}), **CYCLONE})
+    assert (found.is_foreign, found.has_robot) == (True, False)
 
 
 @pytest.mark.parametrize('rmw', ['', 'rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp'])

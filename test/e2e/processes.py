@@ -213,6 +213,7 @@ class Processes:
     def node(
         self, store: Mapping[str, str] | None = None, parameters: Mapping[str, Any] | None = None, *arguments: str,
         ready: bool = True, robot: str | None = None, home: str = 'home', environ: Mapping[str, str] | None = None,
+        program: Sequence[str] = ('-m', NODE),
     ) -> Node:  # fmt: skip
         """The logger: ``store`` is the environment that names one, ``parameters`` are flat ROS names."""
         name = self._name('node')
@@ -221,7 +222,7 @@ class Processes:
         file.write_text(json.dumps({'/**': {'ros__parameters': given}}))
         robot = self.robot if robot is None else robot
         own = {'SHADOWHOUND_HOME': str(self.folder / home), 'SHADOWHOUND_ROBOT': robot}
-        command = [sys.executable, '-m', NODE, '--ros-args', '--params-file', str(file), *arguments]
+        command = [sys.executable, *program, '--ros-args', '--params-file', str(file), *arguments]
         node = Node(name, command, self.folder / f'{name}.log', {**self.environ, **own, **(store or {}), **(environ or {})})
         self.started.append(node)
         node.home, node.robot = self.folder / home, robot

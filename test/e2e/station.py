@@ -20,9 +20,10 @@ NODE = '/sensor_logger_node'
 
 
 class Station:
-    """New with the environment of the node's processes; close once."""
+    """New with the environment of the node's processes, and the namespace of the one that is meant; close once."""
 
-    def __init__(self, environ: Mapping[str, str]) -> None:
+    def __init__(self, environ: Mapping[str, str], namespace: str = '') -> None:
+        self._name = namespace + NODE
         self._context = Context()
         rclpy.init(context=self._context, domain_id=int(environ['ROS_DOMAIN_ID']))
         self.node = Node('station', context=self._context, start_parameter_services=False, enable_rosout=False)
@@ -34,43 +35,47 @@ class Station:
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
 
+    def spin(self) -> None:
+        """Hear what there is to hear."""
+        self._executor.spin_once(timeout_sec=0.1)
+
     def flush(self) -> str:
         """What ``~/flush`` answers; it must succeed."""
-        answer = self._call(Trigger, '/flush', Trigger.Request())
+        answer = self.call(Trigger, '/flush', Trigger.Request())
         assert answer.success, answer.message
         return str(answer.message)
 
     def pause(self, *, paused: bool) -> str:
         """What ``~/pause`` answers; it must succeed."""
-        answer = self._call(SetBool, '/pause', SetBool.Request(data=paused))
+        answer = self.call(SetBool, '/pause', SetBool.Request(data=paused))
         assert answer.success, answer.message
         return str(answer.message)
 
     def bag(self, what: str) -> tuple[bool, str]:
         """What ``~/bag/start``, ``stop`` or ``split`` answers."""
-        answer = self._call(Trigger, f'/bag/{what}', Trigger.Request())
+        answer = self.call(Trigger, f'/bag/{what}', Trigger.Request())
         return bool(answer.success), str(answer.message)
 
     def bag_pause(self, *, paused: bool) -> tuple[bool, str]:
         """What ``~/bag/pause`` answers."""
-        answer = self._call(SetBool, '/bag/pause', SetBool.Request(data=paused))
+        answer = self.call(SetBool, '/bag/pause', SetBool.Request(data=paused))
         return bool(answer.success), str(answer.message)
 
     def event(self) -> tuple[bool, str]:
         """What ``~/event/trigger`` answers."""
-        answer = self._call(Trigger, '/event/trigger', Trigger.Request())
+        answer = self.call(Trigger, '/event/trigger', Trigger.Request())
         return bool(answer.success), str(answer.message)
 
     def set(self, **values: Any) -> str:
         """Set parameters (``sensor__name``) together; why they were refused, empty where they were not."""
         parameters = [Parameter(name.replace('__', '.'), value=value).to_parameter_msg() for name, value in values.items()]
-        answer = self._call(SetParametersAtomically, '/set_parameters_atomically',
+        answer = self.call(SetParametersAtomically, '/set_parameters_atomically',
                             SetParametersAtomically.Request(parameters=parameters))  # fmt: skip
         assert bool(answer.result.reason) is not answer.result.successful
         return str(answer.result.reason)
 
     def get(self, name: str) -> Any:
-        (value,) = self._call(GetParameters, '/get_parameters', GetParameters.Request(names=[name])).values
+        (value,) = self.call(GetParameters, '/get_parameters', GetParameters.Request(names=[name])).values
         return Parameter.from_parameter_msg(ParameterMessage(name=name, value=value)).value
 
     def diagnostics(self) -> dict[str, Any]:
@@ -86,13 +91,23 @@ class Station:
             self.node.destroy_subscription(subscription)
         return {entry.name: entry for entry in heard[0].status}
 
-    def _call(self, kind: Any, name: str, request: Any) -> Any:
-        client = self.node.create_client(kind, NODE + name)
+    def answers(self, seconds: float) -> bool:
+        """Whether ``~/flush`` answers in that time. While a server that was killed is still known, a call may go to it alone."""
+        return self._ask(Trigger, '/flush', Trigger.Request(), seconds) is not None
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        """The answer of one of the node's services."""
+        answer = self._ask(kind, name, request, WAIT_S)
+        assert answer is not None, f'{self._name + name} does not answer'
+        return answer
+
+    def _ask(self, kind: Any, name: str, request: Any, seconds: float) -> Any:
+        """None where no answer comes in that time."""
+        client = self.node.create_client(kind, self._name + name)
         try:
-            assert client.wait_for_service(WAIT_S), f'there is no {NODE + name}'
+            assert client.wait_for_service(WAIT_S), f'there is no {self._name + name}'
             future = client.call_async(request)
-            self._executor.spin_until_future_complete(future, WAIT_S)
-            assert future.done(), f'{NODE + name} does not answer'
-            return future.result()
+            self._executor.spin_until_future_complete(future, seconds)
+            return future.result() if future.done() else None
         finally:
             self.node.destroy_client(client)

@@ -1,0 +1,9 @@
+"""Program of a test: the node as it is on a robot with another RMW, whose front speaks the same one as the node itself."""
+
+import sys
+
+from shadowhound_data_logger.capture.middleware import Middleware
+from shadowhound_data_logger.capture.sensor_logger_node import main
+
+Middleware.is_foreign = property(lambda _: True)  # type: ignore[assignment, method-assign]
+sys.exit(main())

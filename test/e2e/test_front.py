@@ -1,0 +1,259 @@
+"""Beside another RMW the front stands for the node: it answers as the node itself would, and lives as long as the node does."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from e2e.processes import HERE, Node, Processes, until
+from e2e.reading import STRING, texts
+from e2e.station import Station
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
+from rclpy.node import NodeNameNonExistentError
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+
+from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.missions.mission_data_logger import MissionDataLogger
+
+FRONTED = (str(HERE / 'fronted_node.py'),)
+FRONT = 'shadowhound_data_logger.capture.front'
+OFFERED = 'services and parameters are offered in'
+DIRECT, BESIDE = '/direct', '/beside'
+COUNT = 20
+ENDS_S = 10.0
+"""It takes a second and a half at most on a machine that is idle."""
+SENSORS: dict[str, Any] = {
+    'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 3600.0,
+    'events.topics': ['talk'], 'events.post_s': 0.1,
+}  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def nodes(shared: Processes) -> dict[str, Node]:
+    """One that speaks for itself, and one with a front, alike in all else; each with a home of its own."""
+    given = {
+        space: shared.node(None, SENSORS, '-r', f'__ns:={space}', home=space.strip('/'), program=program)
+        for space, program in ((DIRECT, ('-m', 'shadowhound_data_logger.capture.sensor_logger_node')), (BESIDE, FRONTED))
+    }
+    given[BESIDE].said(OFFERED)
+    return given
+
+
+@pytest.fixture(scope='module')
+def stations(shared: Processes, nodes: dict[str, Node]) -> Iterator[dict[str, Station]]:
+    made = {space: Station(shared.environ, space) for space in nodes}
+    yield made
+    for station in made.values():
+        station.close()
+
+
+def fronts(node: Node) -> list[int]:
+    """The processes that are fronts of a node."""
+    found = []
+    for path in Path('/proc').glob('[0-9]*/cmdline'):
+        try:
+            words = path.read_bytes().decode(errors='replace').split('\0')
+        except OSError:
+            continue
+        if FRONT in words and str(node.popen.pid) in words:
+            found.append(int(path.parent.name))
+    return found
+
+
+def services_of(station: Station, name: str, namespace: str) -> set[str]:
+    """Without their namespaces; none of a node that is not seen yet."""
+    try:
+        found = station.node.get_service_names_and_types_by_node(name, namespace)
+    except NodeNameNonExistentError:
+        return set()
+    return {service.removeprefix(f'{namespace.rstrip("/")}/{name}/') for service, _ in found}
+
+
+def test_the_front_has_the_name_and_all_services(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
+    """Those that the node has where it speaks for itself; the one that listens is hidden and offers nothing."""
+    station = stations[BESIDE]
+    until(lambda: ('_sensor_logger_intake', BESIDE) in station.node.get_node_names_and_namespaces(), 'the listener is seen')
+    some = {'flush', 'pause', 'bag/start', 'event/trigger', 'set_parameters', 'describe_parameters'}
+
+    def alike() -> bool:
+        direct, beside = (services_of(station, 'sensor_logger_node', space) for space in (DIRECT, BESIDE))
+        return some <= direct == beside
+
+    until(alike, 'it offers all')
+    assert services_of(station, '_sensor_logger_intake', BESIDE) == set()
+    assert ('_sensor_logger_intake', DIRECT) not in station.node.get_node_names_and_namespaces()
+
+
+def answers(station: Station) -> Iterator[Any]:
+    """What each service says, one after the other; a bag's name is its time, so it is left out of what it says."""
+    yield 'flush', station.flush()
+    yield from (('pause', station.pause(paused=paused)) for paused in (True, True, False, False))
+    done, bag = station.bag('start')
+    yield 'start', done, bag.startswith('recording_')
+    for words in (station.bag('start'), station.bag('split'), station.bag_pause(paused=True), station.bag_pause(paused=False),
+                  station.bag('stop')):  # fmt: skip
+        yield words[0], words[1].replace(bag, 'BAG')
+    yield from (station.bag('stop'), station.bag('split'), station.bag_pause(paused=True))
+    done, event = station.event()
+    yield 'event', done, event.startswith('event_manual_'), event.endswith(' begins')
+
+
+def test_each_service_answers_as_the_node_would(stations: dict[str, Station]) -> None:
+    """In the same words, whether it is done or refused."""
+    direct = list(answers(stations[DIRECT]))
+    assert list(answers(stations[BESIDE])) == direct
+    assert (False, 'nothing is recorded') in direct
+
+
+VALUES: list[tuple[str, Any]] = [
+    ('talk.rate_hz', 5.0), ('talk.rate_hz', 7), ('talk.rate_hz', -1.0), ('talk.rate_hz', 1e-9), ('talk.rate_hz', 'often'),
+    ('talk.rate_hz', None), ('talk.priority', 10), ('talk.priority', 2.5), ('talk.enabled', 1), ('talk.quality', 60),
+    ('talk.batch_s', 1.0), ('talk.format', 'png'), ('sensors', ['talk']), ('events.log_event', '['), ('events.log_event', 'fall'),
+    ('events.max_s', 1.0), ('upload.max_mbps', 8.0), ('talk.nope', 1), ('use_sim_time', 'maybe'), ('talk.rate_hz', 0.0),
+]  # fmt: skip
+
+
+def message(name: str, value: Any) -> ParameterMessage:
+    found = Parameter(name, value=value) if value is not None else Parameter(name, Parameter.Type.NOT_SET)
+    return found.to_parameter_msg()
+
+
+def test_each_parameter_is_judged_as_by_the_node(stations: dict[str, Station]) -> None:
+    """Set alone and together, with the same reasons, and what they are afterwards is the same."""
+    for name, value in VALUES:
+        request = SetParameters.Request(parameters=[message(name, value)])
+        direct, beside = (stations[space].call(SetParameters, '/set_parameters', request).results for space in (DIRECT, BESIDE))
+        assert [(each.successful, each.reason) for each in beside] == [(each.successful, each.reason) for each in direct], name
+        if name != 'talk.nope':
+            assert stations[BESIDE].get(name) == stations[DIRECT].get(name)
+    for values in ({'talk__priority': 3, 'talk__rate_hz': 1e-9}, {'talk__priority': 3, 'talk__rate_hz': 2.0}):
+        assert stations[BESIDE].set(**values) == stations[DIRECT].set(**values)
+        assert stations[BESIDE].get('talk.priority') == stations[DIRECT].get('talk.priority')
+
+
+def test_each_parameter_is_described_as_by_the_node(stations: dict[str, Station]) -> None:
+    """Names, types, ranges and texts."""
+    direct, beside = (
+        stations[space].call(ListParameters, '/list_parameters', ListParameters.Request()) for space in (DIRECT, BESIDE)
+    )
+    assert sorted(beside.result.names) == sorted(direct.result.names)
+    assert len(direct.result.names) > 50
+    request = DescribeParameters.Request(names=sorted(direct.result.names))
+    direct, beside = (stations[space].call(DescribeParameters, '/describe_parameters', request) for space in (DIRECT, BESIDE))
+    assert beside.descriptors == direct.descriptors
+
+
+def run(node: Node, *words: str) -> dict[str, Any]:
+    """What ``shadowhound-data node`` says."""
+    spool = str(node.home / 'spool')
+    result = CliRunner().invoke(cli, ['node', *words, '--json', '--spool', spool], standalone_mode=False)
+    answer: dict[str, Any] = json.loads(result.stdout)
+    return answer
+
+
+def test_front_and_command_line_see_each_other_s_settings(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
+    """What one of them set the other one finds; the node goes by it."""
+    node, station = nodes[BESIDE], stations[BESIDE]
+    assert station.set(talk__quality=77) == ''
+    assert run(node, 'get', 'talk.quality')['values'] == {'talk.quality': 77}
+    node.said('talk.quality = 77 from now on')
+    assert run(node, 'set', 'talk.quality', '66')['ok']
+    until(lambda: station.get('talk.quality') == 66, 'the front follows')
+    assert station.set(talk__quality=65) == ''
+    assert run(node, 'get', 'talk.quality')['values'] == {'talk.quality': 65}
+
+
+def test_the_front_tells_how_the_node_is(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
+    """``/diagnostics`` has the same entries, with the robot as hardware."""
+    heard: dict[str, Any] = {}
+
+    def all_heard() -> bool:
+        heard.update(stations[BESIDE].diagnostics())
+        return {name.partition('/')[0] for name in heard} == {'direct', 'beside'}
+
+    until(all_heard, 'both tell how they are')
+    entries = {space: {name.partition(':')[2].replace(space, '') for name in heard if name.startswith(space[1:])}
+               for space in nodes}  # fmt: skip
+    assert entries[BESIDE] - {'/talk'} == entries[DIRECT] - {'/talk'}
+    assert {entry.hardware_id for name, entry in heard.items() if name.startswith('beside')} == {nodes[BESIDE].robot}
+    assert all(isinstance(pair.value, str) for entry in heard.values() for pair in entry.values)
+
+
+def test_the_front_tells_of_missions(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
+    """Latched, when one begins and when it ends."""
+    node, station = nodes[BESIDE], stations[BESIDE]
+    heard: list[str] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    subscription = station.node.create_subscription(
+        String, f'{BESIDE}/sensor_logger_node/mission', lambda told: heard.append(told.data), latched
+    )
+    logger = MissionDataLogger(home=node.home, robot=node.robot, replay=False, start_timeout_s=0.0)
+    try:
+        until(lambda: station.spin() or heard == [''], 'none is active')
+        mission_id = logger.start_mission('patrol', 'go round')
+        until(lambda: station.spin() or mission_id in heard[-1], 'it is active')
+        logger.end_mission(True, 0.0, 0.0)
+        until(lambda: station.spin() or heard[-1] == '', 'it is over')
+    finally:
+        logger.close()
+        station.node.destroy_subscription(subscription)
+
+
+def test_a_front_that_dies_is_started_again(shared: Processes, nodes: dict[str, Node], stations: dict[str, Station]) -> None:
+    """The node goes on meanwhile, loses nothing, and says what happened."""
+    node, publisher = nodes[BESIDE], shared.publisher()
+    publisher.create(f'{BESIDE}/talk', STRING)
+    publisher.heard(f'{BESIDE}/talk', node, texts(['warm-up'])[0])
+    assert run(node, 'flush')['ok']  # what ``heard`` sent more than once is counted
+    before = node.topic(f'{BESIDE}/talk')['received']
+    (first,) = fronts(node)
+    publisher.publish(f'{BESIDE}/talk', texts(range(COUNT)))
+    os.kill(first, signal.SIGKILL)
+    publisher.publish(f'{BESIDE}/talk', texts(range(COUNT)))
+    until(lambda: fronts(node) not in ([], [first]), 'another front is started')
+    assert run(node, 'flush')['ok']
+    until(lambda: node.log.count(OFFERED) == 2, 'it offers its services')
+    until(lambda: stations[BESIDE].answers(2.0), 'its services answer')
+    row = node.topic(f'{BESIDE}/talk')
+    assert (row['received'], row['missed']) == (before + 2 * COUNT, 0)
+    assert 'front failed (1 times so far) and tries again: it ended by signal 9' in node.log
+
+
+def test_the_front_ends_with_the_node(processes: Processes) -> None:
+    """When it is asked to end, and when it is killed: within seconds nobody answers for a node that is no more."""
+    node = processes.node(None, SENSORS, program=FRONTED)
+    node.said(OFFERED)
+    assert len(fronts(node)) == 1
+    node.kill()
+    until(lambda: not fronts(node), 'the front of a killed node ends', ENDS_S)
+    again = processes.node(None, SENSORS, program=FRONTED)
+    again.said(OFFERED)
+    again.stop()
+    assert fronts(again) == []
+    assert 'front failed' not in again.log
+
+
+def test_the_name_and_the_rules_of_the_command_line_hold(processes: Processes) -> None:
+    """Another name, rules and parameters for that name alone: the front has the name, and the node goes by all of them."""
+    node = processes.node(
+        None, SENSORS, '-r', '__node:=mine', '-r', 'mine:talk:=heard', '-p', 'mine:talk.priority:=2', program=FRONTED
+    )
+    node.said('logging /heard to')
+    node.said(OFFERED)
+    assert run(node, 'get', 'talk.priority')['values'] == {'talk.priority': 2}
+    station = Station(processes.environ)
+    try:
+        until(lambda: 'flush' in services_of(station, 'mine', '/'), 'it has that name')
+        assert services_of(station, '_sensor_logger_intake', '/') == set()
+    finally:
+        station.close()
+    node.stop()
