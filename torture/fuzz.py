@@ -1,10 +1,14 @@
 """Hostile messages through every encoder, damaged spools and indexes through recovery: no crash, no hang, no damage as good.
 
+With ``--readers``, everything that reads what robots write instead (torture/_readers.py): no error but ours, nothing written
+elsewhere, two gigabytes of memory.
+
 Each round has a seed of its own, which is all that it takes to see it again: ``--seed`` is that of the first one.
 """
 
 from __future__ import annotations
 
+import argparse
 import logging
 import random
 import shutil
@@ -23,6 +27,7 @@ from encode.conftest import GO2_MESSAGES, Ros
 from encode.hostile import Fuzzer
 from spool import editing, rotting
 
+from torture import _readers
 from torture._command import Bar, parser, progress, verdict
 from torture.rot import SHARED_MEMORY
 
@@ -126,10 +131,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     options.add_argument(
         '--seconds', type=float, default=0.0, help=f'how long, {SECONDS:g} unless told, {SHORT_SECONDS:g} in short'
     )
+    options.add_argument('--readers', action='store_true', help='what reads the data of robots, instead of what makes them')
     given = options.parse_args(argv)
     logging.disable(logging.CRITICAL)
     seconds = given.seconds or (SHORT_SECONDS if given.short else SECONDS)
     progress(f'seed {given.seed}')
+    if given.readers:
+        return _fuzz_readers(given, seconds)
     with tempfile.TemporaryDirectory(dir=SHARED_MEMORY if SHARED_MEMORY.is_dir() else None) as name:
         folder = Path(name)
         kinds = {'messages': messages(folder), 'spools': spools(folder, edited=False), 'indexes': spools(folder, edited=True)}
@@ -142,6 +150,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     bars = [_bar(what, result) for what, result in fields.items()]
     figures = {'seed': given.seed, 'seconds': seconds, **{what: result.as_dict() for what, result in fields.items()}}
     return verdict(figures, bars, as_json=given.json)
+
+
+def _fuzz_readers(given: argparse.Namespace, seconds: float) -> int:
+    told: dict[str, _readers.Told] = {}
+    for kind in _readers.KINDS:
+        told[kind] = _readers.fuzz(kind, given.seed, seconds / len(_readers.KINDS))
+        progress(f'{kind}: {told[kind].rounds} rounds, {len(told[kind].wrong)} wrong')
+    if not given.json:
+        for kind, result in told.items():
+            found = ', '.join(f'{count} {outcome}' for outcome, count in result.found.most_common(6))
+            print(f'{result.rounds} rounds of {kind}, {result.peak_bytes / 1e6:.0f} MB at most: {found}')
+            print(*(f'    {wrong}' for wrong in result.wrong), sep='\n', end='\n' if result.wrong else '')
+    what = 'no error but ours, nothing written elsewhere, in 2 GB'
+    bars = [Bar(f'readers of {kind}: {what}', not result.wrong and result.rounds > 0,
+                f'{len(result.wrong)} of {result.rounds} rounds' if result.wrong else '')
+            for kind, result in told.items()]  # fmt: skip
+    return verdict({'seed': given.seed, 'seconds': seconds, **{kind: each.as_dict() for kind, each in told.items()}}, bars,
+                   as_json=given.json)  # fmt: skip
 
 
 def _bar(what: str, result: Field) -> Bar:

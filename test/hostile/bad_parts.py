@@ -40,10 +40,11 @@ def arrow(rows: Sequence[schema.Row], about: Mapping[str, str] | None = None, **
     return written(table, about)
 
 
-def written(table: pa.Table, about: Mapping[str, str] | None = None, **how: Any) -> bytes:
+def written(table: pa.Table, about: Mapping[str, str] | None = None, *, group: int | None = None, **how: Any) -> bytes:
+    """A file of groups of so many rows."""
     body = io.BytesIO()
     with pq.ParquetWriter(body, table.schema, **{'compression': 'zstd', 'store_schema': False, **how}) as file:
-        file.write_table(table)
+        file.write_table(table, row_group_size=group)
         if about:
             file.add_key_value_metadata(dict(about))
     return body.getvalue()

@@ -1,0 +1,122 @@
+"""``python -m torture.fuzz --readers``: each reader of what robots write in a process of its own, with two gigabytes and no more.
+
+A process that dies, or does not end a round, is a finding as an exception is; the next one goes on after its seed.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import random
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from hostile.rounds import KINDS, Shop, watch_writes
+
+LIMIT_BYTES: Final = 2 << 30
+HANG_S: Final = 60.0
+"""A round takes some milliseconds; of one that takes a minute its reader does not end by itself."""
+MOST_TOLD: Final = 20
+TRIES: Final = 20
+"""Processes of one kind that may die before the others have their turn."""
+
+
+@dataclass(slots=True)
+class Told:
+    """What came of one kind of readers."""
+
+    rounds: int = 0
+    found: Counter[str] = field(default_factory=Counter)
+    wrong: list[str] = field(default_factory=list)
+    peak_bytes: int = 0
+    """Of memory in use, of the largest of its processes."""
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            'rounds': self.rounds,
+            'found': dict(self.found.most_common()),
+            'wrong': self.wrong,
+            'peak_bytes': self.peak_bytes,
+        }
+
+
+def fuzz(kind: str, seed: int, seconds: float) -> Told:
+    """Rounds of one kind until the time is over, or there is enough to tell."""
+    told, end = Told(), time.monotonic() + seconds
+    for _ in range(TRIES):
+        left = end - time.monotonic()
+        if left <= 0 or len(told.wrong) >= MOST_TOLD:
+            break
+        with tempfile.TemporaryDirectory(prefix='readers-') as name:
+            _watch(kind, seed + told.rounds, left, Path(name), told)
+    return told
+
+
+def _watch(kind: str, seed: int, seconds: float, folder: Path, told: Told) -> None:
+    """One process; it says what each round came to."""
+    command = [sys.executable, '-m', 'torture._readers', kind, str(seed), f'{seconds:.3f}', str(folder)]
+    environ = {**os.environ, 'TMPDIR': str(folder / 'tmp'), 'PYTHONFAULTHANDLER': '1'}
+    (folder / 'tmp').mkdir()
+    with (
+        tempfile.TemporaryFile() as errors,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, env=environ, text=True) as child,
+    ):
+        assert child.stdout is not None
+        is_over = False
+        for line in child.stdout:
+            said = json.loads(line)
+            is_over = 'peak' in said
+            if is_over:
+                told.peak_bytes = max(told.peak_bytes, said['peak'])
+            elif 'wrong' in said:
+                told.wrong.append(f'seed {said["seed"]}: {said["wrong"]}')
+            else:
+                told.rounds += 1
+                told.found[said['found']] += 1
+            told.rounds += 'wrong' in said
+        code = child.wait()
+        if not is_over:
+            errors.seek(0)
+            tail = errors.read()[-2000:].decode(errors='replace')
+            told.wrong.append(f'seed {seed + told.rounds}: the process ended with {code}: {tail}')
+            told.rounds += 1
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The process of one kind."""
+    kind, seed, seconds, folder = arguments[0], int(arguments[1]), float(arguments[2]), Path(arguments[3])
+    resource.setrlimit(resource.RLIMIT_AS, (LIMIT_BYTES, LIMIT_BYTES))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    logging.disable(logging.CRITICAL)
+    warnings.simplefilter('ignore')
+    one = KINDS[kind](Shop(folder))
+    watch_writes()
+    end, wrong = time.monotonic() + seconds, 0
+    while time.monotonic() < end and wrong < MOST_TOLD:
+        resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + HANG_S), resource.RLIM_INFINITY))
+        said: dict[str, object] = {'seed': seed}
+        try:
+            said['found'] = one(random.Random(seed))
+        except Exception as error:  # noqa: BLE001 - whatever it is, it is what this looks for
+            wrong += 1
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            said['wrong'] = f'{type(error).__name__}: {str(error)[:200]} ({where.filename}:{where.lineno})'
+        print(json.dumps(said), flush=True)
+        seed += 1
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+    print(json.dumps({'peak': peak}), flush=True)
+
+
+if __name__ == '__main__':
+    main(sys.argv[1:])
