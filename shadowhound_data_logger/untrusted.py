@@ -10,6 +10,7 @@ import json
 import re
 import sys
 import unicodedata
+import warnings
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
@@ -185,7 +186,9 @@ def open_image(content: bytes | Path) -> Any:
 
     source = content if isinstance(content, Path) else BytesIO(content)
     try:
-        opened = Image.open(source, formats=('JPEG', 'PNG', 'TIFF'))
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')  # of what is refused below
+            opened = Image.open(source, formats=('JPEG', 'PNG', 'TIFF'))
     except (Image.DecompressionBombError, SyntaxError) as error:  # which are nobody's ValueError
         raise ValueError(str(error)) from None
     try:

@@ -372,8 +372,8 @@ def fetched_objects(shop: Shop) -> Round:
             Wish(rng.choice((schema.BUCKET, schema.BUCKET, schema.BUCKET, '..', '.')),
                  rng.choice((*bodies, *TEXTS, '../' * 5 + 'x')),
                  rng.choice((7, 3000, *NUMBERS)), rng.choice((None, 'ab', 64 * '0')))
-            for _ in range(5)
-        ]  # fmt: skip
+            for _ in range(4)
+        ] + [Wish(schema.BUCKET, key, len(body)) for key, body in bodies.items() if rng.random() < 0.5]  # fmt: skip
         with shop.reading():
             found = fetch_objects(wishes, shop.target, lambda name: open_source(settings, name), threads=2)
         return f'{found.moved} moved'

@@ -159,7 +159,7 @@ def test_a_data_set_says_what_it_leaves_out(home: Path) -> None:
 
 
 def test_a_compacted_part_that_lies_about_its_leaves_costs_itself_alone(home: Path) -> None:
-    """A list that is none, one that unpacks to half a gigabyte, and two that contradict each other."""
+    """A list that is none, one that unpacks to a gigabyte, and two that contradict each other."""
     before = good(home)
     settings = folder_store(home)
     made = [

@@ -11,7 +11,7 @@ from hostile.rounds import KINDS, Shop
 
 from shadowhound_data_logger.lake import reading
 
-ROUNDS = 40
+ROUNDS = 25
 
 
 @pytest.mark.parametrize('kind', KINDS)
