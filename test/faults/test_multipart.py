@@ -162,12 +162,13 @@ store = s3.S3Store(StoreSettings(endpoint_url={front.url!r}), UploadSettings())
 store.open()
 store.put({item!r})
 """
-    front.script = Script([*[Fault.NONE] * (len(BEFORE) + 2), Fault.HUNG])
+    front.script = script = Script([*[Fault.NONE] * (len(BEFORE) + 2), Fault.HUNG])
     path = os.pathsep.join((str(TEST.parent), os.environ.get('PYTHONPATH', '')))
     environment = {**os.environ, **seaweed.environment(), 'PYTHONPATH': path}
     with subprocess.Popen([sys.executable, '-c', program], env=environment) as process:
-        until(lambda: taken(front, item) == [1, 2] or process.poll() is not None)
+        until(lambda: script.counts[Fault.HUNG] or process.poll() is not None)  # the third part has come, and goes no further
         process.send_signal(signal.SIGKILL)
+    assert taken(front, item) == [1, 2]
     front.script = Script()
     sent = store.pace.sent_bytes
     assert store.put(item) is Put.CREATED

@@ -37,7 +37,7 @@ def test_every_image_is_pinned(services: dict[str, Any]) -> None:
     built = (TOWER / 'Dockerfile.mlflow').read_text(encoding='utf-8')
     assert re.search(r'^FROM python:3\.12', built, re.MULTILINE)
     packages = re.findall(r' ([\w-]+)==\d', built)
-    assert packages == ['mlflow', 'psycopg2-binary', 'boto3', 'flask-wtf']
+    assert packages == ['mlflow', 'psycopg2-binary', 'boto3', 'flask-wtf', 'starlette']
 
 
 def test_servers_are_watched_and_come_back(services: dict[str, Any]) -> None:
