@@ -105,7 +105,7 @@ def test_a_run_has_what_the_node_measured(processes: Processes, tower: Tower, mo
         monkeypatch.setenv(name, value)
     node = processes.node(environ, {**PARAMETERS, 'mission.capture': 'always'})
     processes.sim('duration_s:=60.0')
-    logger = MissionDataLogger(home=node.home, robot=processes.robot, start_timeout_s=30.0)
+    logger = MissionDataLogger(home=node.home, robot=processes.robot, experiment='thor_missions', start_timeout_s=30.0)
     until(lambda: node.topic('/imu').get('received', 0) > ENOUGH, 'the robot is heard')
     run_id = logger.start_mission('patrol', command := f'by the node of {processes.robot}')
     (folder,) = missions(node.home)
