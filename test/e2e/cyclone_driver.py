@@ -26,6 +26,7 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
+from e2e.numbered import Numbered
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -112,10 +113,13 @@ class Driver:
         self._writers: dict[str, Any] = {}
         self._readers: dict[str, Any] = {}
         self._counts: dict[str, int] = {}
+        self._numbered = Numbered(self._write)
         self._lock = threading.Lock()
 
     def obey(self, order: dict[str, Any]) -> Any:
         topic = order.get('topic', '')
+        if self._numbered.takes(order):
+            return self._numbered.obey(order)
         match order['do']:
             case 'create':
                 self._writers[topic] = DataWriter(self._participant, self._topic(order), qos(order))
@@ -174,7 +178,10 @@ class Driver:
         for message in messages:
             time.sleep(max(0.0, due - time.monotonic()))
             due += period_s
-            ddspy_write(self._writers[topic]._ref, message)
+            self._write(topic, message)
+
+    def _write(self, topic: str, message: bytes) -> None:
+        ddspy_write(self._writers[topic]._ref, message)
 
 
 def answer(value: Any = None) -> None:

@@ -167,6 +167,14 @@ class Publisher(Process):
     def halt(self, topic: str) -> None:
         self._tell(do='halt', topic=topic)
 
+    def begin_numbered(self, topic: str, name: str, size: int, period_s: float) -> None:
+        """Publish Strings with that name and a number each (numbered.py) from now on, in the background."""
+        self._tell(do='begin_numbered', topic=topic, name=name, size=size, period_s=period_s)
+
+    def halt_numbered(self, topic: str) -> int:
+        """No more of them; how many were sent."""
+        return int(self._tell(do='halt_numbered', topic=topic))
+
     def heard(self, topic: str, node: Node, message: bytes) -> None:
         """Publish the message until the node received it, so that whatever follows comes after the match."""
         self.matched(topic)
@@ -251,7 +259,8 @@ class Processes:
         name = self._name('publisher')
         command = [sys.executable, str(HERE / ('cyclone_driver.py' if cyclone else 'publisher.py'))]
         humble = {'AS_HUMBLE': 'yes'} if os.environ.get('ROS_DISTRO') == 'humble' else {}
-        own = {**self.environ, **humble, **(environ or {})}
+        path = os.pathsep.join([str(HERE.parent), *filter(None, [self.environ.get('PYTHONPATH')])])
+        own = {**self.environ, **humble, **(environ or {}), 'PYTHONPATH': path}
         process = Publisher(name, command, self.folder / f'{name}.log', own, piped=True)
         self.started.append(process)
         return process

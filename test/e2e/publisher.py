@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import Any
 
 import rclpy
+from e2e.numbered import Numbered
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -78,8 +79,8 @@ def publish_evenly(publisher: Any, kind: Any, period_s: float, size: int, stoppe
         due += period_s
 
 
-def answer() -> None:
-    sys.stdout.write('done\n')
+def answer(value: int | None = None) -> None:
+    sys.stdout.write('done\n' if value is None else f'done {value}\n')
     sys.stdout.flush()
 
 
@@ -87,12 +88,16 @@ def main() -> None:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Node('publisher', start_parameter_services=False, enable_rosout=False)
     publishers: dict[str, Any] = {}
+    numbered = Numbered(lambda topic, message: publishers[topic].publish(message))
     for line in sys.stdin:
         order = json.loads(line)
-        obey(order, node, publishers)
         if order['do'] == 'end':
             break
-        answer()
+        if numbered.takes(order):
+            answer(numbered.obey(order))
+        else:
+            obey(order, node, publishers)
+            answer()
     node.destroy_node()
     rclpy.try_shutdown()
     answer()

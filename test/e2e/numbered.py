@@ -1,0 +1,62 @@
+"""Strings with a publisher's name and a number of its own, published in the background until somebody says stop. Knows no DDS."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+def message(name: str, number: int, size: int) -> bytes:
+    """A std_msgs/String in CDR: ``name:number:``, filled up to so many bytes."""
+    text = f'{name}:{number}:'.ljust(size).encode() + b'\0'
+    return b'\0\1\0\0' + struct.pack('<I', len(text)) + text
+
+
+def told(text: str) -> tuple[str, int]:
+    """Name and number of a String."""
+    name, number, _ = text.split(':')
+    return name, int(number)
+
+
+class Numbered:
+    """One thread a topic. Numbers of a topic go on where they were when it is begun again."""
+
+    def __init__(self, write: Callable[[str, bytes], None]) -> None:
+        self._write = write
+        self._sent: dict[str, int] = {}
+        self._running: dict[str, tuple[threading.Event, threading.Thread]] = {}
+
+    @staticmethod
+    def takes(order: Mapping[str, Any]) -> bool:
+        """Whether such an order is for it."""
+        return order['do'] in {'begin_numbered', 'halt_numbered'}
+
+    def obey(self, order: Mapping[str, Any]) -> int | None:
+        """How many were sent, where no more are."""
+        if order['do'] == 'halt_numbered':
+            return self._halt(order['topic'])
+        self._begin(order['topic'], order['name'], order['size'], order['period_s'])
+        return None
+
+    def _begin(self, topic: str, name: str, size: int, period_s: float) -> None:
+        over = threading.Event()
+        thread = threading.Thread(target=self._publish, args=(topic, name, size, period_s, over), daemon=True)
+        self._running[topic] = over, thread
+        thread.start()
+
+    def _halt(self, topic: str) -> int:
+        over, thread = self._running.pop(topic)
+        over.set()
+        thread.join()
+        return self._sent[topic]
+
+    def _publish(self, topic: str, name: str, size: int, period_s: float, over: threading.Event) -> None:
+        due = time.monotonic()
+        while not over.wait(max(0.0, due - time.monotonic())):
+            due = max(due + period_s, time.monotonic() - period_s)
+            number = self._sent.get(topic, 0)
+            self._write(topic, message(name, number, size))
+            self._sent[topic] = number + 1
