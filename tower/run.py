@@ -14,6 +14,7 @@ import pwd
 import shlex
 import shutil
 import signal
+import socket
 import ssl
 import subprocess
 import sys
@@ -61,6 +62,7 @@ class Runner:
 
     def start(self, robots: Sequence[str]) -> None:
         """Returns when all answer. Raises ServerFailed with the end of the log of the one that does not."""
+        self._ask_for_ports()
         with ExitStack() as running:
             for name in ('s3', 'mlflow', 'logs'):
                 (self._folder / 'data' / name).mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -120,6 +122,19 @@ class Runner:
             command += [f'-s3.cert.file={self._certificate[1]}', f'-s3.key.file={self._certificate[2]}']
         server = self._launch(running, 'seaweedfs', command, self._seaweed_environ(), seaweed_sockets(ports))
         server.wait(lambda: _answers(f'http://{LOOPBACK}:{MASTER_PORT + self._offset}/cluster/healthz'), READY_S)
+
+    def _ask_for_ports(self) -> None:
+        """What answers there already would be taken for the server that is started."""
+        for name, standard in (('S3', S3_PORT), ('MLflow', MLFLOW_PORT), ("SeaweedFS's master", MASTER_PORT)):
+            port = standard + self._offset
+            for host in sorted({LOOPBACK, LOOPBACK if self._bind in EVERY_ADDRESS else self._bind}):
+                with socket.socket() as one:
+                    one.settimeout(LOOK_S)
+                    if one.connect_ex((host, port)) == 0:
+                        raise ServerFailed(
+                            f'another process listens at {host}:{port}, the port of {name}',
+                            remedy=f'find it with `ss -ltnp "sport = :{port}"` and stop it, or use other ports with --offset',
+                        )
 
     def _prepare(self, robots: Sequence[str]) -> None:
         environ = self._environ(

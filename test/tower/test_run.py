@@ -157,3 +157,13 @@ def test_a_seaweedfs_that_serves_everybody_is_no_tower(tmp_path: Path, monkeypat
     with pytest.raises(ServerFailed, match='serves everybody at 127'):
         tower.start(['thor'])
     _until(lambda: not processes_of(tmp_path), 10)
+
+
+@pytest.mark.parametrize(('port', 'name'), [(9000, 'S3'), (5001, 'MLflow'), (9333, 'master')])
+def test_a_port_that_is_taken_is_named(tmp_path: Path, port: int, name: str) -> None:
+    """A server that is left over is not taken for the one that is started: nothing is started beside it."""
+    make_secrets.make(tmp_path, HOST, ['thor'])
+    offset = free_offset()
+    with socket.create_server((HOST, port + offset)), pytest.raises(ServerFailed, match=f'{port + offset}, the port of .*{name}'):
+        run.Runner(tmp_path, HOST, offset).start(['thor'])
+    assert not processes_of(tmp_path)
