@@ -27,10 +27,10 @@ from shadowhound_data_logger.bags.plain import Plain, is_plain
 from shadowhound_data_logger.bags.ranges import LocalFile, Meter, StoredFile, read_whole
 from shadowhound_data_logger.bags.remote import Listing, RemoteBag, document, natural
 from shadowhound_data_logger.bags.slice_writer import SliceWriter
-from shadowhound_data_logger.bags.span import when
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
+from shadowhound_data_logger.times import moment_in_bag
 
 UNFINISHED: Final = '.part'
 COMES: Final = 'it may not have arrived yet: shadowhound-data bag list'
@@ -40,7 +40,7 @@ SOURCE: Final = 'source'
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What to cut out. Times as ``span.when`` takes them: from ``start``, before ``end``; empty for the bag's own."""
+    """What to cut out. Times as ``times.moment_in_bag`` takes them: from ``start``, before ``end``; empty for the bag's own."""
 
     start: str = ''
     end: str = ''
@@ -123,8 +123,8 @@ def _cut(source: Material, folder: Path, out: Path, choice: Choice, meter: Meter
          others: Sequence[Part] = ()) -> Cut:  # fmt: skip
     """``others`` are slices that are not there."""
     first_ns, last_ns = source.span()
-    start_ns = when(choice.start, first_ns, last_ns, '--start') if choice.start else first_ns
-    end_ns = when(choice.end, first_ns, last_ns, '--end') if choice.end else last_ns + 1
+    start_ns = moment_in_bag('--start', choice.start, first_ns, last_ns) if choice.start else first_ns
+    end_ns = moment_in_bag('--end', choice.end, first_ns, last_ns) if choice.end else last_ns + 1
     if start_ns > last_ns and not choice.end:
         raise _nothing(source, choice, start_ns, start_ns)
     if end_ns <= start_ns:

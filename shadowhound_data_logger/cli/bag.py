@@ -1,12 +1,75 @@
-"""``shadowhound-data bag``: recordings, wherever they are. The verbs stand in bag_*.py."""
+"""``shadowhound-data bag``: recordings, wherever they are: find, look at, check, download, cut out, send and record them."""
 
 from __future__ import annotations
 
-import click
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
 
-from shadowhound_data_logger.cli.bag_send import record, upload, watch
-from shadowhound_data_logger.cli.bag_show import info, list_, verify
-from shadowhound_data_logger.cli.bag_take import cut, fetch
+import click
+from rich.console import RenderableType
+from rich.text import Text
+
+from shadowhound_data_logger.bags.cut import COMES, Choice, Cut, cut_folder, cut_remote
+from shadowhound_data_logger.bags.fetch import THREADS, fetch
+from shadowhound_data_logger.bags.info import BagInfo, info_folder, info_of
+from shadowhound_data_logger.bags.manifest import ClockOf, Missing
+from shadowhound_data_logger.bags.overview import BagRow, NoStore, overview
+from shadowhound_data_logger.bags.record import DEADLINE_S, record
+from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
+from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, parcel, spool_parcel, upload_now
+from shadowhound_data_logger.bags.verify import Verified, verify_folder, verify_remote
+from shadowhound_data_logger.bags.watch import Step, Watch
+from shadowhound_data_logger.cli.common import as_json, robot_name, the_home, the_store
+from shadowhound_data_logger.cli.output import (
+    duration,
+    number,
+    plain,
+    plain_table,
+    print_json,
+    print_lines,
+    print_page,
+    progress,
+    shown_time,
+    value_table,
+    volume,
+    with_dates,
+)
+from shadowhound_data_logger.clock import SystemClock, iso
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.errors import NameRefused, StoreUnavailable
+from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
+from shadowhound_data_logger.times import moment
+
+STORE_THREADS: Final = 8
+STATES: Final = {'complete': 'green', 'growing': 'cyan', 'recovered': 'yellow', 'gaps': 'yellow', 'foreign': 'dim'}
+STEPS: Final = {'spooled': 'cyan', 'stored': 'green', 'removed': 'green', 'refused': 'red'}
+DURABILITY: Final = {1: 'transient_local', 2: 'volatile'}
+RELIABILITY: Final = {1: 'reliable', 2: 'best_effort'}
+"""rmw's numbers, which bags before Jazzy keep; https://docs.ros.org/en/jazzy/p/rmw/generated/file_include_rmw_types.h.html"""
+
+
+def _bag(_: click.Context, __: click.Parameter, name: str) -> str | Path:
+    """A name, or the path of a folder."""
+    path = Path(name)
+    if '/' in name or name in {'.', '..'}:
+        if not path.is_dir():
+            raise click.BadParameter(f'there is no folder {name}')
+        return path.absolute()
+    try:
+        return check_name(name, 'the bag', MAX_BAG_BYTES)
+    except NameRefused as error:
+        raise click.BadParameter(str(error)) from error
+
+
+_robot = click.option(
+    '--robot', envvar='SHADOWHOUND_ROBOT', default='thor', show_default=True, callback=robot_name, help='Whose bags.'
+)
+_bag_or_folder = click.argument('bag', metavar='BAG|DIR', callback=_bag)
 
 
 @click.group()
@@ -18,5 +81,393 @@ def bag() -> None:
     """
 
 
-for verb in (list_, info, verify, fetch, cut, upload, watch, record):
-    bag.add_command(verb)
+@bag.command('list')
+@click.option(
+    '--since', default='', metavar='TIME', help='Those that began since: yesterday, 2025-10-18, 2025-10-18T12:00, 90min, 2d.'
+)
+@_robot
+@as_json
+def bag_list(*, since: str, robot: str, as_json: bool) -> int:
+    """One line a bag, the newest last: those in the store, and those still on this machine.
+
+    \b
+    growing    still recorded, or not all of it has arrived yet
+    complete   all slices are known, with their checksums
+    gaps       the same, but messages were dropped while it recorded: bag info says which
+    recovered  the same, after a crash or power cut: bag info says what is missing
+    foreign    not from this package: nobody says what should be in it
+
+    Exit code 1 when something is wrong with one of them, or the store is away: then only what is on this machine is told.
+    """  # noqa: D301 - click's mark for lines that stay as they are
+    begin_ns = moment('--since', since, SystemClock.of_this_machine().wall_ns()) if since else 0
+    with the_store(STORE_THREADS) as store:
+        where, away = store.describe(), ''
+        try:
+            rows = overview(store, robot, the_home(), since_ns=begin_ns)
+        except StoreUnavailable as error:
+            rows, away = overview(NoStore(), robot, the_home(), since_ns=begin_ns), str(error)
+            click.echo(f'The store is away, so this is what is on this machine: {away}', err=True)
+    if as_json:
+        print_json([with_dates(asdict(row)) for row in rows])
+    elif not rows:
+        click.echo(f'There is no bag of {robot} in {where}, nor on this machine{" since then" if since else ""}.')
+    else:
+        print_page(_rows(rows), *_findings(rows))
+    return 1 if away or any(row.finding and row.state != GROWING for row in rows) else 0
+
+
+@bag.command('info')
+@_bag_or_folder
+@_robot
+@as_json
+def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> int:
+    """Topics, types, rates, QoS, times and slices of a bag, from a few short reads. Exit code 1 when a slice is missing."""
+    if isinstance(bag, Path):
+        found = info_folder(bag)
+    else:
+        with the_store(STORE_THREADS) as store:
+            found = info_of(store, robot, bag, the_home())
+    if as_json:
+        print_json(_info_json(found))
+    else:
+        print_page(*_page(found))
+    return 1 if found.missing else 0
+
+
+@bag.command('verify')
+@click.option('--deep', is_flag=True, help='Read every byte: content against checksums, and the CRC of every chunk.')
+@_bag_or_folder
+@_robot
+@as_json
+def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> int:
+    """Whether every slice is there as it was recorded. Exit code 0 only when it is, and the bag is not growing.
+
+    In the store sizes and checksums are compared, and nothing is downloaded but each slice's summary; in a folder everything is
+    read. --deep reads everything in the store as well, and unpacks every chunk.
+    """
+    with progress('read', of='bytes') as bar:
+        if isinstance(bag, Path):
+            found = verify_folder(bag, deep=deep, told=bar.have)
+        else:
+            with the_store(STORE_THREADS) as store:
+                found = verify_remote(store, find_bag(store, robot, bag), deep=deep, told=bar.have)
+    if as_json:
+        said = {**asdict(found), 'is_sound': found.is_sound, 'is_complete': found.state not in {GROWING, FOREIGN}}
+        print_json(said)
+    else:
+        print_page(*_verdict(found))
+    return 0 if found.is_sound and found.state != GROWING else 1
+
+
+@bag.command('fetch')
+@click.argument('bag', metavar='BAG')
+@click.option('--to', type=click.Path(path_type=Path, file_okay=False), required=True, help='The folder above that of the bag.')
+@click.option('--threads', type=click.IntRange(1, 32), default=THREADS, show_default=True, help='Files at a time.')
+@_robot
+@as_json
+def bag_fetch(*, bag: str, to: Path, threads: int, robot: str, as_json: bool) -> int:
+    """Download a bag as TO/BAG, or what is there of it yet, each file checked against its SHA-256.
+
+    Run it again after it was stopped: it goes on where it ended. What is there and right is not downloaded again. A bag that is
+    still growing gets a metadata.yaml of what there is, so that players open it; fetch it again later for the rest.
+    """
+    with the_store(STORE_THREADS) as store, progress('fetched', of='bytes') as bar:
+        there = find_bag(store, robot, bag)
+        found = fetch(store, there, to, threads=threads, told=bar)
+    if as_json:
+        print_json({**asdict(found), 'folder': str(found.folder)})
+        return 0
+    lines = [plain(f'{found.folder}: {number(found.files)} files, {volume(found.bytes)}; downloaded {volume(found.downloaded)}')]
+    if found.unverified:
+        lines.append(plain(f'No checksum is known of {", ".join(found.unverified)}: only the size was compared.', 'yellow'))
+    elif found.missing:
+        lines.append(plain(f'Not in the store yet: {", ".join(found.missing)}. Fetch it again for the rest.', 'cyan'))
+    elif not found.is_complete:
+        lines.append(plain('The bag is still growing: fetch it again for the rest.', 'cyan'))
+    print_lines(*lines)
+    return 0
+
+
+@bag.command('cut')
+@_bag_or_folder
+@click.option('--start', default='', metavar='TIME', help='From then on  [default: the start of the bag]')
+@click.option('--end', default='', metavar='TIME', help='Before then  [default: the end of the bag]')
+@click.option('--topics', '--topic', multiple=True, metavar='TOPIC', help='Only these: repeat it, or put commas between them.')
+@click.option('--regex', default='', help='Also topics in which this regular expression is found.')
+@click.option('-o', '--output', type=click.Path(path_type=Path), required=True, help='The new folder, which becomes a bag.')
+@_robot
+@as_json
+def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str, as_json: bool, **wanted: str) -> int:
+    """Copy a span of time and some topics of a bag into a new bag, message by message.
+
+    \b
+    TIME   2025-10-18T12:00:05.5   a date, UTC where it names no zone
+           12.5                    seconds since the start of the bag
+           -30                     seconds before its end
+           1760788805.5            seconds since 1970
+
+    It goes by the time at which messages were received, as ros2 bag play does. Of a bag in the store only the chunks that hold
+    something of it are read. Exit code 1 when a slice of that time is not there.
+    """  # noqa: D301 - click's mark for lines that stay as they are
+    names = tuple(name.strip() for each in topics for name in each.split(',') if name.strip())
+    choice = Choice(topics=names, **wanted)
+    if isinstance(bag, Path):
+        found = cut_folder(bag, output, choice)
+    else:
+        with the_store(STORE_THREADS) as store:
+            found = cut_remote(store, find_bag(store, robot, bag), output, choice)
+    if as_json:
+        print_json(with_dates({**asdict(found), 'folder': str(found.folder)}))
+    else:
+        print_lines(*_told_cut(found))
+    return 1 if found.missing else 0
+
+
+@bag.command('upload')
+@click.argument('folder', metavar='DIR', type=click.Path(path_type=Path))
+@click.option('--name', default='', help='The name of the bag in the store  [default: that of DIR]')
+@click.option('--tar-gz', is_flag=True, help='As one ROBOT/rosbags/NAME.tar.gz instead of its files.')
+@click.option('--now', is_flag=True, help='Past the spool: nothing is left behind when it does not get through in time.')
+@click.option('--deadline', type=click.FloatRange(0.0, 1e7), default=600.0, show_default=True, help='Seconds to wait for Tower.')
+@_robot
+@as_json
+def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: str, as_json: bool, tar_gz: bool) -> int:
+    """Send a finished bag, SQLite or MCAP, as rosbag2 wrote it: its files as they are, and a manifest with their checksums.
+
+    It goes through the spool of this machine and waits until the store has it. When Tower is away for longer than the deadline
+    the bag stays in the spool, safe, and is delivered by the node that runs here, or by the next upload; exit code 1 says so.
+    DIR itself is never touched.
+    """
+    folder = folder.absolute()
+    settings, clock = Settings.load({'robot': robot}, os.environ), SystemClock.of_this_machine()
+    with parcel(folder, robot, name or folder.name, the_home(), is_archive=tar_gz) as sent, progress('sent', of='bytes') as bar:
+        if now:
+            with the_store(STORE_THREADS) as store:
+                found = upload_now(store, sent, deadline_s=deadline, told=bar)
+        else:
+            with opened_spool(settings, clock) as spool:
+                spool_parcel(sent, spool)
+                found = deliver(settings, spool, sent, deadline_s=deadline, told=bar)
+    if as_json:
+        print_json({**asdict(found), 'is_delivered': found.is_delivered})
+    else:
+        print_lines(_told_upload(found))
+    return 0 if found.is_delivered else 1
+
+
+@bag.command('watch')
+@click.argument('folder', metavar='DIR', type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option('--settle', type=click.FloatRange(0.0, 86_400.0), default=10.0, show_default=True, help='Seconds without a change.')
+@click.option('--every', type=click.FloatRange(0.1, 3600.0), default=5.0, show_default=True, help='Seconds between two looks.')
+@click.option('--remove', is_flag=True, help='Remove a bag from DIR once the store has confirmed every file of it.')
+@click.option('--once', is_flag=True, help='Look, wait for what is still changing, look again, and end. For a timer.')
+@_robot
+@as_json
+def bag_watch(*, folder: Path, settle: float, every: float, once: bool, robot: str, as_json: bool, remove: bool) -> int:
+    """Send every bag that `ros2 bag record` finishes in DIR, each once, until Ctrl-C.
+
+    Finished is a folder in DIR with a metadata.yaml and all that it names, unchanged for --settle seconds. What was sent stands
+    in DIR/.shadowhound-bags.json: it is not sent again after a restart. With --once exit code 1 says that something is not in
+    the store yet.
+    """
+    settings = Settings.load({'robot': robot}, os.environ)
+    watching = Watch(folder.absolute(), settings, SystemClock.of_this_machine(), settle_s=settle, is_removing=remove)
+    with watching.alone():
+        try:
+            while True:
+                _tell(watching.round(), as_json)
+                time.sleep(settle if once else every)
+                if once:
+                    _tell(watching.round(), as_json)
+                    return 1 if watching.is_owing() else 0
+        except KeyboardInterrupt:
+            return 0
+
+
+@bag.command('record')
+@click.argument('name')
+@click.option('--duration', type=click.FloatRange(0.1, 86_400.0), required=True, help='Seconds; Ctrl-C ends it earlier.')
+@click.option('--topic', '--topics', 'topics', multiple=True, help='Record it; more by repeating it, or with commas.')
+@click.option('--regex', default='', help='Record also topics in which it is found; ".*" is all of them.')
+@click.option('--deadline', type=click.FloatRange(0.0, 1e6), default=DEADLINE_S, show_default=True, help='Seconds for Tower.')
+@_robot
+@as_json
+def bag_record(*, topics: tuple[str, ...], as_json: bool, **wanted: Any) -> int:
+    """Record topics as NAME_YYYYMMDD_HHMMSS and have it in the store; without a topic those that the node logs by default.
+
+    It needs ROS 2, but not its rosbag2, and no node that runs. Slices leave while it records. When Tower is away the bag waits in
+    the spool, and exit code 1 says so.
+    """
+    names = [name.strip() for each in topics for name in each.split(',') if name.strip()]
+    duration, deadline = wanted.pop('duration'), wanted.pop('deadline')
+    found = record(duration_s=duration, deadline_s=deadline, topics=names, **wanted)
+    if as_json:
+        print_json({**asdict(found), 'where': found.where})
+    else:
+        state = 'confirmed by the store' if found.delivered else f'waits in the spool for the store ({found.last_error})'
+        print_lines(f'{found.where}: {number(found.messages)} messages on {number(len(found.topics))} topics, '
+            f'{number(found.slices)} slices, {volume(found.bytes)}, {state}')  # fmt: skip
+        if found.dropped:
+            print_lines(f'{number(found.dropped)} messages were dropped: this machine was too slow for them.')
+    return 0 if found.delivered and not found.dropped else 1
+
+
+def _rows(rows: Sequence[BagRow]) -> RenderableType:
+    columns = ('bag', 'state', 'began (UTC)', 'duration', 'messages', 'topics', 'slices', 'size', 'where')
+    table = plain_table('Bags', columns, ('bag', 'state', 'began (UTC)', 'where'))
+    for row in rows:
+        length = '-' if row.t_start_ns is None or row.t_end_ns is None else duration((row.t_end_ns - row.t_start_ns) / 1e9)
+        table.add_row(
+            plain(row.bag), plain(row.state, STATES.get(row.state, 'red')), shown_time(row.t_start_ns)[:19], length,
+            number(row.messages), number(row.topics), number(row.slices), volume(row.bytes), _places(row.where),
+        )  # fmt: skip
+    return table
+
+
+def _places(where: Mapping[str, int]) -> str:
+    """Only the place, where it is one."""
+    return next(iter(where)) if len(where) == 1 else ', '.join(f'{place} {count}' for place, count in where.items())
+
+
+def _findings(rows: Sequence[BagRow]) -> Iterator[RenderableType]:
+    found = [row for row in rows if row.finding]
+    if found:
+        yield ''
+        yield from (plain(f'{row.bag}: {row.finding}', 'yellow') for row in found)
+
+
+def _page(found: BagInfo) -> Iterator[RenderableType]:
+    told = found.description
+    yield Text.assemble(plain(found.bag, 'bold'), '  ', plain(found.state, STATES.get(found.state, 'red')))
+    manifest = found.manifest
+    mission, event = (manifest.mission, manifest.event) if manifest else (None, None)
+    lines = {
+        'robot': found.robot or (manifest.robot if manifest else ''),
+        'mission': f'{mission.type}, run {mission.run_id or "-"}, id {mission.mission_id or "-"}' if mission else '',
+        'event': ', '.join(f'{each.name} by {each.by}' for each in event.triggers) if event else '',
+        'clock': _clock(manifest.clock, told.t_start_ns) if manifest and manifest.clock else '',
+        'began': f'{shown_time(told.t_start_ns)} UTC' if told.messages else '-',
+        'ended': f'{shown_time(told.t_end_ns)} UTC' if told.messages else '-',
+        'duration': duration(told.duration_s), 'messages': f'{number(told.messages)} on {len(told.topics)} topics',
+        'size': f'{volume(found.bytes)} in {len(found.files)} files',
+        'storage': ', '.join(filter(None, (told.storage, told.compression, f'ROS {told.distro}' if told.distro else ''))),
+    }  # fmt: skip
+    yield value_table('', {name: value for name, value in lines.items() if value})
+    yield ''
+    yield _topics(found)
+    yield ''
+    yield _files(found)
+    if found.missing:
+        yield plain(f'Not here yet: {", ".join(found.missing)}', 'yellow')
+    yield from _lost(manifest.missing if manifest else ())
+
+
+def _clock(clock: ClockOf, start_ns: int) -> str:
+    """What the times of a bag are worth whose clock was not set."""
+    if clock.offset_ns is None:
+        return f'was never set in boot {clock.boot_id}: nobody knows the date, and the times below are by that clock'
+    began = f'the bag began {shown_time(start_ns + clock.offset_ns)} UTC'
+    return f'was not set yet: {began}, and {clock.offset_ns / 1e9:.3f} s are to be added to the times below'
+
+
+def _lost(missing: Sequence[Missing]) -> Iterator[RenderableType]:
+    """What the recording itself could not get into the bag."""
+    for lost in missing:
+        count = '' if lost.messages is None else f' ({number(lost.messages)} messages)'
+        topic = f' of {lost.topic}' if lost.topic else ''
+        yield plain(f'Missing{topic}, in or after {lost.file}: {lost.what}{count}', 'yellow')
+
+
+def _topics(found: BagInfo) -> RenderableType:
+    table = plain_table('Topics', ('topic', 'type', 'messages', 'rate', 'QoS'), ('topic', 'type', 'QoS'))
+    seconds = found.description.duration_s
+    for topic in sorted(found.description.topics, key=lambda each: each.name):
+        rate = f'{(topic.messages - 1) / seconds:.1f} Hz' if topic.messages > 1 and seconds else '-'
+        table.add_row(plain(topic.name), plain(topic.type), number(topic.messages), rate, plain(_qos(topic.qos)))
+    return table
+
+
+def _files(found: BagInfo) -> RenderableType:
+    columns = ('file', 'began (UTC)', 'duration', 'messages', 'size', 'where')
+    table = plain_table('Files', columns, ('file', 'began (UTC)', 'where'))
+    parts = {part.name: part for part in found.description.parts}
+    for name, (size, where) in found.files.items():
+        part = parts.get(name)
+        start, end = (part.t_start_ns, part.t_end_ns) if part else (None, None)
+        length = '-' if start is None or end is None else duration((end - start) / 1e9)
+        table.add_row(plain(name), shown_time(start), length, number(part.messages if part else None), volume(size), where)
+    return table
+
+
+def _qos(profiles: Sequence[Mapping[str, Any]]) -> str:
+    """What decides whether a subscription hears anything; of several publishers each that differs."""
+    found: list[str] = []
+    for profile in profiles:
+        reliability, durability = profile.get('reliability'), profile.get('durability')
+        words = [str(RELIABILITY.get(reliability, reliability) if isinstance(reliability, int) else reliability)]
+        durability = DURABILITY.get(durability, durability) if isinstance(durability, int) else durability
+        words += [str(durability)] if durability != 'volatile' else []
+        if ' '.join(words) not in found:
+            found.append(' '.join(words))
+    return ', '.join(found) or '-'
+
+
+def _info_json(found: BagInfo) -> dict[str, Any]:
+    told = found.description
+    times = with_dates({'t_start_ns': told.t_start_ns, 't_end_ns': told.t_end_ns}) if told.messages else {}
+    parts = {part.name: with_dates(asdict(part)) for part in told.parts}
+    return {
+        'robot': found.robot, 'bag': found.bag, 'state': found.state, **times, 'duration_s': told.duration_s,
+        'messages': told.messages, 'bytes': found.bytes, 'storage': told.storage, 'compression': told.compression,
+        'ros_distro': told.distro, 'topics': [asdict(topic) for topic in told.topics],
+        'files': [
+            {**parts.get(name, {'name': name}), 'bytes': size, 'where': where} for name, (size, where) in found.files.items()
+        ],
+        'missing': list(found.missing), 'read_bytes': found.read_bytes,
+        'manifest': json.loads(found.manifest.to_json()) if found.manifest else None,
+    }  # fmt: skip
+
+
+def _verdict(found: Verified) -> Iterator[RenderableType]:
+    for check in found.findings:
+        yield plain(f'{check.name} {check.finding}', 'red')
+    sound = [check for check in found.checks if not check.finding]
+    how = ', '.join(sorted({check.checked for check in sound}))
+    text = f'{number(len(sound))} of {number(len(found.checks))} files are sound (by {how})' if sound else 'No file is sound'
+    yield Text.assemble(plain(found.bag, 'bold'), ' ', plain(found.state, STATES.get(found.state, 'red')), f': {text}.')
+    yield from _lost(found.missing)
+    if found.state == GROWING:
+        yield plain('It is still growing: its manifest, or a slice that it promises, is not there yet.', 'yellow')
+    if found.state == FOREIGN:
+        yield plain('It has no manifest, so nobody says what should be in it.', 'dim')
+
+
+def _told_cut(found: Cut) -> Iterator[str | Text]:
+    length = duration((found.t_end_ns - found.t_start_ns) / 1e9)
+    what = f'{number(found.messages)} messages on {number(found.topics)} topics, {volume(found.bytes)}'
+    share = f'{100 * found.read_bytes / max(found.bag_bytes, 1):.1f} %'
+    read = f'Read {volume(found.read_bytes)} of {volume(found.bag_bytes)} ({share}) in {number(found.read_requests)} requests.'
+    yield f'{found.folder}: {what}, {shown_time(found.t_start_ns)} to {shown_time(found.t_end_ns)} UTC ({length})'
+    yield read
+    if found.absent:
+        yield plain(f'The bag has no topic {", ".join(found.absent)}.', 'yellow')
+    if found.missing:
+        yield plain(f'Not all of that time: {", ".join(found.missing)} is not there; {COMES}', 'yellow')
+
+
+def _told_upload(found: Uploaded) -> str:
+    name = f'{found.robot}/rosbags/{found.bag}'
+    if found.is_delivered:
+        return f'{name}: {number(found.files)} files, {volume(found.bytes)}, confirmed by the store'
+    left = found.files - found.delivered
+    why = f' ({found.last_error})' if found.last_error else ''
+    return f'{name}: {number(left)} of {number(found.files)} files wait in the spool for the store{why}'
+
+
+def _tell(steps: list[Step], as_json: bool) -> None:
+    for step in steps:
+        if as_json:
+            print_json(asdict(step), is_line=True)
+        else:
+            now = iso(SystemClock.of_this_machine().wall_ns())[:19]
+            print_lines(plain(f'{now} {step.bag} {step.what} {step.reason}'.rstrip(), STEPS[step.what]))

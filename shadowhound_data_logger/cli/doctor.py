@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections import Counter
@@ -13,10 +12,10 @@ from typing import Any, Final
 import click
 from rich.console import Console, RenderableType
 from rich.padding import Padding
-from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.text import Text
 
-from shadowhound_data_logger.cli.tables import plain
+from shadowhound_data_logger.cli.common import as_json
+from shadowhound_data_logger.cli.output import plain, print_json, progress
 from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make
 from shadowhound_data_logger.doctor.fixes import fix as mend
@@ -64,7 +63,7 @@ def _is_of(check: str, name: str) -> bool:
 @click.command()
 @click.option('--role', type=click.Choice([role.value for role in Role]), help='What this machine is  [default: guessed]')
 @click.option('--only', 'checks', multiple=True, metavar='CHECK', callback=_selected, help='Ask this alone; may be repeated.')
-@click.option('--json', 'as_json', is_flag=True, help='Print the results as JSON.')
+@as_json
 @click.option('--fix', is_flag=True, help='Do what is safe (modes of files, missing buckets); the rest is for you to paste.')
 @click.option('--timeout', type=click.FloatRange(0.5, 600.0), default=TIMEOUT_S, show_default=True, help='Seconds for all of it.')
 @click.option('--params-file', type=click.Path(path_type=Path, dir_okay=False, exists=True), envvar='SHADOWHOUND_PARAMETERS',
@@ -93,9 +92,9 @@ def doctor(  # noqa: PLR0913 - one for each option
     took_s = time.monotonic() - began_s
     left = [result for result in results if result.is_finding and not _is_mended(result, mended)]
     if as_json:
-        click.echo(json.dumps(_said(results, mended, context, took_s, ok=not left), indent=2))
+        print_json(_said(results, mended, context, took_s, ok=not left))
     else:
-        for part in view(results, mended, context, took_s, verbose=verbose):
+        for part in report(results, mended, context, took_s, verbose=verbose):
             console().print(part)
     return 1 if left else 0
 
@@ -110,15 +109,12 @@ def console() -> Console:
 
 def _examine(checks: Sequence[Check], context: Context, timeout_s: float) -> list[Result]:
     """With what is still under way shown meanwhile on standard error, where that is a terminal."""
-    stderr = Console(stderr=True)
-    columns = (SpinnerColumn(), TextColumn('{task.description}'))
     waiting = [check.name for check in checks]
-    with Progress(*columns, console=stderr, transient=True, disable=not stderr.is_terminal) as bar:
-        task = bar.add_task(f'asking {", ".join(waiting)}')
+    with progress(f'asking {", ".join(waiting)}') as bar:
 
         def tell(check: Check) -> None:
             waiting.remove(check.name)
-            bar.update(task, description=f'asking {", ".join(waiting)}')
+            bar.say(f'asking {", ".join(waiting)}')
 
         return Examination(checks, context, timeout_s=timeout_s, tell=tell).run()
 
@@ -136,7 +132,7 @@ def _said(results: Sequence[Result], mended: Sequence[tuple[Result, str]], conte
     }  # fmt: skip
 
 
-def view(results: Sequence[Result], mended: Sequence[tuple[Result, str]], context: Context, took_s: float,
+def report(results: Sequence[Result], mended: Sequence[tuple[Result, str]], context: Context, took_s: float,
          *, verbose: bool) -> list[RenderableType]:  # fmt: skip
     """The verdict, each finding with cause and remedy, what was done, what is good to know, and what is fine."""
     findings = sorted(

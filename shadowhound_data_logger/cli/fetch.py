@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from rich.text import Text
 
-from shadowhound_data_logger.cli.question import asking, question, quietly, settings, tell_left_out
-from shadowhound_data_logger.cli.tables import duration, number, plain, volume
+from shadowhound_data_logger.cli.common import as_json, the_store_settings
+from shadowhound_data_logger.cli.output import duration, number, plain, print_json, print_lines, progress, volume
+from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 
 SHOWN: Final = 20
 """Of what could not be fetched; --json has all."""
@@ -28,7 +27,7 @@ SHOWN: Final = 20
 @click.option('--bucket', default='sensor-data', show_default=True, help='Of a prefix.')
 @click.option('--verify', is_flag=True, help='Read again what is there already.')
 @click.option('--threads', type=click.IntRange(1, 256), default=16, show_default=True, help='Objects at a time.')
-@click.option('--json', 'as_json', is_flag=True, help='Print what became of it as JSON.')
+@as_json
 def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to: Path, bucket: str, verify: bool, threads: int,  # noqa: PLR0913 - one an option
           as_json: bool) -> int:  # fmt: skip
     """Download objects, each verified; a second time only what is new. Exit code 1 when something could not be fetched.
@@ -42,27 +41,33 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
         from shadowhound_data_logger.lake import fetched_rows  # noqa: PLC0415
         from shadowhound_data_logger.lake.source import open_source  # noqa: PLC0415
 
-        store = settings()
+        store = the_store_settings()
         begun_s = time.monotonic()
         left_out = quietly()
         rows = [] if prefix is not None else _asked(flags, limit, left_out)
         wishes = list(dict.fromkeys(lake.Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows))
         if prefix is not None:
             wishes = lake.under(open_source(store, bucket), prefix)
-    with _progress() as bar:
-        task = bar.add_task('', total=sum(wish.size for wish in wishes), objects=0, of=len(wishes))
-        found = lake.fetch(wishes, to, lambda name: open_source(store, name), verify=verify, threads=threads,
-                           tell=lambda size, objects: _advance(bar, task, size, objects))  # fmt: skip
+    with progress(f'0 of {number(len(wishes))} objects', sum(wish.size for wish in wishes), of='bytes') as bar:
+        here = 0
+
+        def tell(size: int, objects: int) -> None:
+            nonlocal here
+            here += objects
+            bar.have(size)
+            bar.say(f'{number(here)} of {number(len(wishes))} objects')
+
+        found = lake.fetch(wishes, to, lambda name: open_source(store, name), verify=verify, threads=threads, tell=tell)
         fetched_rows.keep(to, [row for row in rows if f'{row["bucket"]}/{row["key"]}' not in found.failed])
     took_s = time.monotonic() - begun_s
     if as_json:
         told = {'to': str(to), 'asked': len(wishes), 'moved': found.moved, 'present': found.present, 'bytes': found.bytes,
                 'unverified': found.unverified, 'failed': found.failed, 'left_out': [asdict(one) for one in left_out],
                 'took_s': round(took_s, 3)}  # fmt: skip
-        click.echo(json.dumps(told, indent=2))
+        print_json(told)
     else:
         where = f'{"" if prefix is None else f"under {prefix} "}in {open_source(store, bucket).describe()}'
-        _show(found, len(wishes), took_s, to, where)
+        print_lines(*_report(found, len(wishes), took_s, to, where))
         tell_left_out(left_out)
     return 1 if found.failed or len(left_out) else 0
 
@@ -72,34 +77,21 @@ def _asked(flags: Mapping[str, Any], limit: int | None, left_out: Any) -> list[d
     from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
 
     with lake.answering():
-        rows = lake.objects(lake.default_source(settings()), findings=left_out, **flags).sort('t_start_ns')
+        rows = lake.objects(lake.default_source(the_store_settings()), findings=left_out, **flags).sort('t_start_ns')
         found: list[dict[str, Any]] = (rows.limit(limit) if limit else rows).to_pylist()
     return found
 
 
-def _progress() -> Progress:
-    """On standard error, where that is a terminal; nothing else is ever written there."""
-    console = Console(stderr=True)
-    columns = (BarColumn(), DownloadColumn(), TextColumn('{task.fields[objects]:,} of {task.fields[of]:,} objects'),
-               TransferSpeedColumn(), TimeRemainingColumn())  # fmt: skip
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-
-
-def _advance(bar: Progress, task: TaskID, size: int, objects: int) -> None:
-    bar.update(task, advance=size, objects=bar.tasks[0].fields['objects'] + objects)
-
-
-def _show(found: Any, asked: int, took_s: float, to: Path, where: str) -> None:
-    console = Console(highlight=False, soft_wrap=True)
+def _report(found: Any, asked: int, took_s: float, to: Path, where: str) -> Iterator[Text]:
     if not asked:
-        console.print(plain(f'There is nothing to fetch {where}.'))
+        yield plain(f'There is nothing to fetch {where}.')
         return
     rate = f', {volume(found.bytes / took_s)}/s' if found.moved and took_s else ''
-    console.print(plain(f'{number(found.moved)} objects ({volume(found.bytes)}) moved to {to} in {duration(took_s)}{rate}; '
-                        f'{number(found.present)} were there already.'))  # fmt: skip
+    yield plain(f'{number(found.moved)} objects ({volume(found.bytes)}) moved to {to} in {duration(took_s)}{rate}; '
+                f'{number(found.present)} were there already.')  # fmt: skip
     if found.unverified:
-        console.print(plain(f'{number(found.unverified)} have no checksum in the store: their sizes are right.', 'yellow'))
+        yield plain(f'{number(found.unverified)} have no checksum in the store: their sizes are right.', 'yellow')
     for key, why in list(found.failed.items())[:SHOWN]:
-        console.print(plain(f'  {key}: {why}', 'red'))
+        yield plain(f'  {key}: {why}', 'red')
     if found.failed:
-        console.print(plain(f'{number(len(found.failed))} could not be fetched; run it again to try only those.', 'red'))
+        yield plain(f'{number(len(found.failed))} could not be fetched; run it again to try only those.', 'red')

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import click
-from rich.console import Console, RenderableType
+from rich.console import RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.cli.tables import figure, number, plain, plain_table, show_whole, unsure, volume
-from shadowhound_data_logger.config import home
+from shadowhound_data_logger.cli.audit import verify_delivered
+from shadowhound_data_logger.cli.common import as_json, spool_folder, the_spool
+from shadowhound_data_logger.cli.output import figure, number, plain, plain_table, print_json, print_page, unsure, volume
 from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.ledger import imbalances, read
 from shadowhound_data_logger.spool.status import robots
@@ -31,8 +31,8 @@ ACCOUNTING: Final = {
 
 
 @click.command()
-@click.option('--json', 'as_json', is_flag=True, help='Print the ledger as JSON.')
-@click.option('--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool  [default: $SHADOWHOUND_HOME/spool]')
+@as_json
+@spool_folder
 @click.option('--verify', 'ask', is_flag=True, help='Ask the store for every delivered object: is it there, with its checksum?')
 @click.option('--deep', is_flag=True, help='Verify by reading every object back.')
 @click.option('--again', is_flag=True, help='Verify from the beginning, also where a run was interrupted.')
@@ -42,29 +42,27 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
     Reads the spool while the node runs and when it does not. Exit code 1 when the ledger does not balance, or when the store
     does not hold what was delivered; an interrupted --verify goes on where it was.
     """
-    folder = spool or home(os.environ) / 'spool'
+    folder = the_spool(spool)
     if ask or deep:
-        from shadowhound_data_logger.cli.verify import verify  # noqa: PLC0415 - the other verbs need no threads and no store
-
-        return verify(folder, deep=deep, again=again, as_json=as_json)
+        return verify_delivered(folder, deep=deep, again=again, as_json=as_json)
     if again:
         raise click.UsageError('--again is for --verify or --deep')
     names = robots(folder)
     found = read(folder, os.environ.get('SHADOWHOUND_ROBOT') or next(iter(names), 'thor'))
     found['robots'] = names if len(names) > 1 else [found['robot']]  # a spool that several share has one ledger of them all
     if as_json:
-        click.echo(json.dumps(found, indent=2))
+        print_json(found)
     else:
-        show(found, Console(highlight=False))
+        print_page(*page(found))
     return 0 if found['balanced'] else 1
 
 
-def show(found: Mapping[str, Any], console: Console) -> None:
+def page(found: Mapping[str, Any]) -> list[RenderableType]:
     """The ledger as tables, what there is to say about single topics, and a verdict."""
     titles = {'bags': 'Messages recorded into bags of', 'events': 'Messages that events asked for of'}
     tables = [_table(f'{title} {_whose(found)}', found[sink]) for sink, title in titles.items() if found.get(sink)]
     files = [part for table in tables for part in (table, '')]
-    show_whole([topics_table(found), '', *files, objects_table(found), *_section(notes(found)), '', verdict(found)], console)
+    return [topics_table(found), '', *files, objects_table(found), *_section(notes(found)), '', verdict(found)]
 
 
 def topics_table(found: Mapping[str, Any]) -> RenderableType:

@@ -12,12 +12,21 @@ from typing import IO, Any, Final
 
 import click
 from rich.console import Console, RenderableType
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from shadowhound_data_logger.cli.tables import duration, number, plain, plain_table, show_whole
+from shadowhound_data_logger.cli.common import as_json, the_home
+from shadowhound_data_logger.cli.output import (
+    duration,
+    number,
+    plain,
+    plain_table,
+    print_json,
+    print_page,
+    progress,
+    shown_iso,
+    value_table,
+)
 from shadowhound_data_logger.clock import iso
-from shadowhound_data_logger.config import home
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder
 from shadowhound_data_logger.missions.overview import ACTIVE, export, find, overview, overviews
@@ -31,7 +40,7 @@ COLUMNS: Final = ('time', 'kind', 'key', 'value', 'step', 'source')
 
 
 def _folder(_: click.Context, __: click.Parameter, wanted: str) -> MissionFolder:
-    found = find(home(os.environ), wanted)
+    found = find(the_home(), wanted)
     if not found:
         raise click.BadParameter(f'no mission here has the id {wanted!r}, nor has its run: shadowhound-data missions list')
     if len(found) > 1:
@@ -39,7 +48,6 @@ def _folder(_: click.Context, __: click.Parameter, wanted: str) -> MissionFolder
     return found[0]
 
 
-_as_json = click.option('--json', 'as_json', is_flag=True, help='Print it as JSON.')
 _mission = click.argument('folder', metavar='ID', callback=_folder)
 
 
@@ -49,22 +57,22 @@ def missions() -> None:
 
 
 @missions.command('list')
-@_as_json
+@as_json
 def list_(*, as_json: bool) -> int:
     """One row a mission, the newest last. Exit code 1 when one that is over is not sent."""
-    where = home(os.environ)
+    where = the_home()
     found = overviews(where)
     if as_json:
-        click.echo(json.dumps(found, indent=2))
+        print_json(found)
     elif not found:
         click.echo(f'No mission has been logged in {where / FOLDER} yet. SHADOWHOUND_HOME names the folder above it.')
     else:
-        show_whole([_table(found), *_verdict(found, is_sending=is_sending(where / FOLDER))], Console(highlight=False))
+        print_page(_table(found), *_verdict(found, is_sending=is_sending(where / FOLDER)))
     return 1 if _late(found) else 0
 
 
 @missions.command()
-@_as_json
+@as_json
 @_mission
 def show(*, folder: MissionFolder, as_json: bool) -> int:
     """All there is to know of one mission. Exit code 1 when it is over and not sent: then what is left, and why."""
@@ -72,9 +80,9 @@ def show(*, folder: MissionFolder, as_json: bool) -> int:
     if found is None:
         raise click.UsageError(f'{folder.path} has no mission in it')
     if as_json:
-        click.echo(json.dumps(found, indent=2))
+        print_json(found)
     else:
-        show_whole(list(_page(found)), Console(highlight=False))
+        print_page(*_page(found))
     return 1 if _late([found]) else 0
 
 
@@ -83,7 +91,7 @@ def show(*, folder: MissionFolder, as_json: bool) -> int:
 @click.option('--experiment', help='The MLflow experiment of new runs.  [default: ROBOT_missions]')
 def resume(*, deadline: float, experiment: str | None) -> int:
     """Send what is unsent, and wait for it. Exit code 1 when something stays; it is tried on for ten minutes then."""
-    where = home(os.environ)
+    where = the_home()
     if not _late(overviews(where)):
         click.echo('Nothing is left to send.')
         return 0
@@ -95,7 +103,7 @@ def resume(*, deadline: float, experiment: str | None) -> int:
     finally:
         replayer.let_go()
     for each in left:
-        show_whole([*_reason(each)], Console(highlight=False, stderr=True))
+        print_page(*_reason(each), console=Console(highlight=False, stderr=True))
     click.echo(f'{number(len(left))} not sent within {deadline:g} s.' if left else 'All is sent.')
     return 1 if left else 0
 
@@ -133,13 +141,10 @@ def _late(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _wait(where: Path, end_s: float) -> list[dict[str, Any]]:
     """What is left in the end."""
-    console = Console(stderr=True)
-    columns = (SpinnerColumn(), TextColumn('{task.description}'), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task('')
+    with progress(of='seconds') as bar:
         while (left := _late(overviews(where))) and time.monotonic() < end_s:
             records = sum(each['unsent']['records'] for each in left)
-            progress.update(task, description=f'{number(len(left))} missions, {number(records)} records to send')
+            bar.say(f'{number(len(left))} missions, {number(records)} records to send')
             time.sleep(POLL_S)
     return left
 
@@ -148,7 +153,7 @@ def _table(found: list[dict[str, Any]]) -> RenderableType:
     left = ('mission', 'type', 'started', 'result', 'run')
     table = plain_table('Missions', ('mission', 'type', 'started', 'duration', 'result', 'unsent', 'run'), left)
     for each in found:
-        table.add_row(plain(each['mission_id']), plain(each['type']), _when(each['started']), duration(each['duration_s']),
+        table.add_row(plain(each['mission_id']), plain(each['type']), shown_iso(each['started']), duration(each['duration_s']),
                       _result(each), _unsent(each), plain(each['run_id'] or '-'))  # fmt: skip
     return table
 
@@ -165,18 +170,18 @@ def _verdict(found: list[dict[str, Any]], *, is_sending: bool) -> Iterator[Rende
 def _page(found: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield Text.assemble(plain(found['mission_id'], 'bold'), '  ', _result(found))
     lines = {
-        'type': found['type'], 'command': found['command'], 'robot': found['robot'], 'started': _when(found['started']),
-        'ended': _when(found['ended']) if found['ended'] else '-', 'duration': duration(found['duration_s']),
+        'type': found['type'], 'command': found['command'], 'robot': found['robot'], 'started': shown_iso(found['started']),
+        'ended': shown_iso(found['ended']) if found['ended'] else '-', 'duration': duration(found['duration_s']),
         'distance': '-' if found['distance_m'] is None else f'{found["distance_m"]:.2f} m',
         'battery used': '-' if found['battery_consumed_pct'] is None else f'{found["battery_consumed_pct"]:.1f} %',
         'MLflow run': found['run_id'] or '-', 'folder': found['folder'],
     }  # fmt: skip
-    yield _pairs('', lines)
+    yield value_table('', lines)
     yield ''
-    yield _pairs('Logged', {name.replace('_', ' '): number(count) for name, count in found['counts'].items()})
+    yield value_table('Logged', {name.replace('_', ' '): number(count) for name, count in found['counts'].items()})
     if found['last']:
         yield ''
-        yield _pairs('Last values', {name: f'{value:g}' for name, value in found['last'].items()})
+        yield value_table('Last values', {name: f'{value:g}' for name, value in found['last'].items()})
     yield from (plain(f'Error: {error}', 'red') for error in found['errors'])
     yield from (plain(f'Left out: {count} by {reason}', 'yellow') for reason, count in found['refused'].items())
     yield ''
@@ -196,22 +201,9 @@ def _reason(found: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield plain(f'Last error: {found["last_error"]}', 'red' if found['complete'] else 'yellow')
 
 
-def _pairs(title: str, lines: Mapping[str, Any]) -> RenderableType:
-    table = plain_table(title, ('', 'value'), ('', 'value'))
-    table.show_header = False
-    table.padding = (0, 2, 0, 0)
-    for name, value in lines.items():
-        table.add_row(plain(name, 'dim'), plain(value))
-    return table
-
-
 def _result(found: Mapping[str, Any]) -> Text:
     return plain(found['result'], STYLES.get(found['result'], 'red'))
 
 
 def _unsent(found: Mapping[str, Any]) -> str:
     return '-' if found['complete'] else number(sum(found['unsent'].values()))
-
-
-def _when(time_: str) -> str:
-    return f'{time_[:10]} {time_[11:19]}'

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import click
-from rich.console import Console, RenderableType
+from rich.console import RenderableType
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from shadowhound_data_logger.cli.status import robot_name
-from shadowhound_data_logger.cli.tables import plain, plain_table, show_whole
-from shadowhound_data_logger.config import home
+from shadowhound_data_logger.cli.common import as_json, robot_name, spool_folder, the_spool
+from shadowhound_data_logger.cli.output import plain, plain_table, print_json, print_page
 from shadowhound_data_logger.spool.control import connect
 
 F = TypeVar('F', bound=Callable[..., Any])
@@ -26,11 +24,11 @@ LIVE: Final = {True: 'at a start', False: 'yes'}
 
 def _of_node(verb: F) -> F:
     """The options that each verb has."""
-    where, whose = 'Its spool  [default: $SHADOWHOUND_HOME/spool]', 'Whose node  [default: the only one that runs here]'
+    whose = 'Whose node  [default: the only one that runs here]'
     for option in (
-        click.option('--json', 'as_json', is_flag=True, help='Print its answer as JSON.'),
+        as_json,
         click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help=whose),
-        click.option('--spool', type=click.Path(path_type=Path, file_okay=False), help=where),
+        spool_folder,
     ):
         verb = option(verb)
     return verb
@@ -116,16 +114,16 @@ def _ask(
     chosen: Callable[[dict[str, Any]], dict[str, Any]] = lambda answer: answer, **arguments: Any,
 ) -> int:  # fmt: skip
     """Ask, print what is answered, and say by the exit code whether it was done."""
-    with closing(connect(spool or home(os.environ) / 'spool', robot)) as connection:
+    with closing(connect(the_spool(spool), robot)) as connection:
         answer = connection.ask(do, **arguments)
     if answer['ok']:
         answer = chosen(answer)
     if as_json:
-        click.echo(json.dumps(answer, indent=2))
+        print_json(answer)
     elif not answer['ok']:
         click.echo(f'shadowhound-data: {answer["error"]}', err=True)
     elif show is not None:
-        show_whole(list(show(answer)), Console(highlight=False))
+        print_page(*show(answer))
     else:
         click.echo(answer['message'])
     return 0 if answer['ok'] else 1

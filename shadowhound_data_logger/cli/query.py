@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import functools
-import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
@@ -12,10 +11,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import click
-from rich.console import Console, RenderableType
+from rich.console import RenderableType
 
-from shadowhound_data_logger.cli.question import asking, question, quietly, settings, tell_left_out, words
-from shadowhound_data_logger.cli.tables import number, plain, plain_table, show_whole, volume
+from shadowhound_data_logger.cli.common import as_json, the_store_settings
+from shadowhound_data_logger.cli.output import number, plain, plain_table, print_json, print_page, volume
+from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, tell_left_out
 from shadowhound_data_logger.untrusted import csv_cell, visible
 
 SHOWN: Final = 30
@@ -32,7 +32,7 @@ _OBJECTS: Final = {'bucket', 'key'}
 @click.option('--order', metavar='COLUMN', help="What to sort by, such as 't_start desc'  [default: t_start]")
 @click.option('--limit', type=click.IntRange(1), metavar='N', help='At most so many rows.')
 @click.option('--format', 'kind', type=click.Choice(['table', 'csv', 'json', 'keys']), default='table', show_default=True)
-@click.option('--json', 'as_json', is_flag=True, help='Print it as JSON.')
+@as_json
 @click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')
 @click.option('--map', 'ground', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw where the objects lie.')
 def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str, as_json: bool,  # noqa: PLR0913 - one an option
@@ -48,7 +48,7 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
     with asking():
         from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
 
-        source, left_out = lake.default_source(settings()), quietly()
+        source, left_out = lake.default_source(the_store_settings()), quietly()
         ask = functools.partial(lake.sql, sql) if sql else lake.objects
         frame = ask(source, findings=left_out, **flags)
         with lake.answering():
@@ -77,13 +77,13 @@ def _print(found: Any, kind: str, where: str, *, is_objects: bool, is_limited: b
         for bucket, key in zip(found['bucket'].to_pylist(), found['key'].to_pylist(), strict=True):
             click.echo(visible(f'{bucket}/{key}'))
     elif kind == 'json':
-        click.echo(json.dumps([_told(row) for row in found.to_pylist()], indent=2, default=str))
+        print_json([_told(row) for row in found.to_pylist()])
     elif kind == 'csv':
         writer = csv.writer(sys.stdout, lineterminator='\n')
         writer.writerow(map(csv_cell, found.column_names))
         writer.writerows(map(csv_cell, _told(row).values()) for row in found.to_pylist())
     else:
-        show_whole(list(_table(found, where, is_objects=is_objects, is_limited=is_limited)), Console(highlight=False))
+        print_page(*_table(found, where, is_objects=is_objects, is_limited=is_limited))
 
 
 def _table(found: Any, where: str, *, is_objects: bool, is_limited: bool) -> Iterator[RenderableType]:
@@ -132,12 +132,12 @@ def _pictures(source: Any, rows: Sequence[Mapping[str, Any]], flags: Mapping[str
     from shadowhound_data_logger.lake.source import open_source  # noqa: PLC0415
 
     if sheet:
-        pictures.sheet(rows, lambda bucket: open_source(source.settings, bucket), words(flags), sheet)
+        pictures.sheet(rows, lambda bucket: open_source(source.settings, bucket), question_text(flags), sheet)
         click.echo(f'Wrote {sheet}', err=True)
     if ground:
         around = {name: flags[name] for name in ('robot', 'since', 'until') if name in flags}
         poses = lake.objects(source, findings=left_out, **around, where='x IS NOT NULL').select('x', 'y').to_pydict()
         path = list(zip(poses['x'], poses['y'], strict=True))
         near = wanted(0, near=flags.get('near')).near
-        pictures.ground(rows, path[:: len(path) // MOST_POSES + 1], near, words(flags), ground)
+        pictures.ground(rows, path[:: len(path) // MOST_POSES + 1], near, question_text(flags), ground)
         click.echo(f'Wrote {ground}', err=True)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from shadowhound_data_logger.cli.tables import number
-from shadowhound_data_logger.config import home, store_settings
+from shadowhound_data_logger.cli.output import number
 from shadowhound_data_logger.errors import LakeError, SettingError
-from shadowhound_data_logger.options import StoreSettings
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.findings import Findings
@@ -49,7 +46,7 @@ def question(command: _Command) -> _Command:
     return asked  # type: ignore[return-value]
 
 
-def words(flags: Mapping[str, Any]) -> str:
+def question_text(flags: Mapping[str, Any]) -> str:
     """The question, to stand over a picture."""
     told = {**flags, 'success': {True: 'succeeded', False: 'failed'}.get(flags.get('success'), '')}  # type: ignore[arg-type]
     return ', '.join(
@@ -85,8 +82,3 @@ def tell_left_out(left_out: Findings) -> int:
         text = f'{number(len(left_out))} of the catalogue are left out. Move them away, and run `shadowhound-data lake reindex`.'
         click.echo(text, err=True)
     return 1 if len(left_out) else 0
-
-
-def settings() -> StoreSettings:
-    """The store that the environment names."""
-    return store_settings(os.environ, home(os.environ))

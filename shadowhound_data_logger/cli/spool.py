@@ -2,45 +2,64 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sqlite3
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
-from rich.console import Console, RenderableType
+from rich.console import RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.cli.tables import duration, number, plain, plain_table, show_whole, volume
+from shadowhound_data_logger.cli.common import as_json, spool_folder, the_spool
+from shadowhound_data_logger.cli.output import (
+    ProgressBar,
+    duration,
+    number,
+    plain,
+    plain_table,
+    print_json,
+    print_page,
+    progress,
+    volume,
+)
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock, SystemClock, iso
-from shadowhound_data_logger.config import home
+from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.lake.catalogue import Catalogue
 from shadowhound_data_logger.model import State
+from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
+from shadowhound_data_logger.spool.delivering import delivering
 from shadowhound_data_logger.spool.index import MISSING, Index
 from shadowhound_data_logger.spool.listing import HERE, Heap, heaps, objects
 from shadowhound_data_logger.spool.listing import retry as retry_objects
-from shadowhound_data_logger.spool.status import read, robots
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.status import limits, read, robots
+from shadowhound_data_logger.spool.writer import SpoolWriter
 
 MOST: Final = 1000
+LOOK_S: Final = 0.2
+CLOSE_S: Final = 5.0
+OTHER: Final = 'another process delivers from this spool: look at it with shadowhound-data status'
+"""What holds the drain lock is a node, or for a moment a mission agent."""
 STYLES: Final = {State.HELD.value: 'yellow', State.QUARANTINED.value: 'red'}
-_as_json = click.option('--json', 'as_json', is_flag=True, help='Print it as JSON.')
 
 
 @click.group(invoke_without_command=True)
-@click.option('--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool  [default: $SHADOWHOUND_HOME/spool]')
-@_as_json
+@spool_folder
+@as_json
 @click.pass_context
 def spool(context: click.Context, *, spool: Path | None, as_json: bool) -> int:
     """What lies on this machine and is not in the store: how much, how old, and why.
 
     It reads the spool while a node runs and when none does. Exit code 1 when something is quarantined.
     """
-    context.obj = folder = (spool or home(os.environ) / 'spool').absolute()
+    context.obj = folder = the_spool(spool).absolute()
     return 0 if context.invoked_subcommand else _overview(folder, as_json=as_json)
 
 
@@ -49,7 +68,7 @@ def spool(context: click.Context, *, spool: Path | None, as_json: bool) -> int:
 @click.option('--state', type=click.Choice([state.value for state in HERE]), help='Only these.')
 @click.option('--sensor', help='Only of this sensor.')
 @click.option('--limit', type=click.IntRange(1), default=MOST, show_default=True, help='So many at most, the oldest first.')
-@_as_json
+@as_json
 @click.pass_obj
 def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, limit: int, as_json: bool) -> int:
     """Each object, the oldest first: its bucket and key, its state, and where its file lies below the spool."""
@@ -57,12 +76,12 @@ def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, l
         found = objects(index, folder, state=State(state) if state else None, sensor=sensor, prefix=prefix)
         rows, more = list(islice(found, limit)), next(found, None) is not None
     if as_json:
-        click.echo(json.dumps([asdict(row) for row in rows], indent=2))
+        print_json([asdict(row) for row in rows])
     else:
         table = plain_table('', ('object', 'state', 'size', 'file'), left=('object', 'state', 'file'))
         for row in rows:
             table.add_row(plain(f'{row.bucket}/{row.key}'), _state(row.state, row.reason), volume(row.bytes), plain(row.path))
-        show_whole([table if rows else Text('Nothing.')], Console(highlight=False))
+        print_page(table if rows else Text('Nothing.'))
     if more:
         click.echo(f'... there are more than {number(limit)}: --limit', err=True)
     return 0
@@ -71,7 +90,7 @@ def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, l
 @spool.command()
 @click.option('--patience', type=click.FloatRange(1.0, 1e6), default=60.0, show_default=True,
               help='Seconds in which nothing gets on after which it gives up.')  # fmt: skip
-@_as_json
+@as_json
 @click.pass_obj
 def drain(folder: Path, *, patience: float, as_json: bool) -> int:
     """Deliver all that waits, where no node runs to do it: before a robot is put away, or from the disk of one that is broken.
@@ -79,16 +98,14 @@ def drain(folder: Path, *, patience: float, as_json: bool) -> int:
     The store is the one that the environment names. Each object is verified as by the node, and gets its row in the catalogue.
     Exit code 1 when something of that is left or refused. Ctrl-C loses nothing.
     """
-    from shadowhound_data_logger.cli.spool_drain import drain_all  # noqa: PLC0415 - the other verbs need no store
-
     _check(folder)
-    return drain_all(folder, patience_s=patience, as_json=as_json)
+    return _drain(folder, patience_s=patience, as_json=as_json)
 
 
 @spool.command()
 @click.argument('names', nargs=-1, metavar='[BUCKET/KEY]...')
 @click.option('--reason', help='Only those quarantined for this reason, such as access_denied.')
-@_as_json
+@as_json
 @click.pass_obj
 def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bool) -> int:
     """Let what was quarantined wait for delivery again, once the cause is gone: all of it, or these objects.
@@ -101,7 +118,7 @@ def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bo
         remedy = 'is it yours, and its disk neither full nor read-only?'
         raise SpoolError(f'the spool {folder} cannot be changed: {error}', remedy=remedy) from error
     if as_json:
-        click.echo(json.dumps(asdict(done), indent=2))
+        print_json(asdict(done))
     else:
         click.echo(f'{number(done.objects)} objects ({volume(done.bytes)}) wait for delivery again')
         if done.gone:
@@ -117,9 +134,9 @@ def _overview(folder: Path, *, as_json: bool) -> int:
     quarantined = sum(heap.objects for heap in found if heap.state == State.QUARANTINED.value)
     if as_json:
         said = [{**asdict(heap), 'oldest': iso(heap.oldest_ns)} for heap in found]
-        click.echo(json.dumps({'spool': str(folder), 'running': running, 'heaps': said, 'quarantined': quarantined}, indent=2))
+        print_json({'spool': str(folder), 'running': running, 'heaps': said, 'quarantined': quarantined})
     else:
-        show_whole(list(_view(folder, found, running, clock)), Console(highlight=False))
+        print_page(*_view(folder, found, running, clock))
     return 1 if quarantined else 0
 
 
@@ -179,3 +196,74 @@ def _opened(folder: Path) -> Iterator[Index]:
             yield index
     except (OSError, sqlite3.Error) as error:
         raise SpoolError(f'the spool {folder} cannot be read: {error}') from error
+
+
+def _drain(folder: Path, *, patience_s: float, as_json: bool) -> int:
+    """The exit code."""
+    settings, clock = Settings.load({}, os.environ), SystemClock.of_this_machine()
+    # A robot of its own: its session is none of the node's, and what that left open is not for it to settle.
+    spool = Spool(folder, limits(folder, settings.spool), clock, f'{settings.robot} drain')
+    spool.open()
+    catalogue = Catalogue(folder, settings.catalogue, settings.robot, clock)
+    try:
+        with (
+            closing(spool),
+            delivering(spool, settings, CLOSE_S) as (uploader, writer),
+            progress('delivered', spool.pending_count(), of='objects') as bar,
+        ):
+            _wait(spool, uploader, writer, catalogue, patience_s, bar)
+            writer.flush(CLOSE_S)
+            said = _drained(folder, spool, uploader.status())
+    except (OSError, sqlite3.Error) as error:
+        raise SpoolError(f'the spool {folder} cannot be used: {error}') from error
+    if as_json:
+        print_json(said)
+    else:
+        click.echo(_told(said))
+    return 0 if said['ok'] else 1
+
+
+def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalogue: Catalogue, patience_s: float,
+          bar: ProgressBar) -> None:  # fmt: skip
+    """Until nothing waits that can be delivered, the catalogue's parts of it included; or nothing moves for so long."""
+    done, sent, retries, moved_s = -1, 0, 0, time.monotonic()
+    while time.monotonic() - moved_s < patience_s:
+        is_drained = uploader.drain(LOOK_S)
+        status = uploader.status()
+        if status.delivered + status.quarantined > done:
+            done, retries, moved_s = status.delivered + status.quarantined, status.retries, time.monotonic()
+        elif status.sent_bytes > sent and status.retries == retries:  # a large one is under way, and none is sent in vain
+            moved_s = time.monotonic()
+        sent = status.sent_bytes
+        what = 'delivered' if status.state in {'idle', 'shipping'} else status.state.replace('_', ' ')
+        bar.begin(status.delivered + spool.pending_count())
+        bar.say(what, done=status.delivered)
+        if not is_drained:
+            time.sleep(LOOK_S)  # it returns at once where the store is away
+            continue
+        parts = catalogue.parts()
+        for part in parts:
+            writer.put(part)
+        if not (parts and writer.flush(CLOSE_S)):
+            return
+
+
+def _drained(folder: Path, spool: Spool, status: UploadStatus) -> dict[str, Any]:
+    piles = spool.piles()
+    why = OTHER if status.state == 'not_draining' else status.last_error
+    return {
+        'spool': str(folder), 'delivered': status.delivered, 'pending': piles.pending, 'held': piles.held,
+        'quarantined': piles.quarantined, 'newly_quarantined': status.quarantined,
+        'last_error': why if piles.pending or status.quarantined else '', 'ok': not piles.pending and not status.quarantined,
+    }  # fmt: skip
+
+
+def _told(said: dict[str, Any]) -> str:
+    lines = [f'{number(said["delivered"])} objects delivered and confirmed']
+    if said['pending']:
+        lines.append(f'{number(said["pending"])} still wait: {said["last_error"] or "ask again later"}')
+    if said['held']:
+        lines.append(f'{number(said["held"])} have no name yet (shadowhound-data spool)')
+    if said['quarantined']:
+        lines.append(f'{number(said["quarantined"])} are quarantined (shadowhound-data spool)')
+    return '\n'.join(lines)

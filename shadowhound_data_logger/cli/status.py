@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
@@ -16,11 +14,22 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from shadowhound_data_logger.cli.tables import bar, duration, figure, fit, number, plain, plain_table, show_whole, unsure, volume
+from shadowhound_data_logger.cli.common import as_json, robot_name, spool_folder, the_spool
+from shadowhound_data_logger.cli.output import (
+    duration,
+    figure,
+    fit,
+    number,
+    plain,
+    plain_table,
+    print_json,
+    print_page,
+    share_bar,
+    shown_iso,
+    unsure,
+    volume,
+)
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
-from shadowhound_data_logger.config import home
-from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.spool.accounts import EXACT
 from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, read, robots
 
@@ -29,29 +38,21 @@ LOSSES: Final = ('dropped', 'rejected')
 HEADS: Final = {'running': ('running', 'green'), 'not_answering': ('NOT ANSWERING', 'red'), 'not_running': ('not running', 'red')}
 
 
-def robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str | None:
-    """What ``--robot`` names; raises BadParameter for what is no name of a robot."""
-    try:
-        return check_name(name, 'the robot name') if name else None
-    except NameRefused as error:
-        raise click.BadParameter(str(error)) from error
-
-
 @click.command()
 @click.option('--watch', is_flag=True, help='Go on until Ctrl-C: a live view, or with --json one line each time.')
 @click.option(
     '--interval', type=click.FloatRange(0.05, 3600.0), default=1.0, show_default=True, help='Seconds between two looks.'
 )
-@click.option('--json', 'as_json', is_flag=True, help='Print the status as JSON.')
+@as_json
 @click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Whose node  [default: the one that runs here]')
-@click.option('--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool  [default: $SHADOWHOUND_HOME/spool]')
+@spool_folder
 def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, spool: Path | None) -> int:
     """Rates and ages of the topics, queue, spool, store and workers of the node that runs on this machine.
 
     Without one: what lies in its spool. Exit code 1 when something needs a look: the node does not run, the store is away,
     messages were lost. With --watch it is 0.
     """
-    folder, clock = spool or home(os.environ) / 'spool', SystemClock.of_this_machine()
+    folder, clock = the_spool(spool), SystemClock.of_this_machine()
 
     def look() -> dict[str, Any]:
         return _look(folder, robot, clock)
@@ -62,9 +63,9 @@ def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, sp
         return 0
     found = look()
     if as_json:
-        click.echo(json.dumps(found, indent=2))
+        print_json(found)
     else:
-        show_whole(view(found, console), console)
+        print_page(*view(found, console), console=console)
     return 1 if found['findings'] else 0
 
 
@@ -83,9 +84,9 @@ def _watch(look: Callable[[], dict[str, Any]], console: Console, interval: float
             while True:
                 found = look()
                 if as_json:
-                    click.echo(json.dumps(found))
+                    print_json(found, is_line=True)
                 else:
-                    show_whole([*view(found, console), ''], console)
+                    print_page(*view(found, console), '', console=console)
                 time.sleep(interval)
         with Live(console=console, auto_refresh=False, screen=True) as live:
             while True:
@@ -95,7 +96,7 @@ def _watch(look: Callable[[], dict[str, Any]], console: Console, interval: float
                 time.sleep(interval)
     except KeyboardInterrupt:
         if console.is_terminal and not as_json:
-            show_whole(view(look(), console), console)
+            print_page(*view(look(), console), console=console)
 
 
 def view(found: Mapping[str, Any], console: Console) -> list[RenderableType]:
@@ -139,7 +140,7 @@ def _head(found: Mapping[str, Any]) -> Text:
 def _ended(session: Mapping[str, Any] | None) -> str:
     if session is None:
         return '; it has not run here yet'
-    began, ended = (stamp and f'{stamp[:10]} {stamp[11:19]}' for stamp in (session['started'], session['ended']))
+    began, ended = (stamp and shown_iso(stamp) for stamp in (session['started'], session['ended']))
     if ended:
         return f'; last session {began} to {ended} UTC'
     return f'; session of {began} UTC cut off, or just beginning'
@@ -177,10 +178,10 @@ def _way(found: Mapping[str, Any], console: Console, *, live: bool) -> Table:
         queue = found['queue']
         share = max(_share(queue['messages'], queue['max_messages']), _share(queue['bytes'], queue['max_bytes']))
         text = f'{queue["messages"]:,} of {queue["max_messages"]:,} messages, {volume(queue["bytes"])}'
-        grid.add_row('queue', bar(share, console), text)
+        grid.add_row('queue', share_bar(share, console), text)
     if found['spool']:
         spool = found['spool']
-        grid.add_row('spool', bar(_share(spool['bytes'], spool['max_bytes']), console), _disk(spool))
+        grid.add_row('spool', share_bar(_share(spool['bytes'], spool['max_bytes']), console), _disk(spool))
         grid.add_row('', '', _piles(spool))
     if live:
         _add_store(grid, found)
@@ -229,7 +230,7 @@ def _add_mission(grid: Table, found: Mapping[str, Any]) -> None:
     """The mission that is active, its type, since when, and its run."""
     mission = found['mission']
     began, now = (datetime.fromisoformat(stamp.replace('Z', '+00:00')) for stamp in (mission['started'], found['time']))
-    since = f'since {mission["started"][:10]} {mission["started"][11:19]} UTC, {duration((now - began).total_seconds())}'
+    since = f'since {shown_iso(mission["started"])} UTC, {duration((now - began).total_seconds())}'
     if began < utc(EARLIEST_SANE_NS):
         since = 'begun before the clock was set'
     grid.add_row('mission', Text('active', 'cyan'), plain(f'{mission["type"]}, {since}'))
@@ -258,7 +259,7 @@ def _add_events(grid: Table, events: Mapping[str, Any]) -> None:
         grid.add_row('', '', plain(f'the disk takes nothing: {events["refused"]}', 'red'))
     if events['last']:
         last = events['last']
-        grid.add_row('', '', plain(f'last: {last["name"]} by {last["by"]}, {last["time"][:10]} {last["time"][11:19]} UTC'))
+        grid.add_row('', '', plain(f'last: {last["name"]} by {last["by"]}, {shown_iso(last["time"])} UTC'))
 
 
 def _share(part: float, whole: float | None) -> float:

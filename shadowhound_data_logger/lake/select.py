@@ -6,22 +6,18 @@ An object belongs to the moment at which it begins (``t_start``, UTC), as its ro
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
-from datetime import datetime, timedelta, timezone
+from datetime import datetime, timedelta
 from typing import Final
 
-from shadowhound_data_logger.clock import FUTURE_SLACK_NS, SECOND, utc
+from shadowhound_data_logger.clock import FUTURE_SLACK_NS, utc
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.lake.schema import UNDATED
+from shadowhound_data_logger.times import moment
 
 DAY: Final = timedelta(days=1)
 MOST_FOLDERS: Final = 400
 """Dates that are asked for by name; for a longer time the folders that there are are listed first."""
-_AGO: Final = re.compile(r'(\d+(?:\.\d+)?)\s*(s|min|h|d|w)')
-_UNITS: Final = {'s': 1, 'min': 60, 'h': 3600, 'd': 86_400, 'w': 604_800}
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
-TIMES: Final = 'now, today, yesterday, an age such as 30min, 2h or 3d, a date or an ISO time (UTC unless it names a zone)'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,29 +74,6 @@ def wanted(  # noqa: PLR0913 - the flags of a question
         until_ns=None if until is None else moment('until', until, now_ns),
         near=None if near is None else _circle(near),
     )  # fmt: skip
-
-
-def moment(name: str, given: str | datetime, now_ns: int) -> int:
-    """A time in ns: see ``TIMES``. Raises SettingError with ``name``."""
-    if isinstance(given, datetime):
-        return _ns(given)
-    text, now = given.strip().lower(), utc(now_ns)
-    midnight = now.replace(hour=0, minute=0, second=0, microsecond=0)
-    named = {'now': now, 'today': midnight, 'yesterday': midnight - DAY}
-    if text in named:
-        return _ns(named[text])
-    try:
-        if ago := _AGO.fullmatch(text):
-            return _ns(utc(now_ns - round(float(ago[1]) * _UNITS[ago[2]] * SECOND)))
-        return _ns(datetime.fromisoformat(given.strip().replace('Z', '+00:00').replace('z', '+00:00')))
-    except (ValueError, OverflowError, OSError):
-        raise SettingError(name, given, TIMES) from None
-
-
-def _ns(time: datetime) -> int:
-    aware = time if time.tzinfo else time.replace(tzinfo=timezone.utc)
-    since = aware - _EPOCH
-    return ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * 1000
 
 
 def _circle(given: tuple[float, float, float] | str) -> tuple[float, float, float]:

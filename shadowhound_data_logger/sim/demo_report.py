@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from shadowhound_data_logger.cli.ledger import verdict
-from shadowhound_data_logger.cli.tables import figure, number, plain_table, show_whole, volume
+from shadowhound_data_logger.cli.output import figure, number, plain_table, print_page, volume
 from shadowhound_data_logger.sim.demo_audit import BUCKET, Audit
 from shadowhound_data_logger.sim.demo_processes import OUR_VARIABLE
 from shadowhound_data_logger.sim.demo_run import Reading, Record, Show
@@ -84,7 +84,7 @@ def line(reading: Reading) -> str:
 
 def show_result(audit: Audit, record: Record, console: Console) -> None:
     """The tables, what they leave to say, and the verdicts."""
-    show_whole([messages_table(audit), '', objects_table(audit)], console)
+    print_page(messages_table(audit), '', objects_table(audit), console=console)
     console.print()
     for remark in _remarks(audit, record):
         console.print(remark)

@@ -14,9 +14,8 @@ from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.overview import BagRow, named_ns, overview
 from shadowhound_data_logger.bags.remote import find_bag, find_bags, natural
 from shadowhound_data_logger.bags.slice_writer import SliceWriter
-from shadowhound_data_logger.bags.span import since, when
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import BagError, SettingError
+from shadowhound_data_logger.errors import BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore
 
@@ -113,30 +112,7 @@ def test_slices_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert [file.name for file in find_bags(store, 'thor')[0].slices][-2:] == [f'{NAME}_9.mcap', f'{NAME}_10.mcap']
 
 
-@pytest.mark.parametrize(('text', 'wanted'), [
-    ('0', T0), ('1.5', T0 + 1_500_000_000), ('-2', T0 + 8 * SECOND), ('+3', T0 + 3 * SECOND),
-    ('-0.000000001', T0 + 10 * SECOND - 1), ('2025-10-18T12:00:01.25Z', T0 + 1_250_000_000), ('2025-10-18 12:00', T0),
-    ('2025-10-18T14:00:00.123456789+02:00', T0 + 123_456_789), ('2025-10-18T07:00:00-0500', T0),
-    ('1760788801', T0 + SECOND), ('1760788801.5', T0 + 1_500_000_000), (str(T0 + 7), T0 + 7),
-])  # fmt: skip
-def test_a_time_in_a_bag(text: str, wanted: int) -> None:
-    """In any of the forms, to the nanosecond."""
-    assert when(text, T0, T0 + 10 * SECOND, '--start') == wanted
-
-
-@pytest.mark.parametrize(
-    'text', ['', 'x', '12:00', '2025-13-01', '2025-10-18T25:00', '1e3', 'nan', '--1', '2025-10-18T12:00:00 ']
-)
-def test_what_is_no_time_is_refused(text: str) -> None:
-    """With the option's name."""
-    with pytest.raises(SettingError, match='--start'):
-        when(text, T0, T0, '--start')
-
-
-def test_a_time_ago() -> None:
-    """Days, hours and minutes, or a date."""
-    assert since('2d', T0, '--since') == T0 - 2 * 86400 * SECOND
-    assert since('1.5h', T0, '--since') == T0 - 5400 * SECOND
-    assert since('2025-10-18', T0, '--since') == T0 - 12 * 3600 * SECOND
+def test_the_time_in_a_name() -> None:
+    """Of our recordings alone, packed or not."""
     assert named_ns('patrol_20251018_120000') == named_ns('patrol_20251018_120000.tar.gz') == T0
     assert named_ns('rosbag2_2025_10_18-12_00_00') is None

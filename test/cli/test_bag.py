@@ -49,6 +49,9 @@ def test_list(home: Path) -> None:
     empty = run(home, 'list', '--robot', 'tachi')
     assert (empty.return_value, 'There is no bag of tachi in the folder' in empty.output) == (0, True)
     assert said(run(home, 'list', '--since', '2026-01-01', '--json')) == []
+    for since in ('yesterday', '2w', '20260101'):
+        assert said(run(home, 'list', '--since', since, '--json')) == []
+    assert len(said(run(home, 'list', '--since', '2025-10-18T14:00:00+02:00', '--json'))) == 1  # type: ignore[arg-type]
 
 
 def test_info(home: Path) -> None:
@@ -123,7 +126,7 @@ def test_an_away_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> Non
     (('info', 'patrol_2025'), BagError, f'there is {NAME}'),
     (('cut', NAME, '--topic', '/imv', '-o', 'new'), BagError, 'is it /imu?'),
     (('cut', NAME, '--start', 'noon', '-o', 'new'), SettingError, 'seconds since the start'),
-    (('list', '--since', 'yesterday'), SettingError, '12h'),
+    (('list', '--since', 'tomorrow'), SettingError, 'yesterday'),
     (('upload', '/nowhere'), BagError, 'is no folder'),
     (('verify', './nowhere'), Exception, 'there is no folder'),
     (('info', 'a b'), Exception, 'cannot be part of an object key'),

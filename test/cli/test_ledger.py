@@ -13,8 +13,9 @@ from click.testing import CliRunner
 from rich.console import Console
 from spool.making import abandon, make, new_spool, put, settle
 
-from shadowhound_data_logger.cli.ledger import ledger, show
+from shadowhound_data_logger.cli.ledger import ledger, page
 from shadowhound_data_logger.cli.main import main
+from shadowhound_data_logger.cli.output import print_page
 from shadowhound_data_logger.model import State
 
 STATES = ('delivered', 'pending', 'held', 'evicted', 'quarantined', 'deduplicated')
@@ -40,7 +41,9 @@ def a_ledger(balanced: bool = True, **topics: dict[str, Any]) -> dict[str, Any]:
 
 def shown(found: dict[str, Any], width: int = 80, *, terminal: bool = False) -> str:
     output = io.StringIO()
-    show(found, Console(file=output, width=width, highlight=False, force_terminal=terminal, color_system=None))
+    print_page(
+        *page(found), console=Console(file=output, width=width, highlight=False, force_terminal=terminal, color_system=None)
+    )
     return output.getvalue()
 
 

@@ -14,8 +14,9 @@ import pytest
 from click.testing import CliRunner, Result
 from spool.making import BUCKET, assert_whole, make, new_spool, put, rows, settle
 
-from shadowhound_data_logger.cli import spool_drain
+from shadowhound_data_logger.cli import spool as drains
 from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.cli.output import progress
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Outcome, State
@@ -241,8 +242,10 @@ def test_patience_is_for_what_stands_still(home: Path, monkeypatch: pytest.Monke
         return sent.delivered == 1
 
     time.sleep = lambda _: None
-    monkeypatch.setattr(spool_drain, 'time', time)
-    nothing = SimpleNamespace(parts=list, update=lambda *_, **__: None, pending_count=lambda: 1)
-    spool_drain._wait(nothing, SimpleNamespace(drain=drain, status=lambda: sent), nothing, nothing, 1.0, (nothing, 0))  # type: ignore[arg-type]
+    monkeypatch.setattr(drains, 'time', time)
+    nothing = SimpleNamespace(parts=list, pending_count=lambda: 1)
+    uploader = SimpleNamespace(drain=drain, status=lambda: sent)
+    with progress() as bar:
+        drains._wait(nothing, uploader, nothing, nothing, 1.0, bar)  # type: ignore[arg-type]
     assert sent.sent_bytes > rounds
     assert (sent.delivered == 1) is not bool(retries)

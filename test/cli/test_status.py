@@ -17,8 +17,8 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 from spool.making import make, new_spool, put
 
+from shadowhound_data_logger.cli.output import print_page
 from shadowhound_data_logger.cli.status import status, view
-from shadowhound_data_logger.cli.tables import show_whole
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.spool.status import file
 
@@ -59,9 +59,8 @@ def shown(width: int = 80, *, terminal: bool = True, encoding: str = 'utf-8', **
     told = {'state': 'running', 'running': True, 'age_s': 0.5, 'findings': [], 'others': []}
     output = io.TextIOWrapper(io.BytesIO(), encoding)
     console = Console(file=output, width=width, highlight=False, force_terminal=terminal, color_system=None)
-    show_whole(
-        view({**a_status(**changes), **{name: changes.get(name, value) for name, value in told.items()}}, console), console
-    )
+    found = {**a_status(**changes), **{name: changes.get(name, value) for name, value in told.items()}}
+    print_page(*view(found, console), console=console)
     output.flush()
     output.seek(0)
     return output.read()

@@ -40,7 +40,7 @@ from shadowhound_data_logger.bags.mcap_messages import unpack
 from shadowhound_data_logger.bags.overview import overview
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile
 from shadowhound_data_logger.bags.verify import verify_folder
-from shadowhound_data_logger.cli.bag_common import moment
+from shadowhound_data_logger.cli.output import shown_time
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.lake import decode, parts, query, reading, schema
 from shadowhound_data_logger.lake.fetch import Wish
@@ -608,7 +608,7 @@ def metadata(shop: Shop) -> Round:
         (folder / 'metadata.yaml').write_bytes(body)
         with shop.reading():
             for each in overview(store, 'thor', shop.input / 'home'):
-                assert moment(each.t_start_ns)
+                assert shown_time(each.t_start_ns)
             said(lambda: verify_folder(folder))
             return said(lambda: of_metadata(body, 'x'))
 

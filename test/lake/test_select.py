@@ -2,43 +2,17 @@
 
 from __future__ import annotations
 
-from datetime import datetime, timedelta, timezone
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lake.making import DAY_NS, NOON_NS
 
-from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.clock import utc
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.lake.schema import UNDATED
-from shadowhound_data_logger.lake.select import Wanted, moment, wanted
+from shadowhound_data_logger.lake.select import Wanted, wanted
 
 MIDNIGHT_NS = NOON_NS - DAY_NS // 2
-
-
-@pytest.mark.parametrize(
-    ('text', 'ns'),
-    [
-        ('now', NOON_NS), ('today', MIDNIGHT_NS), ('Yesterday', MIDNIGHT_NS - DAY_NS), ('2h', NOON_NS - 7200 * SECOND),
-        ('30min', NOON_NS - 1800 * SECOND), ('1.5 d', NOON_NS - DAY_NS * 3 // 2), ('2026-10-28', MIDNIGHT_NS),
-        ('2026-10-28T12:00', NOON_NS), ('2026-10-28 12:00:00.000001', NOON_NS + 1000), ('2026-10-28T12:00:00Z', NOON_NS),
-        ('2026-10-28T14:00:00+02:00', NOON_NS), (datetime(2026, 10, 28, 12, tzinfo=timezone.utc), NOON_NS),
-        (datetime(2026, 10, 28, 14, tzinfo=timezone(timedelta(hours=2))), NOON_NS),
-    ],
-)  # fmt: skip
-def test_times_in_words(text: str | datetime, ns: int) -> None:
-    """UTC unless a zone is named; a date is its beginning."""
-    assert moment('since', text, NOON_NS) == ns
-
-
-@pytest.mark.parametrize('text', ['', 'tomorrow', '2 fortnights', '2026-13-01', '-2h', '9e999d', 'h', '900000d'])
-def test_what_is_no_time_is_refused_by_name(text: str) -> None:
-    """The error names the flag, the value and what is allowed."""
-    with pytest.raises(SettingError, match='until') as caught:
-        moment('until', text, NOON_NS)
-    assert caught.value.data['value'] == text
-    assert 'yesterday' in str(caught.value)
 
 
 @pytest.mark.parametrize('near', ['1,2', '1,2,0', '1,2,-3', 'a,b,c', '1,2,nan', '1,2,3,4'])

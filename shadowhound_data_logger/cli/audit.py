@@ -1,54 +1,39 @@
-"""``shadowhound-data ledger --verify``: whether the store still holds what it confirmed, as text or as JSON."""
+"""Whether the store still holds what it confirmed: ``shadowhound-data ledger --verify``, and how findings are told."""
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import closing
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-import click
-from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.console import RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.cli.tables import number, plain, show_whole
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings, home, store_settings
+from shadowhound_data_logger.cli.common import the_store
+from shadowhound_data_logger.cli.output import number, plain, print_json, print_page, progress, shown_time
 from shadowhound_data_logger.ship.audit import KEYS, KINDS, THREADS, Audit, audit
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.status import targets
-from shadowhound_data_logger.stores import open_store
 
 
-def verify(spool: Path, *, deep: bool, again: bool, as_json: bool) -> int:
+def verify_delivered(spool: Path, *, deep: bool, again: bool, as_json: bool) -> int:
     """Ask the store that the environment names; 0 when all is there as it was delivered, else 1."""
-    settings = store_settings(os.environ, home(os.environ))
-    with closing(open_store(settings, UploadSettings(threads=THREADS))) as store, closing(Deliveries(spool)) as deliveries:
+    with the_store(THREADS) as store, closing(Deliveries(spool)) as deliveries:
         deliveries.open(f'{"deep" if deep else "head"} {store.describe()}', again=again)
         earlier, known = deliveries.noted(), deliveries.known()
-        with progress() as bar:
-            task = bar.add_task('read back' if deep else 'asked for', total=known, completed=earlier)
-            found = audit(deliveries, store, deep=deep, tell=lambda: bar.advance(task))
+        with progress('read back' if deep else 'asked for', known, of='objects') as bar:
+            bar.have(earlier)
+            found = audit(deliveries, store, deep=deep, tell=bar.have)
         said = _said(found, deliveries, store.describe(), deep=deep, earlier=earlier)
         said['delivered_to'] = targets(spool)
         if found.away is None:
             deliveries.finish()
     if as_json:
-        click.echo(json.dumps(said, indent=2))
+        print_json(said)
     else:
-        show(said, Console(highlight=False))
+        print_page(plain(_scope(said)), *finding_lines(said['findings'], KINDS), '', _verdict(said), *_doubt(said))
     return 0 if said['ok'] else 1
-
-
-def progress() -> Progress:
-    """On standard error, where that is a terminal; nothing else is ever written there."""
-    console = Console(stderr=True)
-    columns = (TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def _said(found: Audit, deliveries: Deliveries, store: str, *, deep: bool, earlier: int) -> dict[str, Any]:
@@ -70,12 +55,7 @@ def findings(found: Audit) -> dict[str, Any]:
     return {kind: {'count': count, 'first': listed[kind]} for kind, count in found.counts.items()}
 
 
-def show(said: Mapping[str, Any], console: Console) -> None:
-    """What was asked, each kind of finding with its first keys, and a verdict."""
-    show_whole([plain(_scope(said)), *piles(said['findings'], KINDS), '', _verdict(said), *_doubt(said)], console)
-
-
-def piles(found: Mapping[str, Any], words: Mapping[str, str]) -> Iterator[RenderableType]:
+def finding_lines(found: Mapping[str, Any], words: Mapping[str, str]) -> Iterator[RenderableType]:
     """Each kind of finding in these words, and the first of it by name."""
     for kind, piled in found.items():
         first = piled['first'][:KEYS]
@@ -90,7 +70,7 @@ def _scope(said: Mapping[str, Any]) -> str:
     text = f'{said["store"]} was asked for {number(said["asked"])} of {number(said["known"])} delivered objects'
     text += f' ({number(said["asked_earlier"])} more by an earlier run)' if said['asked_earlier'] else ''
     if since is not None:
-        text += f', those since {datetime.fromtimestamp(since / SECOND, timezone.utc):%Y-%m-%d %H:%M:%S} UTC'
+        text += f', those since {shown_time(since)[:19]} UTC'
     forgotten = said['forgotten']
     return f'{text}; {number(forgotten)} older ones are not remembered (spool.remember_days).' if forgotten > 0 else f'{text}.'
 

@@ -1,0 +1,56 @@
+"""What the verbs share: options, and the store that the environment names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from shadowhound_data_logger.config import UploadSettings, home, store_settings
+from shadowhound_data_logger.errors import NameRefused
+from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
+
+
+def robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str | None:
+    """What ``--robot`` names; raises BadParameter for what is no name of a robot."""
+    try:
+        return None if name is None else check_name(name, 'the robot name')
+    except NameRefused as error:
+        raise click.BadParameter(str(error)) from error
+
+
+as_json = click.option('--json', 'as_json', is_flag=True, help='Print it as JSON.')
+spool_folder = click.option(
+    '--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool  [default: $SHADOWHOUND_HOME/spool]'
+)
+
+
+def the_home() -> Path:
+    """The folder of the spool and of what is being recorded."""
+    return home(os.environ)
+
+
+def the_spool(given: Path | None) -> Path:
+    """The folder that ``--spool`` names, else the one in the home."""
+    return given or the_home() / 'spool'
+
+
+def the_store_settings() -> StoreSettings:
+    """Of the store that the environment names."""
+    return store_settings(os.environ, the_home())
+
+
+@contextmanager
+def the_store(threads: int = UploadSettings().threads) -> Iterator[ObjectStore]:
+    """The one that the environment names, asked by so many threads at a time."""
+    store = open_store(the_store_settings(), UploadSettings(threads=threads))
+    try:
+        yield store
+    finally:
+        store.close()

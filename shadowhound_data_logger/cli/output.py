@@ -1,0 +1,208 @@
+"""What the verbs print with: JSON, tables, progress, figures, and text from outside that can hurt neither layout nor terminal."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from typing import Any, Final, Literal
+
+import click
+from rich.console import Console, Group, RenderableType
+from rich.measure import Measurement
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+from shadowhound_data_logger.bags.fetch import Told
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.keys import printable
+from shadowhound_data_logger.spool.accounts import ESTIMATED, RECEIVED_ONLY
+
+BAR_COLUMNS: Final = 10
+WIDEST: Final = 1000
+UNSURE: Final = {ESTIMATED: 'estimated', RECEIVED_ONLY: 'not known'}
+UNITS: Final = ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min'), (60, 'min', 1, 's'))
+
+
+def print_json(value: object, *, is_line: bool = False) -> None:
+    """On standard output, for programs: one value, or one of many, a line each. What JSON does not know is told as text."""
+    click.echo(json.dumps(value, indent=None if is_line else 2, default=str))
+
+
+def print_page(*parts: RenderableType, console: Console | None = None) -> None:
+    """Parts under one another, tables two columns apart where there is room; without a terminal no table is cut or broken."""
+    console = console or Console(highlight=False)
+    width = console.width
+    widest = fit(parts, console)
+    if not console.is_terminal:
+        console.width = max(width, widest)
+    console.print(Group(*parts))
+    console.width = width
+
+
+def print_lines(*lines: str | Text, console: Console | None = None) -> None:
+    """Lines that a terminal folds and a file keeps whole."""
+    console = console or Console(highlight=False)
+    for line in lines:
+        console.print(plain(line) if isinstance(line, str) else line, soft_wrap=True)
+
+
+class ProgressBar(Told):
+    """How far something is; any thread may move it. See ``progress``."""
+
+    def __init__(self, bar: Progress, what: str, total: int | None) -> None:
+        self._bar = bar
+        self._task = bar.add_task(what, total=total)
+
+    def begin(self, total: int) -> None:
+        """So much there is to do in all."""
+        self._bar.update(self._task, total=total)
+
+    def have(self, count: int = 1) -> None:
+        """So much more is done; negative where some of it turned out wrong."""
+        self._bar.advance(self._task, count)
+
+    def say(self, what: str, done: int | None = None) -> None:
+        """What is under way now, and how much is done of it."""
+        self._bar.update(self._task, description=what, completed=done)
+
+
+@contextmanager
+def progress(what: str = '', total: int | None = None, *, of: Literal['bytes', 'objects', 'words', 'seconds'] = 'words'
+             ) -> Iterator[ProgressBar]:  # fmt: skip
+    """A line on standard error where that is a terminal, gone at the end: a bar of bytes or objects, or what is said to it."""
+    console = Console(stderr=True)
+    with Progress(*_columns(of), console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield ProgressBar(bar, what, total)
+
+
+def _columns(of: str) -> Sequence[ProgressColumn]:
+    words = TextColumn('{task.description}')
+    if of == 'bytes':
+        return words, BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
+    if of == 'objects':
+        return words, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    return (SpinnerColumn(), words, TimeElapsedColumn()) if of == 'seconds' else (SpinnerColumn(), words)
+
+
+def plain(text: object, style: str = '') -> Text:
+    """Text from outside, as it is: no markup in it is obeyed, and a control character becomes a question mark."""
+    return Text(printable(str(text)), style)
+
+
+def plain_table(title: str, columns: Iterable[str], left: Iterable[str] = ('topic', '')) -> Table:
+    """Without lines, numbers to the right, nothing cut: a topic is broken across lines before it loses a letter."""
+    table = Table(title=title, title_justify='left', title_style='bold', header_style='dim', box=None, pad_edge=False)
+    for name in columns:
+        is_left = name in left
+        table.add_column(plain(name), justify='left' if is_left else 'right', overflow='fold', no_wrap=not is_left)
+    return table
+
+
+def value_table(title: str, values: Mapping[str, object]) -> Table:
+    """Names and values under one another."""
+    table = plain_table(title, ('', 'value'), ('', 'value'))
+    table.show_header = False
+    table.padding = (0, 2, 0, 0)
+    for name, value in values.items():
+        table.add_row(plain(name, 'dim'), plain(value))
+    return table
+
+
+def fit(parts: Sequence[RenderableType], console: Console) -> int:
+    """Set the columns of all tables with a header two apart, or one where that is too wide; the width of the widest."""
+    widest = 0
+    for table in (part for part in parts if isinstance(part, Table) and part.show_header):
+        table.padding = (0, 2, 0, 0)
+        if _width(table, console) > console.width:
+            table.padding = (0, 1, 0, 0)
+        widest = max(widest, _width(table, console))
+    return widest
+
+
+def share_bar(share: float, console: Console) -> Text:
+    """How full something is, 0 to 1, in ten columns: yellow from a half, red from nine tenths, never empty above 0."""
+    full, empty = ('#', '.') if console.options.ascii_only else ('█', '░')
+    share = min(max(share, 0.0), 1.0)
+    count = max(round(share * BAR_COLUMNS), 1 if share > 0 else 0)
+    style = 'red' if share >= 0.9 else 'yellow' if share >= 0.5 else 'green'
+    return Text.assemble((full * count, style), (empty * (BAR_COLUMNS - count), 'dim'))
+
+
+def number(value: int | None) -> str:
+    """With separators; a dash for what is not known."""
+    return '-' if value is None else f'{value:,}'
+
+
+def figure(row: Mapping[str, Any], name: str) -> str:
+    """A figure of a ledger or a status: ``~12`` where it is estimated, a dash where it is not known."""
+    about = row.get(f'{name}_estimated')
+    return number(row[name]) if about is None else f'~{about:,}'
+
+
+def unsure(grades: Sequence[str]) -> str:
+    """``estimated for 2 topics and not known for 1 topic``, of the grades of several."""
+    counts = {text: grades.count(grade) for grade, text in UNSURE.items()}
+    return ' and '.join(f'{text} for {count} topic{"s" * (count > 1)}' for text, count in counts.items() if count)
+
+
+def volume(count: float) -> str:
+    """Bytes in decimal units, as disks and networks are sold."""
+    for unit in ('B', 'KB', 'MB'):
+        if count < 1000:
+            return f'{count:.0f} {unit}' if unit == 'B' else f'{count:.1f} {unit}'
+        count /= 1000
+    return f'{count:.1f} GB'
+
+
+def duration(seconds: float) -> str:
+    """In the two largest units, such as ``0.4 s``, ``12 s``, ``3 min 5 s``, ``2 h 10 min``, ``4 d 3 h``."""
+    if seconds < 60:
+        return f'{seconds:.1f} s' if seconds < 10 else f'{seconds:.0f} s'
+    left = round(seconds)
+    size, unit, part, smaller = next(units for units in UNITS if left >= units[0])
+    rest = left % size // part
+    return f'{left // size} {unit} {rest} {smaller}' if rest else f'{left // size} {unit}'
+
+
+def shown_time(time_ns: int | None) -> str:
+    """UTC, to the millisecond; a dash for what is not known."""
+    if time_ns is None:
+        return '-'
+    when = datetime.fromtimestamp(time_ns // SECOND, timezone.utc)
+    return f'{when:%Y-%m-%d %H:%M:%S}.{time_ns % SECOND // 1_000_000:03d}'
+
+
+def shown_iso(stamp: str) -> str:
+    """An ISO time as people read it, to the second."""
+    return f'{stamp[:10]} {stamp[11:19]}'
+
+
+def with_dates(value: Mapping[str, Any]) -> dict[str, Any]:
+    """For JSON: with each ``..._ns`` told as a date as well, to the nanosecond."""
+    dates = {name.removesuffix('_ns'): _iso_or_none(time) for name, time in value.items() if name.endswith('_ns')}
+    return {**value, **dates}
+
+
+def _iso_or_none(time_ns: int | None) -> str | None:
+    if time_ns is None:
+        return None
+    when = datetime.fromtimestamp(time_ns // SECOND, timezone.utc)
+    return f'{when:%Y-%m-%dT%H:%M:%S}.{time_ns % SECOND:09d}Z'
+
+
+def _width(table: Table, console: Console) -> int:
+    return Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum
