@@ -162,6 +162,7 @@ class Source:
         self._retiring: dict[Reader, float] = {}
         self._heard: set[Plan] = set()
         self._senders = Senders()
+        self._of_nodes: dict[str, set[str]] = {}
         self._stream: AnyStream | None = None
         self._kept_ns: dict[str, int] = {}
         self._paused = False
@@ -251,7 +252,7 @@ class Source:
 
     def _choose(self, now_s: float) -> list[Endpoint]:
         """Publishers of the topic to listen to: the preferred one at once, another after a while without it."""
-        found = {topic: endpoints(self._node, topic) for topic in self._topics}
+        found = {topic: self._publishers_of(topic) for topic in self._topics}
         present = {topic for topic, publishers in found.items() if self._has_own(topic, publishers)}
         best = next((topic for topic in self._topics if topic in present), self._chosen)
         if best == self._chosen or self._chosen in present:
@@ -266,6 +267,17 @@ class Source:
             self._chosen = best
             self._absent_since_s = None
         return found[self._chosen]
+
+    def _publishers_of(self, topic: str) -> list[Endpoint]:
+        """As the graph knows them, without those that were a node's and are no more: they ended.
+
+        Fast DDS 2.6 does not understand Cyclone DDS when it says that a publisher ended (it ignores a serialized key of more than
+        16 bytes, MessageReceiver.cpp), and keeps it while the process lives; what its node has is told by another way.
+        """
+        found = endpoints(self._node, topic)
+        before = self._of_nodes.get(topic, set())
+        known = self._of_nodes[topic] = {each.gid for each in found if each.node or each.gid in before}
+        return [each for each in found if each.node or each.gid not in known]
 
     def _has_own(self, topic: str, publishers: Sequence[Endpoint]) -> bool:
         """Whether somebody publishes the topic with the type that is named for it."""
@@ -375,6 +387,6 @@ class Source:
         last_s, self._last_received_s = self._last_received_s, now_s
         is_unnamed = taken[0].publisher is None or taken[0].number is None
         if is_unnamed and (not self._senders.gids or last_s is None or now_s - last_s > PAUSE_S):
-            gids = [each.gid for each in endpoints(self._node, self._chosen) if each.type == self._type]
+            gids = [each.gid for each in self._publishers_of(self._chosen) if each.type == self._type]
             self._senders.look(gids, now_s)
         self._stream.add(taken, self._senders, now_s, paused=self._paused, idle=self._idle)

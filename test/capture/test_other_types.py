@@ -21,6 +21,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import Float64, Int32, String
 
 from shadowhound_data_logger.capture import source as module
+from shadowhound_data_logger.capture.endpoints import Endpoint
 from shadowhound_data_logger.capture.reader import FAST_DDS, PolledGroup
 from shadowhound_data_logger.capture.source import OtherTypes, Source
 from shadowhound_data_logger.capture.stream import Shared
@@ -241,6 +242,30 @@ def test_without_a_named_type_the_first_stays(make: Callable[[str], Any], monkey
     make('three').create(Float64, '/odom')
     logger.until(lambda: FLOAT in logger.totals('/odom').other_types, 'the third is seen')
     assert (logger.totals('/odom').accounting, logger.totals('/odom').missed) == (RECEIVED_ONLY, None)
+
+
+def test_a_publisher_that_ended_and_stays_in_the_graph(make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its type gives way to the one that is published now: no node has it any more (Fast DDS 2.6 beside Cyclone DDS)."""
+    logger, robot = make('logger'), make('robot')
+    real, seen = module.endpoints, {}
+
+    def kept(node: Node, topic: str) -> list[Endpoint]:
+        found = {each.gid: each for each in real(node, topic)}
+        seen.update(found)
+        return [*found.values(), *(replace(each, node='') for gid, each in seen.items() if gid not in found)]
+
+    monkeypatch.setattr(module, 'endpoints', kept)
+    robot.create(String, '/odom')
+    logger.listen('/odom')
+    logger.until(lambda: any(each.node for each in seen.values()), 'it is known as of its node')
+    logger.until(robot.matched, 'it is heard')
+    robot.leave()
+    robot.create(Int32, '/odom')
+    logger.until(lambda: logger.source.status().publishers == 1 and logger.totals('/odom').type == INT, 'the other type is taken')
+    logger.until(robot.matched, 'the successor is heard')
+    robot.publish(*ints(3))
+    logger.until(lambda: logger.totals('/odom').received == 3, 'it is received')
+    assert logger.numbers() == [0, 1, 2]
 
 
 def test_a_squatter_is_no_reason_to_prefer_a_topic(make: Callable[[str], Any]) -> None:

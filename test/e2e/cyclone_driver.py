@@ -168,7 +168,7 @@ class Driver:
 
     def _wait_for(self, topic: str, count: int) -> None:
         end = time.monotonic() + MATCH_S
-        while len(self._writers[topic].get_matched_subscriptions()) < count:
+        while self._writers[topic].get_publication_matched_status().current_count < count:
             if time.monotonic() > end:
                 raise TimeoutError(f'nobody listens to {topic}')
             time.sleep(0.005)
