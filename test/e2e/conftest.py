@@ -44,7 +44,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:  # type: ign
 def running(folder: Path) -> Iterator[Processes]:
     """Processes in a domain of their own; whatever happens, none of them stays."""
     with free_domain() as domain:
-        processes = Processes(folder, domain, f'r{secrets.token_hex(4)}')
+        processes = Processes(folder, domain, f'r{secrets.token_hex(4)}', forked=True)
         LIVE.append(processes)
         try:
             yield processes

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from forking import Forked, can_fork, fork
+
 from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE
 from shadowhound_data_logger.spool import ledger
 
@@ -35,15 +37,23 @@ def until(condition: Callable[[], T], what: str | Callable[[], str], seconds: fl
 
 
 class Process:
-    """A child whose standard error (and output, unless that is piped) goes to a log file."""
+    """A program of Python whose standard error (and output, unless that is piped) goes to a log file."""
 
-    def __init__(self, name: str, command: Sequence[str], log: Path, environ: Mapping[str, str], *, piped: bool = False) -> None:
+    def __init__(
+        self, name: str, command: Sequence[str], log: Path, environ: Mapping[str, str], *,
+        piped: bool = False, forked: bool = False,
+    ) -> None:  # fmt: skip
         self.name, self.log_path = name, log
         pipe = subprocess.PIPE if piped else None
+        self.popen: subprocess.Popen[str] | Forked
         with log.open('ab') as file:
-            self.popen = subprocess.Popen(
-                command, stdin=pipe or subprocess.DEVNULL, stdout=pipe or file, stderr=file, env=dict(environ), text=True
-            )
+            if forked and can_fork(environ):
+                self.popen = fork(command, environ, file, piped=piped)
+            else:
+                self.popen = subprocess.Popen(
+                    [sys.executable, *command], stdin=pipe or subprocess.DEVNULL, stdout=pipe or file, stderr=file,
+                    env=dict(environ), text=True,
+                )  # fmt: skip
 
     @property
     def log(self) -> str:
@@ -207,10 +217,10 @@ class Publisher(Process):
 
 
 class Processes:
-    """All that a test starts. ``end`` reaps what still runs."""
+    """All that a test starts. ``end`` reaps what still runs. What can be is ``forked``, which is quicker (forking.py)."""
 
-    def __init__(self, folder: Path, domain: int, robot: str) -> None:
-        self.folder, self.robot = folder, robot
+    def __init__(self, folder: Path, domain: int, robot: str, *, forked: bool = False) -> None:
+        self.folder, self.robot, self._forked = folder, robot, forked
         self.started: list[Process] = []
         foreign = ('AWS_', 'MLFLOW_', 'SHADOWHOUND_HOME', 'SHADOWHOUND_ROBOT', 'ROS_LOCALHOST_ONLY')
         self.environ = {name: value for name, value in os.environ.items() if not name.startswith(foreign)} | {
@@ -230,8 +240,9 @@ class Processes:
         file.write_text(json.dumps({'/**': {'ros__parameters': given}}))
         robot = self.robot if robot is None else robot
         own = {'SHADOWHOUND_HOME': str(self.folder / home), 'SHADOWHOUND_ROBOT': robot}
-        command = [sys.executable, *program, '--ros-args', '--params-file', str(file), *arguments]
-        node = Node(name, command, self.folder / f'{name}.log', {**self.environ, **own, **(store or {}), **(environ or {})})
+        command = [*program, '--ros-args', '--params-file', str(file), *arguments]
+        environ = {**self.environ, **own, **(store or {}), **(environ or {})}
+        node = Node(name, command, self.folder / f'{name}.log', environ, forked=self._forked)
         self.started.append(node)
         node.home, node.robot = self.folder / home, robot
         if ready:
@@ -242,26 +253,27 @@ class Processes:
         """The simulated Go2; ``published`` has what it said at its end."""
         given = [word for parameter in parameters for word in ('-p', parameter)]
         name = self._name('sim')
-        command = [sys.executable, '-m', SIM, '--ros-args', '-r', f'__ns:={namespace}', *given]
-        return self._keep(Process(name, command, self.folder / f'{name}.log', self.environ))
+        command = ['-m', SIM, '--ros-args', '-r', f'__ns:={namespace}', *given]
+        return self._keep(Process(name, command, self.folder / f'{name}.log', self.environ, forked=self._forked))
 
     def witness(self, topics: Mapping[str, str], output: Path, *, best_effort: Iterable[str] = ()) -> Process:
         """A second listener that writes all it hears, as it came, to a file (witness.py); SIGTERM ends it."""
         order = json.dumps({topic: [type_name, topic not in best_effort] for topic, type_name in topics.items()})
         name = self._name('witness')
-        command = [sys.executable, str(HERE / 'witness.py'), str(output), order]
-        witness = self._keep(Process(name, command, self.folder / f'{name}.log', self.environ))
+        command = [str(HERE / 'witness.py'), str(output), order]
+        witness = self._keep(Process(name, command, self.folder / f'{name}.log', self.environ, forked=self._forked))
         witness.said('ready')
         return witness
 
     def publisher(self, *, cyclone: bool = False, environ: Mapping[str, str] | None = None) -> Publisher:
         """A process with publishers, of rclpy or as a robot with Cyclone DDS has them."""
         name = self._name('publisher')
-        command = [sys.executable, str(HERE / ('cyclone_driver.py' if cyclone else 'publisher.py'))]
+        command = [str(HERE / ('cyclone_driver.py' if cyclone else 'publisher.py'))]
         humble = {'AS_HUMBLE': 'yes'} if os.environ.get('ROS_DISTRO') == 'humble' else {}
-        path = os.pathsep.join([str(HERE.parent), *filter(None, [self.environ.get('PYTHONPATH')])])
-        own = {**self.environ, **humble, **(environ or {}), 'PYTHONPATH': path}
-        process = Publisher(name, command, self.folder / f'{name}.log', own, piped=True)
+        own = {**self.environ, **humble, **(environ or {})}
+        if not self._forked or not can_fork(own):
+            own['PYTHONPATH'] = os.pathsep.join([str(HERE.parent), *filter(None, [own.get('PYTHONPATH')])])
+        process = Publisher(name, command, self.folder / f'{name}.log', own, piped=True, forked=self._forked)
         self.started.append(process)
         return process
 
