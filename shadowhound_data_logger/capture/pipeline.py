@@ -208,6 +208,7 @@ class Pipeline:
         if self.writer.damaged:
             text = f'the index of the spool {self.spool.root} is damaged'
             raise SpoolError(text, remedy='start the node again: it is rebuilt then')
+        self._obey()  # whoever woke the executor just as it went to sleep is not heard (rmw_fastrtps clears the condition unseen)
         now_s = time.monotonic()
         if not self._supervise() and now_s < self._due_s:
             return

@@ -17,6 +17,9 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 NODE = '/sensor_logger_node'
+ASK_S = WAIT_S / 3
+"""After which a request is sent again. A client that the server has not discovered yet may never be answered: services of ROS are
+pairs of topics, and neither rmw_fastrtps nor rmw_cyclonedds tells a client that the server knows both of its own."""
 
 
 class Station:
@@ -29,6 +32,7 @@ class Station:
         self.node = Node('station', context=self._context, start_parameter_services=False, enable_rosout=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -97,17 +101,19 @@ class Station:
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
         """The answer of one of the node's services."""
-        answer = self._ask(kind, name, request, WAIT_S)
+        tries = round(WAIT_S / ASK_S)
+        answer = next((answer for _ in range(tries) if (answer := self._ask(kind, name, request, ASK_S)) is not None), None)
         assert answer is not None, f'{self._name + name} does not answer'
         return answer
 
     def _ask(self, kind: Any, name: str, request: Any, seconds: float) -> Any:
         """None where no answer comes in that time."""
-        client = self.node.create_client(kind, self._name + name)
-        try:
-            assert client.wait_for_service(WAIT_S), f'there is no {self._name + name}'
-            future = client.call_async(request)
-            self._executor.spin_until_future_complete(future, seconds)
-            return future.result() if future.done() else None
-        finally:
-            self.node.destroy_client(client)
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, self._name + name)
+        client = self._clients[name]
+        assert client.wait_for_service(WAIT_S), f'there is no {self._name + name}'
+        future = client.call_async(request)
+        self._executor.spin_until_future_complete(future, seconds)
+        if not future.done():
+            client.remove_pending_request(future)
+        return future.result() if future.done() else None
