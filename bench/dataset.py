@@ -29,9 +29,10 @@ from obstore.store import S3Store
 from PIL import Image
 from torch.utils.data import DataLoader
 
+from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.encode.archive import Member, pack_tar
-from shadowhound_data_logger.lake import MissionDataset, parts, query, schema
+from shadowhound_data_logger.lake import MissionDataset, query
 from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.sim.tower import Tower
 

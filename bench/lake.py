@@ -31,10 +31,11 @@ from _report import Bar, Report, main, progress
 from _world import make_bucket
 from obstore.store import S3Store
 
+from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.lake import fetch as fetching
-from shadowhound_data_logger.lake import parts, query, schema
+from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.source import Source, open_source
 from shadowhound_data_logger.options import StoreSettings

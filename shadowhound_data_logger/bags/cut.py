@@ -16,20 +16,20 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Final, Protocol
 
-from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.description import Description, Part, of_metadata
 from shadowhound_data_logger.bags.fetch import fetch, on_disk
-from shadowhound_data_logger.bags.mcap_messages import Message, Wanted
-from shadowhound_data_logger.bags.metadata import metadata_yaml
 from shadowhound_data_logger.bags.naming import BUCKET, METADATA
 from shadowhound_data_logger.bags.packed import Packed
 from shadowhound_data_logger.bags.plain import Plain, is_plain
-from shadowhound_data_logger.bags.ranges import LocalFile, Meter, StoredFile, read_whole
 from shadowhound_data_logger.bags.remote import Listing, RemoteBag, document, natural
-from shadowhound_data_logger.bags.slice_writer import SliceWriter
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
+from shadowhound_data_logger.mcap.messages import Message, Wanted
+from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, StoredFile, read_whole
+from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.mcap.slice_info import Channel
+from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.times import moment_in_bag
 
 UNFINISHED: Final = '.part'

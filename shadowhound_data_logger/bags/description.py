@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from shadowhound_data_logger.bags.mcap_index import McapIndex
-from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.mcap.index import McapIndex
+from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.untrusted import check_size, from_yaml
 
 MOST_QOS_BYTES: Final = 64 << 10

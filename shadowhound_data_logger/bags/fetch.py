@@ -18,13 +18,13 @@ from typing import Final
 
 from shadowhound_data_logger.bags.description import slice_info
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.mcap_index import read_index
-from shadowhound_data_logger.bags.metadata import metadata_yaml
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
-from shadowhound_data_logger.bags.ranges import LocalFile, Meter, check_document, read_whole
 from shadowhound_data_logger.bags.remote import Listing, RemoteBag, RemoteFile, missing_of
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import BagDamaged, BagError, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.mcap.index import read_index
+from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, check_document, read_whole
+from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.ship.retry import backoff
 from shadowhound_data_logger.stores.download import UNFINISHED, download

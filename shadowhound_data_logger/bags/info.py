@@ -12,9 +12,7 @@ from shadowhound_data_logger.bags.description import Description, of_metadata, o
 from shadowhound_data_logger.bags.local import LocalFile as Waiting
 from shadowhound_data_logger.bags.local import local_files
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.mcap_index import read_index
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
-from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
 from shadowhound_data_logger.bags.remote import (
     FOREIGN,
     GROWING,
@@ -26,8 +24,10 @@ from shadowhound_data_logger.bags.remote import (
     natural,
     state_of,
 )
-from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.errors import BagError
+from shadowhound_data_logger.mcap.index import read_index
+from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
+from shadowhound_data_logger.mcap.slice_info import SliceInfo
 
 THREADS: Final = 8
 

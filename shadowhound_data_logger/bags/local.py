@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.naming import BUCKET, FOLDER, prefix_of
-from shadowhound_data_logger.bags.slice_writer import OPEN
 from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.mcap.writer import OPEN
 from shadowhound_data_logger.spool.index import Index
 
 RECORDS: Final = 'records'

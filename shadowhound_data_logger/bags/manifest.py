@@ -32,8 +32,8 @@ from dataclasses import asdict, dataclass
 from typing import Final
 
 from shadowhound_data_logger.bags.json_object import JsonObject
-from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.untrusted import from_json, is_path
 
 VERSION: Final = 1

@@ -23,7 +23,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.json_object import JsonObject
 from shadowhound_data_logger.bags.manifest import (
     ClockOf,
@@ -36,10 +35,10 @@ from shadowhound_data_logger.bags.manifest import (
     read_mission,
 )
 from shadowhound_data_logger.bags.naming import slice_file, slice_number
-from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.errors import BagDamaged, NameRefused
 from shadowhound_data_logger.keys import check_key
+from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
 from shadowhound_data_logger.spool.accounts import BAG, EVENT
 
 log = logging.getLogger(__name__)

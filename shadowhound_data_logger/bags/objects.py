@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, RECOVERED, Manifest, Missing, SliceEntry, topics_of
-from shadowhound_data_logger.bags.metadata import metadata_yaml
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, slice_number
 from shadowhound_data_logger.bags.notes import Notes
-from shadowhound_data_logger.bags.slice_info import SliceInfo
+from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.retention import NO_ROOM
 

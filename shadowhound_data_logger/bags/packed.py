@@ -18,13 +18,13 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.metadata import dump_qos_v8
 
-from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.definitions import describe
 from shadowhound_data_logger.bags.description import Description
-from shadowhound_data_logger.bags.mcap_messages import Message, Wanted
 from shadowhound_data_logger.bags.plain import Plain
-from shadowhound_data_logger.bags.ranges import LocalFile
 from shadowhound_data_logger.errors import BagDamaged, DataLoggerError
+from shadowhound_data_logger.mcap.messages import Message, Wanted
+from shadowhound_data_logger.mcap.ranges import LocalFile
+from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, path_below, unpacked
 
 if sys.version_info >= (3, 14):

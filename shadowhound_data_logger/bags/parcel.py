@@ -15,13 +15,13 @@ from typing import IO, Final, cast
 
 from shadowhound_data_logger.bags.description import Description, Part, of_metadata, slice_info
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, RecordedTopic, SliceEntry
-from shadowhound_data_logger.bags.mcap_index import read_index
 from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, prefix_of
-from shadowhound_data_logger.bags.ranges import LocalFile
 from shadowhound_data_logger.bags.remote import ARCHIVE, natural
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_key, check_name
+from shadowhound_data_logger.mcap.index import read_index
+from shadowhound_data_logger.mcap.ranges import LocalFile
 
 CONTENT_TYPES: Final = {'.yaml': 'application/yaml', '.json': 'application/json', '.gz': 'application/gzip'}
 _NUMBER: Final = re.compile(r'_(\d+)\.', re.ASCII)

@@ -8,9 +8,9 @@ from functools import cache
 from typing import Final
 
 from shadowhound_data_logger.bags.description import Description, Part
-from shadowhound_data_logger.bags.mcap_index import McapIndex, read_index
-from shadowhound_data_logger.bags.mcap_messages import Message, Wanted, read_messages
-from shadowhound_data_logger.bags.ranges import Ranged
+from shadowhound_data_logger.mcap.index import McapIndex, read_index
+from shadowhound_data_logger.mcap.messages import Message, Wanted, read_messages
+from shadowhound_data_logger.mcap.ranges import Ranged
 
 THREADS: Final = 8
 

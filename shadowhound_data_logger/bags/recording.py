@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.definitions import describe
 from shadowhound_data_logger.bags.manifest import Missing, MissionOf
 from shadowhound_data_logger.bags.naming import prefix_of, slice_file
@@ -23,9 +22,9 @@ from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.objects import ending_objects, note_evicted, ros_distro, slice_object
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import Lot
-from shadowhound_data_logger.bags.recovery import recover
-from shadowhound_data_logger.bags.slice_info import SliceInfo
-from shadowhound_data_logger.bags.slice_writer import OPEN, SliceWriter
+from shadowhound_data_logger.mcap.recovery import recover
+from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.mcap.writer import OPEN, SliceWriter
 from shadowhound_data_logger.model import DataObject, State
 from shadowhound_data_logger.options import BagSettings
 from shadowhound_data_logger.spool.accounts import Accounts

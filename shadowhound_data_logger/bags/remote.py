@@ -14,8 +14,8 @@ from typing import Final, Protocol
 
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, prefix_of
-from shadowhound_data_logger.bags.ranges import StoredFile, read_whole
 from shadowhound_data_logger.errors import BagError
+from shadowhound_data_logger.mcap.ranges import StoredFile, read_whole
 from shadowhound_data_logger.model import ObjectInfo
 
 ARCHIVE: Final = '.tar.gz'

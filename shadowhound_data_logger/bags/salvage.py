@@ -24,9 +24,9 @@ from shadowhound_data_logger.bags.notes import FILE, Notes
 from shadowhound_data_logger.bags.objects import ending_objects, note_evicted, ros_distro, slice_object
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.recording import Outlet
-from shadowhound_data_logger.bags.recovery import read_info, recover
-from shadowhound_data_logger.bags.slice_writer import OPEN
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.mcap.recovery import read_info, recover
+from shadowhound_data_logger.mcap.writer import OPEN
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.worker import Worker

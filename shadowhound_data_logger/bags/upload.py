@@ -23,9 +23,9 @@ from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import BagError, ForeignObject, StoreUnavailable
 from shadowhound_data_logger.model import DataObject, FileBody, ObjectInfo, Put, SpooledObject, State
+from shadowhound_data_logger.ship.delivering import delivering
 from shadowhound_data_logger.ship.retry import backoff
 from shadowhound_data_logger.ship.uploader import Uploader
-from shadowhound_data_logger.spool.delivering import delivering
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import limits

@@ -15,14 +15,14 @@ from typing import Final
 
 from shadowhound_data_logger.bags.description import Description, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest, Missing
-from shadowhound_data_logger.bags.mcap_format import Op
-from shadowhound_data_logger.bags.mcap_index import read_index, records
-from shadowhound_data_logger.bags.mcap_messages import unpack, walk
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.packed import check_tables
-from shadowhound_data_logger.bags.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
 from shadowhound_data_logger.bags.remote import FOREIGN, Listing, RemoteBag, RemoteFile, document, state_of
 from shadowhound_data_logger.errors import BagDamaged, BagError
+from shadowhound_data_logger.mcap.format import Op
+from shadowhound_data_logger.mcap.index import read_index, records
+from shadowhound_data_logger.mcap.messages import unpack, walk
+from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
 from shadowhound_data_logger.untrusted import is_path
 
 THREADS: Final = 4

@@ -11,11 +11,11 @@ from typing import Final
 
 from rclpy.node import Node
 
-from shadowhound_data_logger.bags.metadata import offered_qos
 from shadowhound_data_logger.bags.queue import QUEUE_FULL, BagQueue, Lot
 from shadowhound_data_logger.capture.endpoints import Senders
 from shadowhound_data_logger.capture.stream import Pace, Repeats, Shared, is_named
 from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.mcap.rosbag2_metadata import offered_qos
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.spool.accounts import BAG, PAUSED, Accounts, Losses, TopicAccount
 from shadowhound_data_logger.spool.estimator import TopicEstimate

@@ -34,6 +34,7 @@ from shadowhound_data_logger.capture.parameters import Parameters, live
 from shadowhound_data_logger.capture.pose_track import RobotTrack
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.capture.stream import Shared
+from shadowhound_data_logger.catalogue.writer import Catalogue
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import SensorSettings, Settings
@@ -42,7 +43,6 @@ from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import dated
-from shadowhound_data_logger.lake.catalogue import Catalogue
 from shadowhound_data_logger.model import DataObject, Outcome
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool import ledger

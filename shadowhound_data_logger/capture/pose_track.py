@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.capture.mission_tap import number_at, yaw_of
+from shadowhound_data_logger.catalogue.schema import BATTERY, POSE
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import MissionSettings
 from shadowhound_data_logger.encode.records import ODOMETRY
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
-from shadowhound_data_logger.lake.schema import BATTERY, POSE
 from shadowhound_data_logger.model import DataObject
 
 SPAN_NS: Final = 60 * SECOND

@@ -16,6 +16,7 @@ import click
 from rich.console import RenderableType
 from rich.text import Text
 
+from shadowhound_data_logger.catalogue.writer import Catalogue
 from shadowhound_data_logger.cli.common import as_json, spool_folder, the_spool
 from shadowhound_data_logger.cli.output import (
     ProgressBar,
@@ -31,10 +32,9 @@ from shadowhound_data_logger.cli.output import (
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock, SystemClock, iso
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.lake.catalogue import Catalogue
 from shadowhound_data_logger.model import State
+from shadowhound_data_logger.ship.delivering import delivering
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
-from shadowhound_data_logger.spool.delivering import delivering
 from shadowhound_data_logger.spool.index import MISSING, Index
 from shadowhound_data_logger.spool.listing import HERE, Heap, heaps, objects
 from shadowhound_data_logger.spool.listing import retry as retry_objects

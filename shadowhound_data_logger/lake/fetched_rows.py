@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from shadowhound_data_logger.catalogue import parts
+from shadowhound_data_logger.catalogue.schema import COLUMNS
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.keys import is_name
-from shadowhound_data_logger.lake import parts
 from shadowhound_data_logger.lake.fetched import PARTS
-from shadowhound_data_logger.lake.schema import COLUMNS
 from shadowhound_data_logger.lake.standing import mended_key
 
 

@@ -8,9 +8,9 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from shadowhound_data_logger.catalogue.parts import CONTENT_TYPE
+from shadowhound_data_logger.catalogue.schema import BUCKET, SENSOR
 from shadowhound_data_logger.errors import ForeignObject
-from shadowhound_data_logger.lake.parts import CONTENT_TYPE
-from shadowhound_data_logger.lake.schema import BUCKET, SENSOR
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.stores.base import ObjectStore
 

@@ -19,10 +19,10 @@ from typing import Any, Final
 
 import pyarrow as pa
 
+from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
-from shadowhound_data_logger.lake import schema
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.reading import THREADS
 from shadowhound_data_logger.lake.scan import Catalogue
@@ -63,7 +63,7 @@ class _Asked:
 
 
 def objects(source: Source | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
-    """One row an object, with the columns of ``lake/schema.py``.
+    """One row an object, with the columns of ``catalogue/schema.py``.
 
     ``flags`` are those of ``select.wanted``: ``sensor topic robot since until near mission mission_type success where``.
     Without a source, of the store that the environment names. Parts that are none are left out: ``findings`` has them once

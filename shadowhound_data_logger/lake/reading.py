@@ -21,10 +21,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from shadowhound_data_logger.catalogue.schema import REQUIRED, arrow_schema
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.schema import REQUIRED, arrow_schema
 from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.lake.source import Entry, Source
 from shadowhound_data_logger.untrusted import check_size, is_path

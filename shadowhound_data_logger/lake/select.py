@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Final
 
+from shadowhound_data_logger.catalogue.schema import UNDATED
 from shadowhound_data_logger.clock import FUTURE_SLACK_NS, utc
 from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.lake.schema import UNDATED
 from shadowhound_data_logger.times import moment
 
 DAY: Final = timedelta(days=1)

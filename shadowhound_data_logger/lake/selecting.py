@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from shadowhound_data_logger.catalogue.schema import SENSOR
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import query  # first: it turns Daft's telemetry off
@@ -14,7 +15,6 @@ from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES, extens
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.folder_source import FolderSource
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
-from shadowhound_data_logger.lake.schema import SENSOR
 from shadowhound_data_logger.lake.source import Source
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.options import StoreSettings

@@ -16,10 +16,10 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Final
 
+from shadowhound_data_logger.catalogue.schema import part_key, prefix
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.schema import part_key, prefix
 from shadowhound_data_logger.lake.source import Entry, Source
 from shadowhound_data_logger.untrusted import from_json
 

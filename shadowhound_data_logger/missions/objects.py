@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.catalogue.writer import Catalogue
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import StoreUnavailable
-from shadowhound_data_logger.lake.catalogue import Catalogue
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, safe_type, stamped
 from shadowhound_data_logger.missions.story import BUCKET, TRAJECTORIES
 from shadowhound_data_logger.model import Binding, DataObject
-from shadowhound_data_logger.spool.delivering import delivering
+from shadowhound_data_logger.ship.delivering import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import LAST, Spool

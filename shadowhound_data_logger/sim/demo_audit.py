@@ -15,7 +15,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.lake.schema import is_row
+from shadowhound_data_logger.catalogue.schema import is_row
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.index import Index

@@ -19,7 +19,7 @@ from shadowhound_data_logger.model import ObjectInfo
 PAGE: Final = 256
 """Objects asked for between two notes of what was sound: what an interruption costs."""
 _DELIVERED: Final = "FROM spool.objects AS object WHERE state = 'delivered' AND sensor <> '_catalog'"
-"""Without the catalogue's parts (lake/schema.py): others stand for them in time, and they go; they can be made again."""
+"""Without the catalogue's parts (catalogue/schema.py): others stand for them in time, and they go; they can be made again."""
 _NOT_NOTED: Final = 'AND NOT EXISTS (SELECT 1 FROM sound WHERE sound.id = object.id)'
 BUSY_TIMEOUT_S: Final = 1.0
 _SCHEMA: Final = """

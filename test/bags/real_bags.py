@@ -9,16 +9,15 @@ from pathlib import Path
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, SliceEntry, topics_of
-from shadowhound_data_logger.bags.mcap_index import read_index
-from shadowhound_data_logger.bags.mcap_messages import Message, Wanted, read_messages
-from shadowhound_data_logger.bags.metadata import metadata_yaml
 from shadowhound_data_logger.bags.naming import BUCKET, prefix_of
-from shadowhound_data_logger.bags.ranges import LocalFile
-from shadowhound_data_logger.bags.slice_info import SliceInfo
-from shadowhound_data_logger.bags.slice_writer import SliceWriter
 from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.mcap.index import read_index
+from shadowhound_data_logger.mcap.messages import Message, Wanted, read_messages
+from shadowhound_data_logger.mcap.ranges import LocalFile
+from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.stores.base import ObjectStore
 

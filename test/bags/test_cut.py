@@ -14,11 +14,11 @@ from ruamel.yaml import YAML
 from stores.spooled import QUICK
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
-from shadowhound_data_logger.bags.mcap_messages import Message
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
-from shadowhound_data_logger.bags.slice_writer import SliceWriter
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
+from shadowhound_data_logger.mcap.messages import Message
+from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore

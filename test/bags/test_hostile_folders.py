@@ -13,7 +13,7 @@ from bags.recording import ROBOT, desk, manifest
 from bags.slices import closed, fill, messages
 
 from shadowhound_data_logger.bags.notes import FILE, MOST_BYTES, Notes
-from shadowhound_data_logger.bags.slice_writer import SliceWriter
+from shadowhound_data_logger.mcap.writer import SliceWriter
 
 BAG = 'patrol_20251018_120000'
 

@@ -13,7 +13,7 @@ from bags.recording import ROBOT, Desk, desk, manifest, numbers, start, write_ou
 
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.overview import NoStore, overview
-from shadowhound_data_logger.bags.slice_writer import SliceWriter
+from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.spool import ledger
 

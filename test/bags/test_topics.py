@@ -6,13 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.manifest import Missing, MissionOf
 from shadowhound_data_logger.bags.naming import bag_name, key_of, slice_file, slice_number, unsynced_name
 from shadowhound_data_logger.bags.notes import FILE, Notes
-from shadowhound_data_logger.bags.slice_info import SliceInfo
 from shadowhound_data_logger.bags.topics import Choice
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_key, check_name
+from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
 from shadowhound_data_logger.options import BagSettings
 
 NOON_NS = 1_760_788_800 * 10**9

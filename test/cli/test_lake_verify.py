@@ -13,10 +13,10 @@ import pytest
 from click.testing import CliRunner, Result
 from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, row
 
+from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.lake import schema
 from shadowhound_data_logger.stores import open_store
 
 TIMES = [NOON_NS + second * SECOND for second in range(5)]

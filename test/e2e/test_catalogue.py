@@ -14,7 +14,7 @@ import pyarrow.parquet
 from e2e.processes import Processes, until
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.lake import schema
+from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.sim.world import World

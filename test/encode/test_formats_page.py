@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from shadowhound_data_logger.bags.channel import Channel
 from shadowhound_data_logger.bags.definitions import describe
-from shadowhound_data_logger.bags.metadata import metadata_yaml
-from shadowhound_data_logger.bags.slice_writer import SliceWriter
-from shadowhound_data_logger.lake.parts import encode
-from shadowhound_data_logger.lake.schema import row_of
+from shadowhound_data_logger.catalogue.parts import encode
+from shadowhound_data_logger.catalogue.schema import row_of
+from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.mcap.slice_info import Channel
+from shadowhound_data_logger.mcap.writer import SliceWriter
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / 'docs' / 'formats.md').read_text(encoding='utf-8')

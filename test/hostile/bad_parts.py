@@ -15,7 +15,7 @@ from typing import Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shadowhound_data_logger.lake import parquet, parts, schema
+from shadowhound_data_logger.catalogue import parquet, parts, schema
 from shadowhound_data_logger.lake.standing import LEAVES, compacted_key
 from shadowhound_data_logger.options import StoreSettings
 

@@ -34,15 +34,13 @@ from shadowhound_data_logger.bags.description import of_metadata
 from shadowhound_data_logger.bags.fetch import fetch as fetch_bag
 from shadowhound_data_logger.bags.info import info_folder
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.mcap_format import CHUNK, RECORD, Op, record, text
-from shadowhound_data_logger.bags.mcap_index import records
-from shadowhound_data_logger.bags.mcap_messages import unpack
 from shadowhound_data_logger.bags.overview import overview
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile
 from shadowhound_data_logger.bags.verify import verify_folder
+from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.cli.output import shown_time
 from shadowhound_data_logger.errors import DataLoggerError
-from shadowhound_data_logger.lake import decode, parts, query, reading, schema
+from shadowhound_data_logger.lake import decode, query, reading
 from shadowhound_data_logger.lake.fetch import Wish
 from shadowhound_data_logger.lake.fetch import fetch as fetch_objects
 from shadowhound_data_logger.lake.findings import Findings
@@ -51,6 +49,9 @@ from shadowhound_data_logger.lake.samples import Near, Samples, Selection, Windo
 from shadowhound_data_logger.lake.source import Entry, open_source
 from shadowhound_data_logger.lake.standing import leaves_of
 from shadowhound_data_logger.lake.track import Track
+from shadowhound_data_logger.mcap.format import CHUNK, RECORD, Op, record, text
+from shadowhound_data_logger.mcap.index import records
+from shadowhound_data_logger.mcap.messages import unpack
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore

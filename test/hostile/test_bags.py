@@ -21,13 +21,13 @@ from shadowhound_data_logger.bags.cut import Choice, cut_folder
 from shadowhound_data_logger.bags.description import of_metadata
 from shadowhound_data_logger.bags.info import info_folder
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.mcap_format import CHUNK, MAGIC, Op, record, text
-from shadowhound_data_logger.bags.mcap_index import read_index
-from shadowhound_data_logger.bags.mcap_messages import read_messages
 from shadowhound_data_logger.bags.overview import overview
-from shadowhound_data_logger.bags.ranges import LocalFile
 from shadowhound_data_logger.bags.verify import verify_folder
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.mcap.format import CHUNK, MAGIC, Op, record, text
+from shadowhound_data_logger.mcap.index import read_index
+from shadowhound_data_logger.mcap.messages import read_messages
+from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 if sys.version_info >= (3, 14):

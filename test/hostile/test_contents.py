@@ -19,8 +19,9 @@ from hostile.test_bags import LIMIT_BYTES
 from lake.making import NOON_NS, folder_store, row
 from PIL import Image
 
+from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.errors import LakeError
-from shadowhound_data_logger.lake import decode, schema
+from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bodies import Bodies
 from shadowhound_data_logger.lake.numbers import table
 from shadowhound_data_logger.lake.query import _summary
@@ -233,7 +234,7 @@ def test_an_object_of_which_a_row_claims_a_million_messages_is_left_out(tmp_path
     from hostile import bad_parts
 
     from shadowhound_data_logger import lake
-    from shadowhound_data_logger.lake import parts
+    from shadowhound_data_logger.catalogue import parts
 
     rows = [
         row('camera', NOON_NS),

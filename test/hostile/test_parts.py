@@ -21,11 +21,11 @@ from hostile import bad_parts
 from lake.making import NOON_NS, add, add_part, content, fill, folder_store, keys, row
 
 from shadowhound_data_logger import lake
+from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.cli.lake import lake as lake_command
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.lake import parts, schema
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.stores import open_store

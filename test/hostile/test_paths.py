@@ -16,9 +16,9 @@ from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, find_bag
 from shadowhound_data_logger.bags.verify import verify_folder
+from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import BagDamaged, LakeError, NameRefused, ObjectRefused, StoreError
-from shadowhound_data_logger.lake import parts, schema
 from shadowhound_data_logger.lake.bodies import Place
 from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.options import StoreSettings

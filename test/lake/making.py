@@ -11,9 +11,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.lake import parts, schema
 from shadowhound_data_logger.lake.source import Entry, Source, open_source
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.options import StoreSettings

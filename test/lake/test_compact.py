@@ -13,10 +13,10 @@ import pytest
 from lake.making import NOON_NS, SENSORS, Watched, add_part, fill, folder_store, keys, row, watched
 
 from shadowhound_data_logger import lake
+from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import AccessDenied, StoreUnavailable
-from shadowhound_data_logger.lake import schema
 from shadowhound_data_logger.lake.compact import Compacted, compact
 from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.lake.standing import is_compacted

@@ -13,13 +13,13 @@ import simplejpeg
 from lake.making import NOON_NS, folder_store
 from lake.training import FRAMES_HZ, IMU_HZ, LATE_NS, Drive, imu_reading, jpeg, seconds_of
 
+from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.lake import MissionDataset, Near, Window, fetched_rows, query, selecting
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.fetch import Wish, fetch
-from shadowhound_data_logger.lake.schema import BUCKET
 from shadowhound_data_logger.lake.source import Source, open_source
 from shadowhound_data_logger.stores import open_store
 

@@ -15,8 +15,8 @@ import pytest
 from lake.making import folder_store
 from lake.training import FRAMES_HZ, Drive, in_a_child
 
+from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.lake import MissionDataset, dataset, shards
-from shadowhound_data_logger.lake.schema import BUCKET
 from shadowhound_data_logger.lake.source import Source, open_source
 
 if TYPE_CHECKING:

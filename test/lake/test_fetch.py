@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from lake.making import NOON_NS, Watched, add, folder_store, row, watched
 
+from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import CredentialsRejected, LakeError, StoreUnavailable
 from shadowhound_data_logger.lake import fetched_rows
 from shadowhound_data_logger.lake.fetch import Result, Wish, fetch, under
 from shadowhound_data_logger.lake.fetched import Fetched
-from shadowhound_data_logger.lake.schema import BUCKET
 from shadowhound_data_logger.lake.source import Content, open_source
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store

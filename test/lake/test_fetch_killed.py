@@ -20,9 +20,10 @@ from faults.kinds import Fault
 from faults.upstream import Request
 from lake.making import NOON_NS, add, add_part
 
+from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.lake import fetched_rows, schema
+from shadowhound_data_logger.lake import fetched_rows
 from shadowhound_data_logger.lake.fetched import Fetched
 from shadowhound_data_logger.stores import open_store
 

@@ -14,9 +14,9 @@ from faults.front import Front
 from lake.making import DAY_NS, FAILED, FINISHED, NOON_NS, Watched, add, add_part, fill, folder_store, keys, minutes, row, watched
 
 from shadowhound_data_logger import lake
+from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import CredentialsRejected, LakeError, SettingError
-from shadowhound_data_logger.lake import schema
 from shadowhound_data_logger.lake.query import answering
 from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.options import StoreSettings

@@ -11,11 +11,11 @@ import pytest
 from lake.making import DAY_NS, NOON_NS, SENSORS, Watched, add, add_part, content, folder_store, keys, row
 
 from shadowhound_data_logger import lake
+from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import StoreUnavailable
 from shadowhound_data_logger.lake import reindex as library
-from shadowhound_data_logger.lake import schema
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.options import StoreSettings

@@ -16,9 +16,10 @@ import simplejpeg
 from encode.conftest import GO2_MESSAGES, Ros
 from lake.making import NOON_NS, add, add_part
 
+from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.lake import MissionDataset, schema
+from shadowhound_data_logger.lake import MissionDataset
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store

@@ -17,10 +17,10 @@ from PIL import Image
 from rich.console import Console
 from spool.making import FakeClock, make, new_spool, settle
 
+from shadowhound_data_logger.catalogue.parts import encode
+from shadowhound_data_logger.catalogue.schema import row_of
+from shadowhound_data_logger.catalogue.writer import Catalogue
 from shadowhound_data_logger.config import CatalogueSettings
-from shadowhound_data_logger.lake.catalogue import Catalogue
-from shadowhound_data_logger.lake.parts import encode
-from shadowhound_data_logger.lake.schema import row_of
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.sim import demo, demo_processes, demo_report
 from shadowhound_data_logger.sim.demo_audit import Audit, audit

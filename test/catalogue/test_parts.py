@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shadowhound_data_logger.lake import parquet, parts, schema
+from shadowhound_data_logger.catalogue import parquet, parts, schema
 
 INTS = st.integers(-(1 << 63), (1 << 63) - 1)
 VALUES = {
@@ -133,7 +133,7 @@ def test_a_part_is_one_folders() -> None:
 def test_a_robot_needs_no_arrow() -> None:
     """What the node imports to write parts loads none of the libraries that read them."""
     program = (
-        'import sys; import shadowhound_data_logger.lake.catalogue;'
+        'import sys; import shadowhound_data_logger.catalogue.writer;'
         'print([name for name in ("pyarrow", "daft", "numpy", "boto3", "rclpy") if name in sys.modules])'
     )
     ran = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60)

@@ -12,8 +12,8 @@ from typing import Final
 
 from backports import zstd
 
-from shadowhound_data_logger.bags.channel import Channel
-from shadowhound_data_logger.bags.mcap_format import (
+from shadowhound_data_logger.disk import sync
+from shadowhound_data_logger.mcap.format import (
     CHUNK,
     MESSAGE,
     MESSAGE_FIELDS,
@@ -26,9 +26,8 @@ from shadowhound_data_logger.bags.mcap_format import (
     span,
     text,
 )
-from shadowhound_data_logger.bags.metadata import bagfile_information, to_yaml
-from shadowhound_data_logger.bags.slice_info import SliceInfo
-from shadowhound_data_logger.disk import sync
+from shadowhound_data_logger.mcap.rosbag2_metadata import bagfile_information, to_yaml
+from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
 
 OPEN: Final = '.open'
 """Ends the name of a slice that is being written."""

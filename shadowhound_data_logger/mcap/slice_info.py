@@ -1,4 +1,4 @@
-"""What is known of a whole slice without opening it."""
+"""What is known of a whole slice without opening it: its channels, times, counts, and what recovery had to leave out."""
 
 from __future__ import annotations
 
@@ -6,7 +6,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from shadowhound_data_logger.bags.channel import Channel
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One topic with one type: all that a reader needs to decode its messages.
+
+    ``type`` is the ROS name (``sensor_msgs/msg/Imu``). ``encoding`` says how ``definition`` is written: ``ros2msg`` or
+    ``ros2idl``; both are empty where nobody knows the type. ``type_hash`` is ``RIHS01_...``, empty where the distribution
+    knows none (Humble). ``qos`` is the YAML that rosbag2 calls offered_qos_profiles, its policies in
+    numbers as Humble reads them, empty when it is not known.
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    definition: str
+    type_hash: str
+    qos: str
 
 
 @dataclass(frozen=True, slots=True)

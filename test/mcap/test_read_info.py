@@ -11,9 +11,9 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from shadowhound_data_logger.bags.recovery import read_info
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.mcap.recovery import read_info
 
 
 def test_ours(tmp_path: Path) -> None:

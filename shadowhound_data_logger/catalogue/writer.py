@@ -11,12 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.catalogue import parts
+from shadowhound_data_logger.catalogue.schema import BUCKET, SENSOR, Row, part_key, row_of
 from shadowhound_data_logger.clock import Clock, utc
 from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_name
-from shadowhound_data_logger.lake import parts
-from shadowhound_data_logger.lake.schema import BUCKET, SENSOR, Row, part_key, row_of
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.spool import uncatalogued
 

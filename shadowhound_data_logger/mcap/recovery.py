@@ -11,14 +11,14 @@ import logging
 import os
 from pathlib import Path
 
-from shadowhound_data_logger.bags.mcap_index import read_index
-from shadowhound_data_logger.bags.mcap_messages import Wanted, read_messages
-from shadowhound_data_logger.bags.metadata import bagfile_information, to_yaml
-from shadowhound_data_logger.bags.ranges import LocalFile
-from shadowhound_data_logger.bags.slice_info import SliceInfo
-from shadowhound_data_logger.bags.slice_writer import OPEN
-from shadowhound_data_logger.bags.survey import survey
 from shadowhound_data_logger.disk import fingerprint, sync
+from shadowhound_data_logger.mcap.index import read_index
+from shadowhound_data_logger.mcap.messages import Wanted, read_messages
+from shadowhound_data_logger.mcap.ranges import LocalFile
+from shadowhound_data_logger.mcap.rosbag2_metadata import bagfile_information, to_yaml
+from shadowhound_data_logger.mcap.slice_info import SliceInfo
+from shadowhound_data_logger.mcap.survey import survey
+from shadowhound_data_logger.mcap.writer import OPEN
 
 log = logging.getLogger(__name__)
 

@@ -11,9 +11,9 @@ import pyarrow.parquet
 import pytest
 from spool.making import NOON_NS, FakeClock, assert_whole, make, new_spool, put, rows
 
+from shadowhound_data_logger.catalogue.writer import Catalogue
 from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.lake.catalogue import Catalogue
 from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.spool.spool import Spool
 
@@ -138,7 +138,7 @@ def test_a_part_a_period(spool: Spool, clock: FakeClock) -> None:
 
 def test_a_backlog_goes_on_at_the_next_look(spool: Spool, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
     """After an outage parts of a bounded size follow one another without waiting for the next period."""
-    monkeypatch.setattr('shadowhound_data_logger.lake.catalogue.MOST_ROWS', 2)
+    monkeypatch.setattr('shadowhound_data_logger.catalogue.writer.MOST_ROWS', 2)
     hand = Hand()
     catalogue = made(spool, clock, hand, period_s=60.0)
     delivered(spool, *'abcde')

@@ -11,8 +11,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.channel import Channel
-from shadowhound_data_logger.bags.slice_info import Damage, SliceInfo
+from shadowhound_data_logger.mcap.slice_info import Channel, Damage, SliceInfo
 
 MAGIC: Final = b'\x89MCAP0\r\n'
 LIBRARY: Final = 'shadowhound_data_logger'

@@ -10,11 +10,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from shadowhound_data_logger.bags.channel import Channel
-from shadowhound_data_logger.bags.mcap_format import MAGIC, RECORD, Op
-from shadowhound_data_logger.bags.metadata import in_numbers
-from shadowhound_data_logger.bags.ranges import Ranged
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.mcap.format import MAGIC, RECORD, Op
+from shadowhound_data_logger.mcap.ranges import Ranged
+from shadowhound_data_logger.mcap.rosbag2_metadata import in_numbers
+from shadowhound_data_logger.mcap.slice_info import Channel
 
 FOOTER_BYTES: Final = 20
 TAIL_BYTES: Final = RECORD.size + FOOTER_BYTES + len(MAGIC)

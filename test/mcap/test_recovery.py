@@ -14,9 +14,9 @@ from bags.slices import check, closed, fill, in_order, indexed, messages
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from shadowhound_data_logger.bags.recovery import recover
-from shadowhound_data_logger.bags.slice_info import Damage, SliceInfo
-from shadowhound_data_logger.bags.slice_writer import SliceWriter
+from shadowhound_data_logger.mcap.recovery import recover
+from shadowhound_data_logger.mcap.slice_info import Damage, SliceInfo
+from shadowhound_data_logger.mcap.writer import SliceWriter
 
 COUNT, A_CHUNK = 60, 12
 HOSTILE = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -201,7 +201,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from bags.slices import fill, messages
-from shadowhound_data_logger.bags.slice_writer import SliceWriter
+from shadowhound_data_logger.mcap.writer import SliceWriter
 writer = SliceWriter(Path(sys.argv[1]), chunk_bytes=2000)
 while True:
     fill(writer, messages(37))

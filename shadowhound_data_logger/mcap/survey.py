@@ -15,7 +15,7 @@ from typing import Final
 
 from backports import zstd
 
-from shadowhound_data_logger.bags.mcap_format import (
+from shadowhound_data_logger.mcap.format import (
     CHUNK,
     MESSAGE,
     MESSAGE_FIELDS,
@@ -29,8 +29,8 @@ from shadowhound_data_logger.bags.mcap_format import (
     span,
     text,
 )
-from shadowhound_data_logger.bags.mcap_index import Fields, Schemas
-from shadowhound_data_logger.bags.slice_info import Damage
+from shadowhound_data_logger.mcap.index import Fields, Schemas
+from shadowhound_data_logger.mcap.slice_info import Damage
 
 MOST_CHUNK_BYTES: Final = 256 << 20
 MOST_SUMMARY_BYTES: Final = 64 << 20

@@ -13,9 +13,8 @@ from bags.slices import TALK
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowhound_data_logger.bags.channel import Channel
-from shadowhound_data_logger.bags.metadata import in_numbers, metadata_yaml, offered_qos, to_yaml
-from shadowhound_data_logger.bags.slice_info import SliceInfo
+from shadowhound_data_logger.mcap.rosbag2_metadata import in_numbers, metadata_yaml, offered_qos, to_yaml
+from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
 
 OTHER = Channel('/späti', 'std_msgs/msg/Empty', '', '', '', '')
 

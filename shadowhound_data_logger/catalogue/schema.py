@@ -11,8 +11,8 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
+from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, utc
-from shadowhound_data_logger.lake.parquet import DOUBLE, INT32, INT64, STRING, TIME
 
 if TYPE_CHECKING:
     import pyarrow

@@ -11,8 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from shadowhound_data_logger.bags.channel import Channel
-from shadowhound_data_logger.bags.slice_info import SliceInfo
+from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
 
 VERSION: Final = 8
 STORAGE: Final = 'mcap'

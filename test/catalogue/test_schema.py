@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.lake import schema
 
 NOON_NS = 1_760_788_800 * SECOND
 CAMERA = 'thor/camera/20251018/120000_front.jpg'

@@ -13,11 +13,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from shadowhound_data_logger.bags.channel import Channel
-from shadowhound_data_logger.bags.mcap_format import CHUNK, MAGIC, RECORD, Op
-from shadowhound_data_logger.bags.mcap_index import Chunk, Fields, McapIndex, Schemas, records
-from shadowhound_data_logger.bags.ranges import Ranged
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.mcap.format import CHUNK, MAGIC, RECORD, Op
+from shadowhound_data_logger.mcap.index import Chunk, Fields, McapIndex, Schemas, records
+from shadowhound_data_logger.mcap.ranges import Ranged
+from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, unpacked
 
 SPAN_BYTES: Final = 8 << 20

@@ -12,9 +12,9 @@ import pytest
 from bags.slices import BLOB, ECHO, TALK, Recorded, check, closed, fill, in_order, indexed, messages
 from mcap.reader import make_reader
 
-from shadowhound_data_logger.bags.channel import Channel
-from shadowhound_data_logger.bags.recovery import recover
-from shadowhound_data_logger.bags.slice_writer import SliceWriter
+from shadowhound_data_logger.mcap.recovery import recover
+from shadowhound_data_logger.mcap.slice_info import Channel
+from shadowhound_data_logger.mcap.writer import SliceWriter
 
 
 @pytest.mark.parametrize('compression', ['none', 'zstd'])

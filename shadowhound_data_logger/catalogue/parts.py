@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
-from shadowhound_data_logger.lake.parquet import Column, table
-from shadowhound_data_logger.lake.schema import COLUMNS, FORMAT_VERSION, REQUIRED, Row, date_of
+from shadowhound_data_logger.catalogue.parquet import Column, table
+from shadowhound_data_logger.catalogue.schema import COLUMNS, FORMAT_VERSION, REQUIRED, Row, date_of
 
 CONTENT_TYPE: Final = 'application/vnd.apache.parquet'
 ABOUT: Final = {'shadowhound.catalog': str(FORMAT_VERSION)}

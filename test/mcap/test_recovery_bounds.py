@@ -17,11 +17,11 @@ from bags.slices import TALK, check, fill, in_order, messages
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from shadowhound_data_logger.bags import survey
-from shadowhound_data_logger.bags.mcap_format import CHUNK, Contents, Op, head, record, text
-from shadowhound_data_logger.bags.recovery import recover
-from shadowhound_data_logger.bags.slice_info import SliceInfo
-from shadowhound_data_logger.bags.slice_writer import SliceWriter
+from shadowhound_data_logger.mcap import survey
+from shadowhound_data_logger.mcap.format import CHUNK, Contents, Op, head, record, text
+from shadowhound_data_logger.mcap.recovery import recover
+from shadowhound_data_logger.mcap.slice_info import SliceInfo
+from shadowhound_data_logger.mcap.writer import SliceWriter
 
 LONG = bool(os.environ.get('SHADOWHOUND_TEST_LONG'))
 MEBI = 1 << 20
@@ -128,7 +128,7 @@ def test_a_summary_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 PROGRAM = """
 import resource, sys
 from pathlib import Path
-from shadowhound_data_logger.bags.recovery import recover
+from shadowhound_data_logger.mcap.recovery import recover
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 info = recover(Path(sys.argv[1]))
 print(info.messages, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
