@@ -1,1 +1,1 @@
-"""From the robot to closed batches: the only folder that imports rclpy. Messages are handed on as they came."""
+"""From the robot to closed batches: all of the node that imports rclpy. Messages are handed on as they came."""

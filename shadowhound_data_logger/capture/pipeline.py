@@ -34,7 +34,7 @@ from shadowhound_data_logger.capture.parameters import Parameters, live
 from shadowhound_data_logger.capture.pose_track import RobotTrack
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.capture.stream import Shared
-from shadowhound_data_logger.catalogue.writer import Catalogue
+from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import SensorSettings, Settings
@@ -83,7 +83,7 @@ class Pipeline:
         self._record = record = ClockRecord(settings.spool_path, settings.robot)
         self._clock = ClockWatch(SystemClock.of_this_machine(), settings.clock.hold_s, record.steps)
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
-        self._catalogue = Catalogue(settings.spool_path, settings.catalogue, settings.robot, self._clock)
+        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, self._clock)
         self._redating = Redating(self.spool, self._clock, record, settings.robot)
         self._node = ros.node
         self._day = self._today()

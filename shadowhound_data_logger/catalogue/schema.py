@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, utc
-
-if TYPE_CHECKING:
-    import pyarrow
 
 FORMAT_VERSION: Final = 1
 """Of the rows. Columns are only ever added, at the end."""
@@ -66,15 +63,6 @@ SENSOR: Final = '_catalog'
 
 Row = dict[str, Any]
 """Column -> value; a time as an int of microseconds."""
-
-
-def arrow_schema() -> pyarrow.Schema:
-    """The columns as pyarrow has them."""
-    import pyarrow  # noqa: PLC0415 - 40 MB and a second, for those that read or write with it
-
-    kinds = {STRING: pyarrow.string(), INT32: pyarrow.int32(), INT64: pyarrow.int64(), DOUBLE: pyarrow.float64(),
-             TIME: pyarrow.timestamp('us', tz='UTC')}  # fmt: skip
-    return pyarrow.schema([pyarrow.field(name, kinds[kind], nullable=name not in REQUIRED) for name, kind in COLUMNS.items()])
 
 
 def prefix(robot: str) -> str:

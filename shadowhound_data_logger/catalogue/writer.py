@@ -26,7 +26,7 @@ PRIORITY: Final = 1
 """As a mission's summary: a part has what the store holds already."""
 
 
-class Catalogue:
+class CatalogueWriter:
     """New; ``due`` now and then, on one thread. What it returns is to be spooled, by the thread that commits."""
 
     def __init__(self, spool: Path, settings: CatalogueSettings, robot: str, clock: Clock,

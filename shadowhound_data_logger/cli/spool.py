@@ -16,7 +16,7 @@ import click
 from rich.console import RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.catalogue.writer import Catalogue
+from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.cli.common import as_json, spool_folder, the_spool
 from shadowhound_data_logger.cli.output import (
     ProgressBar,
@@ -204,7 +204,7 @@ def _drain(folder: Path, *, patience_s: float, as_json: bool) -> int:
     # A robot of its own: its session is none of the node's, and what that left open is not for it to settle.
     spool = Spool(folder, limits(folder, settings.spool), clock, f'{settings.robot} drain')
     spool.open()
-    catalogue = Catalogue(folder, settings.catalogue, settings.robot, clock)
+    catalogue = CatalogueWriter(folder, settings.catalogue, settings.robot, clock)
     try:
         with (
             closing(spool),
@@ -223,7 +223,7 @@ def _drain(folder: Path, *, patience_s: float, as_json: bool) -> int:
     return 0 if said['ok'] else 1
 
 
-def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalogue: Catalogue, patience_s: float,
+def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalogue: CatalogueWriter, patience_s: float,
           bar: ProgressBar) -> None:  # fmt: skip
     """Until nothing waits that can be delivered, the catalogue's parts of it included; or nothing moves for so long."""
     done, sent, retries, moved_s = -1, 0, 0, time.monotonic()

@@ -20,11 +20,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from shadowhound_data_logger.catalogue.parts import ABOUT
-from shadowhound_data_logger.catalogue.schema import arrow_schema
 from shadowhound_data_logger.errors import AccessDenied
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.putting import put_part
-from shadowhound_data_logger.lake.reading import THREADS, whole
+from shadowhound_data_logger.lake.reading import THREADS, arrow_schema, whole
 from shadowhound_data_logger.lake.scan import unrepeated
 from shadowhound_data_logger.lake.source import Entry, Source
 from shadowhound_data_logger.lake.standing import (

@@ -21,7 +21,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from shadowhound_data_logger.catalogue.schema import REQUIRED, arrow_schema
+from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
+from shadowhound_data_logger.catalogue.schema import COLUMNS, REQUIRED
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake.findings import Findings
@@ -97,6 +98,13 @@ def whole(source: Source, entries: Sequence[Entry], findings: Findings) -> Itera
             yield entry, pa.concat_tables([schema.empty_table(), *made])
         for one in found:
             findings.add(one.key, one.why, one.rows)
+
+
+@lru_cache(maxsize=1)
+def arrow_schema() -> pa.Schema:
+    """The columns of the catalogue as pyarrow has them."""
+    kinds = {STRING: pa.string(), INT32: pa.int32(), INT64: pa.int64(), DOUBLE: pa.float64(), TIME: pa.timestamp('us', tz='UTC')}
+    return pa.schema([pa.field(name, kinds[kind], nullable=name not in REQUIRED) for name, kind in COLUMNS.items()])
 
 
 def narrow(columns: Sequence[str]) -> pa.Schema:
@@ -403,14 +411,9 @@ def _opened(tail: bytes) -> pq.ParquetFile:
     return pq.ParquetFile(pa.BufferReader(tail), pre_buffer=False, **limits)
 
 
-@lru_cache(maxsize=1)
-def _ours() -> pa.Schema:
-    return arrow_schema()
-
-
 def _places(file: pq.ParquetFile, schema: pa.Schema) -> dict[str, int]:
     """The columns of a schema that a file has, and their numbers. Raises ValueError where one is not as ours are."""
-    found, ours = file.schema_arrow, _ours()
+    found, ours = file.schema_arrow, arrow_schema()
     if found.equals(ours):
         return {name: ours.get_field_index(name) for name in schema.names}
     names = found.names

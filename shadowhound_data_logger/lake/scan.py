@@ -16,10 +16,9 @@ from typing import Final, TypeVar
 
 import pyarrow as pa
 
-from shadowhound_data_logger.catalogue.schema import arrow_schema
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, THREADS
+from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, THREADS, arrow_schema
 from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.lake.source import Entry, Source
 from shadowhound_data_logger.lake.standing import Day, days, robots

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.catalogue.writer import Catalogue
+from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import StoreUnavailable
@@ -104,7 +104,7 @@ class Shelf:
         self._used_s = 0.0
         self._node_drains = False
         self._is_new = True
-        self._catalogue = Catalogue(settings.spool_path, settings.catalogue, settings.robot, clock)
+        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, clock)
         self._spool: Spool | None = None
 
     def add(self, objects: Sequence[DataObject]) -> None:

@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shadowhound_data_logger.catalogue import parquet, parts, schema
+from shadowhound_data_logger.lake import reading
 
 INTS = st.integers(-(1 << 63), (1 << 63) - 1)
 VALUES = {
@@ -67,7 +68,7 @@ def some(count: int) -> list[schema.Row]:
 def test_every_value_reads_back(rows: list[schema.Row]) -> None:
     """Also nulls, the largest numbers, -0.0, infinities and text of any script; in the schema that is promised."""
     table = read(parts.encode(rows))
-    assert table.schema.equals(schema.arrow_schema())
+    assert table.schema.equals(reading.arrow_schema())
     found = plain(table)
     assert found == rows
     assert [str(row['x']) for row in found] == [str(row['x']) for row in rows]  # -0.0 equals 0.0

@@ -11,7 +11,7 @@ import pyarrow.parquet
 import pytest
 from spool.making import NOON_NS, FakeClock, assert_whole, make, new_spool, put, rows
 
-from shadowhound_data_logger.catalogue.writer import Catalogue
+from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
@@ -48,12 +48,12 @@ def spool(root: Path, clock: FakeClock) -> Iterator[Spool]:
 
 
 @pytest.fixture
-def catalogue(spool: Spool, clock: FakeClock) -> Catalogue:
+def catalogue(spool: Spool, clock: FakeClock) -> CatalogueWriter:
     return made(spool, clock)
 
 
-def made(spool: Spool, clock: FakeClock, monotonic: Any = lambda: 0.0, **settings: Any) -> Catalogue:
-    return Catalogue(spool.root, CatalogueSettings(**settings), 'thor', clock, monotonic)
+def made(spool: Spool, clock: FakeClock, monotonic: Any = lambda: 0.0, **settings: Any) -> CatalogueWriter:
+    return CatalogueWriter(spool.root, CatalogueSettings(**settings), 'thor', clock, monotonic)
 
 
 def deliver(spool: Spool, items: list[SpooledObject]) -> None:
@@ -75,7 +75,7 @@ def keys(part: DataObject) -> list[str]:
     return found
 
 
-def test_what_is_delivered_has_a_row_once(spool: Spool, root: Path, catalogue: Catalogue) -> None:
+def test_what_is_delivered_has_a_row_once(spool: Spool, root: Path, catalogue: CatalogueWriter) -> None:
     """Not before, not again, and the parts have none."""
     items = put(spool, *map(of, 'abc'))
     assert catalogue.parts() == []
@@ -91,7 +91,7 @@ def test_what_is_delivered_has_a_row_once(spool: Spool, root: Path, catalogue: C
     assert_whole(root)
 
 
-def test_a_part_is_named_and_kept_like_bookkeeping(spool: Spool, catalogue: Catalogue) -> None:
+def test_a_part_is_named_and_kept_like_bookkeeping(spool: Spool, catalogue: CatalogueWriter) -> None:
     """Its key has date, time and boot; it is Parquet, protected, and says how many rows it has."""
     delivered(spool, 'a', 'b')
     (part,) = catalogue.parts()
@@ -102,7 +102,7 @@ def test_a_part_is_named_and_kept_like_bookkeeping(spool: Spool, catalogue: Cata
     assert (part.t_start_ns, part.t_end_ns) == (NOON_NS, NOON_NS)
 
 
-def test_a_folder_for_each_robot_and_date(spool: Spool, catalogue: Catalogue) -> None:
+def test_a_folder_for_each_robot_and_date(spool: Spool, catalogue: CatalogueWriter) -> None:
     """Whoever delivers for several robots, or after midnight, writes a part for each; one without a name goes to this robot."""
     delivered(spool, 'a', metadata={'robot': 'tachi'})
     delivered(spool, 'b', t_start_ns=NOON_NS + 86_400 * 10**9, metadata={'robot': 'thor'})
@@ -150,7 +150,7 @@ def test_a_backlog_goes_on_at_the_next_look(spool: Spool, clock: FakeClock, monk
     assert found == [[['a', 'b']], [['c', 'd']], [['e']], []]
 
 
-def test_rows_on_their_way_are_not_handed_out_again(spool: Spool, root: Path, catalogue: Catalogue) -> None:
+def test_rows_on_their_way_are_not_handed_out_again(spool: Spool, root: Path, catalogue: CatalogueWriter) -> None:
     """While a full disk keeps a part back, the next one has what is new only."""
     delivered(spool, 'a')
     first = catalogue.parts()
@@ -187,7 +187,7 @@ def test_what_a_part_left_out_is_in_the_next(spool: Spool, root: Path, clock: Fa
     assert [keys(part) for part in catalogue.parts()] == [['b']]
 
 
-def test_a_repeat_has_a_row_of_its_own(spool: Spool, root: Path, catalogue: Catalogue) -> None:
+def test_a_repeat_has_a_row_of_its_own(spool: Spool, root: Path, catalogue: CatalogueWriter) -> None:
     """Content that was not stored again is found at its own time, under the key that holds it."""
     first, later = (make(f'thor/camera/{second}.jpg', t_start_ns=NOON_NS + second, t_end_ns=NOON_NS + second, dedup=True,
                          metadata={'robot': 'thor'}) for second in (0, 1))  # fmt: skip

@@ -15,6 +15,7 @@ from e2e.processes import Processes, until
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.catalogue import schema
+from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.sim.world import World
@@ -50,7 +51,7 @@ def catalogued(store: S3Store, robot: str) -> list[dict[str, Any]]:
     rows = []
     for info in store.list(schema.BUCKET, schema.prefix(robot)):
         table = pyarrow.parquet.read_table(io.BytesIO(store.get(schema.BUCKET, info.key)))
-        assert table.schema.equals(schema.arrow_schema())
+        assert table.schema.equals(reading.arrow_schema())
         for row in table.to_pylist():
             assert f'/date={row["t_start"]:%Y-%m-%d}/' in info.key
             rows.append(row)

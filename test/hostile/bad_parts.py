@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shadowhound_data_logger.catalogue import parquet, parts, schema
+from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.standing import LEAVES, compacted_key
 from shadowhound_data_logger.options import StoreSettings
 
@@ -36,7 +37,7 @@ def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str
 def arrow(rows: Sequence[schema.Row], about: Mapping[str, str] | None = None, **columns: Any) -> bytes:
     """These rows by pyarrow, with some columns replaced."""
     table = pa.table({name: columns.get(name, [row[name] for row in rows]) for name in schema.COLUMNS},
-                     schema=None if columns else schema.arrow_schema())  # fmt: skip
+                     schema=None if columns else reading.arrow_schema())  # fmt: skip
     return written(table, about)
 
 
@@ -52,7 +53,7 @@ def written(table: pa.Table, about: Mapping[str, str] | None = None, *, group: i
 
 def dictionary_bomb(row: schema.Row) -> bytes:
     """Some kilobytes that are a million rows of one key of 42 KB: 42 GB."""
-    whole = pa.Table.from_pylist([row], schema=schema.arrow_schema())
+    whole = pa.Table.from_pylist([row], schema=reading.arrow_schema())
     columns = [_repeated(whole[name][0], LONG if name == 'key' else None) for name in schema.COLUMNS if row[name] is not None]
     table = pa.table(columns, names=[name for name in schema.COLUMNS if row[name] is not None])
     return written(table)
@@ -65,7 +66,7 @@ def _repeated(value: pa.Scalar, text: str | None) -> pa.Array:
 
 def zeros_bomb(rows: Sequence[schema.Row]) -> bytes:
     """A page of a quarter of a gigabyte of zeros, as zstd makes some kilobytes of it."""
-    table = pa.Table.from_pylist(list(rows), schema=schema.arrow_schema())
+    table = pa.Table.from_pylist(list(rows), schema=reading.arrow_schema())
     place = table.column_names.index('topic')
     return written(table.set_column(place, 'topic', pa.array(['\0' * (1 << 26)] * len(table))), use_dictionary=False)
 
@@ -101,7 +102,7 @@ def compacted(rows: Sequence[schema.Row], leaves: str | Sequence[str]) -> tuple[
     """A compacted part that says so of its leaves."""
     said = leaves if isinstance(leaves, str) else base64.b64encode(zlib.compress(json.dumps(list(leaves)).encode())).decode()
     key = compacted_key('thor', DATE, [said], is_mended=False)
-    table = pa.Table.from_pylist(list(rows), schema=schema.arrow_schema())
+    table = pa.Table.from_pylist(list(rows), schema=reading.arrow_schema())
     return Path(key).stem, written(table, {LEAVES: said})
 
 

@@ -26,6 +26,7 @@ from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.cli.lake import lake as lake_command
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.stores import open_store
@@ -52,9 +53,9 @@ BAD: dict[str, Callable[[], bytes]] = {
     'a dictionary bomb': lambda: bad_parts.dictionary_bomb(ROWS[0]),
     'a bomb of zeros': lambda: bad_parts.zeros_bomb(ROWS),
     'a page that claims 2 GB': lambda: bad_parts.lying_page(ROWS),
-    'brotli': lambda: bad_parts.written(pa.Table.from_pylist(ROWS, schema=schema.arrow_schema()), compression='brotli'),
+    'brotli': lambda: bad_parts.written(pa.Table.from_pylist(ROWS, schema=reading.arrow_schema()), compression='brotli'),
     'delta encoding': lambda: bad_parts.written(
-        pa.Table.from_pylist(ROWS, schema=schema.arrow_schema()), use_dictionary=False,
+        pa.Table.from_pylist(ROWS, schema=reading.arrow_schema()), use_dictionary=False,
         column_encoding={'key': 'DELTA_BYTE_ARRAY'},
     ),
 }  # fmt: skip
@@ -221,7 +222,7 @@ def test_large_parts_are_read_in_pieces_and_ruled_out_by_their_statistics(
     """A file that is not read whole gives the same rows, and what cannot hold an answer is not asked for."""
     settings = folder_store(tmp_path)
     rows = [row(sensor, NOON_NS + number * 10**9) for sensor in ('camera', 'odom') for number in range(6000)]
-    table = pa.Table.from_pylist(rows, schema=schema.arrow_schema())
+    table = pa.Table.from_pylist(rows, schema=reading.arrow_schema())
     bad_parts.put(settings, bad_parts.written(table, write_batch_size=4096), 'thor_large')
     from lake.making import watched
 

@@ -19,7 +19,7 @@ from spool.making import FakeClock, make, new_spool, settle
 
 from shadowhound_data_logger.catalogue.parts import encode
 from shadowhound_data_logger.catalogue.schema import row_of
-from shadowhound_data_logger.catalogue.writer import Catalogue
+from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.sim import demo, demo_processes, demo_report
@@ -61,7 +61,7 @@ class Scene:
         settle(self.spool, item, State.DELIVERED)
 
     def catalogue(self) -> None:
-        for part in self.spool.commit(Catalogue(self.root, CatalogueSettings(), 'thor', FakeClock()).parts()):
+        for part in self.spool.commit(CatalogueWriter(self.root, CatalogueSettings(), 'thor', FakeClock()).parts()):
             self.deliver(part)
 
     def audit(self) -> Audit:
