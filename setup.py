@@ -30,6 +30,7 @@ setup(
         'boto3>=1.36',
         'click>=8.1',
         'lz4>=4.0',
+        'mcap>=1.1',
         'numpy>=1.21',
         'orjson>=3.9',
         'pillow>=9',

@@ -2,22 +2,26 @@
 
 Run it as ``python bench/bag_writer.py``. All write the same messages in turn, several times over: the profile of a Go2 (30
 pictures of 150 KB and 230 small messages a second), and 10,000 small messages a second. Ours ends a chunk and waits for the disk
-once a second of the recording, and computes the SHA-256 of the file; the others do neither. `rosbags` leaves out CRC-32s as well.
+once a second of the recording, and computes the SHA-256 of the file; ``mcap, as ours`` does the same (its ``flush``, a file that
+hashes). The others do neither. `rosbags` leaves out CRC-32s as well. Memory is the most that was allocated at once.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+import io
 import os
 import random
 import shutil
 import tempfile
+import tracemalloc
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 from time import process_time
+from typing import Any
 
 from _report import Bar, Report, main, progress
 from mcap.writer import CompressionType
@@ -91,6 +95,50 @@ def mcap(compression: CompressionType) -> Callable[[Path, Stream], None]:
     return write
 
 
+class Hashing(io.RawIOBase):
+    """A file that knows its SHA-256."""
+
+    def __init__(self, path: Path) -> None:
+        self.file = path.open('wb', buffering=0)
+        self.digest = hashlib.sha256()
+        self._at = 0
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, content: Any) -> int:
+        self.digest.update(content)
+        self._at += len(content)
+        view = memoryview(content)
+        while view:
+            view = view[self.file.write(view) :]
+        return len(content)
+
+    def tell(self) -> int:
+        return self._at
+
+
+def mcap_as_ours(compression: CompressionType) -> Callable[[Path, Stream], None]:
+    def write(folder: Path, messages: Stream) -> None:
+        hashing = Hashing(folder / 'bag.mcap')
+        writer = McapWriter(io.BufferedWriter(hashing), compression=compression)
+        writer.start('ros2')
+        schema = writer.register_schema('std_msgs/msg/String', 'ros2msg', STRING.encode())
+        channels = [writer.register_channel(one.topic, 'cdr', schema) for one in CHANNELS]
+        synced = 0
+        for place, at, cdr in messages:
+            writer.add_message(channels[place], at, cdr, at)
+            if at - synced >= SECOND:
+                writer.flush()
+                os.fdatasync(hashing.file.fileno())
+                synced = at
+        writer.finish()
+        writer.flush()
+        hashing.file.close()
+
+    return write
+
+
 def bytes_alone(folder: Path, messages: Stream) -> None:
     """What the bytes cost whoever writes them so: CRC-32, SHA-256, the write of a megabyte at a time, a sync a second."""
     digest = hashlib.sha256()
@@ -109,7 +157,8 @@ def bytes_alone(folder: Path, messages: Stream) -> None:
 WRITERS: dict[str, Callable[[Path, Stream], None]] = {
     'ours': ours('none'), 'rosbags': rosbags(CompressionMode.NONE), 'mcap': mcap(CompressionType.NONE),
     'bytes alone': bytes_alone, 'ours, zstd': ours('zstd'), 'rosbags, zstd': rosbags(CompressionMode.STORAGE),
-    'mcap, zstd': mcap(CompressionType.ZSTD),
+    'mcap, zstd': mcap(CompressionType.ZSTD), 'mcap, as ours': mcap_as_ours(CompressionType.NONE),
+    'mcap, as ours, zstd': mcap_as_ours(CompressionType.ZSTD),
 }  # fmt: skip
 
 
@@ -127,9 +176,24 @@ def measure(options: argparse.Namespace) -> Report:
                 write(folder, messages)
                 figures[load][name].append((process_time() - start) * 1e6 / len(messages))
                 shutil.rmtree(folder)
-    return Report(tuple(_bars(figures)), {'us_per_message': {
-        load: {name: round(median(rounds), 2) for name, rounds in names.items()} for load, names in figures.items()
-    }})  # fmt: skip
+    return Report(tuple(_bars(figures)), {
+        'us_per_message': {
+            load: {name: round(median(rounds), 2) for name, rounds in names.items()} for load, names in figures.items()
+        },
+        'most_mb': {name: _most_mb(write, options.folder) for name, write in WRITERS.items() if name != 'bytes alone'},
+    })  # fmt: skip
+
+
+def _most_mb(write: Callable[[Path, Stream], None], folder: Path) -> float:
+    """Allocated at once over two seconds of the profile, beside the messages."""
+    messages, place = stream(260, 30, 2), Path(tempfile.mkdtemp(dir=folder))
+    tracemalloc.start()
+    try:
+        write(place, messages)
+        return round(tracemalloc.get_traced_memory()[1] / 1e6, 1)
+    finally:
+        tracemalloc.stop()
+        shutil.rmtree(place)
 
 
 def _bars(figures: dict[str, dict[str, list[float]]]) -> list[Bar]:
@@ -140,10 +204,21 @@ def _bars(figures: dict[str, dict[str, list[float]]]) -> list[Bar]:
         Bar('a small message', budget, median(small['ours']), 'us', median(small['ours']) <= BUDGET_US, tuple(small['ours'])),
         Bar('a message of the profile, beside its bytes', budget, median(own), 'us', median(own) <= BUDGET_US, tuple(own)),
     ]
-    for other in ('rosbags', 'mcap'):
+    for other in ('rosbags', 'mcap, as ours'):
         ratios = [mine / theirs for mine, theirs in zip(small['ours'], small[other], strict=True)]
         ratio = median(ratios)
         bars.append(Bar(f'a small message against {other}', 'at most 0.5', ratio, 'ratio', ratio <= 0.5, tuple(ratios)))
+    ratios = [mine / theirs for mine, theirs in zip(figures['profile']['ours'], figures['profile']['mcap, as ours'], strict=True)]
+    bars.append(
+        Bar(
+            'a message of the profile against mcap, as ours',
+            'at most 1',
+            median(ratios),
+            'ratio',
+            median(ratios) <= 1,
+            tuple(ratios),
+        )
+    )
     return bars
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import unicodedata
 import warnings
 from io import BytesIO
@@ -157,18 +156,15 @@ def unpacked(compression: str, content: bytes, size: int | None = None) -> bytes
 
 
 def _zstd(content: bytes, size: int) -> tuple[bytes, bool]:
-    if sys.version_info >= (3, 14):
-        from compression import zstd  # noqa: PLC0415 - for bags alone
-    else:
-        from backports import zstd  # noqa: PLC0415
+    from shadowhound_data_logger.zstd import ZstdDecompressor, ZstdError  # noqa: PLC0415 - for bags alone
 
     found, left, is_whole = b'', content, False
     try:
         while left and len(found) <= size:  # frames may follow each other
-            reader = zstd.ZstdDecompressor()
+            reader = ZstdDecompressor()
             found += reader.decompress(left, size + 1 - len(found))
             left, is_whole = reader.unused_data, reader.eof
-    except zstd.ZstdError as error:
+    except ZstdError as error:
         raise ValueError(str(error)) from error
     return found, is_whole
 

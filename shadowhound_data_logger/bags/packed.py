@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -26,11 +25,7 @@ from shadowhound_data_logger.mcap.messages import Message, Wanted
 from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, path_below, unpacked
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
+from shadowhound_data_logger.zstd import ZstdError, ZstdFile
 
 PIECE_BYTES: Final = 1 << 20
 MOST_RATIO: Final = 1000
@@ -146,13 +141,13 @@ def _unpack(path: Path, whole: Path) -> None:
     """Raises BagDamaged for what is no zstd, or unpacks to more than it may."""
     try:
         most = min(path.stat().st_size * MOST_RATIO, shutil.disk_usage(whole.parent).free // 2)
-        with path.open('rb') as raw, zstd.open(raw, 'rb') as packed, whole.open('wb') as out:
+        with path.open('rb') as raw, ZstdFile(raw, 'rb') as packed, whole.open('wb') as out:
             _copy(packed, out, most)
-    except (zstd.ZstdError, OSError, EOFError, ValueError) as error:
+    except (ZstdError, OSError, EOFError, ValueError) as error:
         raise BagDamaged(f'{path} cannot be unpacked: {error}', path=str(path)) from error
 
 
-def _copy(packed: zstd.ZstdFile, out: IO[bytes], most: int) -> None:
+def _copy(packed: ZstdFile, out: IO[bytes], most: int) -> None:
     left = most
     while piece := packed.read(PIECE_BYTES):
         left -= len(piece)

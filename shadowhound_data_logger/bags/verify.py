@@ -13,13 +13,14 @@ from hashlib import sha256 as sha256_new
 from pathlib import Path
 from typing import Final
 
+from mcap.opcode import Opcode
+
 from shadowhound_data_logger.bags.description import Description, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest, Missing
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.packed import check_tables
 from shadowhound_data_logger.bags.remote import FOREIGN, Listing, RemoteBag, RemoteFile, document, state_of
 from shadowhound_data_logger.errors import BagDamaged, BagError
-from shadowhound_data_logger.mcap.format import Op
 from shadowhound_data_logger.mcap.index import read_index, records
 from shadowhound_data_logger.mcap.messages import unpack, walk
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
@@ -204,10 +205,10 @@ def _check_content(source: Ranged, expected: _Expected, deep: bool, told: Tellin
 
 def _messages(kind: int, start: int, content: memoryview, name: str) -> int:
     """In one record."""
-    if kind == Op.CHUNK:
+    if kind == Opcode.CHUNK:
         where = f'the chunk at {start} of {name}'
-        return sum(inner == Op.MESSAGE for inner, _, _ in records(unpack(content, where), where))
-    return int(kind == Op.MESSAGE)
+        return sum(inner == Opcode.MESSAGE for inner, _, _ in records(unpack(content, where), where))
+    return int(kind == Opcode.MESSAGE)
 
 
 class _Once:

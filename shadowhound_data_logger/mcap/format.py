@@ -7,9 +7,10 @@ import zlib
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import IntEnum
 from pathlib import Path
 from typing import Final
+
+from mcap.opcode import Opcode
 
 from shadowhound_data_logger.mcap.slice_info import Channel, Damage, SliceInfo
 
@@ -26,24 +27,6 @@ _FOOTER: Final = struct.Struct('<QQI')
 _PLACE: Final = struct.Struct('<HQ')
 _COUNTED: Final = struct.Struct('<HI')
 CDR: Final = 'cdr'
-
-
-class Op(IntEnum):
-    """The first byte of a record."""
-
-    HEADER = 0x01
-    FOOTER = 0x02
-    SCHEMA = 0x03
-    CHANNEL = 0x04
-    MESSAGE = 0x05
-    CHUNK = 0x06
-    MESSAGE_INDEX = 0x07
-    CHUNK_INDEX = 0x08
-    STATISTICS = 0x0B
-    METADATA = 0x0C
-    METADATA_INDEX = 0x0D
-    SUMMARY_OFFSET = 0x0E
-    DATA_END = 0x0F
 
 
 def record(op: int, *parts: bytes) -> bytes:
@@ -66,7 +49,7 @@ def mapping(values: Mapping[str, str]) -> bytes:
 
 def head() -> bytes:
     """What a slice begins with: always the same, so that recovery knows where the records begin."""
-    return MAGIC + record(Op.HEADER, text('ros2'), text(LIBRARY))
+    return MAGIC + record(Opcode.HEADER, text('ros2'), text(LIBRARY))
 
 
 @dataclass(slots=True)
@@ -115,11 +98,11 @@ class Contents:
         number = self._schema_ids.get(schema)
         if number is None:
             number = self._schema_ids[schema] = len(self.schemas) + 1
-            records = record(Op.SCHEMA, struct.pack('<H', number), *map(text, schema))
+            records = record(Opcode.SCHEMA, struct.pack('<H', number), *map(text, schema))
             self.schemas[number] = records
         track = Track(len(self.tracks) + 1, channel)
         said = mapping({'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash})
-        declared = record(Op.CHANNEL, struct.pack('<HH', track.number, number), text(channel.topic), text(CDR), said)
+        declared = record(Opcode.CHANNEL, struct.pack('<HH', track.number, number), text(channel.topic), text(CDR), said)
         self.tracks[track.number], self.declared[track.number] = track, declared
         return track, records + declared
 
@@ -131,14 +114,14 @@ class Contents:
         for track in tracks:
             offsets += _PLACE.pack(track.number, at + length + len(indexes))
             entries = track.index.tobytes()
-            indexes += record(Op.MESSAGE_INDEX, _COUNTED.pack(track.number, len(entries)), entries)
+            indexes += record(Opcode.MESSAGE_INDEX, _COUNTED.pack(track.number, len(entries)), entries)
             track.count += len(track.index) // 2
             messages += len(track.index) // 2
             track.index = array('Q')
         self.t_start_ns, self.t_end_ns = (min(self.t_start_ns, start), max(self.t_end_ns, end)) if self.messages else (start, end)
         self.messages = messages
         self.chunks.append(record(
-            Op.CHUNK_INDEX, struct.pack('<QQQQI', start, end, at, length, len(offsets)), bytes(offsets),
+            Opcode.CHUNK_INDEX, struct.pack('<QQQQI', start, end, at, length, len(offsets)), bytes(offsets),
             struct.pack('<Q', len(indexes)), text(packed.compression), struct.pack('<QQ', packed.compressed, packed.size),
         ))  # fmt: skip
         return bytes(indexes)
@@ -153,23 +136,23 @@ class Contents:
 
     def ending(self, at: int, metadata: str) -> bytes:
         """All that follows the last chunk, which ends at the offset ``at``: rosbag2's metadata, the summary, the footer."""
-        said = record(Op.METADATA, text('rosbag2'), mapping({'serialized_metadata': metadata}))
-        data = said + record(Op.DATA_END, struct.pack('<I', 0))
+        said = record(Opcode.METADATA, text('rosbag2'), mapping({'serialized_metadata': metadata}))
+        data = said + record(Opcode.DATA_END, struct.pack('<I', 0))
         groups = {
-            Op.SCHEMA: b''.join(self.schemas.values()),
-            Op.CHANNEL: b''.join(self.declared.values()),
-            Op.STATISTICS: self._statistics(),
-            Op.CHUNK_INDEX: b''.join(self.chunks),
-            Op.METADATA_INDEX: record(Op.METADATA_INDEX, struct.pack('<QQ', at, len(said)), text('rosbag2')),
+            Opcode.SCHEMA: b''.join(self.schemas.values()),
+            Opcode.CHANNEL: b''.join(self.declared.values()),
+            Opcode.STATISTICS: self._statistics(),
+            Opcode.CHUNK_INDEX: b''.join(self.chunks),
+            Opcode.METADATA_INDEX: record(Opcode.METADATA_INDEX, struct.pack('<QQ', at, len(said)), text('rosbag2')),
         }
         start = position = at + len(data)
         summary, offsets = b'', b''
         for op, group in groups.items():
             if group:
-                offsets += record(Op.SUMMARY_OFFSET, struct.pack('<BQQ', op, position, len(group)))
+                offsets += record(Opcode.SUMMARY_OFFSET, struct.pack('<BQQ', op, position, len(group)))
                 summary += group
                 position += len(group)
-        tail = summary + offsets + RECORD.pack(Op.FOOTER, _FOOTER.size) + struct.pack('<QQ', start, position)
+        tail = summary + offsets + RECORD.pack(Opcode.FOOTER, _FOOTER.size) + struct.pack('<QQ', start, position)
         return data + tail + struct.pack('<I', zlib.crc32(tail)) + MAGIC
 
     def _statistics(self) -> bytes:
@@ -177,4 +160,4 @@ class Contents:
         body = _STATISTICS.pack(
             self.messages, len(self.schemas), len(self.tracks), 0, 1, len(self.chunks), self.t_start_ns, self.t_end_ns
         )
-        return record(Op.STATISTICS, body, struct.pack('<I', len(counted)), counted)
+        return record(Opcode.STATISTICS, body, struct.pack('<I', len(counted)), counted)

@@ -5,13 +5,20 @@ The format: https://mcap.dev/spec. Two short reads tell all of it, so a file in 
 
 from __future__ import annotations
 
+import io
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol, TypeVar
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import ChunkIndex, Footer, Schema, Statistics
 
 from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.format import MAGIC, RECORD, Op
+from shadowhound_data_logger.mcap.format import MAGIC, RECORD
 from shadowhound_data_logger.mcap.ranges import Ranged
 from shadowhound_data_logger.mcap.rosbag2_metadata import in_numbers
 from shadowhound_data_logger.mcap.slice_info import Channel
@@ -22,12 +29,11 @@ FIRST_READ: Final = 64 << 10
 """From the end: the whole summary of most slices, so that one request does."""
 MOST_SUMMARY_BYTES: Final = 64 << 20
 """That of a hundred thousand chunks: a bag of 100 GB in one file."""
-_CHUNK_INDEX = struct.Struct('<QQQQ')
-_STATISTICS = struct.Struct('<QHIIIIQQ')
-_ID_COUNT = struct.Struct('<HQ')
 INDEX_HEAD: Final = 15
 """Bytes of a message index record before its entries: head, channel, length of the entries."""
 INDEX_ENTRY: Final = 16
+UNREADABLE: Final = (McapError, EOFError, struct.error, UnicodeDecodeError)
+"""What ``parsed`` raises for a record that is none of its kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +68,31 @@ class McapIndex:
     """Whether ``chunks`` and ``counts`` tell of every message; else the file has to be read from one end to the other."""
 
 
+_Record = TypeVar('_Record', covariant=True)
+
+
+class RecordKind(Protocol[_Record]):
+    """A class of ``mcap.records``."""
+
+    @staticmethod
+    def read(stream: ReadDataStream) -> _Record: ...
+
+
+def parsed(kind: RecordKind[_Record], content: bytes | memoryview) -> _Record:
+    """The content of one record. Raises one of ``UNREADABLE`` where it says that it is longer than it is."""
+    return kind.read(ReadDataStream(_Exact(content)))
+
+
+class _Exact(io.BytesIO):
+    """Gives all that is asked for: `mcap` takes less of a record that is cut off for the whole of it."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        found = super().read(size)
+        if size is None or len(found) != size:
+            raise EOFError(f'{size} bytes are wanted, {len(found)} are left')
+        return found
+
+
 @dataclass(slots=True)
 class Schemas:
     """Channels as they are found, and the schemas that they need."""
@@ -69,18 +100,18 @@ class Schemas:
     channels: dict[int, Channel] = field(default_factory=dict)
     _schemas: dict[int, tuple[str, str, str]] = field(default_factory=dict)
 
-    def add(self, kind: int, content: memoryview) -> None:
-        """A schema or channel record."""
-        fields = Fields(content)
-        number = fields.uint(2)
-        if kind == Op.SCHEMA:
-            self._schemas[number] = fields.text(), fields.text(), fields.text()
+    def add(self, kind: int, content: bytes | memoryview) -> None:
+        """A schema or channel record. Raises one of ``UNREADABLE``."""
+        if kind == Opcode.SCHEMA:
+            schema = parsed(Schema, content)
+            self._schemas[schema.id] = schema.name, schema.encoding, schema.data.decode()
             return
-        name, encoding, definition = self._schemas.get(fields.uint(2), ('', '', ''))
-        topic, _, metadata = fields.text(), fields.text(), fields.texts()
-        self.channels[number] = Channel(
-            topic=topic, type=name, encoding=encoding, definition=definition,
-            type_hash=metadata.get('topic_type_hash', ''), qos=in_numbers(metadata.get('offered_qos_profiles', '')),
+        channel = parsed(ChannelRecord, content)
+        name, encoding, definition = self._schemas.get(channel.schema_id, ('', '', ''))
+        self.channels[channel.id] = Channel(
+            topic=channel.topic, type=name, encoding=encoding, definition=definition,
+            type_hash=channel.metadata.get('topic_type_hash', ''),
+            qos=in_numbers(channel.metadata.get('offered_qos_profiles', '')),
         )  # fmt: skip
 
 
@@ -95,10 +126,10 @@ def read_index(source: Ranged) -> McapIndex:
         remedy = 'it was cut off; slices of this package are recovered when the node starts again, for others see `mcap recover`'
         raise BagDamaged(f'{source.name} has no end of an MCAP file', remedy=remedy, path=source.name)
     kind, length = RECORD.unpack_from(tail, tail_length - TAIL_BYTES)
-    if (kind, length) != (Op.FOOTER, FOOTER_BYTES):
+    if (kind, length) != (Opcode.FOOTER, FOOTER_BYTES):
         raise BagDamaged(f'{source.name} has no footer of an MCAP file', path=source.name)
     footer_start = source.size - TAIL_BYTES
-    summary_start = int.from_bytes(tail[-TAIL_BYTES + RECORD.size :][:8], 'little')
+    summary_start = parsed(Footer, tail[-FOOTER_BYTES - len(MAGIC) : -len(MAGIC)]).summary_start
     if not summary_start:
         return McapIndex({}, (), {}, 0, 0, 0, footer_start, is_indexed=False)
     if not len(MAGIC) <= summary_start <= footer_start:
@@ -125,80 +156,35 @@ def records(content: memoryview, name: str) -> Iterator[tuple[int, int, memoryvi
         place = end
 
 
-class Fields:
-    """Reads the fields of a record one after the other; what is not there raises struct.error or UnicodeDecodeError."""
-
-    def __init__(self, content: memoryview) -> None:
-        self._content = content
-        self._place = 0
-
-    def uint(self, size: int) -> int:
-        return int.from_bytes(self._take(size), 'little')
-
-    def text(self) -> str:
-        return str(self._take(self.uint(4)), 'utf-8')
-
-    def texts(self) -> dict[str, str]:
-        inner = Fields(self._take(self.uint(4)))
-        found: dict[str, str] = {}
-        while inner.left:
-            name = inner.text()
-            found[name] = inner.text()
-        return found
-
-    def numbers(self) -> dict[int, int]:
-        """A map from channel to a number."""
-        return dict(_ID_COUNT.iter_unpack(self._take(self.uint(4))))
-
-    def unpack(self, form: struct.Struct) -> tuple[int, ...]:
-        return form.unpack(self._take(form.size))
-
-    @property
-    def left(self) -> int:
-        return len(self._content) - self._place
-
-    def rest(self) -> memoryview:
-        return self._content[self._place :]
-
-    def _take(self, size: int) -> memoryview:
-        if size > self.left:
-            raise struct.error(f'{size} bytes are wanted, {self.left} are left')
-        self._place += size
-        return self._content[self._place - size : self._place]
-
-
 def _index(summary: memoryview, data_end: int, source: Ranged) -> McapIndex:
-    schemas, chunks, statistics, counts = Schemas(), [], None, {}
+    schemas, chunks, statistics = Schemas(), [], None
     try:
         for kind, _, content in records(summary, source.name):
-            if kind in {Op.SCHEMA, Op.CHANNEL}:
+            if kind in {Opcode.SCHEMA, Opcode.CHANNEL}:
                 schemas.add(kind, content)
-            elif kind == Op.CHUNK_INDEX:
-                chunks.append(_chunk(Fields(content), data_end))
-            elif kind == Op.STATISTICS:
-                fields = Fields(content)
-                statistics = fields.unpack(_STATISTICS)
-                counts = fields.numbers()
-    except (struct.error, UnicodeDecodeError) as error:
+            elif kind == Opcode.CHUNK_INDEX:
+                chunks.append(_chunk(parsed(ChunkIndex, content), data_end))
+            elif kind == Opcode.STATISTICS:
+                statistics = parsed(Statistics, content)
+    except UNREADABLE as error:
         raise BagDamaged(f'{source.name} has a summary that cannot be read: {error}', path=source.name) from error
-    messages, t_start_ns, t_end_ns = (statistics[0], statistics[6], statistics[7]) if statistics else (0, 0, 0)
-    known = statistics is not None and sum(counts.values()) == messages and counts.keys() <= schemas.channels.keys()
-    reached = sum(sum(chunk.counts.values()) for chunk in chunks)
-    is_indexed = known and reached == messages
     chunks.sort(key=lambda chunk: chunk.start)
-    return McapIndex(schemas.channels, tuple(chunks), counts, messages, t_start_ns, t_end_ns, data_end, is_indexed)
+    if statistics is None:
+        return McapIndex(schemas.channels, tuple(chunks), {}, 0, 0, 0, data_end, is_indexed=False)
+    counts, messages = statistics.channel_message_counts, statistics.message_count
+    is_known = sum(counts.values()) == messages and counts.keys() <= schemas.channels.keys()
+    is_indexed = is_known and sum(sum(chunk.counts.values()) for chunk in chunks) == messages
+    times = statistics.message_start_time, statistics.message_end_time
+    return McapIndex(schemas.channels, tuple(chunks), counts, messages, *times, data_end, is_indexed)
 
 
-def _chunk(fields: Fields, data_end: int) -> Chunk:
-    t_start_ns, t_end_ns, start, length = fields.unpack(_CHUNK_INDEX)
-    offsets = fields.numbers()
-    index_length = fields.uint(8)
-    end = start + length + index_length
+def _chunk(found: ChunkIndex, data_end: int) -> Chunk:
+    end = found.chunk_start_offset + found.chunk_length + found.message_index_length
     if end > data_end:
-        raise struct.error(f'a chunk ends at {end}, outside the data')
-    ordered = sorted((place, channel) for channel, place in offsets.items())
+        raise EOFError(f'a chunk ends at {end}, outside the data')
+    ordered = sorted((place, channel) for channel, place in found.message_index_offsets.items())
     ends = [place for place, _ in ordered[1:]] + [end]
     counts = {
         channel: max(after - place - INDEX_HEAD, 0) // INDEX_ENTRY for (place, channel), after in zip(ordered, ends, strict=True)
     }
-    return Chunk(start, length, t_start_ns, t_end_ns, counts)
+    return Chunk(found.chunk_start_offset, found.chunk_length, found.message_start_time, found.message_end_time, counts)

@@ -13,9 +13,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from mcap.opcode import Opcode
+from mcap.records import Chunk as ChunkRecord
+
 from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.format import CHUNK, MAGIC, RECORD, Op
-from shadowhound_data_logger.mcap.index import Chunk, Fields, McapIndex, Schemas, records
+from shadowhound_data_logger.mcap.format import MAGIC, RECORD
+from shadowhound_data_logger.mcap.index import UNREADABLE, Chunk, McapIndex, Schemas, parsed, records
 from shadowhound_data_logger.mcap.ranges import Ranged
 from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, unpacked
@@ -69,7 +72,7 @@ def read_messages(source: Ranged, index: McapIndex, wanted: Wanted) -> Iterator[
             raise BagDamaged(f'{source.name} has a chunk of {chunk.length:,} bytes at {chunk.start}', path=source.name)
     for chunk, record in _read_chunks(source, chunks):
         kind, length = RECORD.unpack_from(record) if len(record) >= RECORD.size else (0, 0)
-        if (kind, RECORD.size + length) != (Op.CHUNK, chunk.length):
+        if (kind, RECORD.size + length) != (Opcode.CHUNK, chunk.length):
             raise BagDamaged(f'{source.name} has no chunk at {chunk.start}', path=source.name)
         content = unpack(record[RECORD.size :], f'the chunk at {chunk.start} of {source.name}')
         yield from _in_chunk(content, channels, wanted, source.name)
@@ -78,18 +81,14 @@ def read_messages(source: Ranged, index: McapIndex, wanted: Wanted) -> Iterator[
 def unpack(content: memoryview, name: str) -> memoryview:
     """The records in a chunk. Raises BagDamaged for a checksum that does not hold or a compression nobody here knows."""
     try:
-        fields = Fields(content)
-        _, _, size, crc = fields.unpack(CHUNK)
-        compression, packed = fields.text(), fields.uint(8)
-        body = fields.rest()
-        if packed != len(body):
-            raise BagDamaged(f'{name} has wrong lengths', path=name)
-        found = body if not compression else memoryview(unpacked(compression, bytes(body), size))
-    except (struct.error, ValueError) as error:
+        chunk = parsed(ChunkRecord, content)
+        size, crc = chunk.uncompressed_size, chunk.uncompressed_crc
+        found = unpacked(chunk.compression, chunk.data, size) if chunk.compression else chunk.data
+    except (*UNREADABLE, ValueError) as error:
         raise BagDamaged(f'{name} cannot be unpacked: {error}', path=name) from error
     if len(found) != size or (crc and zlib.crc32(found) != crc):
         raise BagDamaged(f'{name} is not what was written: its CRC-32 or its length is another', path=name)
-    return found
+    return memoryview(found)
 
 
 def walk(source: Ranged, end: int) -> Iterator[tuple[int, int, memoryview]]:
@@ -114,7 +113,7 @@ def walk(source: Ranged, end: int) -> Iterator[tuple[int, int, memoryview]]:
 
 def _in_chunk(content: memoryview, channels: dict[int, Channel], wanted: Wanted, name: str) -> Iterator[Message]:
     for kind, _, record in records(content, name):
-        if kind == Op.MESSAGE and (found := _message(record, channels, wanted)):
+        if kind == Opcode.MESSAGE and (found := _message(record, channels, wanted)):
             yield found
 
 
@@ -166,22 +165,22 @@ def _scan(source: Ranged, index: McapIndex, wanted: Wanted) -> Iterator[Message]
     schemas = Schemas()
     known: dict[int, Channel] = {}
     for kind, start, content in walk(source, index.data_end):
-        if kind in {Op.DATA_END, Op.FOOTER}:
+        if kind in {Opcode.DATA_END, Opcode.FOOTER}:
             return
         inner = [(kind, 0, content)]
-        if kind == Op.CHUNK:
+        if kind == Opcode.CHUNK:
             name = f'the chunk at {start} of {source.name}'
             inner = list(records(unpack(content, name), name))
         for part, _, record in inner:
-            if part in {Op.SCHEMA, Op.CHANNEL}:
+            if part in {Opcode.SCHEMA, Opcode.CHANNEL}:
                 _add(schemas, part, record, source.name)
                 known = {number: channel for number, channel in schemas.channels.items() if wanted.channel(channel)}
-            elif part == Op.MESSAGE and (found := _message(record, known, wanted)):
+            elif part == Opcode.MESSAGE and (found := _message(record, known, wanted)):
                 yield found
 
 
 def _add(schemas: Schemas, kind: int, record: memoryview, name: str) -> None:
     try:
         schemas.add(kind, record)
-    except (struct.error, UnicodeDecodeError) as error:
+    except UNREADABLE as error:
         raise BagDamaged(f'{name} has a schema or channel that cannot be read: {error}', path=name) from error

@@ -13,7 +13,8 @@ from array import array
 from dataclasses import dataclass, field
 from typing import Final
 
-from backports import zstd
+from mcap.opcode import Opcode
+from mcap.records import Chunk
 
 from shadowhound_data_logger.mcap.format import (
     CHUNK,
@@ -21,7 +22,6 @@ from shadowhound_data_logger.mcap.format import (
     MESSAGE_FIELDS,
     RECORD,
     Contents,
-    Op,
     Packed,
     Track,
     head,
@@ -29,14 +29,15 @@ from shadowhound_data_logger.mcap.format import (
     span,
     text,
 )
-from shadowhound_data_logger.mcap.index import Fields, Schemas
+from shadowhound_data_logger.mcap.index import UNREADABLE, Schemas, parsed
 from shadowhound_data_logger.mcap.slice_info import Damage
+from shadowhound_data_logger.zstd import ZstdDecompressor, ZstdError
 
 MOST_CHUNK_BYTES: Final = 256 << 20
 MOST_SUMMARY_BYTES: Final = 64 << 20
 RETIRED: Final = 0x80
 """Added to the first byte of a record that is damaged: what begins with 0x80 or more is skipped by every reader."""
-_DATA: Final = frozenset({Op.SCHEMA, Op.CHANNEL, Op.CHUNK, Op.MESSAGE_INDEX})
+_DATA: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE_INDEX})
 _ENDING: Final = text('rosbag2')
 """What the metadata record begins with that follows the last chunk of a slice that was being closed; it is written anew."""
 _SUSPECT_BYTES: Final = 200
@@ -91,7 +92,7 @@ class _Surveyor:
         while at < self._size:
             start = os.pread(self._file, RECORD.size, at)
             op, length = RECORD.unpack(start) if len(start) == RECORD.size else (0, 0)
-            if op == Op.METADATA and _ENDING.startswith(os.pread(self._file, len(_ENDING), at + RECORD.size)):
+            if op == Opcode.METADATA and _ENDING.startswith(os.pread(self._file, len(_ENDING), at + RECORD.size)):
                 break
             after = at + RECORD.size + length
             if after > self._size or op & ~RETIRED not in _DATA or self._held_bytes > MOST_SUMMARY_BYTES:
@@ -115,9 +116,9 @@ class _Surveyor:
         """Take in one record; where the next one begins."""
         after = at + RECORD.size + length
         try:
-            if op == Op.CHUNK:
+            if op == Opcode.CHUNK:
                 after = self._chunk(at, length)
-            elif op in {Op.SCHEMA, Op.CHANNEL}:
+            elif op in {Opcode.SCHEMA, Opcode.CHANNEL}:
                 self._declare(op, at, length)
             else:  # retired by a recovery before this one, or the index of a chunk that is not whole
                 self._suspect(op, at, length)
@@ -131,14 +132,14 @@ class _Surveyor:
     def _suspect(self, op: int, at: int, length: int) -> None:
         self._suspects.append((at, op))
         self._held_bytes += _SUSPECT_BYTES
-        if op & ~RETIRED == Op.MESSAGE_INDEX:
+        if op & ~RETIRED == Opcode.MESSAGE_INDEX:
             self._suspect_messages += max(length - _INDEX_HEAD, 0) // _INDEX_ENTRY
 
     def _accept(self, after: int) -> None:
         """All up to here stays: suspects in between are skipped from now on."""
         found = self._found
         found.repairs += [(at, bytes([op | RETIRED])) for at, op in self._suspects]
-        found.lost_chunks += sum(op & ~RETIRED == Op.CHUNK for _, op in self._suspects)
+        found.lost_chunks += sum(op & ~RETIRED == Opcode.CHUNK for _, op in self._suspects)
         found.lost_messages += self._suspect_messages
         found.end = after
         self._suspects, self._suspect_messages = [], 0
@@ -149,17 +150,17 @@ class _Surveyor:
             raise _Damaged
         content = self._read(at + RECORD.size, length)
         contents = self._found.contents
-        known = contents.schemas if op == Op.SCHEMA else contents.declared
+        known = contents.schemas if op == Opcode.SCHEMA else contents.declared
         number, schema = int.from_bytes(content[:2], 'little'), int.from_bytes(content[2:4], 'little')
-        if number in known or (op == Op.CHANNEL and schema not in contents.schemas):
+        if number in known or (op == Opcode.CHANNEL and schema not in contents.schemas):
             raise _Damaged
         try:
-            self._schemas.add(op, memoryview(content))
-        except (struct.error, UnicodeDecodeError) as error:
+            self._schemas.add(op, content)
+        except UNREADABLE as error:
             raise _Damaged from error
         self._held_bytes += length
         known[number] = record(op, content)
-        if op == Op.CHANNEL:
+        if op == Opcode.CHANNEL:
             self._tracks[number] = Track(number, self._schemas.channels[number])
 
     def _chunk(self, at: int, length: int) -> int:
@@ -192,7 +193,7 @@ class _Surveyor:
                 index.append(log_ns)
                 index.append(at)
                 at += RECORD.size + length
-                if op != Op.MESSAGE or length < MESSAGE_FIELDS:
+                if op != Opcode.MESSAGE or length < MESSAGE_FIELDS:
                     raise _Damaged
         except struct.error as error:
             raise _Damaged from error
@@ -216,16 +217,13 @@ class _Surveyor:
 def _unpack(body: bytes) -> tuple[memoryview, Packed]:
     """The records in a chunk, checked."""
     try:
-        _, _, size, crc = CHUNK.unpack_from(body)
-        fields = Fields(memoryview(body)[CHUNK.size :])
-        compression, packed = fields.text(), fields.uint(8)
-        raw = fields.rest()
-        if packed != len(raw) or size > MOST_CHUNK_BYTES or compression not in {'', 'zstd'}:
+        chunk = parsed(Chunk, body)
+        if chunk.uncompressed_size > MOST_CHUNK_BYTES or chunk.compression not in {'', 'zstd'}:
             raise _Damaged
-        if compression:
-            raw = memoryview(zstd.ZstdDecompressor().decompress(raw, size + 1))
-    except (struct.error, UnicodeDecodeError, zstd.ZstdError) as error:
+        packed = Packed(chunk.compression, len(chunk.data), chunk.uncompressed_size)
+        raw = ZstdDecompressor().decompress(chunk.data, packed.size + 1) if chunk.compression else chunk.data
+    except (*UNREADABLE, ZstdError) as error:
         raise _Damaged from error
-    if len(raw) != size or zlib.crc32(raw) != crc:
+    if len(raw) != packed.size or zlib.crc32(raw) != chunk.uncompressed_crc:
         raise _Damaged
-    return raw, Packed(compression, packed, size)
+    return memoryview(raw), packed

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from backports import zstd
+from mcap.opcode import Opcode
 
 from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.mcap.format import (
@@ -19,7 +19,6 @@ from shadowhound_data_logger.mcap.format import (
     MESSAGE_FIELDS,
     RECORD,
     Contents,
-    Op,
     Packed,
     Track,
     head,
@@ -28,11 +27,12 @@ from shadowhound_data_logger.mcap.format import (
 )
 from shadowhound_data_logger.mcap.rosbag2_metadata import bagfile_information, to_yaml
 from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.zstd import compress
 
 OPEN: Final = '.open'
 """Ends the name of a slice that is being written."""
 DEFAULT_CHUNK_BYTES: Final = 1 << 20
-_MESSAGE: Final = int(Op.MESSAGE)
+_MESSAGE: Final = int(Opcode.MESSAGE)
 
 
 class SliceWriter:
@@ -156,7 +156,7 @@ class SliceWriter:
         indexes = self._contents.chunk(at, Packed(compression, len(data), len(raw)), tracks)
         declared, self._declared = self._declared, b''
         self._used = 0
-        self._append(declared + RECORD.pack(Op.CHUNK, len(fields) + len(data)) + fields, data, indexes)
+        self._append(declared + RECORD.pack(Opcode.CHUNK, len(fields) + len(data)) + fields, data, indexes)
 
     def _append(self, *parts: bytes | memoryview) -> None:
         for part in parts:
@@ -168,7 +168,7 @@ class SliceWriter:
 
 
 def _zstd(raw: memoryview) -> bytes:
-    return zstd.compress(raw, 1)
+    return compress(raw, 1)
 
 
 _COMPRESSORS: Final[dict[str, Callable[[memoryview], bytes | memoryview]]] = {'zstd': _zstd, 'none': lambda raw: raw}

@@ -26,6 +26,7 @@ import numpy as np
 from bags.real_bags import NAME, put_item, write_ours, write_rosbags
 from hostile import bad_parts
 from lake.making import NOON_NS, row
+from mcap.opcode import Opcode
 from PIL import Image
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
@@ -49,7 +50,7 @@ from shadowhound_data_logger.lake.samples import Near, Samples, Selection, Windo
 from shadowhound_data_logger.lake.source import Entry, open_source
 from shadowhound_data_logger.lake.standing import leaves_of
 from shadowhound_data_logger.lake.track import Track
-from shadowhound_data_logger.mcap.format import CHUNK, RECORD, Op, record, text
+from shadowhound_data_logger.mcap.format import CHUNK, RECORD, record, text
 from shadowhound_data_logger.mcap.index import records
 from shadowhound_data_logger.mcap.messages import unpack
 from shadowhound_data_logger.options import StoreSettings
@@ -535,17 +536,19 @@ def _repacked(body: bytes, compression: str) -> bytes:
     """A slice with its chunks in another compression; its index goes."""
     out = bytearray(body[:8])
     for kind, _, content in records(memoryview(body)[8:-8], 'x'):
-        if kind == Op.CHUNK:
+        if kind == Opcode.CHUNK:
             start, end, size, crc = CHUNK.unpack_from(content)
             plain = bytes(unpack(content, 'x'))
             packed = {'zstd': zstd.compress, 'lz4': lz4.frame.compress, '': bytes}[compression](plain)
-            out += record(Op.CHUNK, CHUNK.pack(start, end, size, crc), text(compression), struct.pack('<Q', len(packed)), packed)
-        elif kind == Op.DATA_END:
-            out += record(Op.DATA_END, bytes(4))
+            out += record(
+                Opcode.CHUNK, CHUNK.pack(start, end, size, crc), text(compression), struct.pack('<Q', len(packed)), packed
+            )
+        elif kind == Opcode.DATA_END:
+            out += record(Opcode.DATA_END, bytes(4))
             break
-        elif kind != Op.MESSAGE_INDEX:
+        elif kind != Opcode.MESSAGE_INDEX:
             out += record(kind, bytes(content))
-    return bytes(out + record(Op.FOOTER, struct.pack('<QQI', 0, 0, 0)) + body[:8])
+    return bytes(out + record(Opcode.FOOTER, struct.pack('<QQI', 0, 0, 0)) + body[:8])
 
 
 def slices(shop: Shop) -> Round:

@@ -15,6 +15,7 @@ from pathlib import Path
 import lz4.frame
 import pytest
 from bags.real_bags import EVER, NAME, T0, messages_of, write_ours, write_rosbags
+from mcap.opcode import Opcode
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder
@@ -24,7 +25,7 @@ from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.overview import overview
 from shadowhound_data_logger.bags.verify import verify_folder
 from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.format import CHUNK, MAGIC, Op, record, text
+from shadowhound_data_logger.mcap.format import CHUNK, MAGIC, record, text
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.messages import read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile
@@ -51,9 +52,9 @@ def zeros(compression: str) -> bytes:
 def mcap(chunk: bytes, compression: str, claim: int) -> bytes:
     """A file without an index, and in it a chunk that says that it unpacks to so many bytes."""
     head = CHUNK.pack(T0, T0, claim, 0)
-    body = record(Op.CHUNK, head, text(compression), struct.pack('<Q', len(chunk)), chunk)
-    footer = record(Op.FOOTER, struct.pack('<QQI', 0, 0, 0))
-    return MAGIC + record(Op.HEADER, text('ros2'), text('evil')) + body + record(Op.DATA_END, bytes(4)) + footer + MAGIC
+    body = record(Opcode.CHUNK, head, text(compression), struct.pack('<Q', len(chunk)), chunk)
+    footer = record(Opcode.FOOTER, struct.pack('<QQI', 0, 0, 0))
+    return MAGIC + record(Opcode.HEADER, text('ros2'), text('evil')) + body + record(Opcode.DATA_END, bytes(4)) + footer + MAGIC
 
 
 @pytest.mark.parametrize('claim', [100, 1 << 20, HUGE, (1 << 63) - 1])
@@ -83,8 +84,8 @@ def test_a_file_that_is_one_record_is_not_read_whole(tmp_path: Path) -> None:
         path = tmp_path / name / 'evil.mcap'
         path.parent.mkdir()
         with path.open('wb') as file:
-            tail = record(Op.FOOTER, struct.pack('<QQI', summary, 0, 0)) + MAGIC
-            file.write(MAGIC + struct.pack('<BQ', Op.MESSAGE, HUGE - len(MAGIC) - 9 - len(tail)))
+            tail = record(Opcode.FOOTER, struct.pack('<QQI', summary, 0, 0)) + MAGIC
+            file.write(MAGIC + struct.pack('<BQ', Opcode.MESSAGE, HUGE - len(MAGIC) - 9 - len(tail)))
             file.seek(HUGE - len(tail))
             file.write(tail)
         ran = in_2_gb('bag', 'verify', '--deep', str(path.parent))
@@ -237,7 +238,7 @@ def test_a_file_that_unpacks_to_more_than_there_is_room_for(tmp_path: Path) -> N
 
 def test_crcs_still_count(tmp_path: Path) -> None:
     """A chunk of the right size and other content."""
-    chunk = record(Op.MESSAGE, bytes(30))
+    chunk = record(Opcode.MESSAGE, bytes(30))
     path = tmp_path / 'a.mcap'
     right, wrong = (CHUNK.pack(T0, T0, len(chunk), crc) for crc in (0, zlib.crc32(b'other')))
     path.write_bytes(mcap(zstd.compress(chunk), 'zstd', len(chunk)).replace(right, wrong))

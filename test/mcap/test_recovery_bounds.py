@@ -16,9 +16,10 @@ from backports import zstd
 from bags.slices import TALK, check, fill, in_order, messages
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 
 from shadowhound_data_logger.mcap import survey
-from shadowhound_data_logger.mcap.format import CHUNK, Contents, Op, head, record, text
+from shadowhound_data_logger.mcap.format import CHUNK, Contents, head, record, text
 from shadowhound_data_logger.mcap.recovery import recover
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.mcap.writer import SliceWriter
@@ -44,7 +45,7 @@ def recovered(folder: Path, content: bytes) -> SliceInfo:
 def chunk(data: bytes, *, size: int, compression: str = '', crc: int = 0) -> bytes:
     """A chunk record that claims what it is told to."""
     fields = CHUNK.pack(1, 1, size, crc) + text(compression) + struct.pack('<Q', len(data))
-    return record(Op.CHUNK, fields, data)
+    return record(Opcode.CHUNK, fields, data)
 
 
 def declared() -> bytes:
@@ -95,7 +96,7 @@ def test_what_unpacks_to_more(tmp_path: Path, bomb: bytes, claimed: int) -> None
 def test_a_chunk_as_large_as_its_file(tmp_path: Path) -> None:
     """A record of 2 GB in a file that has as many (nothing but a hole) is not read into memory."""
     path = tmp_path / 'bag_0.mcap.open'
-    path.write_bytes(head() + struct.pack('<BQ', Op.CHUNK, 2 << 30))
+    path.write_bytes(head() + struct.pack('<BQ', Opcode.CHUNK, 2 << 30))
     os.truncate(path, len(head()) + 9 + (2 << 30))
     tracemalloc.start()
     info = recover(path)
@@ -119,7 +120,7 @@ def test_a_summary_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert found == written[: len(found)]
     assert info.damage is not None
     assert info.damage.tail_bytes > 2000
-    schema = record(Op.SCHEMA, struct.pack('<H', 1), text('a'), text('b'), text('c' * 4000))
+    schema = record(Opcode.SCHEMA, struct.pack('<H', 1), text('a'), text('b'), text('c' * 4000))
     assert recovered(tmp_path, head() + schema + declared()).channels == (TALK,)
     retired = recovered(tmp_path, head() + struct.pack('<BQ', 0x86, 0) * 100 + declared())
     assert retired.channels == ()
