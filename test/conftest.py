@@ -7,9 +7,11 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import botocore.loaders
 import pytest
 from domains import free_domain
 
@@ -44,6 +46,7 @@ def pytest_configure() -> None:
     Nodes of the tests, in this process and in others, are among themselves.
     """
     os.environ.update(THIS_MACHINE)
+    botocore.loaders.create_loader = lru_cache(botocore.loaders.create_loader)  # whose descriptions of S3 each store would read
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import pytest
 from e2e.processes import Processes
 from e2e.reading import STRING, cdr, texts
 
 from shadowhound_data_logger.capture.middleware import possible_buffer
 
-pytest.importorskip('cyclonedds')
+pytestmark = pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')  # imported by children
 
 CYCLONE = {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
 """What the environment of such a robot has."""

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import pytest
 from e2e.finding import TOPICS
 from e2e.processes import HERE, WAIT_S
 
-pytest.importorskip('cyclonedds')
+pytestmark = pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')  # imported by children
 
 ROBOT, OTHER, SECOND = '10.77.0.1', '10.77.0.2', '10.78.0.1'
 MAKE = f"""

@@ -40,7 +40,7 @@ def front(seaweed: Tower) -> Iterator[Front]:
         yield standing
 
 
-@pytest.fixture
+@pytest.fixture(scope='module')
 def direct(seaweed: Tower) -> Iterator[S3Store]:
     """The server without the front."""
     store = S3Store(seaweed.store_settings(), UploadSettings())

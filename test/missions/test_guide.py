@@ -10,7 +10,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
 
-import mlflow
 import pytest
 from missions.agent import jpeg
 from missions.server import Server, complete, until
@@ -131,6 +130,8 @@ def test_the_guide_s_executor_and_query(
     server: Server, warm_home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its MissionExecutor logs a mission that succeeds and one that fails, and its query finds and prints both."""
+    import mlflow  # takes a second, which those who only collect do not need
+
     monkeypatch.setenv('SHADOWHOUND_HOME', str(warm_home))
     good, bad = executor(command_fails=False), executor(command_fails=True)
     assert good.execute_mission('patrol by the guide') == ('done: patrol by the guide', {})

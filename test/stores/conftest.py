@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from moto.server import ThreadedMotoServer
 from stores.asking import settings_for
 from stores.spooled import QUICK, Spool
 
@@ -36,6 +35,8 @@ def spool(tmp_path: Path, bucket: str) -> Spool:
 @pytest.fixture(scope='session')
 def moto() -> Iterator[StoreSettings]:
     """A moto server, over real HTTP."""
+    from moto.server import ThreadedMotoServer  # takes half a second, which those who only collect do not need
+
     server = ThreadedMotoServer(ip_address='127.0.0.1', port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
