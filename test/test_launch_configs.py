@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import yaml
-
 from shadowhound_data_logger.capture.gate import EveryMessage, gate_for
+
 from shadowhound_data_logger.config import Settings, default_parameters
 
 FOLDER = Path(__file__).parents[1] / 'launch_configs'

@@ -22,8 +22,9 @@ from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, MissionOf, T
 from shadowhound_data_logger.bags.notes import Notes, discard
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.recorder import SYNC_S, Answer
-from shadowhound_data_logger.bags.recording import UNWRITABLE, Outlet, Recording
+from shadowhound_data_logger.bags.recording import UNWRITABLE, Recording
 from shadowhound_data_logger.bags.ring import Ring
+from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.missions.folder import safe_type
 from shadowhound_data_logger.options import BagSettings, EventSettings
@@ -86,15 +87,15 @@ class Events:
     ``_lock`` guards which event goes on and what is asked of it; the writing belongs to the thread ``event-writer``.
     """
 
-    def __init__(self, settings: EventSettings, bag: BagSettings, place: Place, ring: Ring, outlet: Outlet, poll_s: float,
-                 monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
+    def __init__(self, settings: EventSettings, bag: BagSettings, place: Place, ring: Ring, salvage: Salvage,
+                 poll_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
         """``poll_s``: how late the intake may take a message."""
         self._settings = settings
         self._bag = bag
         self._place = place
         self._ring = ring
-        self.claims = Claims(outlet.accounts)
-        self._outlet = outlet
+        self.claims = Claims(place.spool.accounts)
+        self._salvage = salvage
         self._poll_s = poll_s
         self._monotonic = monotonic
         self._lock = threading.Lock()
@@ -246,7 +247,7 @@ class Events:
             event.refused = UNWRITABLE
             return False
         event.refused = ''
-        event.recording = Recording(notes, self._bag, self._outlet, self._place)
+        event.recording = Recording(notes, self._bag, self._place, self._salvage)
         self._due_s = now_s + SYNC_S
         return True
 

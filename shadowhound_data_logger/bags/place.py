@@ -1,4 +1,4 @@
-"""Where bags begin, what they are named by, and by which clock their times are.
+"""Where bags begin and leave, what they are named by, and by which clock their times are.
 
 A bag that begins while the clock of this machine is not set has the name of its boot. It waits in its folder, as the spool holds
 objects (spool/redating.py), until the clock is set; then it is named after the time at which it began. Its times stay as
@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.manifest import ClockOf
-from shadowhound_data_logger.bags.naming import UNSYNCED, bag_name, unsynced_name
+from shadowhound_data_logger.bags.naming import BUCKET, UNSYNCED, bag_name, key_of, slice_file, unsynced_name
 from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock
 from shadowhound_data_logger.missions.dating import Dating
+from shadowhound_data_logger.spool.writer import SpoolWriter
 
 SET_LATER, UNSET = 'set_later', 'unset'
 """How the date of such a bag is known, in the words of spool/redating.py."""
@@ -28,16 +29,17 @@ _LATEST: Final = 1 << 63
 class Place:
     """New before anything is received; from any thread."""
 
-    def __init__(self, root: Path, robot: str, clock: Clock, is_known: Callable[[str], bool], hold_s: float = 0.0,
+    def __init__(self, root: Path, robot: str, clock: Clock, writer: SpoolWriter, hold_s: float = 0.0,
                  offsets: Callable[[], Mapping[str, int]] = dict) -> None:  # fmt: skip
-        """``root`` is the robot's folder of bags; ``is_known`` says whether a bag's name is taken in the spool.
+        """``root`` is the robot's folder of bags; bags go through ``writer`` into its spool, under names that none has there.
 
         ``hold_s`` and ``offsets`` as in ``missions.dating``: how long a bag waits for its date, and what is known of other boots.
         """
         self.root = root
         self.robot = robot
         self.clock = clock
-        self._is_known = is_known
+        self.writer = writer
+        self.spool = writer.spool
         self._dating = Dating(clock, hold_s, offsets)
         self._first_ns = clock.wall_ns() - clock.boot_ns()
 
@@ -100,4 +102,4 @@ class Place:
         return self._dating.offset_ns(notes.clock.boot_id, notes.clock.boot_ns)
 
     def _is_taken(self, bag: str) -> bool:
-        return (self.root / bag).exists() or self._is_known(bag)
+        return (self.root / bag).exists() or self.spool.has(BUCKET, key_of(self.robot, bag, slice_file(bag, 0)))

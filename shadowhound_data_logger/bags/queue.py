@@ -22,7 +22,7 @@ class Lot(NamedTuple):
     topic: str
     type: str
     qos: str
-    """As rosbag2 writes it (``bags.metadata``)."""
+    """As rosbag2 writes it (``mcap.rosbag2_metadata``)."""
     messages: Sequence[Taken]
 
 

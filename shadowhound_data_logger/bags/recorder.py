@@ -17,7 +17,7 @@ from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
-from shadowhound_data_logger.bags.recording import Outlet, Recording
+from shadowhound_data_logger.bags.recording import Recording
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.options import BagSettings
 from shadowhound_data_logger.spool.accounts import BAG
@@ -72,13 +72,12 @@ class Recorder:
     ``_control`` makes each of these one step; the recording itself belongs to the thread ``bag-writer``.
     """
 
-    def __init__(self, settings: BagSettings, place: Place, queue: BagQueue, outlet: Outlet, salvage: Salvage,
+    def __init__(self, settings: BagSettings, place: Place, queue: BagQueue, salvage: Salvage,
                  listen: Callable[[bool, float], bool]) -> None:  # fmt: skip
         """``listen`` has the intake begin (True) or end, and says whether that was done within so many seconds."""
         self._settings = settings
         self._place = place
         self._queue = queue
-        self._outlet = outlet
         self._salvage = salvage
         self._listen = listen
         self._control = threading.Lock()
@@ -224,8 +223,8 @@ class Recorder:
             return False, f'no bag can be made in {place.root}: {error.strerror}'
         goes_on = by == ALWAYS or listening or (mission is not None and mission.mission_id in self._salvage.missions)
         if not goes_on:
-            self._outlet.accounts.rebase_all(BAG)
-        recording = Recording(notes, self._settings, self._outlet, place)
+            self._place.spool.accounts.rebase_all(BAG)
+        recording = Recording(notes, self._settings, place, self._salvage)
         self._current = _Current(recording, by, time.monotonic(), self._queue.dropped)
         self._queue.paused = self._queue.paused and listening
         if not listening:
@@ -283,7 +282,7 @@ class Recorder:
             elif self._writing is not None:
                 self._writing.write(item)
             else:
-                self._outlet.accounts.drop(f'{BAG}{item.topic}', 'stopped', len(item.messages))
+                self._place.spool.accounts.drop(f'{BAG}{item.topic}', 'stopped', len(item.messages))
             self._sync()
         self._sync()
 

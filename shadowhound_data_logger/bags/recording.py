@@ -11,23 +11,22 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.definitions import describe
 from shadowhound_data_logger.bags.manifest import Missing, MissionOf
-from shadowhound_data_logger.bags.naming import prefix_of, slice_file
+from shadowhound_data_logger.bags.naming import BUCKET, prefix_of, slice_file
 from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.objects import ending_objects, note_evicted, ros_distro, slice_object
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.mcap.recovery import recover
 from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
 from shadowhound_data_logger.mcap.writer import OPEN, SliceWriter
-from shadowhound_data_logger.model import DataObject, State
 from shadowhound_data_logger.options import BagSettings
-from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.retention import NO_ROOM
 
 log = logging.getLogger(__name__)
@@ -39,29 +38,12 @@ UNWRITABLE: Final = 'unwritable'
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
-@dataclass(frozen=True, slots=True)
-class Outlet:
-    """Where a bag goes."""
-
-    accounts: Accounts
-    put: Callable[[DataObject], None]
-    """Into the spool, soon."""
-    flush: Callable[[float], bool]
-    """Whether all of it became durable within so many seconds."""
-    has_room: Callable[[], bool]
-    """Whether the disk has space to record into."""
-    states: Callable[[str], Mapping[str, State]] = lambda _: {}
-    """What became in the spool of all whose key begins so."""
-    wait: Callable[[Path], None] = lambda _: None
-    """Have the bag of a folder, whole but for its name, shipped once that is known."""
-
-
 class Recording:
     """New; ``write``, ``tick`` and ``split`` any number of times; ``close`` once. Owned by the thread that writes bags."""
 
-    def __init__(
-        self, notes: Notes, settings: BagSettings, outlet: Outlet, place: Place, monotonic: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, notes: Notes, settings: BagSettings, place: Place, salvage: Salvage,
+                 monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
+        """``salvage`` gets a bag that waits for its date."""
         self.notes = notes
         self._place = place
         self.number = -1
@@ -70,7 +52,7 @@ class Recording:
         self.refused = ''
         """Why nothing is written now; empty while all is well."""
         self._settings = settings
-        self._outlet = outlet
+        self._salvage = salvage
         self._monotonic = monotonic
         self._writer: SliceWriter | None = None
         self._channels: dict[tuple[str, str], Channel] = {}
@@ -121,7 +103,7 @@ class Recording:
         except OSError as error:
             self._break(error)
             return
-        if not self._outlet.has_room():
+        if not self._place.spool.has_room():
             self.split()
             self._refuse(NO_ROOM, 'there is no room')
         elif self._monotonic() - self._began_s >= self._settings.slice_s:
@@ -143,7 +125,7 @@ class Recording:
             self._note_lost()
 
     def close(self, deadline_s: float) -> bool:
-        """End the bag; False when it is left to the next start to make it whole. One without a date waits for it (``outlet``)."""
+        """End the bag; False when it is left to the next start to make it whole. Without a date it waits for one."""
         self.split()
         self._again_s = 0.0
         if not self._mend():
@@ -155,12 +137,12 @@ class Recording:
                 notes.end()
                 if not self._name():
                     return True
-                if not self._outlet.flush(deadline_s):
+                if not self._place.writer.flush(deadline_s):
                     return False
-                note_evicted(notes, self._outlet.states(prefix_of(notes.robot, notes.bag)))
+                note_evicted(notes, self._place.spool.states(BUCKET, prefix_of(notes.robot, notes.bag)))
                 for item in ending_objects(notes):
-                    self._outlet.put(item)
-                if not self._outlet.flush(deadline_s):
+                    self._place.writer.put(item, wait=False)
+                if not self._place.writer.flush(deadline_s):
                     return False
             notes.remove()
         except OSError as error:
@@ -190,7 +172,7 @@ class Recording:
         now_s = self._monotonic()
         if now_s < self._again_s:
             return False
-        if not self._outlet.has_room():
+        if not self._place.spool.has_room():
             self._refuse(NO_ROOM, 'there is no room')
             return False
         if not self._mend():
@@ -250,7 +232,10 @@ class Recording:
         except OSError as error:
             log.warning('bag %s: %s', self.notes.bag, error)
         if self.notes.is_named:
-            self._outlet.put(slice_object(self.notes, info, self._settings.priority))
+            self._put_slice(info)
+
+    def _put_slice(self, info: SliceInfo) -> None:
+        self._place.writer.put(slice_object(self.notes, info, self._settings.priority), wait=False)
 
     def _name(self) -> bool:
         """Whether the bag has a name to leave by; one that gets it now lets go of its slices. Raises OSError."""
@@ -258,10 +243,10 @@ class Recording:
         if notes.is_named:
             return True
         if not self._place.settle(notes):
-            self._outlet.wait(notes.folder)
+            self._salvage.add(notes.folder)
             return False
         for info in notes.slices.values():
-            self._outlet.put(slice_object(notes, info, self._settings.priority))
+            self._put_slice(info)
         return True
 
     def _note_lost(self) -> None:
@@ -284,7 +269,7 @@ class Recording:
 
     def _count(self, topic: str, reason: str, count: int) -> None:
         self.dropped += count
-        self._outlet.accounts.drop(f'{self.notes.sink}{topic}', reason, count)
+        self._place.spool.accounts.drop(f'{self.notes.sink}{topic}', reason, count)
 
     def _refuse(self, reason: str, text: str) -> None:
         self._again_s = self._monotonic() + RETRY_S

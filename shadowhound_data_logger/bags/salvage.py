@@ -12,18 +12,17 @@ import os
 import stat
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.manifest import Missing
-from shadowhound_data_logger.bags.naming import prefix_of, slice_number
+from shadowhound_data_logger.bags.naming import BUCKET, prefix_of, slice_number
 from shadowhound_data_logger.bags.notes import FILE, Notes
 from shadowhound_data_logger.bags.objects import ending_objects, note_evicted, ros_distro, slice_object
 from shadowhound_data_logger.bags.place import Place
-from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.recovery import read_info, recover
 from shadowhound_data_logger.mcap.writer import OPEN
@@ -41,8 +40,6 @@ LOOK_S: Final = 1.0
 """Between two looks at the clock, for a bag that waits for it."""
 DAMAGED: Final = '.damaged'
 """Ends the name of the folder, beside the robot's, where lies what is no slice."""
-Knows = Callable[[str, str, str], bool]
-"""Whether the spool was given a content by (bucket, key, sha256) already."""
 
 
 class Salvage:
@@ -52,11 +49,9 @@ class Salvage:
     thread.
     """
 
-    def __init__(self, place: Place, priority: int, outlet: Outlet, knows: Knows) -> None:
+    def __init__(self, place: Place, priority: int) -> None:
         self._place = place
         self._priority = priority
-        self._outlet = outlet
-        self._knows = knows
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._opened = self._closed = False
@@ -131,7 +126,7 @@ class Salvage:
         return Notes.read(folder, self._place.robot)
 
     def _settle(self) -> None:
-        lost = self._outlet.accounts.drop_carried(RESTART)
+        lost = self._place.spool.accounts.drop_carried(RESTART)
         if lost:
             log.warning('%d messages of bags were in memory when the node before ended', lost)
 
@@ -149,7 +144,7 @@ class Salvage:
             notes.add_missing(Missing(last, IN_MEMORY, None))
         if notes.slices or (notes.ended and notes.missing):
             self._flush(notes)
-            note_evicted(notes, self._outlet.states(prefix_of(self._place.robot, notes.bag)))
+            note_evicted(notes, self._place.spool.states(BUCKET, prefix_of(self._place.robot, notes.bag)))
             for item in ending_objects(notes):
                 self._put(item, notes)
         self._flush(notes)
@@ -165,7 +160,7 @@ class Salvage:
         return True
 
     def _flush(self, notes: Notes) -> None:
-        if not self._outlet.flush(FLUSH_S):
+        if not self._place.writer.flush(FLUSH_S):
             raise OSError(f'the spool did not take bag {notes.bag} within {FLUSH_S:g} s')
 
     def _slices(self, notes: Notes, suffix: str) -> Iterator[Path]:
@@ -211,12 +206,12 @@ class Salvage:
         """Into the spool; False where that was given it before."""
         if item.key in self._handed:
             return True
-        if self._knows(item.bucket, item.key, content_sha256(item.body)):
+        if self._place.spool.knows(item.bucket, item.key, content_sha256(item.body)):
             return False
         if notes.folder not in self._own:
-            self._outlet.accounts.find(item.counts)
+            self._place.spool.accounts.find(item.counts)
         self._handed.add(item.key)
-        self._outlet.put(item)
+        self._place.writer.put(item, wait=False)
         return True
 
 

@@ -17,7 +17,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import rclpy
@@ -26,16 +26,14 @@ from rclpy.signals import SignalHandlerOptions
 
 from shadowhound_data_logger.bags.local import RECORDS, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, key_of, slice_file
+from shadowhound_data_logger.bags.naming import MANIFEST
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
-from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.salvage import Salvage
-from shadowhound_data_logger.capture.bag_tap import BagTap
+from shadowhound_data_logger.capture.bags import BagConsumer
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.node import StopSignals
-from shadowhound_data_logger.capture.stream import Shared
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -57,24 +55,15 @@ STEP_S: Final = 0.1
 CLOSE_S: Final = 5.0
 
 
-@dataclass(slots=True)
-class Stages:
-    """What is open while it records."""
+class ManifestWriter(SpoolWriter):
+    """The spool's writer; ``manifest`` is that of the bag, once it has ended."""
 
-    writer: SpoolWriter
-    uploader: Uploader
     manifest: Manifest | None = None
-    """Of the bag, once it has ended."""
 
-    @property
-    def workers(self) -> Sequence[Worker]:
-        return *self.uploader.workers, self.writer.worker
-
-    def put(self, item: DataObject) -> None:
-        """Into the spool, soon."""
+    def put(self, item: DataObject, *, wait: bool = True) -> None:
         if item.key.endswith(f'/{MANIFEST}') and isinstance(item.body, bytes):
             self.manifest = Manifest.from_json(item.body)
-        self.writer.put(item, wait=False)
+        super().put(item, wait=wait)
 
 
 def main() -> int:
@@ -120,35 +109,30 @@ def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[st
         spool = Spool(settings.spool_path, settings.spool, SystemClock.of_this_machine(), owner)
         spool.open()
         opened.callback(spool.close)
-        writer = SpoolWriter(spool, settings.spool.commit_s, spooled=lambda new: uploader.wake(new),  # noqa: PLW0108
-                             settled=lambda ids: uploader.settled(ids))  # fmt: skip  # noqa: PLW0108 - made below
+        writer = ManifestWriter(spool, settings.spool.commit_s, spooled=lambda new: uploader.wake(new),  # noqa: PLW0108
+                                settled=lambda ids: uploader.settled(ids))  # fmt: skip  # noqa: PLW0108 - made below
         uploader = Uploader(spool, store, settings.upload, writer.settle)
-        stages = Stages(writer, uploader)
-        recorder = _open_recorder(opened, node, settings, spool, stages)
+        recorder = _open_recorder(opened, node, settings, writer)
         uploader.open()
         opened.callback(uploader.close, CLOSE_S)
-        dropped = _until_over(recorder, stages, name, given.duration, stop)
-        if stages.manifest is None:
+        workers = *uploader.workers, writer.worker
+        dropped = _until_over(recorder, workers, name, given.duration, stop)
+        if writer.manifest is None:
             raise BagError('nothing was published on the topics that were to be recorded', topics=topics,
                            remedy=f'`ros2 topic list`; asked for was {" ".join(topics) or given.regex}')  # fmt: skip
-        return _delivered(settings, stages.manifest, stages, given.deadline) | {'dropped': dropped}
+        waiting = _wait_for_delivery(settings, writer, workers, given.deadline)
+        return _told(writer.manifest, dropped, waiting=waiting, last_error=uploader.status().last_error)
 
 
-def _open_recorder(opened: ExitStack, node: Node, settings: Settings, spool: Spool, stages: Stages) -> Recorder:
+def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: SpoolWriter) -> Recorder:
     """Writer, intake and recorder, opened; they are closed in the opposite order."""
-    clock, writer = SystemClock.of_this_machine(), stages.writer
-    types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
+    clock, accounts = SystemClock.of_this_machine(), writer.spool.accounts
     queue = BagQueue(settings.bag.queue_bytes)
-    shared = Shared(spool.accounts, types, lambda _: None, clock, None, BagTap(node, spool.accounts, queue))
-    intake = Intake(node, {}, settings.intake, shared, settings.bag)
-    place = Place(settings.home / RECORDS / settings.robot, settings.robot, clock,
-                  lambda bag: spool.has(BUCKET, key_of(settings.robot, bag, slice_file(bag, 0))))  # fmt: skip
-    outlet = Outlet(spool.accounts, stages.put, writer.flush,
-                    lambda: spool.free_bytes() >= settings.spool.min_free_bytes // 2,
-                    lambda prefix: spool.states(BUCKET, prefix))  # fmt: skip
-    salvage = Salvage(place, settings.bag.priority, outlet, spool.knows)
-    recorder = Recorder(settings.bag, place, queue, outlet, salvage,
-                        lambda on, deadline_s: intake.record(deadline_s, on=on))  # fmt: skip
+    bags = BagConsumer(node, settings.bag, accounts, queue)
+    intake = Intake(node, {}, settings.intake, accounts, MessageTypes(), [bags])
+    place = Place(settings.home / RECORDS / settings.robot, settings.robot, clock, writer)
+    salvage = Salvage(place, settings.bag.priority)
+    recorder = Recorder(settings.bag, place, queue, salvage, partial(intake.listen, bags))
     writer.open()
     opened.callback(writer.close, CLOSE_S)
     intake.open()
@@ -170,7 +154,7 @@ def _topics_there(node: Node, robot: str, stop: StopSignals) -> list[str]:
     return [next((topic for topic in topics if node.count_publishers(topic)), topics[0]) for topics in sensors]
 
 
-def _until_over(recorder: Recorder, stages: Stages, name: str, duration_s: float, stop: StopSignals) -> int:
+def _until_over(recorder: Recorder, workers: Sequence[Worker], name: str, duration_s: float, stop: StopSignals) -> int:
     """Record; how many messages were dropped meanwhile."""
     recorder.on_mission({'type': name, 'mission_id': None})
     done, text = recorder.start()
@@ -179,7 +163,7 @@ def _until_over(recorder: Recorder, stages: Stages, name: str, duration_s: float
     end_s = time.monotonic() + duration_s
     while time.monotonic() < end_s and not stop.received:
         time.sleep(min(STEP_S, max(0.0, end_s - time.monotonic())))
-        _supervise((*recorder.workers, *stages.workers))
+        _supervise((*recorder.workers, *workers))
     dropped, bag = recorder.status().dropped, text
     done, text = recorder.stop()
     if not done:
@@ -187,21 +171,25 @@ def _until_over(recorder: Recorder, stages: Stages, name: str, duration_s: float
     return dropped
 
 
-def _delivered(settings: Settings, manifest: Manifest, stages: Stages, deadline_s: float) -> dict[str, Any]:
-    """Wait until nothing of the bag is in the spool any more."""
+def _wait_for_delivery(settings: Settings, writer: ManifestWriter, workers: Sequence[Worker], deadline_s: float) -> bool:
+    """Until nothing of the bag is in the spool any more; whether something still is."""
     end_s = time.monotonic() + deadline_s
-    stages.writer.prompt = True
-    stages.writer.flush(CLOSE_S)
-    while (
-        waiting := _waits(settings, manifest.bag)
-    ) and time.monotonic() < end_s:  # a second signal ends the process: the bag is safe
+    writer.prompt = True
+    writer.flush(CLOSE_S)
+    bag = writer.manifest.bag if writer.manifest is not None else ''
+    while (waiting := _waits(settings, bag)) and time.monotonic() < end_s:  # a second signal ends the process: the bag is safe
         time.sleep(STEP_S)
-        _supervise(stages.workers)
+        _supervise(workers)
+    return waiting
+
+
+def _told(manifest: Manifest, dropped: int, *, waiting: bool, last_error: str) -> dict[str, Any]:
+    """What became of the bag."""
     return {
         'robot': manifest.robot, 'bag': manifest.bag, 'messages': sum(each.messages for each in manifest.slices),
         'slices': len(manifest.slices), 'bytes': sum(each.bytes for each in manifest.slices),
         'topics': {each.topic: each.messages for each in manifest.topics}, 'delivered': not waiting,
-        'last_error': stages.uploader.status().last_error if waiting else '',
+        'last_error': last_error if waiting else '', 'dropped': dropped,
     }  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, inf
+from math import ceil
 from typing import Final
 
 from shadowhound_data_logger.config import IntakeSettings
@@ -91,44 +91,3 @@ def depth(type_name: str, settings: IntakeSettings) -> int:
     rate_hz = LARGE_RATE_HZ if type_name in LARGE_TYPES else settings.max_rate_hz
     wanted = ceil(rate_hz * max(STALL_S, 4 * settings.poll_s))
     return max(1, min(max(wanted, MIN_DEPTH), settings.history_bytes // size))
-
-
-class Senders:
-    """Who sent a message, where the middleware gives its number but not its sender's gid (Jazzy and older).
-
-    With one publisher in the graph it is that one. Its successor is told from it before the graph shows the change: its
-    numbers begin anew while the time of sending goes on. When the old numbers go on as well, there are two of them.
-    """
-
-    def __init__(self) -> None:
-        self.gids: list[str] = []
-        self.changed_s = -inf
-        """When one came that was not there before, by the monotonic clock; the first ones are not counted."""
-        self.several_s: float | None = None
-        """Since when there are several."""
-        self._successors = 0
-        self._number = 0
-        self._number_before = 0
-        self._sent_ns = 0
-
-    def look(self, gids: list[str], now_s: float = 0.0) -> None:
-        """What the graph says now."""
-        self.several_s = None if len(gids) < 2 else now_s if self.several_s is None else self.several_s
-        if gids and gids != self.gids:
-            if self.gids and not set(gids) <= set(self.gids):
-                self.changed_s = now_s
-            self.gids = gids
-            self._successors = 0
-
-    def name(self, number: int | None, sent_ns: int) -> str | None:
-        """A name for the sender of this message; None where there is more than one, or no number."""
-        if number is None or len(self.gids) != 1:
-            return None
-        if self._successors and self._number < self._number_before < number:
-            return None
-        if number <= self._number and sent_ns > self._sent_ns:
-            self._successors += 1
-            self._number_before = self._number
-        if sent_ns >= self._sent_ns:
-            self._number, self._sent_ns = number, sent_ns
-        return f'{self.gids[0]}.{self._successors}'

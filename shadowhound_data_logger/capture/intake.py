@@ -1,6 +1,7 @@
 """The intake thread: it alone creates, drains and destroys subscriptions, on its own clock (D1, D2).
 
-Nothing here touches disk or network or parses a message. What the bounded queue has no room for is dropped and counted.
+What it takes of a topic goes to the consumers of that topic (``stream.Consumer``), in order; it knows none of them. Nothing here
+touches disk or network or parses a message.
 """
 
 from __future__ import annotations
@@ -8,22 +9,19 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
 from rclpy.node import Node
 
-from shadowhound_data_logger.bags.topics import Choice
-from shadowhound_data_logger.capture.bag_sources import BagSources
-from shadowhound_data_logger.capture.event_tap import EventTap, Taps
+from shadowhound_data_logger.capture.extra_topics import ExtraTopics
 from shadowhound_data_logger.capture.reader import PolledGroup
-from shadowhound_data_logger.capture.source import OtherTypes, Source, SourceStatus
-from shadowhound_data_logger.capture.stream import Offer, Shared
-from shadowhound_data_logger.config import BagSettings, IntakeSettings, SensorSettings
-from shadowhound_data_logger.encode.queue import BatchQueue
-from shadowhound_data_logger.model import Batch
+from shadowhound_data_logger.capture.stream import Consumer
+from shadowhound_data_logger.capture.subscriber import OtherTypes, Subscriber, SubscriberStatus, Surroundings
+from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.worker import Worker
 
@@ -34,29 +32,29 @@ PATIENCE_S: Final = 5.0
 
 
 class Intake:
-    """New; open once; close once. ``flush``, ``pause`` and ``update`` are done by the thread, between two drains.
+    """New; open once; close once. What is asked of it is done by the thread, between two drains.
 
-    ``sensors`` are the settings in force, shared with the encoders; while it runs, this thread alone replaces its entries.
+    ``sensors`` are the settings in force, shared with consumers and encoders; while it runs, this thread alone replaces entries.
     """
 
-    def __init__(self, node: Node, sensors: dict[str, SensorSettings], settings: IntakeSettings, shared: Shared,
-                 bag: BagSettings, events: EventTap | None = None) -> None:  # fmt: skip
+    def __init__(self, node: Node, sensors: dict[str, SensorSettings], settings: IntakeSettings, accounts: Accounts,
+                 types: MessageTypes, consumers: Sequence[Consumer], first: Collection[str] = ()) -> None:  # fmt: skip
+        """``consumers`` get what is taken; one that wants topics besides those of the sensors shares what those before it have.
+
+        ``first`` are topics to be drained before all others.
+        """
         self._sensors = sensors
         self._settings = settings
-        group, of_bag = PolledGroup(), shared
-        self._taps = Taps(of_bag.tap, *([events] if events is not None else []))
-        if events is not None:
-            shared = shared._replace(tap=self._taps)
-        self._others = OtherTypes(node, shared.accounts)
-        self._sources = tuple(Source(node, sensor, settings, group, shared, others=self._others) for sensor in sensors.values())
-        # The odometry comes first, so that what is taken after it finds its pose.
-        self._by_turn = sorted(self._sources, key=lambda source: not (shared.robot and shared.robot.is_odometry(source.topic)))
-        named = (node.resolve_topic_name(topic) for topic in bag.topics if topic)
-        types = {node.resolve_topic_name(topic): type_name for sensor in sensors.values()
+        self._consumers = consumers
+        around = Surroundings(node, settings, PolledGroup(), accounts, types)
+        self._others = OtherTypes(node, accounts)
+        self._subscribers = tuple(Subscriber(around, sensor, consumers, self._others) for sensor in sensors.values())
+        self._by_turn = sorted(self._subscribers, key=lambda subscriber: subscriber.topic not in first)
+        named = {node.resolve_topic_name(topic): type_name for sensor in sensors.values()
                  for topic, type_name in zip(sensor.topics, sensor.types, strict=False) if type_name}  # fmt: skip
-        self._bag = BagSources(node, Choice(bag, named), of_bag.tap, settings, group, of_bag, types)
-        self._ring = BagSources(node, events.choice, events, settings, group, shared, types) if events is not None else None
-        self._records = False
+        self._extra = [ExtraTopics(around, consumers[place:], named)
+                       for place, consumer in enumerate(consumers) if consumer.choice is not None]  # fmt: skip
+        self._listening = [extra for extra in self._extra if extra.consumer.from_start]
         self._requests: deque[Callable[[], None]] = deque()
         self._wake = threading.Event()
         self._next_poll_s = self._next_refresh_s = 0.0
@@ -66,31 +64,29 @@ class Intake:
 
     @property
     def topics(self) -> Sequence[str]:
-        """The resolved topics it listens to, or would."""
-        return [source.topic for source in self._sources if source.sensor.enabled]
+        """The resolved topics of sensors that it listens to, or would."""
+        return [subscriber.topic for subscriber in self._subscribers if subscriber.sensor.enabled]
 
     @property
-    def _unsampled(self) -> Sequence[Source]:
-        """Of topics that only a bag or the ring wants."""
-        return *self._bag.own, *(self._ring.own if self._ring is not None else ())
+    def _unsampled(self) -> Sequence[Subscriber]:
+        """Of topics that no sensor has."""
+        return [subscriber for extra in self._extra for subscriber in extra.own]
 
-    @property
-    def left_out(self) -> tuple[int, int]:
-        """Topics that a bag, and the ring of the events, would have by an expression, and do not: there are too many."""
-        return self._bag.left_out, self._ring.left_out if self._ring is not None else 0
+    def left_out(self, consumer: Consumer) -> int:
+        """Topics that a consumer would have by an expression, and does not: there are too many."""
+        return next((extra.left_out for extra in self._extra if extra.consumer is consumer), 0)
 
-    def status(self) -> list[SourceStatus]:
-        return [source.status() for source in self._sources]
+    def status(self) -> list[SubscriberStatus]:
+        return [subscriber.status() for subscriber in self._subscribers]
 
     def open(self) -> None:
+        for consumer in self._consumers:
+            if consumer.from_start:
+                consumer.begin()
         self.worker.start()
 
-    def begin_idle(self) -> None:
-        """Before ``open``: nobody wants the data yet."""
-        self._set_idle(idle=True)
-
     def close(self, deadline_s: float) -> bool:
-        """Take what waits, close the batches and the subscriptions, end the thread; False if that failed or took too long."""
+        """Take what waits, have it all handed on, end the subscriptions and the thread; False if that failed or took too long."""
         if self.worker.stopping:
             return True
         finished = self._ask(self._finish, deadline_s)
@@ -98,24 +94,24 @@ class Intake:
         self._wake.set()
         return self.worker.join(deadline_s) and finished
 
-    def flush(self, deadline_s: float) -> bool:
-        """Take what waits and close the open batches; False if that failed or took too long."""
-        return self._ask(self._flush, deadline_s)
+    def flush(self, deadline_s: float, then: Callable[[], None] | None = None) -> bool:
+        """Take what waits, and have the consumers hand on what they gathered; False if that failed or took too long.
+
+        ``then`` is called by the thread: what comes after it is of another time.
+        """
+        return self._ask(partial(self._flush, then), deadline_s)
 
     def pause(self, deadline_s: float, *, paused: bool) -> bool:
         """From now on count and drop what comes, or store it again; False if that failed or took too long."""
-        return self._ask(partial(self._pause, paused=paused), deadline_s)
+        return self.flush(deadline_s, partial(self._set_paused, paused=paused))
 
-    def idle(self, deadline_s: float, *, idle: bool) -> bool:
-        """From now on count and skip what comes, or store it again; False if that failed or took too long."""
-        return self._ask(partial(self._set_idle, idle=idle), deadline_s)
+    def listen(self, consumer: Consumer, on: bool, deadline_s: float) -> bool:
+        """From now on a consumer with a choice gets its topics, or nothing more; False if that failed or took too long.
 
-    def record(self, deadline_s: float, *, on: bool) -> bool:
-        """From now on hand all that comes of the bag's topics to the bag, or no more; False if that failed or took too long.
-
-        ``on`` while it is done already: another bag begins here.
+        ``on`` while it is on already: something new begins for it here. What came before is taken before.
         """
-        return self._ask(partial(self._record, on=on), deadline_s)
+        extra = next(extra for extra in self._extra if extra.consumer is consumer)
+        return self._ask(partial(self._listen, extra, on), deadline_s)
 
     def update(self, sensors: Iterable[SensorSettings]) -> None:
         """Go on by these settings soon; sensors that are not among them stay as they are."""
@@ -124,71 +120,70 @@ class Intake:
     # -- what the thread does --------------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        """One round: wait for the next poll, follow the graph, drain every source, do what was asked for."""
+        """One round: wait for the next poll, follow the graph, drain every topic, do what was asked for."""
         self._wake.wait(max(0.0, self._next_poll_s - time.monotonic()))
         self._wake.clear()
         now_s = time.monotonic()
         self._next_poll_s = now_s + self._settings.poll_s
-        todo: list[Callable[[], None]] = [partial(source.drain, now_s) for source in self._by_turn]
-        todo += [partial(source.drain, now_s) for source in self._unsampled]
-        todo.append(self._others.drain)
-        if now_s >= self._next_refresh_s:
+        todo: list[Callable[[], None]] = []
+        if refreshes := now_s >= self._next_refresh_s:
             self._next_refresh_s = now_s + REFRESH_S
-            todo = [*(partial(source.refresh, now_s) for source in self._by_turn), *todo]
-            if self._records or self._ring is not None:
-                todo.append(partial(self._follow, now_s))
+            todo += [partial(subscriber.refresh, now_s) for subscriber in self._by_turn]
+        todo += [partial(subscriber.drain, now_s) for subscriber in (*self._by_turn, *self._unsampled)]
+        todo.append(self._others.drain)
+        if refreshes and self._listening:
+            todo.append(partial(self._follow, now_s))
+        todo += [partial(consumer.tick, now_s) for consumer in self._consumers]
         _each([*todo, self._obey])
 
     def _obey(self) -> None:
         while self._requests:
             self._requests.popleft()()
 
-    def _flush(self) -> None:
-        now_s = time.monotonic()
-        _each([partial(source.flush, now_s) for source in self._sources])
+    def _drain(self, now_s: float) -> None:
+        _each([partial(subscriber.drain, now_s) for subscriber in (*self._by_turn, *self._unsampled)])
 
-    def _pause(self, *, paused: bool) -> None:
-        now_s = time.monotonic()
+    def _flush(self, then: Callable[[], None] | None = None) -> None:
+        steps: list[Callable[[], None]] = [partial(self._drain, time.monotonic())]
+        _each([*steps, *(consumer.flush for consumer in self._consumers), *([then] if then is not None else [])])
+
+    def _set_paused(self, *, paused: bool) -> None:
         self.paused = paused
-        _each([partial(source.pause, now_s, paused=paused) for source in (*self._sources, *self._unsampled)])
-
-    def _set_idle(self, *, idle: bool) -> None:
-        now_s = time.monotonic()
-        _each([partial(source.idle, now_s, idle=idle) for source in self._sources])
+        for subscriber in (*self._subscribers, *self._unsampled):
+            subscriber.paused = paused
 
     def _update(self, sensors: Sequence[SensorSettings]) -> None:
         now_s = time.monotonic()
         self._sensors.update((sensor.name, sensor) for sensor in sensors)
-        _each([partial(source.update, self._sensors[source.sensor.name], now_s) for source in self._sources])
+        _each([partial(subscriber.update, self._sensors[subscriber.sensor.name], now_s) for subscriber in self._subscribers])
         self._next_refresh_s = now_s
 
-    def _record(self, *, on: bool) -> None:
-        """What came before is drained first: it is not of this recording, or the last of it."""
+    def _listen(self, extra: ExtraTopics, on: bool) -> None:
+        """What came before is drained first: it is not of what begins, or the last of what ends."""
         now_s = time.monotonic()
-        _each([partial(source.drain, now_s) for source in (*self._sources, *self._unsampled)])
-        if on and self._records:
-            self._bag.renew(now_s)
-        self._records = on
+        self._drain(now_s)
+        is_on = extra in self._listening
+        self._listening = [each for each in self._extra if (on if each is extra else each in self._listening)]
         if on:
+            if is_on:
+                extra.renew(now_s)
+            extra.consumer.begin()
             self._follow(now_s)
         else:
-            self._bag.end(now_s)
+            extra.end(now_s)
 
     def _follow(self, now_s: float) -> None:
-        sensors = {source.topic: source.has_latched for source in self._sources if source.sensor.enabled}
-        ring: dict[str, bool] = {}
-        if self._ring is not None:
-            self._ring.refresh(dict.fromkeys(sensors, False), sensors, now_s, paused=self.paused)
-            ring = {source.topic: source.has_latched for source in self._ring.own}
-        if self._records:
-            self._bag.refresh(sensors | ring, sensors, now_s, paused=self.paused)
-        self._taps.look()
+        sensors = {each.topic: each.has_latched for each in self._subscribers if each.sensor.enabled}
+        taken = dict(sensors)
+        for extra in self._listening:
+            extra.refresh(taken, sensors, now_s, paused=self.paused)
+            taken |= {each.topic: each.has_latched for each in extra.own}
 
     def _finish(self) -> None:
         now_s = time.monotonic()
-        ends = [partial(source.close, now_s) for source in self._sources]
-        ends += [partial(each.end, now_s) for each in (self._bag, self._ring) if each is not None]
-        _each([*ends, self._others.close, self.worker.stop])
+        ends = [partial(subscriber.close, now_s) for subscriber in self._subscribers]
+        ends += [partial(extra.end, now_s) for extra in self._extra]
+        _each([*ends, *(consumer.flush for consumer in self._consumers), self._others.close, self.worker.stop])
 
     # -- between the threads ---------------------------------------------------------------------------------------
 
@@ -210,16 +205,6 @@ class Intake:
 
         self._post(answer)
         return done.wait(max(0.0, deadline_s)) and bool(succeeded)
-
-
-def offer_to(queue: BatchQueue, sensors: Mapping[str, SensorSettings], accounts: Accounts) -> Offer:
-    """The way of a batch to the encoders: what the queue has no room for is dropped and counted."""
-
-    def offer(batch: Batch) -> None:
-        for lost in queue.put(batch, sensors[batch.sensor].priority):
-            accounts.drop(lost.topic, 'queue_full', len(lost.samples))
-
-    return offer
 
 
 def _each(steps: Sequence[Callable[[], None]]) -> None:

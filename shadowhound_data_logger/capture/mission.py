@@ -10,13 +10,15 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
+from shadowhound_data_logger.capture.encode_pool import BatchQueue
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.mission_tap import MissionTap
+from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.missions.active import THIS_MACHINE, Active, Lookout, ended
 from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import safe_type
@@ -41,11 +43,12 @@ class MissionWatch:
     ``mark`` and ``observe`` are called by the encoders; they see the mission as a whole, as it is replaced.
     """
 
-    def __init__(self, settings: Settings, intake: Intake, queue: BatchQueue, tap: MissionTap,
+    def __init__(self, settings: Settings, intake: Intake, sampler: Sampler, queue: BatchQueue, tap: MissionTap,
                  tell: Callable[[Mapping[str, Any]], None]) -> None:  # fmt: skip
         """``tell`` is given what is active whenever that changes; empty when nothing is."""
         self._settings = settings.mission
         self._intake = intake
+        self._sampler = sampler
         self._queue = queue
         self._tap = tap
         self._tell = tell
@@ -61,7 +64,7 @@ class MissionWatch:
     def open(self) -> None:
         """Before the intake is opened: with ``mission.capture: mission`` it stores nothing before it is told to."""
         if self._settings.capture == 'mission':
-            self._intake.begin_idle()
+            self._sampler.set_idle(idle=True)
         self.worker.start()
 
     def stop(self) -> None:
@@ -153,7 +156,7 @@ class MissionWatch:
 
     def _set_idle(self, *, idle: bool) -> bool:
         if self._settings.capture == 'mission':
-            return self._intake.idle(FLUSH_S, idle=idle)
+            return self._intake.flush(FLUSH_S, partial(self._sampler.set_idle, idle=idle))
         return self._intake.flush(FLUSH_S)
 
     def _find_run(self, mission: Active) -> bool:

@@ -10,36 +10,35 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from rclpy.node import Node
 
-from shadowhound_data_logger.bags.naming import BUCKET, FOLDER, key_of, slice_file
+from shadowhound_data_logger.bags.naming import FOLDER
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
-from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.salvage import Salvage
-from shadowhound_data_logger.capture.bag_tap import BagTap
+from shadowhound_data_logger.capture.bags import BagConsumer
 from shadowhound_data_logger.capture.commands import Commands
 from shadowhound_data_logger.capture.control import ControlSocket
-from shadowhound_data_logger.capture.event_buffer import EventBuffer
+from shadowhound_data_logger.capture.encode_pool import BatchQueue, EncodePool
+from shadowhound_data_logger.capture.events import EventBuffer
 from shadowhound_data_logger.capture.front import Front
-from shadowhound_data_logger.capture.intake import Intake, offer_to
+from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.interface import Interface
 from shadowhound_data_logger.capture.middleware import Middleware
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_tap import MissionTap
 from shadowhound_data_logger.capture.parameters import Parameters, live
 from shadowhound_data_logger.capture.pose_track import RobotTrack
+from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
-from shadowhound_data_logger.capture.stream import Shared
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.clock_watch import ClockWatch
-from shadowhound_data_logger.config import SensorSettings, Settings
-from shadowhound_data_logger.encode.pool import EncodePool
-from shadowhound_data_logger.encode.queue import BatchQueue
+from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import dated
@@ -118,21 +117,27 @@ class Pipeline:
         self.uploader = Uploader(self.spool, self._store, settings.upload, self._settle)
         self.writer = SpoolWriter(self.spool, settings.spool.commit_s, spooled=self.uploader.wake,
                                   settled=self.uploader.settled)  # fmt: skip
-        types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
-        queue = BatchQueue(settings.queue)
+        accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
+        place = Place(settings.home / FOLDER / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
+                      self._record.offsets)  # fmt: skip
+        salvage = Salvage(place, settings.bag.priority)
+        self.event_buffer = EventBuffer(node, settings, place, salvage, types)
+        # Who listens to the robot; what is wanted besides the sensors' topics is shared with those further down.
+        queue, bag_queue = BatchQueue(settings.queue), BagQueue(settings.bag.queue_bytes)
         sensors = {sensor.name: sensor for sensor in settings.sensors}
-        self.pool = EncodePool(queue, sensors, settings.robot, types, self._spool_later, self.spool.accounts.reject,
-                               settings.encode.threads)  # fmt: skip
-        self._track = RobotTrack(settings.mission, types, self._node.resolve_topic_name)
-        shared = Shared(self.spool.accounts, types, offer_to(queue, sensors, self.spool.accounts), self._clock, self._track,
-                        BagTap(self._node, self.spool.accounts, bag_queue := BagQueue(settings.bag.queue_bytes)))  # fmt: skip
-        self._make_intake(sensors, shared, bag_queue)
-        tap = MissionTap(settings.mission, sensors, settings.robot, types, self._node.resolve_topic_name, self._track.marks)
-        self.mission = MissionWatch(settings, self.intake, queue, tap, self._tell_mission)
-        self.pool.observe = self.mission.observe
+        track = RobotTrack(settings.mission, types, self._clock, node.resolve_topic_name)
+        sampler = Sampler(sensors, settings.intake, accounts, types, self._clock, queue)
+        bags = BagConsumer(node, settings.bag, accounts, bag_queue)
+        consumers = (track, sampler, *self.event_buffer.consumers, bags)
+        self.intake = Intake(node, sensors, settings.intake, accounts, types, consumers, first=[track.odometry])
+        self.recorder = Recorder(settings.bag, place, bag_queue, salvage, partial(self.intake.listen, bags))
+        tap = MissionTap(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
+        self.mission = MissionWatch(settings, self.intake, sampler, queue, tap, self._tell_mission)
+        marks = self.mission.mark, track.mark, self._redating.date
+        self.pool = EncodePool(settings, queue, sensors, types, self.writer, marks, self.mission.observe)
         self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
-                                       self.recorder, self.event_buffer, self._control, self._ros.middleware,
+                                       self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,
                                        self._ros.front)  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
         self._commands = Commands(stages, self._parameters, self._status, settings.robot, self._ros.name)
@@ -243,22 +248,6 @@ class Pipeline:
         self.uploader.set_max_mbps(settings.upload.max_mbps)
         self.event_buffer.update(settings.events)
 
-    def _make_intake(self, sensors: dict[str, SensorSettings], shared: Shared, queue: BagQueue) -> None:
-        """The intake with what takes all messages of it, for bags and for events."""
-        settings, spool, writer = self._settings, self.spool, self.writer
-        place = Place(settings.home / FOLDER / settings.robot, settings.robot, self._clock,
-                      lambda bag: spool.has(BUCKET, key_of(settings.robot, bag, slice_file(bag, 0))), settings.clock.hold_s,
-                      lambda: self._record.offsets)  # fmt: skip
-        outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush,
-                        lambda: spool.free_bytes() >= settings.spool.min_free_bytes // 2,
-                        lambda prefix: spool.states(BUCKET, prefix),
-                        lambda folder: salvage.add(folder))  # fmt: skip  # noqa: PLW0108 - made below
-        self.event_buffer = EventBuffer(self._node, settings, place, outlet, shared.types)
-        self.intake = Intake(self._node, sensors, settings.intake, shared, settings.bag, self.event_buffer.tap)
-        salvage = Salvage(place, settings.bag.priority, outlet, spool.knows)
-        self.recorder = Recorder(settings.bag, place, queue, outlet, salvage,
-                                 lambda on, deadline_s: self.intake.record(deadline_s, on=on))  # fmt: skip
-
     def _tell_mission(self, mission: Mapping[str, Any]) -> None:
         if self._interface is not None:
             self._interface.tell_mission(mission)
@@ -281,9 +270,6 @@ class Pipeline:
             self.writer.put(self._redating.date(self._ledger()), wait=False)
         except DataLoggerError as error:
             log.warning('the ledger was not shipped: %s', error)
-
-    def _spool_later(self, item: DataObject) -> None:
-        self.writer.put(self._redating.date(self._track.mark(self.mission.mark(item))))
 
     def _spool_parts(self, made: Callable[[], list[DataObject]]) -> None:
         """The catalogue's next parts; what keeps them back now keeps them until the next time."""

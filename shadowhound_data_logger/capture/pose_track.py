@@ -1,7 +1,7 @@
 """Where the robot was, and how full its battery, at the time of an object: read from what was received in the last minute.
 
-The intake keeps some messages of the two topics as they came; only those around an object's time are ever deserialized, by the
-encoder that asks.
+Some messages of the two topics are kept as they came; only those around an object's time are ever deserialized, by the encoder
+that asks.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.capture.mission_tap import number_at, yaw_of
+from shadowhound_data_logger.capture.stream import Consumer, Drained
 from shadowhound_data_logger.catalogue.schema import BATTERY, POSE
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.clock import SECOND, Clock, stamp_of
 from shadowhound_data_logger.config import MissionSettings
 from shadowhound_data_logger.encode.records import ODOMETRY
-from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import DataObject
 
@@ -55,13 +56,13 @@ class _Pose(NamedTuple):
     frame: str
 
 
-class Track:
+class KeptMessages:
     """Some messages of one topic and type: one each ``every_ns`` and the newest. One thread adds, any asks; ``_lock`` guards."""
 
     def __init__(self, every_ns: int, type_name: str, read: Callable[[str, bytes], Any]) -> None:
         """``read`` makes a value of a message; None where it says nothing."""
         self._every_ns = every_ns
-        self._type = type_name
+        self.type = type_name
         self._read = read
         self._lock = threading.Lock()
         self._stamps: list[int] = []
@@ -97,34 +98,41 @@ class Track:
 
     def _value(self, kept: _Kept) -> Any:
         if kept.value is None:
-            kept.value = self._read(self._type, kept.cdr)
+            kept.value = self._read(self.type, kept.cdr)
         return kept.value
 
 
-class RobotTrack:
-    """New; ``of`` as topics begin, ``mark`` each object on its way to the spool, on any thread."""
+class RobotTrack(Consumer):
+    """New; ``take`` what the intake drained, ``mark`` each object on its way to the spool, on any thread."""
 
-    def __init__(self, settings: MissionSettings, types: MessageTypes, resolve: Callable[[str], str]) -> None:
+    def __init__(self, settings: MissionSettings, types: MessageTypes, clock: Clock, resolve: Callable[[str], str]) -> None:
         """The topics are those of missions; ``resolve`` makes their full names."""
         self._types = types
-        self._odometry = resolve(settings.odometry) if settings.odometry else ''
+        self._clock = clock
+        self.odometry = resolve(settings.odometry) if settings.odometry else ''
         topic, _, field = settings.battery.partition(':')
         self._battery, self._field = resolve(topic) if topic else '', field.split('.')
-        self._poses: Track | None = None
-        self._charges: Track | None = None
+        self._poses: KeptMessages | None = None
+        self._charges: KeptMessages | None = None
 
-    def of(self, topic: str, type_name: str) -> Track | None:
-        """A new track for what a topic publishes from now on; None where nobody needs one."""
-        if topic == self._odometry and type_name == ODOMETRY:
-            self._poses = Track(POSE_EVERY_NS, type_name, self._pose)
+    def take(self, drained: Drained) -> None:
+        kept = self.of(drained.topic, drained.type)
+        if kept is not None:
+            has_header = self._types.has_header(drained.type)
+            for cdr, source_ns, _, _, _ in drained.messages:
+                kept.add(stamp_of(header_stamp_ns(cdr) if has_header else 0, source_ns, self._clock), cdr)
+
+    def of(self, topic: str, type_name: str) -> KeptMessages | None:
+        """Where messages of a topic are kept; None where nobody needs them."""
+        if topic == self.odometry and type_name == ODOMETRY:
+            if self._poses is None:
+                self._poses = KeptMessages(POSE_EVERY_NS, type_name, self._pose)
             return self._poses
         if topic == self._battery:
-            self._charges = Track(BATTERY_EVERY_NS, type_name, self._charge)
+            if self._charges is None or self._charges.type != type_name:
+                self._charges = KeptMessages(BATTERY_EVERY_NS, type_name, self._charge)
             return self._charges
         return None
-
-    def is_odometry(self, topic: str) -> bool:
-        return topic == self._odometry
 
     def mark(self, item: DataObject) -> DataObject:
         """The object with what is known of the middle of its time."""

@@ -17,19 +17,19 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.recorder import Recorder
+from shadowhound_data_logger.capture.bags import BagConsumer
 from shadowhound_data_logger.capture.control import ControlSocket
-from shadowhound_data_logger.capture.event_buffer import EventBuffer
+from shadowhound_data_logger.capture.encode_pool import BatchQueue, EncodePool
+from shadowhound_data_logger.capture.events import EventBuffer
 from shadowhound_data_logger.capture.front import Front
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.middleware import Middleware
 from shadowhound_data_logger.capture.mission import MissionWatch
-from shadowhound_data_logger.capture.source import SourceStatus
+from shadowhound_data_logger.capture.subscriber import SubscriberStatus
 from shadowhound_data_logger.capture.watchdog import Watchdog
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.encode.pool import EncodePool
-from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
 from shadowhound_data_logger.spool.account_rows import Totals
 from shadowhound_data_logger.spool.accounts import BAG, EVENT
@@ -58,6 +58,7 @@ class Stages:
     uploader: Uploader
     mission: MissionWatch
     recorder: Recorder
+    bags: BagConsumer
     event_buffer: EventBuffer
     control: ControlSocket
     middleware: Middleware
@@ -145,7 +146,7 @@ class Status:
         topics = dict.fromkeys((*sources, *totals))
         return {topic: self._topic(topic, sources.get(topic), totals.get(topic, _NOTHING), now_s) for topic in topics}
 
-    def _topic(self, topic: str, source: SourceStatus | None, totals: Totals, now_s: float) -> dict[str, Any]:
+    def _topic(self, topic: str, source: SubscriberStatus | None, totals: Totals, now_s: float) -> dict[str, Any]:
         received_s = source.received_s if source else None
         row = {
             'sensor': source.sensor if source else '', 'enabled': source.enabled if source else False,
@@ -165,12 +166,13 @@ class Status:
     def _bag(self) -> dict[str, Any]:
         """What is recorded, with the messages of this session by topic."""
         topics = {topic: asdict(totals) for topic, totals in self._stages.spool.accounts.totals(BAG).items()}
-        return {**asdict(self._stages.recorder.status()), 'topics': topics, 'left_out': self._stages.intake.left_out[0]}
+        return {**asdict(self._stages.recorder.status()), 'topics': topics,
+                'left_out': self._stages.intake.left_out(self._stages.bags)}  # fmt: skip
 
     def _events(self) -> dict[str, Any]:
         """Ring and events, with the messages that events asked for in this session by topic."""
         topics = {topic: asdict(totals) for topic, totals in self._stages.spool.accounts.totals(EVENT).items()}
-        left_out = self._stages.intake.left_out[1]
+        left_out = sum(self._stages.intake.left_out(each) for each in self._stages.event_buffer.consumers)
         return {**asdict(self._stages.event_buffer.events.status()), 'topics': topics, 'left_out': left_out}
 
     def _store(self, upload: UploadStatus, now_s: float) -> dict[str, Any]:

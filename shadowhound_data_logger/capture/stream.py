@@ -1,23 +1,27 @@
-"""The messages of one topic and type on their way: counted, thinned out, batched. Plain Python, owned by the intake thread."""
+"""The messages of one topic and type on their way from the take to whoever listens. Plain Python, owned by the intake thread.
+
+A stream names who sent each message, leaves out what came twice, and estimates what was lost between messages without numbers.
+What is left goes to the consumers of the topic: ``Consumer`` is all that the intake knows of them.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from typing import Final, NamedTuple, Protocol
+from collections.abc import Sequence
+from math import inf
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 from zlib import crc32
 
-from shadowhound_data_logger.capture.batching import Batcher
-from shadowhound_data_logger.capture.endpoints import Senders
-from shadowhound_data_logger.capture.gate import gate_for
-from shadowhound_data_logger.capture.pose_track import RobotTrack
-from shadowhound_data_logger.clock import SECOND, Clock, stamp_of
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SensorSettings
-from shadowhound_data_logger.encode.types import CounterField, MessageTypes, header_stamp_ns
+from shadowhound_data_logger.encode.types import CounterField, MessageTypes
 from shadowhound_data_logger.errors import Rejected
-from shadowhound_data_logger.model import Batch, Sample, Taken
-from shadowhound_data_logger.spool.accounts import EXACT, PAUSED, Accounts, Losses
-from shadowhound_data_logger.spool.estimator import Expectation, Hearing
+from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.spool.accounts import EXACT, Accounts, Losses
+from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.capture.extra_topics import TopicChoice
 
 log = logging.getLogger(__name__)
 
@@ -27,39 +31,103 @@ DEAD_S: Final = 15.0
 """A publisher that was killed stays in the graph for less: Cyclone DDS gives it up after ten seconds."""
 NEW_S: Final = 2.0
 """The graph may know a publisher so long before its first message is taken, and its predecessor's last one."""
-Offer = Callable[[Batch], None]
 
 
-class Tap(Protocol):
-    """What takes all messages of some topics, whatever is kept of them (``BagTap``)."""
+class Drained(NamedTuple):
+    """What one drain took of a topic."""
 
-    topics: frozenset[str]
+    topic: str
+    type: str
+    sensor: str
+    """The name of the sensor that has the topic; empty where none has."""
+    messages: Sequence[Taken]
+    """The oldest first, each with its sender where that is known; none came before. Where ``sensor`` is empty, numbered messages
+    may be repeats: whoever counts them leaves those out."""
+    lost: Losses
+    """What is estimated to have been lost before these messages, where they have no numbers; None where nobody knows."""
+    now_s: float
+    """When they were drained, by the monotonic clock."""
+    paused: bool
+    """Whether messages are only counted now."""
 
-    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: Losses, *, paused: bool) -> None: ...
 
+class Consumer(Protocol):
+    """Whoever listens to what the robot publishes: derive from it, and name it where the node is put together (``pipeline``).
 
-class NoTap:
-    """Takes nothing."""
+    The intake thread calls all of it, in the order in which messages came, and nothing in it may wait.
+    """
 
+    choice: TopicChoice | None = None
+    """Which topics it wants; None for those that the sensors have."""
     topics: frozenset[str] = frozenset()
+    """With a choice: those that it gets now, by their full names. The intake sets them."""
+    from_start: bool = True
+    """With a choice: whether it listens as soon as the intake is open, or once ``Intake.listen`` says so."""
+    wants_latched: bool = False
+    """With a choice: whether it begins with what latched publishers sent before, with subscriptions of its own for that."""
 
-    def add(self, topic: str, type_name: str, taken: Sequence[Taken], lost: Losses, *, paused: bool) -> None:
-        """Never called: there are no topics."""
+    def take(self, drained: Drained) -> None:
+        """Messages of one topic, and the gap before them."""
+
+    def begin(self) -> None:
+        """It listens from now on; again without an ``end`` where something new begins for it here."""
+        return
+
+    def leave(self, topic: str) -> None:  # noqa: ARG002 - for those who have something to do then
+        """The messages of the topic end here; should more come, they are of another type, or another beginning."""
+        return
+
+    def tick(self, now_s: float) -> None:  # noqa: ARG002
+        """Each round, after the messages: do what is due without one."""
+        return
+
+    def flush(self) -> None:
+        """Hand on what was gathered, as if no further message came."""
+        return
 
 
-class Shared(NamedTuple):
-    """What all streams work with."""
+class Senders:
+    """Who sent a message, where the middleware gives its number but not its sender's gid (Jazzy and older).
 
-    accounts: Accounts
-    types: MessageTypes
-    offer: Offer
-    clock: Clock
-    robot: RobotTrack | None = None
-    """Who keeps what some topics publish, at full rate."""
-    tap: Tap = NoTap()
+    With one publisher in the graph it is that one. Its successor is told from it before the graph shows the change: its
+    numbers begin anew while the time of sending goes on. When the old numbers go on as well, there are two of them.
+    """
+
+    def __init__(self) -> None:
+        self.gids: list[str] = []
+        self.changed_s = -inf
+        """When one came that was not there before, by the monotonic clock; the first ones are not counted."""
+        self.several_s: float | None = None
+        """Since when there are several."""
+        self._successors = 0
+        self._number = 0
+        self._number_before = 0
+        self._sent_ns = 0
+
+    def look(self, gids: list[str], now_s: float = 0.0) -> None:
+        """What the graph says now."""
+        self.several_s = None if len(gids) < 2 else now_s if self.several_s is None else self.several_s
+        if gids and gids != self.gids:
+            if self.gids and not set(gids) <= set(self.gids):
+                self.changed_s = now_s
+            self.gids = gids
+            self._successors = 0
+
+    def name(self, number: int | None, sent_ns: int) -> str | None:
+        """A name for the sender of this message; None where there is more than one, or no number."""
+        if number is None or len(self.gids) != 1:
+            return None
+        if self._successors and self._number < self._number_before < number:
+            return None
+        if number <= self._number and sent_ns > self._sent_ns:
+            self._successors += 1
+            self._number_before = self._number
+        if sent_ns >= self._sent_ns:
+            self._number, self._sent_ns = number, sent_ns
+        return f'{self.gids[0]}.{self._successors}'
 
 
-class Repeats:
+class RecentMessages:
     """What came lately without a sender's gid, to know what a second of our subscriptions delivers again."""
 
     def __init__(self) -> None:
@@ -79,12 +147,7 @@ class Repeats:
         return False
 
 
-def is_named(message: Taken) -> bool:
-    """Whether the middleware says who sent it and as which."""
-    return message.publisher is not None and message.number is not None
-
-
-class Pace:
+class Arrivals:
     """When messages without numbers came, as an estimate of what is lost between them wants to know it."""
 
     def __init__(self) -> None:
@@ -110,44 +173,67 @@ class Pace:
         )  # fmt: skip
 
 
-class AnyStream(Protocol):
-    """What becomes of the messages of one topic and type (``Stream``, ``BagStream``)."""
+class TopicStream:
+    """A topic that no sensor has: its consumers count what they want of it. New for each topic and type."""
 
-    kept_ns: int
-
-    def update(self, sensor: SensorSettings) -> None: ...
-
-    def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool, idle: bool = False) -> None: ...
-
-    def close_due(self, now_s: float, grace_s: float) -> None: ...
-
-    def close_batch(self) -> None: ...
-
-
-class Stream:
-    """New for each topic and type; ``add`` what was taken, ``close_batch`` at the end."""
-
-    def __init__(self, sensor: SensorSettings, topic: str, type_name: str, last_kept_ns: int, shared: Shared) -> None:
-        self._clock = shared.clock
-        self.kept_ns = last_kept_ns
-        """Stamp of the newest message that was kept: no period is stored twice."""
+    def __init__(self, topic: str, type_name: str, consumers: Sequence[Consumer]) -> None:
+        """The first of ``consumers`` gets all of it, the others as far as the topic is one of theirs."""
         self._topic = topic
-        self._accounts = shared.accounts
-        self._offer = shared.offer
-        self._sensor = sensor
-        self._has_header = shared.types.has_header(type_name)
-        self._gate = gate_for(sensor, has_header=self._has_header, last_kept_ns=last_kept_ns)
-        self._batcher = Batcher(sensor, topic, type_name)
-        self._repeats = Repeats()
-        self._tap = shared.tap
         self._type = type_name
-        self._pace = Pace()
+        self._owner, self._others = consumers[0], consumers[1:]
+        self._recent = RecentMessages()
+        self._arrivals = Arrivals()
+        self._estimate = TopicEstimate()
+
+    def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool) -> None:
+        """Hand on messages, in the order in which they came."""
+        fresh: list[Taken] = []
+        sent: dict[str, list[int]] = {}
+        for message in taken:
+            _, source_ns, gid, number, _ = message
+            publisher = gid or senders.name(number, source_ns)
+            if (gid is None or number is None) and self._recent.has(message):
+                continue
+            fresh.append(message if gid else message._replace(publisher=publisher))
+            if publisher is None or number is None:
+                sent.setdefault(gid or '', []).append(source_ns)
+        lost = self._estimate.observe(sent, self._arrivals.hear(senders, now_s)).lost if sent else None
+        if fresh:
+            drained = Drained(self._topic, self._type, '', fresh, lost, now_s, paused)
+            self._owner.take(drained)
+            for consumer in self._others:
+                if self._topic in consumer.topics:
+                    consumer.take(drained)
+
+    def look(self, now_s: float) -> None:
+        """All that waited was taken."""
+        self._arrivals.look(now_s)
+
+    def close(self) -> None:
+        """No more of it comes."""
+        self._owner.leave(self._topic)
+        for consumer in self._others:
+            if self._topic in consumer.topics:
+                consumer.leave(self._topic)
+
+
+class SensorStream:
+    """A topic of a sensor: each message is counted once, in the topic's account. New for each topic and type."""
+
+    def __init__(self, sensor: SensorSettings, topic: str, type_name: str, accounts: Accounts, types: MessageTypes,
+                 consumers: Sequence[Consumer]) -> None:  # fmt: skip
+        self._sensor = sensor.name
+        self._topic = topic
+        self._type = type_name
+        self._accounts = accounts
+        self._consumers = consumers
+        self._recent = RecentMessages()
+        self._arrivals = Arrivals()
         self._counter: CounterField | None = None
         self._is_refuted = False
-        self._track = shared.robot.of(topic, type_name) if shared.robot is not None else None
-        with shared.accounts.entry(topic) as account:
+        with accounts.entry(topic) as account:
             account.type = type_name
-            account.expect(self._expected(sensor, shared.types))
+            account.expect(self._expected(sensor, types))
 
     def _expected(self, sensor: SensorSettings, types: MessageTypes) -> Expectation:
         """What is declared of the sensor's messages: a counter in them, else how often they come."""
@@ -159,78 +245,40 @@ class Stream:
                 log.warning('%s.counter is not used, stamps are instead: %s', sensor.name, error)
         return Expectation(period=SECOND / sensor.expected_hz if sensor.expected_hz else 0.0)
 
-    def update(self, sensor: SensorSettings) -> None:
-        """Go on by other settings; the open batch stays."""
-        if sensor.rate_hz != self._sensor.rate_hz and not sensor.on_change:
-            self._gate = gate_for(sensor, has_header=self._has_header, last_kept_ns=self.kept_ns)
-        self._sensor = sensor
-
-    def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool, idle: bool = False) -> None:
-        """Take messages in the order in which they came.
-
-        While ``paused`` they are counted as dropped, while ``idle`` (nobody asked for them) as skipped.
-        """
-        heard: list[Taken] | None = [] if self._topic in self._tap.topics else None
-        kept, lost = self._keep(taken, senders, now_s, heard, paused=paused, idle=idle)
-        for sample in kept:
-            for batch in self._batcher.add(sample, now_s):
-                self._offer(batch)
-        if heard:
-            self._tap.add(self._topic, self._type, heard, lost, paused=paused)
-
-    def close_due(self, now_s: float, grace_s: float) -> None:
-        """End the batch whose time is over, though no message of the next one came."""
-        self._pace.look(now_s)
-        if self._batcher.is_due(now_s, grace_s):
-            self._offer(self._batcher.close())
-
-    def close_batch(self) -> None:
-        """End the open batch, if there is one."""
-        if len(self._batcher):
-            self._offer(self._batcher.close())
-
-    def _keep(self, taken: Sequence[Taken], senders: Senders, now_s: float, heard: list[Taken] | None, *, paused: bool,
-              idle: bool) -> tuple[list[Sample], Losses]:  # fmt: skip
-        """Count the messages, drop repeats and choose those to store; ``heard`` gets all that are no repeats.
-
-        Returns what to store, and what is estimated to have been lost before messages without numbers.
-        """
-        kept: list[Sample] = []
+    def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool) -> None:
+        """Count messages, in the order in which they came, and hand on those that are no repeats."""
+        fresh: list[Taken] = []
         sent: dict[str, list[int]] = {}
-        keep, track, counter = self._gate.keep, self._track, self._counter
+        counter = self._counter
         with self._accounts.entry(self._topic) as account:
             for message in taken:
                 cdr, source_ns, gid, number, _ = message
                 publisher = gid or senders.name(number, source_ns)
-                if not (is_named(message) and account.accounting == EXACT) and self._repeats.has(message):
+                if (gid is None or number is None or account.accounting != EXACT) and self._recent.has(message):
                     continue
                 if not account.receive(publisher, number):
                     continue
+                fresh.append(message if gid else message._replace(publisher=publisher))
                 if publisher is None or number is None:
                     sent.setdefault(gid or '', []).append(source_ns if counter is None else counter.read(cdr))
-                if heard is not None:
-                    heard.append(message if gid else message._replace(publisher=publisher))
-                if track is not None:
-                    track.add(self._time(cdr, source_ns), cdr)
-                if paused:
-                    account.dropped[PAUSED] += 1
-                    continue
-                if idle:
-                    account.skipped += 1
-                    continue
-                stamp_ns = self._time(cdr, source_ns)
-                if keep(stamp_ns, cdr):
-                    self.kept_ns = stamp_ns
-                    kept.append(Sample(stamp_ns, cdr))
-                else:
-                    account.skipped += 1
-            lost = account.observe(sent, self._pace.hear(senders, now_s)) if sent else None
+            lost = account.observe(sent, self._arrivals.hear(senders, now_s)) if sent else None
             is_refuted = bool(sent) and account.estimate.refuted
         if is_refuted and not self._is_refuted:
             self._is_refuted = True
             text = '%s: messages come more often than %s says: how often they are published is learned instead'
-            log.warning(text, self._topic, 'counter_step' if self._counter else 'expected_hz')
-        return kept, lost
+            log.warning(text, self._topic, 'counter_step' if counter else 'expected_hz')
+        if fresh:
+            drained = Drained(self._topic, self._type, self._sensor, fresh, lost, now_s, paused)
+            for consumer in self._consumers:
+                if consumer.choice is None or self._topic in consumer.topics:
+                    consumer.take(drained)
 
-    def _time(self, cdr: bytes, source_ns: int) -> int:
-        return stamp_of(header_stamp_ns(cdr) if self._has_header else 0, source_ns, self._clock)
+    def look(self, now_s: float) -> None:
+        """All that waited was taken."""
+        self._arrivals.look(now_s)
+
+    def close(self) -> None:
+        """No more of it comes."""
+        for consumer in self._consumers:
+            if consumer.choice is None or self._topic in consumer.topics:
+                consumer.leave(self._topic)

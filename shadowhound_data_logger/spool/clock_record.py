@@ -49,7 +49,6 @@ class ClockRecord:
     def steps(self) -> int:
         return int(self._said['steps'])
 
-    @property
     def offsets(self) -> Mapping[str, int]:
         """UTC less boot clock by boot id, of the boots whose clock was set; the others are missing."""
         return dict(self._offsets)

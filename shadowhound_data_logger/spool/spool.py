@@ -159,6 +159,10 @@ class Spool:
         """What this user may still write to the spool's file system. Raises OSError."""
         return self._tree.free_bytes()
 
+    def has_room(self) -> bool:
+        """Whether a bag may go on: it leaves so much free that what it has written still gets into the spool."""
+        return self.free_bytes() >= self._settings.min_free_bytes // 2
+
     def carry(self, sink: str) -> None:
         """Take over what this robot's ended sessions left open in a sink. Once, before anything is counted there."""
         with self._lock:

@@ -33,7 +33,7 @@ class SpoolWriter:
 
     def __init__(self, spool: Spool, commit_s: float, *, spooled: Callable[[Sequence[SpooledObject]], None] = lambda _: None,
                  settled: Callable[[Collection[int]], None] = lambda _: None) -> None:  # fmt: skip
-        self._spool = spool
+        self.spool = spool
         self._commit_s = commit_s
         self._spooled = spooled
         self._settled = settled
@@ -105,9 +105,9 @@ class SpoolWriter:
             objects, outcomes = list(self._objects), list(self._outcomes)
         self._last_commit = time.monotonic()
         try:
-            self._spool.commit(objects, outcomes, durable=lambda spooled: self._committed(objects, outcomes, spooled))
+            self.spool.commit(objects, outcomes, durable=lambda spooled: self._committed(objects, outcomes, spooled))
         except (OSError, sqlite3.OperationalError) as error:
-            raise self._spool.unwritable(error) from error
+            raise self.spool.unwritable(error) from error
         except sqlite3.DatabaseError:
             self.damaged = True
             raise

@@ -5,25 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bags.recording import ROBOT, STRING, WAIT_S, manifest, messages, numbers
+from bags.recording import ROBOT, STRING, WAIT_S, BoundedSpool, manifest, messages, numbers
 from clocks import Clocks
 
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
-from shadowhound_data_logger.bags.naming import BUCKET, key_of, slice_file
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import Lot
-from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.ring import Ring
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.options import BagSettings, EventSettings
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import EVENT, Losses
-from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 POLL_S = 0.2
@@ -40,13 +37,16 @@ def until(condition: Callable[[], Any], what: str) -> None:
 class Buffer:
     """Events with all behind them. ``hear`` is what the intake does at the present second."""
 
-    spool: Spool
+    spool: BoundedSpool
     writer: SpoolWriter
     ring: Ring
     events: Events
     home: Path
     now_s: list[float]
-    room: list[bool] = field(default_factory=lambda: [True])
+
+    @property
+    def room(self) -> list[bool]:
+        return self.spool.room
 
     @property
     def root(self) -> Path:
@@ -93,19 +93,16 @@ def buffer(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator
         clocks.set()
     options = EventSettings(**{'topics': ('/talk',), 'pre_s': 5.0, 'post_s': 2.0, 'max_s': 10.0, **settings})
     bag = BagSettings(compression='none')
-    spool = Spool(home / 'spool', SpoolSettings(min_free_bytes=0), clocks, ROBOT)
+    spool = BoundedSpool(home / 'spool', SpoolSettings(min_free_bytes=0), clocks, ROBOT)
     spool.open()
     spool.carry(EVENT)
     writer = SpoolWriter(spool, 0.01)
     writer.open()
     now_s, made = [1000.0], list[Buffer]()
-    outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush, lambda: made[0].room[0],
-                    lambda prefix: spool.states(BUCKET, prefix), lambda folder: salvage.add(folder))  # fmt: skip  # noqa: PLW0108 - made below
-    place = Place(home / 'bags' / ROBOT, ROBOT, clocks, lambda name: spool.has(BUCKET, key_of(ROBOT, name, slice_file(name, 0))),
-                  600.0)  # fmt: skip
+    place = Place(home / 'bags' / ROBOT, ROBOT, clocks, writer, 600.0)
     ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
-    events = Events(options, bag, place, ring, outlet, POLL_S, lambda: now_s[0])
-    salvage = Salvage(place, 8, outlet, spool.knows)
+    salvage = Salvage(place, 8)
+    events = Events(options, bag, place, ring, salvage, POLL_S, lambda: now_s[0])
     made.append(Buffer(spool, writer, ring, events, home, now_s))
     try:
         salvage.open()

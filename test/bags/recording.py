@@ -13,11 +13,9 @@ from typing import Any
 from clocks import Clocks
 from mcap.reader import make_reader
 
-from shadowhound_data_logger.bags.naming import BUCKET, key_of, slice_file
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
 from shadowhound_data_logger.bags.recorder import Recorder
-from shadowhound_data_logger.bags.recording import Outlet
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import Taken
@@ -46,17 +44,31 @@ def lot(numbers: range, topic: str = '/talk', size: int = 0, type_name: str = ST
     return Lot(topic, type_name, '', messages(numbers, size))
 
 
+class BoundedSpool(Spool):
+    """A spool whose disk has room for bags while the test says so."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.room = [True]
+
+    def has_room(self) -> bool:
+        return self.room[0]
+
+
 @dataclass(slots=True)
 class Desk:
     """A recorder with all behind it. What ``hear`` is given counts as received, as the intake would have it."""
 
-    spool: Spool
+    spool: BoundedSpool
     writer: SpoolWriter
     queue: BagQueue
     recorder: Recorder
     home: Path
     listening: list[bool] = field(default_factory=list)
-    room: list[bool] = field(default_factory=lambda: [True])
+
+    @property
+    def room(self) -> list[bool]:
+        return self.spool.room
 
     @property
     def root(self) -> Path:
@@ -95,7 +107,7 @@ def desk(home: Path, clock: Clocks | None = None, *, offsets: Mapping[str, int] 
     time = clock or Clocks()
     if clock is None:
         time.set()
-    spool = Spool(home / 'spool', SpoolSettings(min_free_bytes=0, **settings.pop('spool', {})), time, ROBOT)
+    spool = BoundedSpool(home / 'spool', SpoolSettings(min_free_bytes=0, **settings.pop('spool', {})), time, ROBOT)
     bag = BagSettings(**{'compression': 'none', **settings})
     spool.open()
     spool.carry(BAG)
@@ -103,19 +115,13 @@ def desk(home: Path, clock: Clocks | None = None, *, offsets: Mapping[str, int] 
     writer.open()
     root, queue = home / 'bags' / ROBOT, BagQueue(bag.queue_bytes)
     made: list[Desk] = []
-    outlet = Outlet(spool.accounts, lambda item: writer.put(item, wait=False), writer.flush, lambda: made[0].room[0],
-                    lambda prefix: spool.states(BUCKET, prefix), lambda folder: salvage.add(folder))  # fmt: skip  # noqa: PLW0108 - made below
 
     def listen(on: bool, deadline_s: float) -> bool:
         made[0].listening.append(on)
         return True
 
-    def is_known(name: str) -> bool:
-        return spool.has(BUCKET, key_of(ROBOT, name, slice_file(name, 0)))
-
-    place = Place(root, ROBOT, time, is_known, HOLD_S, lambda: offsets or {})
-    salvage = Salvage(place, bag.priority, outlet, spool.knows)
-    recorder = Recorder(bag, place, queue, outlet, salvage, listen)
+    place = Place(root, ROBOT, time, writer, HOLD_S, lambda: offsets or {})
+    recorder = Recorder(bag, place, queue, Salvage(place, bag.priority), listen)
     made.append(Desk(spool, writer, queue, recorder, home))
     try:
         recorder.open()

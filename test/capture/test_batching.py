@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from shadowhound_data_logger.capture.batching import (
+from shadowhound_data_logger.capture.sampling import (
     MAX_ARCHIVE_BYTES,
     MAX_BATCH_BYTES,
     MAX_BATCH_MESSAGES,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, depth, logged_type, plans
+from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, depth, logged_type, plans
+from shadowhound_data_logger.capture.stream import Senders
 from shadowhound_data_logger.config import IntakeSettings
 
 TYPE, OTHER = 'std_msgs/msg/String', 'std_msgs/msg/Int32'

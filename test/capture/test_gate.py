@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from shadowhound_data_logger.capture.gate import EveryMessage, FirstOfPeriod, OnChange, gate_for
+from shadowhound_data_logger.capture.sampling import EveryMessage, FirstOfPeriod, OnChange, rule_for
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SensorSettings
 
@@ -62,7 +62,7 @@ def test_the_settings_choose_the_gate() -> None:
     """0 Hz keeps every message, on_change goes before the rate."""
 
     def gate(**settings: object) -> object:
-        return gate_for(SensorSettings(name='x', **settings), has_header=True, last_kept_ns=0)  # type: ignore[arg-type]
+        return rule_for(SensorSettings(name='x', **settings), has_header=True, last_kept_ns=0)  # type: ignore[arg-type]
 
     assert isinstance(gate(rate_hz=0.0), EveryMessage)
     assert isinstance(gate(rate_hz=2.0), FirstOfPeriod)
@@ -72,7 +72,7 @@ def test_the_settings_choose_the_gate() -> None:
 
 def test_the_rate_is_the_period() -> None:
     """At 4 Hz four messages a second are kept."""
-    gate = gate_for(SensorSettings(name='x', rate_hz=4.0), has_header=True, last_kept_ns=0)
+    gate = rule_for(SensorSettings(name='x', rate_hz=4.0), has_header=True, last_kept_ns=0)
     assert sum(gate.keep(NOON_NS + number * SECOND // 100, b'') for number in range(300)) == 12
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,10 @@ from missions.server import until
 from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.capture.encode_pool import BatchQueue
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_tap import MissionTap
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.folder import Run, missions
@@ -34,21 +34,20 @@ JPEG = simplejpeg.encode_jpeg(np.zeros((8, 8, 3), np.uint8))
 
 
 class Intake:
-    """Does at once what it is told."""
+    """Does at once what it is told; stands for the sampler as well."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
 
-    def flush(self, _: float) -> bool:
+    def flush(self, _: float, then: Callable[[], None] | None = None) -> bool:
         self.asked.append('flush')
+        if then is not None:
+            then()
         return True
 
-    def idle(self, _: float, *, idle: bool) -> bool:
+    def set_idle(self, *, idle: bool) -> None:
+        """The sampler's."""
         self.asked.append('idle' if idle else 'busy')
-        return True
-
-    def begin_idle(self) -> None:
-        self.asked.append('begin idle')
 
 
 def given(parameters: Mapping[str, object], home: Path) -> Settings:
@@ -64,7 +63,9 @@ class Setting:
         self.intake: Any = Intake()
         self.told: list[dict[str, Any]] = []
         queue = BatchQueue(settings.queue)
-        self.watch = MissionWatch(settings, self.intake, queue, new_tap(**parameters), lambda said: self.told.append(dict(said)))
+        self.watch = MissionWatch(
+            settings, self.intake, self.intake, queue, new_tap(**parameters), lambda said: self.told.append(dict(said))
+        )
         self.watch.open()
 
     def stop(self) -> None:
@@ -154,7 +155,9 @@ def test_a_mark_is_plain_text(tmp_path: Path, opened: ExitStack) -> None:
     assert all(value.isascii() and value.isprintable() for value in marks.values())
 
 
-@pytest.mark.parametrize(('capture', 'asked'), [('always', ['flush', 'flush']), ('mission', ['begin idle', 'busy', 'idle'])])
+@pytest.mark.parametrize(
+    ('capture', 'asked'), [('always', ['flush', 'flush']), ('mission', ['idle', 'flush', 'busy', 'flush', 'idle'])]
+)
 def test_batches_end_where_missions_begin_and_end(tmp_path: Path, opened: ExitStack, capture: str, asked: list[str]) -> None:
     """No object is of a mission and of another time; with ``capture: mission`` nothing is stored outside of one."""
     setting, logger = watching(opened, tmp_path, capture=capture)

@@ -14,21 +14,21 @@ import pytest
 pytest.importorskip('rclpy')
 
 import rclpy
+from capture.test_stream import Batches
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import Float64, Int32, String
 
-from shadowhound_data_logger.capture import source as module
+from shadowhound_data_logger.capture import subscriber as module
 from shadowhound_data_logger.capture.endpoints import Endpoint
 from shadowhound_data_logger.capture.reader import FAST_DDS, PolledGroup
-from shadowhound_data_logger.capture.source import OtherTypes, Source
-from shadowhound_data_logger.capture.stream import Shared
+from shadowhound_data_logger.capture.sampling import Sampler
+from shadowhound_data_logger.capture.subscriber import OtherTypes, Subscriber, Surroundings
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.model import Batch
 from shadowhound_data_logger.spool.account_rows import Totals
 from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts
 
@@ -76,22 +76,26 @@ class Publishing:
 
 
 class Listening(Publishing):
-    """A source as the intake has it, polled by the test."""
+    """A sensor's subscriber as the intake has it, polled by the test."""
 
     def __init__(self, domain: int) -> None:
         super().__init__('logger', domain)
         self.accounts = Accounts()
-        self.batches: list[Batch] = []
+        self.batches = Batches()
+        self.sampler: Sampler
         self.others = OtherTypes(self.node, self.accounts)
-        self.source: Source
+        self.source: Subscriber
 
     def listen(self, topic: str, type_name: str = '', *, fallback: tuple[str, str] = ('', '')) -> None:
         topics = (topic, fallback[0]) if fallback[0] else (topic,)
         types = (type_name, fallback[1]) if fallback[0] else (type_name,) if type_name else ()
         sensor = SensorSettings(name='sensor', topics=topics, types=types, rate_hz=0.0, batch_s=3600.0)
         types_here = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
-        shared = Shared(self.accounts, types_here, self.batches.append, SystemClock.of_this_machine())
-        self.source = Source(self.node, sensor, SMALL, PolledGroup(), shared, others=self.others)
+        around = Surroundings(self.node, SMALL, PolledGroup(), self.accounts, types_here)
+        self.sampler = Sampler(
+            {sensor.name: sensor}, SMALL, self.accounts, types_here, SystemClock.of_this_machine(), self.batches
+        )
+        self.source = Subscriber(around, sensor, [self.sampler], self.others)
 
     def turn(self) -> None:
         """One round of the intake."""
@@ -122,7 +126,8 @@ class Listening(Publishing):
 
     def numbers(self) -> list[int]:
         """What the sensor logged so far, all of it of one type."""
-        self.source.flush(time.monotonic())
+        self.source.drain(time.monotonic())
+        self.sampler.flush()
         assert {batch.type for batch in self.batches} <= {INT}
         return [deserialize_message(sample.cdr, Int32).data for batch in self.batches for sample in batch.samples]
 

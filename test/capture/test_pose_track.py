@@ -12,11 +12,12 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.capture.pose_track import RobotTrack
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.capture.stream import Drained
+from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import MissionSettings
 from shadowhound_data_logger.encode.records import ODOMETRY
 from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.model import DataObject, Taken
 from shadowhound_data_logger.sim.floor_plan import FloorPlan
 from shadowhound_data_logger.sim.patrol import Patrol
 
@@ -43,17 +44,20 @@ def charge(percent: float) -> bytes:
 
 
 def robot(settings: MissionSettings = SETTINGS) -> RobotTrack:
-    return RobotTrack(settings, TYPES, lambda topic: f'/{topic}')
+    return RobotTrack(settings, TYPES, SystemClock.of_this_machine(), lambda topic: f'/{topic}')
 
 
 def walking(poses: Sequence[tuple[float, bytes]]) -> RobotTrack:
     """A robot whose odometry came at these seconds."""
     found = robot()
-    track = found.of('/odom', ODOMETRY)
-    assert track is not None
-    for t, cdr in poses:
-        track.add(ns(t), cdr)
+    take(found, '/odom', ODOMETRY, *poses)
     return found
+
+
+def take(found: RobotTrack, topic: str, type_name: str, *sent: tuple[float, bytes]) -> None:
+    """Messages as the intake hands them over."""
+    messages = [Taken(cdr, ns(t), 'p', None) for t, cdr in sent]
+    found.take(Drained(topic, type_name, topic[1:], messages, None, 0.0, paused=False))
 
 
 def ns(t: float) -> int:
@@ -179,7 +183,7 @@ def test_only_what_is_asked_for_is_kept() -> None:
     nothing = robot(MissionSettings(battery='', odometry=''))
     assert nothing.of('/', ODOMETRY) is None
     assert marked(nothing, 0.0) == {}
-    assert not nothing.is_odometry('/odom')
+    assert not nothing.odometry
     assert found.is_odometry('/odom')
 
 

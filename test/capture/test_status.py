@@ -16,12 +16,12 @@ pytest.importorskip('rclpy')
 
 from shadowhound_data_logger.bags.events import EventStatus
 from shadowhound_data_logger.bags.recorder import BagStatus
+from shadowhound_data_logger.capture.encode_pool import BatchQueue
 from shadowhound_data_logger.capture.middleware import FAST_DDS, Middleware
-from shadowhound_data_logger.capture.source import SourceStatus
 from shadowhound_data_logger.capture.status import Stages, Status
+from shadowhound_data_logger.capture.subscriber import SubscriberStatus
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import QueueSettings, Settings
-from shadowhound_data_logger.encode.queue import BatchQueue
 from shadowhound_data_logger.model import Batch, Sample
 from shadowhound_data_logger.ship.uploader import UploadStatus
 from shadowhound_data_logger.spool.spool import Spool
@@ -34,11 +34,13 @@ class Intake:
 
     def __init__(self) -> None:
         self.paused = False
-        self.left_out = 0, 0
         self.worker = Worker('intake', lambda: None)
-        self.sources = [SourceStatus('imu', '/imu', enabled=True, publishers=1, received_s=None)]
+        self.sources = [SubscriberStatus('imu', '/imu', enabled=True, publishers=1, received_s=None)]
 
-    def status(self) -> list[SourceStatus]:
+    def left_out(self, _: object) -> int:
+        return 0
+
+    def status(self) -> list[SubscriberStatus]:
         return self.sources
 
 
@@ -66,6 +68,8 @@ class Recorders(Threads):
 
 class EventBuffers(Threads):
     """Keeps nothing."""
+
+    consumers = ()
 
     @property
     def events(self) -> EventBuffers:
@@ -102,11 +106,12 @@ class Setting:
         mission: Any = Missions('mission')
         self.queue = BatchQueue(QueueSettings())
         recorder: Any = Recorders('bag-writer')
+        bags: Any = None
         event_buffer: Any = EventBuffers('event-writer')
         control: Any = Threads('control')
         middleware = Middleware('auto', FAST_DDS, FAST_DDS, "the robot's own")
-        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder, event_buffer, control,
-                        middleware)  # fmt: skip
+        stages = Stages(self.spool, intake, self.queue, encoders, writer, uploader, mission, recorder, bags, event_buffer,
+                        control, middleware)  # fmt: skip
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
         self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 

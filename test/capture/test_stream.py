@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import count
+from typing import Any
 
 import pytest
 
-from shadowhound_data_logger.capture.endpoints import Senders
-from shadowhound_data_logger.capture.stream import Shared, Stream, Taken
+from shadowhound_data_logger.capture.sampling import Sampler
+from shadowhound_data_logger.capture.stream import Senders, SensorStream
 from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.model import Batch
+from shadowhound_data_logger.model import Batch, Taken
 from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, RECEIVED_ONLY, Accounts, TopicAccount
 
 TOPIC, TYPE = '/talk', 'std_msgs/msg/String'
@@ -20,17 +21,29 @@ NOON_NS = 1_760_788_800 * SECOND
 UNNUMBERED: dict[str, None] = {'publisher': None, 'number': None}
 
 
+class Batches(list[Batch]):
+    """The queue to the encoders, without end."""
+
+    def put(self, batch: Batch, _: int) -> list[Batch]:
+        self.append(batch)
+        return []
+
+
 class Talk:
-    """A stream of Strings that are sent every 100 ms."""
+    """A stream of Strings that are sent every 100 ms, and the sampler that listens to it."""
 
     def __init__(self, last_kept_ns: int = 0, **settings: float | str) -> None:
         self.sensor = SensorSettings(name='talk', **{'rate_hz': 0.0, 'batch_s': 3600.0, **settings})  # type: ignore[arg-type]
         self.accounts = Accounts()
-        self.batches: list[Batch] = []
+        self.batches = Batches()
         self.senders = Senders()
         self.numbers = count(1)
-        shared = Shared(self.accounts, MessageTypes(), self.batches.append, SystemClock.of_this_machine())
-        self.stream = Stream(self.sensor, TOPIC, TYPE, last_kept_ns, shared)
+        if last_kept_ns:
+            self.accounts.store({TOPIC: (0, last_kept_ns)})
+        self.sensors, types, clock = {'talk': self.sensor}, MessageTypes(), SystemClock.of_this_machine()
+        queue: Any = self.batches
+        self.sampler = Sampler(self.sensors, IntakeSettings(), self.accounts, types, clock, queue)
+        self.stream = SensorStream(self.sensor, TOPIC, TYPE, self.accounts, types, [self.sampler])
 
     def messages(self, how_many: int, **fields: object) -> list[Taken]:
         """The next ones, of a publisher that is known unless ``fields`` say otherwise."""
@@ -39,15 +52,16 @@ class Talk:
         return [one._replace(**fields) for one in made]  # type: ignore[arg-type]
 
     def add(self, taken: list[Taken], now_s: float = 0.0, *, paused: bool = False, idle: bool = False) -> None:
-        self.stream.add(taken, self.senders, now_s, paused=paused, idle=idle)
+        self.sampler.set_idle(idle=idle)
+        self.stream.add(taken, self.senders, now_s, paused=paused)
 
     def update(self, **settings: float) -> None:
         self.sensor = replace(self.sensor, **settings)  # type: ignore[arg-type]
-        self.stream.update(self.sensor)
+        self.sensors[self.sensor.name] = self.sensor
 
     def kept(self) -> list[int]:
         """The numbers of what was kept, the open batch among it."""
-        self.stream.close_batch()
+        self.sampler.flush()
         return [int(sample.cdr) for batch in self.batches for sample in batch.samples]
 
     @property
@@ -109,7 +123,9 @@ def test_what_was_kept_before_the_stream_began_is_not_kept_again() -> None:
     talk = Talk(rate_hz=1.0, last_kept_ns=NOON_NS + 1)
     talk.add(talk.messages(12))
     assert talk.kept() == [10]
-    assert talk.stream.kept_ns == NOON_NS + SECOND
+    talk.sampler.leave(TOPIC)
+    talk.add(talk.messages(8))
+    assert talk.kept() == [10, 20]
 
 
 def test_other_settings_do_not_repeat_what_has_not_changed() -> None:
@@ -129,7 +145,7 @@ def spoken(talk: Talk, how_many: int, **fields: object) -> None:
     for _ in range(how_many):
         taken = talk.messages(1, **fields)
         talk.add(taken, taken[0].source_ns / SECOND)
-        talk.stream.close_due(taken[0].source_ns / SECOND, 0.0)
+        talk.stream.look(taken[0].source_ns / SECOND)
 
 
 def test_without_numbers_and_rhythm_nothing_is_claimed() -> None:

@@ -1,4 +1,4 @@
-"""Which topics a bag holds, what it is called, and what its notes remember."""
+"""What a bag is called, and what its notes remember."""
 
 from __future__ import annotations
 
@@ -9,27 +9,11 @@ import pytest
 from shadowhound_data_logger.bags.manifest import Missing, MissionOf
 from shadowhound_data_logger.bags.naming import bag_name, key_of, slice_file, slice_number, unsynced_name
 from shadowhound_data_logger.bags.notes import FILE, Notes
-from shadowhound_data_logger.bags.topics import Choice
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_key, check_name
 from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
-from shadowhound_data_logger.options import BagSettings
 
 NOON_NS = 1_760_788_800 * 10**9
 BOOT = '3e2c1f6a-8a4e-4d0e-9d0a-0f6a5b7c9d11'
-GRAPH = ('/imu', '/odom', '/camera/image_raw', '/_hidden', '/a/_hidden/b', '/rosout')
-SENSORS = ('/imu', '/camera/compressed')
-
-
-@pytest.mark.parametrize(('named', 'regex', 'exclude', 'wanted'), [
-    ((), '', '', SENSORS), (('/x',), '', '', ('/x',)), ((), '.*', '', ('/imu', '/odom', '/camera/image_raw', '/rosout')),
-    ((), '.*', 'raw|rosout', ('/imu', '/odom')), (('/x', '/rosout'), 'im', 'raw|rosout', ('/x', '/rosout', '/imu')),
-    ((), '^/imu$', '', ('/imu',)), ((), 'nothing', '', ()),
-])  # fmt: skip
-def test_which_topics(named: tuple[str, ...], regex: str, exclude: str, wanted: tuple[str, ...]) -> None:
-    """Those that are named, those of which a part matches and that are not excluded or hidden; else what the sensors take."""
-    choice = Choice(BagSettings(regex=regex, exclude=exclude), named)
-    assert choice.asks_graph is bool(regex)
-    assert choice.wanted(SENSORS, GRAPH) == set(wanted)
 
 
 def test_names() -> None:
@@ -84,11 +68,3 @@ def test_a_folder_without_notes_is_a_bag_of_which_nothing_is_known(tmp_path: Pat
     """Its slices tell the rest."""
     (tmp_path / 'b').mkdir()
     assert Notes.read(tmp_path / 'b', 'thor') == Notes(tmp_path / 'b', 'b', 'thor', None)
-
-
-@pytest.mark.parametrize(
-    'name', ['/%s%n', '/1digit', '//double', '/{curly}~', '/a b', '/a\x1b]0;owned\x07', '/ä', 'relative', '/a' * 150]
-)
-def test_names_that_are_none_of_ros(name: str) -> None:
-    """A program without ROS may have any; an expression that matches it takes the other topics."""
-    assert Choice(BagSettings(regex='.*'), ()).wanted((), [name, '/good']) == {'/good'}

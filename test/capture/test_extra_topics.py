@@ -17,18 +17,18 @@ import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from shadowhound_data_logger.bags.topics import Choice
-from shadowhound_data_logger.capture import bag_sources as module
-from shadowhound_data_logger.capture.bag_sources import BagSources
+from shadowhound_data_logger.capture import extra_topics as module
+from shadowhound_data_logger.capture.extra_topics import ExtraTopics, TopicChoice
 from shadowhound_data_logger.capture.reader import PolledGroup
-from shadowhound_data_logger.capture.stream import Shared
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.capture.subscriber import Surroundings
 from shadowhound_data_logger.config import BagSettings, IntakeSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.accounts import Accounts
 
 pytestmark = pytest.mark.ros
 WAIT_S: Final = 30.0
+GRAPH: Final = ('/imu', '/odom', '/camera/image_raw', '/_hidden', '/a/_hidden/b', '/rosout')
+SENSORS: Final = ('/imu', '/camera/compressed')
 
 
 @contextmanager
@@ -53,18 +53,17 @@ class Recording:
     """What a bag of ``/crowd/...`` and the named topic ``/named`` listens to."""
 
     def __init__(self, node: Node) -> None:
-        self.tap: Any = SimpleNamespace(topics=frozenset(), add=lambda *_, **__: None)
-        accounts, offer = Accounts(), list[Any]().append
-        shared = Shared(accounts, MessageTypes(), offer, SystemClock.of_this_machine(), tap=self.tap)
+        choice = TopicChoice(BagSettings(regex='^/crowd/'), ['/named'])
+        self.bags: Any = SimpleNamespace(topics=frozenset(), choice=choice, wants_latched=True, take=lambda _: None,
+                                         leave=lambda _: None)  # fmt: skip
         self.group = PolledGroup()
-        choice = Choice(BagSettings(regex='^/crowd/'), ['/named'])
-        self.sources = BagSources(node, choice, self.tap, IntakeSettings(), self.group, shared, {})
+        self.extra = ExtraTopics(Surroundings(node, IntakeSettings(), self.group, Accounts(), MessageTypes()), [self.bags], {})
         self.now_s = time.monotonic()
 
     def look(self, seconds: float = 0.0) -> set[str]:
         self.now_s += seconds
-        self.sources.refresh({}, (), self.now_s, paused=False)
-        return {source.topic for source in self.sources.own if source.status().matched}
+        self.extra.refresh({}, (), self.now_s, paused=False)
+        return {source.topic for source in self.extra.own if source.status().matched}
 
     def until(self, condition: Callable[[set[str]], object]) -> set[str]:
         end = time.monotonic() + WAIT_S
@@ -79,7 +78,7 @@ def recording(domain: int) -> Iterator[Recording]:
     with a_node('logger', domain) as node:
         made = Recording(node)
         yield made
-        made.sources.end(made.now_s)
+        made.extra.end(made.now_s)
 
 
 def crowd(robot: Node, *names: str) -> list[Any]:
@@ -93,13 +92,13 @@ def test_topics_that_no_setting_names_are_few(
     monkeypatch.setattr(module, 'MAX_FOUND', 3)
     crowd(robot, *(f'/crowd/{letter}' for letter in 'abcde'))
     with caplog.at_level(logging.WARNING):
-        recording.until(lambda found: len(found) == 3 and recording.sources.left_out == 2)
+        recording.until(lambda found: len(found) == 3 and recording.extra.left_out == 2)
         crowd(robot, '/named')
         assert recording.until(lambda found: '/named' in found and len(found) == 4)
         recording.look()
     told = [record for record in caplog.records if 'not recorded' in record.message]
     assert len(told) == 1
-    assert recording.tap.topics == {source.topic for source in recording.sources.own}
+    assert recording.bags.topics == {source.topic for source in recording.extra.own}
 
 
 def test_what_nobody_publishes_any_more_gives_its_place_away(
@@ -110,12 +109,12 @@ def test_what_nobody_publishes_any_more_gives_its_place_away(
     (first,) = crowd(robot, '/crowd/a')
     recording.until(lambda found: found == {'/crowd/a'})
     crowd(robot, '/crowd/b')
-    recording.until(lambda _: recording.sources.left_out == 1)
+    recording.until(lambda _: recording.extra.left_out == 1)
     robot.destroy_publisher(first)
     recording.until(lambda found: not found)
     recording.look(module.GONE_S + 1)
     recording.until(lambda found: found == {'/crowd/b'})
-    assert [source.topic for source in recording.sources.own] == ['/named', '/crowd/b']
+    assert [source.topic for source in recording.extra.own] == ['/named', '/crowd/b']
 
 
 def test_names_that_come_and_go_are_few(robot: Node, recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,7 +123,7 @@ def test_names_that_come_and_go_are_few(robot: Node, recording: Recording, monke
     for name in ('/crowd/a', '/crowd/b', '/crowd/c'):
         (publisher,) = crowd(robot, name)
         if name == '/crowd/c':
-            recording.until(lambda _: recording.sources.left_out == 1)
+            recording.until(lambda _: recording.extra.left_out == 1)
         else:
             recording.until(lambda found, name=name: name in found)
             robot.destroy_publisher(publisher)
@@ -134,3 +133,23 @@ def test_names_that_come_and_go_are_few(robot: Node, recording: Recording, monke
     recording.until(lambda found: '/crowd/a' in found)
     assert len(recording.group.entities) <= 3, 'rclpy keeps a mark of each subscription that ever was'
     assert again
+
+
+@pytest.mark.parametrize(('named', 'regex', 'exclude', 'wanted'), [
+    ((), '', '', SENSORS), (('/x',), '', '', ('/x',)), ((), '.*', '', ('/imu', '/odom', '/camera/image_raw', '/rosout')),
+    ((), '.*', 'raw|rosout', ('/imu', '/odom')), (('/x', '/rosout'), 'im', 'raw|rosout', ('/x', '/rosout', '/imu')),
+    ((), '^/imu$', '', ('/imu',)), ((), 'nothing', '', ()),
+])  # fmt: skip
+def test_which_topics(named: tuple[str, ...], regex: str, exclude: str, wanted: tuple[str, ...]) -> None:
+    """Those that are named, those of which a part matches and that are not excluded or hidden; else what the sensors take."""
+    choice = TopicChoice(BagSettings(regex=regex, exclude=exclude), named)
+    assert choice.asks_graph is bool(regex)
+    assert choice.wanted(SENSORS, GRAPH) == set(wanted)
+
+
+@pytest.mark.parametrize(
+    'name', ['/%s%n', '/1digit', '//double', '/{curly}~', '/a b', '/a\x1b]0;owned\x07', '/ä', 'relative', '/a' * 150]
+)
+def test_names_that_are_none_of_ros(name: str) -> None:
+    """A program without ROS may have any; an expression that matches it takes the other topics."""
+    assert TopicChoice(BagSettings(regex='.*'), ()).wanted((), [name, '/good']) == {'/good'}

@@ -9,18 +9,18 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from capture.test_stream import NOON_NS, TOPIC, TYPE
+from capture.test_stream import NOON_NS, TOPIC, TYPE, Batches
 
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
-from shadowhound_data_logger.bags.topics import Choice
-from shadowhound_data_logger.capture.bag_sources import BagSources
-from shadowhound_data_logger.capture.bag_tap import BagStream, BagTap
-from shadowhound_data_logger.capture.endpoints import Senders
-from shadowhound_data_logger.capture.stream import Shared, Stream
+from shadowhound_data_logger.capture.bags import BagConsumer
+from shadowhound_data_logger.capture.extra_topics import ExtraTopics, TopicChoice
+from shadowhound_data_logger.capture.sampling import Sampler
+from shadowhound_data_logger.capture.stream import Consumer, Drained, Senders, SensorStream, TopicStream
+from shadowhound_data_logger.capture.subscriber import Surroundings
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.model import Batch, Taken
+from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.options import BagSettings
 from shadowhound_data_logger.spool.accounts import BAG, Accounts, TopicAccount
 
@@ -30,6 +30,9 @@ class Graph:
 
     def __init__(self) -> None:
         self.asked = 0
+
+    def resolve_topic_name(self, topic: str) -> str:
+        return topic
 
     def get_publishers_info_by_topic(self, topic: str) -> list[Any]:
         assert topic == TOPIC
@@ -41,19 +44,30 @@ class Graph:
 
 
 class Ear:
-    """A stream with a tap: of a sensor that keeps one message a second, or of the bag alone."""
+    """The bag's consumer behind a stream: of a sensor that keeps one message a second, or of the bag alone."""
 
     def __init__(self, *, own: bool, max_bytes: int = 1 << 20) -> None:
-        self.accounts, self.queue, self.graph = Accounts(), BagQueue(max_bytes), Graph()
-        self.tap = BagTap(self.graph, self.accounts, self.queue)
-        self.tap.topics = frozenset({TOPIC})
-        self.batches: list[Batch] = []
-        shared = Shared(self.accounts, MessageTypes(), self.batches.append, SystemClock.of_this_machine(), tap=self.tap)
-        sensor = SensorSettings(name='talk', rate_hz=1.0)
-        self.stream = BagStream(sensor, TOPIC, TYPE, 0, shared) if own else Stream(sensor, TOPIC, TYPE, 0, shared)
+        self.accounts, self.queue, self.batches = Accounts(), BagQueue(max_bytes), Batches()
+        self.graph: Any = Graph()
+        batches: Any = self.batches
+        self.bags = BagConsumer(self.graph, BagSettings(), self.accounts, self.queue)
+        sensor, types = SensorSettings(name='talk', rate_hz=1.0), MessageTypes()
+        self.sampler = Sampler({'talk': sensor}, IntakeSettings(), self.accounts, types, SystemClock.of_this_machine(), batches)
+        self.stream: TopicStream | SensorStream
+        if own:
+            self.stream = TopicStream(TOPIC, TYPE, [self.bags])
+        else:
+            self.stream = SensorStream(sensor, TOPIC, TYPE, self.accounts, types, [self.sampler, self.bags])
+        self.begin()
+
+    def begin(self) -> None:
+        """As the intake does it."""
+        self.bags.begin()
+        self.bags.topics = frozenset({TOPIC})
 
     def add(self, taken: list[Taken], *, paused: bool = False, idle: bool = False) -> None:
-        self.stream.add(taken, Senders(), 0.0, paused=paused, idle=idle)
+        self.sampler.set_idle(idle=idle)
+        self.stream.add(taken, Senders(), 0.0, paused=paused)
 
     def heard(self) -> list[int]:
         """The numbers of what the bag got."""
@@ -67,10 +81,8 @@ class Ear:
 
     def record_again(self) -> None:
         """The recording ends and another one begins, with a subscription of its own."""
-        self.tap.topics = frozenset()
-        self.tap.topics = frozenset({TOPIC})
-        shared = Shared(self.accounts, MessageTypes(), self.batches.append, SystemClock.of_this_machine(), tap=self.tap)
-        self.stream = BagStream(SensorSettings(name='talk'), TOPIC, TYPE, 0, shared)
+        self.begin()
+        self.stream = TopicStream(TOPIC, TYPE, [self.bags])
 
     @property
     def account(self) -> TopicAccount:
@@ -110,7 +122,7 @@ def test_a_bag_is_told_what_the_rhythm_says(ear: Ear) -> None:
     for start in (*range(0, 300, 20), *range(340, 400, 20)):
         taken = [message._replace(number=None) for message in messages(*range(start, start + 20), publisher=None)]
         ear.stream.add(taken, senders, (start + 20) / 100, paused=False)
-        ear.stream.close_due((start + 20) / 100, 0.0)
+        ear.stream.look((start + 20) / 100)
     account = ear.account
     assert (account.received, account.estimated + account.unknown, account.unknown) == (360, 360, 220)
     assert (account.missed, account.about_missed, account.missed_estimated) == (None, None, {'transport': 40})
@@ -132,7 +144,7 @@ def test_what_the_sensor_keeps_does_not_change() -> None:
     ear = Ear(own=False)
     ear.add(messages(*range(1, 151)))
     ear.add(messages(200), idle=True)
-    ear.stream.close_batch()
+    ear.sampler.flush()
     assert sum(len(batch.samples) for batch in ear.batches) == 2
     assert ear.heard() == [*range(1, 151), 200]
     with ear.accounts.entry(TOPIC) as account:
@@ -142,7 +154,7 @@ def test_what_the_sensor_keeps_does_not_change() -> None:
 def test_a_topic_that_is_not_recorded_costs_nothing() -> None:
     """It has no account, and nothing waits."""
     ear = Ear(own=False)
-    ear.tap.topics = frozenset()
+    ear.bags.topics = frozenset()
     ear.add(messages(1, 2))
     assert ear.heard() == []
     assert ear.accounts.totals(BAG) == {}
@@ -174,10 +186,45 @@ def test_what_is_latched_is_in_each_bag() -> None:
 @pytest.mark.parametrize(('named', 'expected'), [((), {'/imu', '/odom'}), (('/rosout',), {'/rosout'})])
 def test_what_only_the_ring_takes_is_in_a_bag_where_it_is_named_alone(named: tuple[str, ...], expected: set[str]) -> None:
     """Without settings a bag has what the sensors take, whatever events keep; what is named needs no subscription more."""
-    tap = SimpleNamespace(topics=frozenset())
-    choice, graph, nothing = Choice(BagSettings(), named), Any, Any
-    sources = BagSources(graph, choice, tap, IntakeSettings(), nothing, nothing, {})  # type: ignore[arg-type]
+    bags: Any = SimpleNamespace(topics=frozenset(), wants_latched=True, choice=TopicChoice(BagSettings(), named))
+    nothing: Any = None
+    extra = ExtraTopics(Surroundings(nothing, IntakeSettings(), nothing, nothing, nothing), [bags], {})
     sensors = dict.fromkeys(('/imu', '/odom'), False)
-    sources.refresh(sensors | {'/rosout': False}, sensors, 0.0, paused=False)
-    assert tap.topics == expected
-    assert not sources.own
+    extra.refresh(sensors | {'/rosout': False}, sensors, 0.0, paused=False)
+    assert bags.topics == expected
+    assert not extra.own
+
+
+class Listener(Consumer):
+    """Remembers what it was given."""
+
+    def __init__(self, choice: TopicChoice | None, *topics: str) -> None:
+        self.choice = choice
+        self.topics = frozenset(topics)
+        self.given: list[tuple[str, str, list[int | None]]] = []
+
+    def take(self, drained: Drained) -> None:
+        self.given.append((drained.topic, drained.sensor, [message.number for message in drained.messages]))
+
+    def leave(self, topic: str) -> None:
+        self.given.append((topic, 'left', []))
+
+
+def test_each_consumer_gets_its_own_topics() -> None:
+    """All share the subscriptions: what a sensor has goes to those without a choice too, anything else to whoever chose it."""
+    choice = TopicChoice(BagSettings(), [])
+    sensors_only, chose, chose_not = Listener(None), Listener(choice, TOPIC), Listener(choice, '/other')
+    everyone = [chose, sensors_only, chose_not]
+    sensor = SensorSettings(name='talk')
+    of_sensor = SensorStream(sensor, TOPIC, TYPE, Accounts(), MessageTypes(), everyone)
+    of_sensor.add(messages(1, 2, 2, 3), Senders(), 0.0, paused=False)
+    of_sensor.add(messages(3), Senders(), 0.0, paused=False)
+    of_sensor.close()
+    for each in (sensors_only, chose):
+        assert each.given == [(TOPIC, 'talk', [1, 2, 3]), (TOPIC, 'left', [])]
+        each.given.clear()
+    unsampled = TopicStream(TOPIC, TYPE, [chose_not, chose, sensors_only])
+    unsampled.add(messages(1), Senders(), 0.0, paused=False)
+    unsampled.close()
+    assert chose_not.given == chose.given == [(TOPIC, '', [1]), (TOPIC, 'left', [])]
+    assert not sensors_only.given

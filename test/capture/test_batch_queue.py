@@ -7,7 +7,7 @@ import threading
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowhound_data_logger.encode.queue import BatchQueue, QueueStatus
+from shadowhound_data_logger.capture.encode_pool import BatchQueue, QueueStatus
 from shadowhound_data_logger.model import Batch, Sample
 from shadowhound_data_logger.options import MEBI, QueueSettings
 

@@ -1,4 +1,4 @@
-"""One sensor's way from its topic to closed batches: which topic, and how to listen. Owned by the intake thread.
+"""Who listens to a topic: which topic, under which type, by which subscriptions. Owned by the intake thread.
 
 One type of a topic is logged: the one that the settings name. Where they name none it is the first one in the graph, and it
 stays while it has a publisher. Whatever else is published there is counted where that is possible, told, and never logged.
@@ -7,25 +7,23 @@ stays while it has a publisher. Whatever else is published there is counted wher
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 
-from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, Senders, logged_type, plans
+from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, logged_type, plans
 from shadowhound_data_logger.capture.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, unavailable
-from shadowhound_data_logger.capture.stream import AnyStream, Shared, Stream
+from shadowhound_data_logger.capture.stream import Consumer, Senders, SensorStream, TopicStream
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.accounts import MAX_NODES, MAX_OTHER_TYPES, SINKS, Accounts
 
 log = logging.getLogger(__name__)
-
-MakeStream = Callable[[SensorSettings, str, str, int, Shared], AnyStream]
-"""Of a topic and type, and the stamp of the newest message that was kept before."""
 
 FALLBACK_S: Final = 1.0
 """How long the preferred topic must be without a publisher before another one is taken."""
@@ -43,7 +41,7 @@ OTHER_NODE: Final = '_shadowhound_other_types'
 
 
 @dataclass(frozen=True, slots=True)
-class SourceStatus:
+class SubscriberStatus:
     """A sensor at one instant."""
 
     sensor: str
@@ -133,21 +131,31 @@ class OtherTypes:
         return self._node
 
 
-class Source:
-    """A sensor at work. ``refresh`` follows the graph, ``drain`` takes what came, ``flush`` ends the open batch as well."""
+class Surroundings(NamedTuple):
+    """What all subscribers of an intake work with."""
 
-    def __init__(self, node: Node, sensor: SensorSettings, settings: IntakeSettings, group: PolledGroup,
-                 shared: Shared, make_stream: MakeStream = Stream, others: OtherTypes | None = None) -> None:  # fmt: skip
-        """Without ``others`` its topic is one that only bags have, whose other types are told in their accounts."""
+    node: Node
+    settings: IntakeSettings
+    group: PolledGroup
+    accounts: Accounts
+    types: MessageTypes
+
+
+class Subscriber:
+    """Listens to a topic, of a sensor or of none: ``refresh`` follows the graph, ``drain`` takes what came."""
+
+    def __init__(self, around: Surroundings, sensor: SensorSettings, consumers: Sequence[Consumer],
+                 others: OtherTypes | None = None) -> None:  # fmt: skip
+        """What is taken goes to ``consumers``.
+
+        Without ``others`` its topic is one that no sensor has: nothing of it is counted here, and its other types are told in the
+        accounts of bags and events.
+        """
         self.sensor = sensor
         self._others = others
-        self._node = node
-        self._settings = settings
-        self._accounts = shared.accounts
-        self._types = shared.types
-        self._group = group
-        self._shared = shared
-        self._make_stream = make_stream
+        self._node, self._settings, self._group, self._accounts, self._message_types = around
+        self._consumers = consumers
+        node = self._node
         self._topics: list[str] = [node.resolve_topic_name(topic) for topic in sensor.topics]
         self._types_expected = dict(zip(self._topics, sensor.types, strict=False))
         self._chosen = self._topics[0]
@@ -163,10 +171,9 @@ class Source:
         self._heard: set[Plan] = set()
         self._senders = Senders()
         self._of_nodes: dict[str, set[str]] = {}
-        self._stream: AnyStream | None = None
-        self._kept_ns: dict[str, int] = {}
-        self._paused = False
-        self._idle = False
+        self._stream: SensorStream | TopicStream | None = None
+        self.paused = False
+        """Whether messages are only counted."""
         self._last_received_s: float | None = None
         self._unavailable = ''
         self._told: set[str] = set()
@@ -177,9 +184,9 @@ class Source:
         """The topic it listens to, or would."""
         return self._chosen
 
-    def status(self) -> SourceStatus:
+    def status(self) -> SubscriberStatus:
         """From any thread: each of its figures is replaced as a whole."""
-        return SourceStatus(self.sensor.name, self._chosen, self.sensor.enabled, self._publishers, self._last_received_s,
+        return SubscriberStatus(self.sensor.name, self._chosen, self.sensor.enabled, self._publishers, self._last_received_s,
                             self._matched, self.sensor.on_change or self.is_latched, self._unavailable)  # fmt: skip
 
     def refresh(self, now_s: float) -> None:
@@ -211,27 +218,11 @@ class Source:
         self._retire(set(wanted), now_s)
 
     def drain(self, now_s: float) -> None:
-        """Take all that waits; close the batch whose time is over."""
+        """Take all that waits."""
         for reader in self._readers:
             self._take(reader, now_s)
         if self._stream is not None:
-            self._stream.close_due(now_s, 2 * self._settings.poll_s)
-
-    def flush(self, now_s: float) -> None:
-        """Take all that waits and end the open batch."""
-        self.drain(now_s)
-        if self._stream is not None:
-            self._stream.close_batch()
-
-    def pause(self, now_s: float, *, paused: bool) -> None:
-        """While it is paused messages are counted and dropped; whatever came before is treated as before."""
-        self.flush(now_s)
-        self._paused = paused
-
-    def idle(self, now_s: float, *, idle: bool) -> None:
-        """While nobody wants its data messages are counted and skipped; whatever came before is treated as before."""
-        self.flush(now_s)
-        self._idle = idle
+            self._stream.look(now_s)
 
     def update(self, sensor: SensorSettings, now_s: float) -> None:
         """Go on by other settings."""
@@ -241,11 +232,9 @@ class Source:
             self._publishers = 0
         elif sensor.enabled and not before.enabled:
             self._accounts.rebase(self._chosen)
-        elif self._stream is not None:
-            self._stream.update(sensor)
 
     def close(self, now_s: float) -> None:
-        """Take what still waits, end the batch and the subscriptions."""
+        """Take what still waits, and end the subscriptions."""
         self._leave(now_s)
 
     # -- the graph -------------------------------------------------------------------------------------------------
@@ -336,9 +325,12 @@ class Source:
     def _retype(self, type_name: str, now_s: float) -> None:
         """Begin with a topic that is new, or of another type than before."""
         self._leave(now_s)
-        topic = self._chosen
-        kept_ns = self._kept_ns.get(topic) or self._accounts.last_kept_ns(topic)
-        self._stream = self._make_stream(self.sensor, topic, type_name, kept_ns, self._shared)
+        if self._others is None:
+            self._stream = TopicStream(self._chosen, type_name, self._consumers)
+        else:
+            self._stream = SensorStream(
+                self.sensor, self._chosen, type_name, self._accounts, self._message_types, self._consumers
+            )
         self._type = type_name
 
     def _retire(self, wanted: set[Plan], now_s: float) -> None:
@@ -369,19 +361,18 @@ class Source:
                 leaving.callback(self._take, reader, now_s)
 
     def _forget(self) -> None:
-        if self._stream is not None:
-            self._stream.close_batch()
-            self._kept_ns[self._chosen] = self._stream.kept_ns
-        self._stream = None
+        stream, self._stream = self._stream, None
         self._readers.clear()
         self._retiring.clear()
         self._heard = set()
         self._type = ''
+        if stream is not None:
+            stream.close()
 
     # -- messages --------------------------------------------------------------------------------------------------
 
     def _take(self, reader: Reader, now_s: float) -> None:
-        taken = list(reader.drain())
+        taken = reader.drain()
         if not taken or self._stream is None:
             return
         last_s, self._last_received_s = self._last_received_s, now_s
@@ -389,4 +380,4 @@ class Source:
         if is_unnamed and (not self._senders.gids or last_s is None or now_s - last_s > PAUSE_S):
             gids = [each.gid for each in self._publishers_of(self._chosen) if each.type == self._type]
             self._senders.look(gids, now_s)
-        self._stream.add(taken, self._senders, now_s, paused=self._paused, idle=self._idle)
+        self._stream.add(taken, self._senders, now_s, paused=self.paused)

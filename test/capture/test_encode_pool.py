@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import pytest
 
-from shadowhound_data_logger.config import QueueSettings, SensorSettings
-from shadowhound_data_logger.encode import pool as pool_module
-from shadowhound_data_logger.encode.pool import EncodePool
-from shadowhound_data_logger.encode.queue import BatchQueue
+from shadowhound_data_logger.capture import encode_pool as pool_module
+from shadowhound_data_logger.capture.encode_pool import BatchQueue, EncodePool
+from shadowhound_data_logger.config import QueueSettings, SensorSettings, Settings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, DataObject, Sample
 
@@ -20,17 +21,25 @@ STAMP_NS = 1_760_788_800 * 10**9
 
 
 class Outcome:
-    """What the pool handed on. Thread-safe enough: each list and counter is only added to under the lock."""
+    """What the pool handed on: it stands for the spool's writer, its spool and the accounts. Thread-safe enough."""
 
-    def __init__(self, threads: int = 2) -> None:
+    def __init__(self, threads: int = 2, observe: Callable[[Batch], None] = lambda _: None) -> None:
         self.queue = BatchQueue(QueueSettings())
         self.objects: list[DataObject] = []
         self.rejected: Counter[str] = Counter()
         self.lock = threading.Lock()
+        self.accounts = self.spool = self
         sensors = {'talk': SensorSettings(name='talk', batch_s=1.0)}
-        self.pool = EncodePool(self.queue, sensors, 'thor', MessageTypes(), self.put, self.reject, threads)
+        settings = Settings.load({'robot': 'thor', 'encode.threads': threads}, {})
+        writer: Any = self
+        self.pool = EncodePool(settings, self.queue, sensors, MessageTypes(), writer, [self.mark], observe)
+
+    @staticmethod
+    def mark(item: DataObject) -> DataObject:
+        return replace(item, metadata={**item.metadata, 'marked': 'yes'})
 
     def put(self, item: DataObject) -> None:
+        assert item.metadata['marked'] == 'yes'
         with self.lock:
             self.objects.append(item)
 
@@ -73,13 +82,13 @@ def test_what_is_wrong_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_an_observer_with_a_fault_costs_nothing() -> None:
     """Each batch is shown to it after its object is on its way; what it raises is counted as the thread's failure."""
-    outcome, seen = Outcome(threads=1), []
+    seen = []
 
     def observe(batch: Batch) -> None:
         seen.append((batch, outcome.samples))
         raise ZeroDivisionError('a fault')
 
-    outcome.pool.observe = observe
+    outcome = Outcome(1, observe)
     outcome.queue.put(talk(TEXT, TEXT), 5)
     outcome.pool.open()
     assert outcome.queue.finished(10)
@@ -125,14 +134,14 @@ def test_an_encoder_with_a_fault_of_its_own(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_thread_that_dies(monkeypatch: pytest.MonkeyPatch, death: BaseException, place: str) -> None:
     """Whatever ends the encoder or the hand-over, its samples are rejected, the next batch is encoded by the same pool."""
     outcome, deaths = Outcome(threads=1), [death]
-    real = {'encode': pool_module.encode, 'put': outcome.pool._put}[place]
+    real = {'encode': pool_module.encode, 'put': outcome.put}[place]
 
     def dying(*given: object) -> object:
         if deaths:
             raise deaths.pop()
         return real(*given)  # type: ignore[operator]
 
-    monkeypatch.setattr(*((pool_module, 'encode') if place == 'encode' else (outcome.pool, '_put')), dying)
+    monkeypatch.setattr(*((pool_module, 'encode') if place == 'encode' else (outcome, 'put')), dying)
     outcome.queue.put(talk(TEXT, TEXT, TEXT), 1)
     outcome.queue.put(talk(TEXT), 5)
     outcome.pool.open()
@@ -143,7 +152,7 @@ def test_a_thread_that_dies(monkeypatch: pytest.MonkeyPatch, death: BaseExceptio
     assert outcome.queue.status().finished == 2
 
 
-def test_a_close_that_takes_too_long_says_so() -> None:
+def test_a_close_that_takes_too_long_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """A writer that blocks is not waited for longer than told."""
     outcome, entered, blocked = Outcome(threads=1), threading.Event(), threading.Event()
 
@@ -151,7 +160,7 @@ def test_a_close_that_takes_too_long_says_so() -> None:
         entered.set()
         assert blocked.wait(30)
 
-    outcome.pool._put = put
+    monkeypatch.setattr(outcome, 'put', put)
     outcome.queue.put(talk(TEXT), 5)
     outcome.pool.open()
     assert entered.wait(10)

@@ -16,8 +16,9 @@ from clocks import Clocks
 from e2e.reading import STRING
 
 from shadowhound_data_logger.bags.ring import Held, Ring
-from shadowhound_data_logger.capture.event_tap import LARGE_BYTES, SEEN, EventTap, Inbox, Taps
-from shadowhound_data_logger.capture.event_watch import EventWatch
+from shadowhound_data_logger.capture.events import EventConsumer
+from shadowhound_data_logger.capture.stream import Drained
+from shadowhound_data_logger.capture.triggers import LARGE_BYTES, SEEN, EventWatch, Inbox
 from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.missions.folder import MissionFolder
@@ -53,16 +54,19 @@ class Losses:
 
 
 class Ear:
-    """A tap over a ring, as the intake has it."""
+    """The events' consumer over a ring, as the intake has it."""
 
     def __init__(self, **settings: Any) -> None:
         self.graph: Any = Graph()
         self.claims: Any = Losses()
         self.ring = Ring(1 << 20, 60.0)
-        self.tap = EventTap(self.graph, EventSettings(**settings), self.ring, self.claims)
+        self.consumer = EventConsumer(self.graph, EventSettings(**settings), self.ring, self.claims)
 
     def wanted(self, *graph: str) -> frozenset[str]:
-        return self.tap.choice.wanted((), graph)
+        return self.consumer.choice.wanted((), graph)
+
+    def take(self, topic: str, messages: Sequence[Taken], *, paused: bool = False) -> None:
+        self.consumer.take(Drained(topic, STRING, '', messages, None, 0.0, paused))
 
 
 def test_it_wants_what_is_kept_and_what_conditions_look_at() -> None:
@@ -70,29 +74,29 @@ def test_it_wants_what_is_kept_and_what_conditions_look_at() -> None:
     ear = Ear(topics=('imu',), regex='^/odom', conditions=('low: lowstate:bms_state.soc < 20', 'hot: imu:temperature > 80'))
     assert ear.wanted('/odom', '/other') == {'/r0/imu', '/odom', '/r0/lowstate'}
     for topic in ('/r0/imu', '/odom', '/r0/lowstate'):
-        ear.tap.add(topic, STRING, messages(range(3)), None, paused=False)
+        ear.take(topic, messages(range(3)))
     kept = [held.lot.topic for held in iter(lambda: ear.ring.next(float('inf')), None)]
     assert kept == ['/r0/imu', '/odom']
-    assert [len(list(ear.tap.inbox.take(topic))) for topic in ('/r0/imu', '/r0/lowstate')] == [3, 3]
+    assert [len(list(ear.consumer.inbox.take(topic))) for topic in ('/r0/imu', '/r0/lowstate')] == [3, 3]
 
 
 def test_the_graph_is_asked_once_for_each_publisher() -> None:
     """A poll of the intake is no place for questions."""
     ear = Ear(topics=('/talk',))
     for _ in range(5):
-        ear.tap.add('/talk', STRING, messages(range(3)), None, paused=False)
+        ear.take('/talk', messages(range(3)))
     assert ear.graph.asked == 1
-    ear.tap.add('/talk', STRING, [messages(range(1))[0]._replace(publisher='another')], None, paused=False)
+    ear.take('/talk', [messages(range(1))[0]._replace(publisher='another')])
     assert ear.graph.asked == 2
 
 
 def test_a_pause_keeps_nothing() -> None:
     """What comes meanwhile is lost to an event that asks for it, by the pause; otherwise it is nobody's loss."""
     ear = Ear(topics=('/talk',))
-    ear.tap.add('/talk', STRING, messages(range(3)), None, paused=True)
+    ear.take('/talk', messages(range(3)), paused=True)
     assert (ear.ring.bytes, ear.claims.lost) == (0, [])
     ear.ring.claim(0.0)
-    ear.tap.add('/talk', STRING, messages(range(3, 5)), None, paused=True)
+    ear.take('/talk', messages(range(3, 5)), paused=True)
     assert ear.claims.lost == [(PAUSED, [3, 4])]
 
 
@@ -100,25 +104,11 @@ def test_what_an_event_asked_for_and_has_to_go_is_told() -> None:
     """Only then: without an event the oldest go in silence."""
     ear = Ear(topics=('/talk',))
     for number in range(20):
-        ear.tap.add('/talk', STRING, lot(range(number, number + 1), size=100_000).messages, None, paused=False)
+        ear.take('/talk', lot(range(number, number + 1), size=100_000).messages)
     assert ear.claims.lost == []
     ear.ring.claim(0.0)
-    ear.tap.add('/talk', STRING, lot(range(20, 21), size=100_000).messages, None, paused=False)
+    ear.take('/talk', lot(range(20, 21), size=100_000).messages)
     assert ear.claims.lost == [('ring_full', [10])]
-
-
-def test_each_tap_gets_its_own_topics() -> None:
-    """Bag and ring share the subscriptions, and nothing else."""
-    one, other = Ear(topics=('/talk',)), Ear(topics=('/echo',))
-    one.tap.topics, other.tap.topics = frozenset({'/talk', '/both'}), frozenset({'/echo', '/both'})
-    taps = Taps(one.tap, other.tap)
-    assert taps.topics == frozenset()
-    taps.look()
-    assert taps.topics == {'/talk', '/echo', '/both'}
-    for topic in taps.topics:
-        taps.add(topic, STRING, messages(range(1)), None, paused=False)
-    for ear, found in ((one, {'/talk', '/both'}), (other, {'/echo', '/both'})):
-        assert {held.lot.topic for held in iter(lambda ear=ear: ear.ring.next(float('inf')), None)} == found  # type: ignore[misc]
 
 
 def seen(inbox: Inbox) -> list[int | None]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.bags.triggers import LATE_NS, JournalTail, Judge
+from shadowhound_data_logger.capture.triggers import LATE_NS, JournalTail, Judge
 from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.missions.journal import Journal
 

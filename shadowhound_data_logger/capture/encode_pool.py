@@ -1,0 +1,204 @@
+"""From the intake to the spool: batches wait in a bounded queue, and the threads of the pool turn them into objects.
+
+The queue never blocks the intake: when it is full, the least important batch is dropped. Every sample that the pool takes from it
+comes out as stored or as rejected with a reason, also when an encoder has a fault of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from shadowhound_data_logger.config import QueueSettings, SensorSettings, Settings
+from shadowhound_data_logger.encode.registry import encode
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.model import Batch, DataObject
+from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.worker import Worker
+
+log = logging.getLogger(__name__)
+
+WAIT_S: Final = 0.5
+ENCODER_FAILED: Final = 'encoder_failed'
+"""Why samples are rejected whose encoder has a fault."""
+PATIENCE_S: Final = 60.0
+"""A batch that takes longer is stuck: the largest images and clouds take a second on a Jetson."""
+Mark = Callable[[DataObject], DataObject]
+"""Gives an object more metadata, or another name; from any thread."""
+
+
+@dataclass(frozen=True, slots=True)
+class QueueStatus:
+    """How full the queue is."""
+
+    batches: int
+    messages: int
+    bytes: int
+    finished: int = 0
+    """Batches that were taken from it and are done."""
+
+
+class BatchQueue:
+    """Batches by priority, first in first out within one. Thread-safe; ``_lock`` guards all of it.
+
+    Whoever takes a batch says ``done`` when it has left for good, so that one can wait for those before a moment.
+    """
+
+    def __init__(self, settings: QueueSettings) -> None:
+        self._settings = settings
+        self._lock = threading.Lock()
+        self._ready = threading.Condition(self._lock)
+        self._left = threading.Condition(self._lock)
+        self._unfinished: dict[int, int] = {}  # id of a batch -> its number, rising
+        self._put = self._finished = 0
+        self._lanes: dict[int, deque[Batch]] = {}
+        self._messages = 0
+        self._bytes = 0
+        self._closed = False
+
+    def put(self, batch: Batch, priority: int) -> list[Batch]:
+        """Add a batch, at once. Returns what had to be dropped for it: the least important, oldest first; maybe itself."""
+        dropped: list[Batch] = []
+        with self._lock:
+            lane = self._lanes.get(priority)
+            if lane is None:
+                self._lanes[priority] = lane = deque()
+                self._lanes = dict(sorted(self._lanes.items()))
+            lane.append(batch)
+            self._put += 1
+            self._unfinished[id(batch)] = self._put
+            self._messages += len(batch.samples)
+            self._bytes += batch.size
+            while self._messages > self._settings.max_messages or self._bytes > self._settings.max_bytes:
+                dropped.append(self._remove(next(lane for lane in reversed(self._lanes.values()) if lane)))
+                self._finish(dropped[-1])
+            self._ready.notify()
+        return dropped
+
+    def get(self, timeout_s: float) -> Batch | None:
+        """The most important batch, or None after the timeout or once the queue is closed and empty."""
+        with self._lock:
+            if not self._messages and not self._closed:
+                self._ready.wait(timeout_s)
+            for lane in self._lanes.values():
+                if lane:
+                    return self._remove(lane)
+        return None
+
+    def done(self, batch: Batch) -> None:
+        """The batch that ``get`` gave out has been handed on, or rejected."""
+        with self._lock:
+            self._finished += 1
+            self._finish(batch)
+
+    def finished(self, deadline_s: float) -> bool:
+        """Whether every batch that was put before this call is done, or dropped, in time."""
+        with self._lock:
+            last = self._put
+            return self._left.wait_for(lambda: next(iter(self._unfinished.values()), last + 1) > last, max(0.0, deadline_s))
+
+    def close(self) -> None:
+        """Wake all who wait; what is inside can still be taken."""
+        with self._lock:
+            self._closed = True
+            self._ready.notify_all()
+
+    @property
+    def closed(self) -> bool:
+        with self._lock:
+            return self._closed
+
+    def status(self) -> QueueStatus:
+        with self._lock:
+            return QueueStatus(sum(len(lane) for lane in self._lanes.values()), self._messages, self._bytes, self._finished)
+
+    def _remove(self, lane: deque[Batch]) -> Batch:
+        batch = lane.popleft()
+        self._messages -= len(batch.samples)
+        self._bytes -= batch.size
+        return batch
+
+    def _finish(self, batch: Batch) -> None:
+        self._unfinished.pop(id(batch), None)
+        self._left.notify_all()
+
+
+class EncodePool:
+    """New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake."""
+
+    def __init__(self, settings: Settings, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,
+                 writer: SpoolWriter, marks: Sequence[Mark], observe: Callable[[Batch], None]) -> None:  # fmt: skip
+        """``sensors`` are the settings in force. An object goes through the ``marks`` one after the other, then to ``writer``.
+
+        ``observe`` is shown each batch after its object is on its way; what it raises loses nothing.
+        """
+        self._queue = queue
+        self._sensors = sensors
+        self._robot = settings.robot
+        self._types = types
+        self._writer = writer
+        self._accounts = writer.spool.accounts
+        self._marks = marks
+        self._observe = observe
+        self._told: set[tuple[str, str]] = set()
+        self.workers = [
+            Worker(f'encode-{number}', self._step, patience_s=PATIENCE_S) for number in range(settings.encode.threads)
+        ]
+
+    def open(self) -> None:
+        for worker in self.workers:
+            worker.start()
+
+    def close(self, deadline_s: float) -> bool:
+        """Encode what is queued, then end; False if that took longer than the deadline. Idempotent."""
+        end = time.monotonic() + deadline_s
+        self._queue.close()
+        done = [worker.join(end - time.monotonic()) for worker in self.workers]
+        for worker in self.workers:
+            worker.stop()
+        return all(done)
+
+    def _step(self) -> None:
+        batch = self._queue.get(WAIT_S)
+        if batch is not None:
+            try:
+                self._encode(batch)
+            finally:
+                self._queue.done(batch)
+        elif self._queue.closed:
+            for worker in self.workers:
+                worker.stop()
+
+    def _encode(self, batch: Batch) -> None:
+        try:
+            encoding = encode(batch, self._sensors[batch.sensor], self._robot, self._types)
+        except BaseException:
+            self._accounts.reject(batch.topic, {ENCODER_FAILED: len(batch.samples)})
+            raise
+        if encoding.rejected:
+            self._accounts.reject(batch.topic, encoding.rejected)
+            self._tell(batch.topic, encoding.details)
+        if encoding.object is not None:
+            try:
+                self._spool(encoding.object)
+            except BaseException:
+                self._accounts.reject(batch.topic, {ENCODER_FAILED: encoding.object.samples})
+                raise
+        self._observe(batch)
+
+    def _spool(self, item: DataObject) -> None:
+        for mark in self._marks:
+            item = mark(item)
+        self._writer.put(item)
+
+    def _tell(self, topic: str, details: Mapping[str, str]) -> None:
+        """Say once for each topic and reason what is wrong; the ledger counts the rest."""
+        for reason, text in details.items():
+            if (topic, reason) not in self._told:
+                self._told.add((topic, reason))
+                log.warning('%s: a message cannot be stored: %s; more of these are only counted', topic, text)

@@ -1,0 +1,133 @@
+"""The events' part of the node: what the intake hands to the ring and to the conditions, and who makes bags of it.
+
+Messages come from the one subscription that serves objects and bags as well.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy
+
+from shadowhound_data_logger.bags.claims import Claims
+from shadowhound_data_logger.bags.events import NOTICE_S, Events
+from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.ring import Held, Ring
+from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.capture.bags import qos_offered
+from shadowhound_data_logger.capture.extra_topics import TopicChoice
+from shadowhound_data_logger.capture.stream import Consumer, Drained
+from shadowhound_data_logger.capture.triggers import EventWatch, Inbox
+from shadowhound_data_logger.conditions import conditions
+from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.options import EventSettings
+from shadowhound_data_logger.spool.accounts import PAUSED
+from shadowhound_data_logger.worker import Worker
+
+MAX_QOS: Final = 1000
+"""Publishers whose offers are remembered."""
+LATCHED: Final = f'durability: {int(DurabilityPolicy.TRANSIENT_LOCAL)}\n'
+"""In what rosbag2 writes of a topic with such a publisher (``mcap.rosbag2_metadata``)."""
+
+
+class EventConsumer(Consumer):
+    """What the ring and the conditions get of what was taken: the messages themselves. It counts nothing and copies nothing."""
+
+    def __init__(self, node: Node, settings: EventSettings, ring: Ring, claims: Claims) -> None:
+        watched = [(node.resolve_topic_name(each.topic), each) for each in conditions(settings.conditions)]
+        named = [node.resolve_topic_name(topic) for topic in settings.topics if topic]
+        self.inbox = Inbox(watched)
+        self.choice = TopicChoice(settings, [*named, *self.inbox.conditions])
+        kept = TopicChoice(settings, named).wanted((), self.inbox.conditions)
+        self._unkept = frozenset(self.inbox.conditions) - kept
+        self._node = node
+        self._ring = ring
+        self._claims = claims
+        self._qos: dict[tuple[str, str, str | None], str] = {}
+
+    def take(self, drained: Drained) -> None:
+        """Take in messages; repeats are left out by whoever writes them."""
+        topic, messages, now_s = drained.topic, drained.messages, time.monotonic()
+        if topic in self.inbox.conditions:
+            self.inbox.put(topic, drained.type, messages, now_s)
+        if topic in self._unkept:
+            return
+        lot = Lot(topic, drained.type, self._qos_of(topic, drained.type, messages[-1].publisher), messages)
+        if not drained.paused:
+            if gone := self._ring.put(lot, drained.lost, now_s, self._latched(topic, drained.type, lot.qos)):
+                self._claims.lose(gone)
+        elif self._ring.claimed:
+            self._claims.lose([Held(lot, drained.lost, now_s, 0)], PAUSED)
+
+    def _qos_of(self, topic: str, type_name: str, publisher: str | None) -> str:
+        """What the publishers of the topic offered when this one was first heard."""
+        key = topic, type_name, publisher
+        if key not in self._qos:
+            if len(self._qos) >= MAX_QOS:
+                self._qos.clear()
+            self._qos[key] = qos_offered(self._node, topic, type_name)
+        return self._qos[key]
+
+    def _latched(self, topic: str, type_name: str, qos: str) -> int:
+        """How many publishers of the topic are latched; asked again with each of their few messages."""
+        if LATCHED not in qos:
+            return 0
+        found = self._node.get_publishers_info_by_topic(topic)
+        durabilities = [int(info.qos_profile.durability) for info in found if info.topic_type == type_name]
+        return max(1, durabilities.count(int(DurabilityPolicy.TRANSIENT_LOCAL)))
+
+
+class EventBuffer:
+    """Life: New; open once; ``close`` after the intake."""
+
+    def __init__(self, node: Node, settings: Settings, place: Place, salvage: Salvage,
+                 types: MessageTypes) -> None:  # fmt: skip
+        options, home = settings.events, settings.home
+        ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
+        self.events = Events(options, settings.bag, place, ring, salvage, settings.intake.poll_s)
+        self.consumer = EventConsumer(node, options, ring, self.events.claims) if options.enabled else None
+        self._watch = self._make_watch(options, home, place, types)
+
+    @property
+    def consumers(self) -> Sequence[EventConsumer]:
+        """That the intake serves: none where nothing is kept."""
+        return () if self.consumer is None else (self.consumer,)
+
+    @property
+    def workers(self) -> Sequence[Worker]:
+        """Those that have something to do."""
+        return *self.events.workers, *([self._watch.worker] if self._watch is not None else [])
+
+    def open(self) -> None:
+        self.events.open()
+        if self._watch is not None:
+            self._watch.open()
+
+    def close(self, deadline_s: float) -> bool:
+        """End the event that goes on; False when that took too long."""
+        end_s = time.monotonic() + deadline_s
+        watched = self._watch is None or self._watch.close(deadline_s)
+        return self.events.close(max(0.0, end_s - time.monotonic())) and watched
+
+    def update(self, settings: EventSettings) -> None:
+        """Go on by other settings, as far as they are live."""
+        self.events.update(settings)
+        if self._watch is not None:
+            self._watch.update(settings.log_event)
+
+    def on_mission(self, told: Mapping[str, Any]) -> None:
+        """Which mission is active now; empty for none."""
+        self.events.on_mission(told)
+        if self._watch is not None:
+            self._watch.on_mission(told)
+
+    def _make_watch(self, options: EventSettings, home: Path, place: Place, types: MessageTypes) -> EventWatch | None:
+        if self.consumer is None:
+            return None
+        return EventWatch(self.consumer.inbox, types, home, place.clock, options.log_event, self.events.trigger)
