@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from bags.eventing import buffer, until
@@ -194,12 +196,13 @@ def test_a_name_that_was_decided_stays(tmp_path: Path) -> None:
     """Whatever becomes of the clock after a death between two slices: a bag has one name."""
     left = left_in_1970(tmp_path / 'home')
     (folder,) = (left / 'bags' / ROBOT).iterdir()
+    nothing_known: Any = SimpleNamespace(spool=SimpleNamespace(has=lambda *_: False))
     for hour in range(2):
         clock = Clocks()
         clock.set(NOON_NS + hour * 3600 * SECOND)
         notes = Notes.read(folder, ROBOT)
         assert notes.is_named is bool(hour)
-        assert Place(folder.parent, ROBOT, clock, lambda _: False).settle(notes)
+        assert Place(folder.parent, ROBOT, clock, nothing_known).settle(notes)
         assert notes.bag == 'recording_20251018_120000'
 
 

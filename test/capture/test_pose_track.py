@@ -184,7 +184,7 @@ def test_only_what_is_asked_for_is_kept() -> None:
     assert nothing.of('/', ODOMETRY) is None
     assert marked(nothing, 0.0) == {}
     assert not nothing.odometry
-    assert found.is_odometry('/odom')
+    assert found.odometry == '/odom'
 
 
 def test_encoders_ask_while_the_intake_adds() -> None:
