@@ -113,7 +113,7 @@ class Driver:
         self._writers: dict[str, Any] = {}
         self._readers: dict[str, Any] = {}
         self._counts: dict[str, int] = {}
-        self._numbered = Numbered(self._write)
+        self._numbered = Numbered(self._write_or_raise)
         self._lock = threading.Lock()
 
     def obey(self, order: dict[str, Any]) -> Any:
@@ -180,8 +180,13 @@ class Driver:
             due += period_s
             self._write(topic, message)
 
-    def _write(self, topic: str, message: bytes) -> None:
-        ddspy_write(self._writers[topic]._ref, message)
+    def _write(self, topic: str, message: bytes) -> int:
+        """Less than 0 where it was not sent (dds/ddsrt/retcode.h)."""
+        return int(ddspy_write(self._writers[topic]._ref, message))
+
+    def _write_or_raise(self, topic: str, message: bytes) -> None:
+        if self._write(topic, message) < 0:
+            raise TimeoutError(topic)
 
 
 def answer(value: Any = None) -> None:

@@ -22,7 +22,10 @@ def told(text: str) -> tuple[str, int]:
 
 
 class Numbered:
-    """One thread a topic. Numbers of a topic go on where they were when it is begun again."""
+    """One thread a topic; who is late catches up. Numbers of a topic go on where they were when it is begun again.
+
+    ``write`` raises TimeoutError for a message that it did not send: that one is tried again, and it is sent once.
+    """
 
     def __init__(self, write: Callable[[str, bytes], None]) -> None:
         self._write = write
@@ -56,7 +59,10 @@ class Numbered:
     def _publish(self, topic: str, name: str, size: int, period_s: float, over: threading.Event) -> None:
         due = time.monotonic()
         while not over.wait(max(0.0, due - time.monotonic())):
-            due = max(due + period_s, time.monotonic() - period_s)
             number = self._sent.get(topic, 0)
-            self._write(topic, message(name, number, size))
+            try:
+                self._write(topic, message(name, number, size))
+            except TimeoutError:
+                continue
+            due += period_s
             self._sent[topic] = number + 1
