@@ -52,7 +52,9 @@ STARVED_TURN_S: Final = 0.03
 KILLED_S: Final = 1.0
 STEADY_S: Final = 2.0
 """Between two disturbances; at the beginning the rhythm of a topic has to be learned, 200 intervals of it."""
-LEARN_S: Final = 6.0
+LEARN_S: Final = 25.0
+SHORT_LEARN_S: Final = 6.0
+"""Enough for what is small: what is large comes at a fifth of its rate."""
 BATCH_S: Final = 0.5
 OPEN_S: Final = BATCH_S + 1.5
 """A kill takes at most what was received for so long; 0.3 s beyond the batch where the machine has nothing else to do."""
@@ -273,7 +275,7 @@ def parameters() -> dict[str, Any]:
     return given
 
 
-def campaign(folder: Path, rounds: int, rng: random.Random) -> Found:
+def campaign(folder: Path, rounds: int, rng: random.Random, learn_s: float) -> Found:
     """Run and judge."""
     hidden = folder / 'hidden'
     hidden.mkdir(parents=True)
@@ -287,7 +289,7 @@ def campaign(folder: Path, rounds: int, rng: random.Random) -> Found:
         })  # fmt: skip
         robot = Robot(processes)
         try:
-            done = _disturb(nodes, robot, rounds, rng)
+            done = _disturb(nodes, robot, rounds, rng, learn_s)
             ledgers = nodes.end()
         finally:
             processes.end()
@@ -301,12 +303,12 @@ def campaign(folder: Path, rounds: int, rng: random.Random) -> Found:
     return found
 
 
-def _disturb(nodes: Nodes, robot: Robot, rounds: int, rng: random.Random) -> Counter[str]:
+def _disturb(nodes: Nodes, robot: Robot, rounds: int, rng: random.Random, learn_s: float) -> Counter[str]:
     """How often was done what; in the end nothing is on its way any more."""
     for who in PUBLISHERS:
         robot.start(who, 0, matched=False)
     nodes.open()
-    time.sleep(LEARN_S)
+    time.sleep(learn_s)
     done = Counter[str]()
 
     def replaced() -> None:
@@ -358,7 +360,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     rounds = given.rounds or (SHORT_ROUNDS if given.short else ROUNDS)
     progress(f'{rounds} rounds, seed {given.seed}')
     with workshop(given) as shop:
-        found = campaign(shop.folder, rounds, random.Random(given.seed))
+        found = campaign(shop.folder, rounds, random.Random(given.seed), SHORT_LEARN_S if given.short else LEARN_S)
         shop.passed = all(bar.holds for bar in found.bars())
     if not given.json:
         for topic, real in found.truths['numbered'].items():

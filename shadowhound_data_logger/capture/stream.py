@@ -153,7 +153,6 @@ class Arrivals:
     def __init__(self) -> None:
         self._heard_s: float | None = None
         self._looked_s: float | None = None
-        self._sent_s = 0.0
 
     def look(self, now_s: float) -> None:
         """All that waited was taken."""
@@ -162,11 +161,11 @@ class Arrivals:
     def hear(self, senders: Senders, now_s: float) -> Hearing:
         """Some came."""
         looked_s = now_s if self._looked_s is None else self._looked_s
-        since_s, sent_s = (now_s, looked_s) if self._heard_s is None else (self._heard_s, self._sent_s)
-        self._heard_s, self._sent_s = now_s, looked_s
+        since_s = now_s if self._heard_s is None else self._heard_s
+        self._heard_s = now_s
         alone = len(senders.gids) == 1
         return Hearing(
-            elapsed_s=now_s - sent_s, quiet_s=max(0.0, looked_s - since_s), alone=alone,
+            now_s=now_s, quiet_s=max(0.0, looked_s - since_s), alone=alone,
             gid=senders.gids[0] if alone else '',
             crowded=senders.several_s is not None and now_s - senders.several_s > DEAD_S,
             new=senders.changed_s > since_s - NEW_S,

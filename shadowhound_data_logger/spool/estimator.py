@@ -42,7 +42,9 @@ BLOCK: Final = 10
 """A gap of more periods says nothing of where the next message is due to the fraction of a period."""
 SILENCE_S: Final = 1.0
 STEP_S: Final = 1.0
-"""So much longer than the time that passed an interval of stamps may be; beyond it a clock stepped."""
+"""So much younger, when it is taken, than all before it a message may be; beyond it a clock stepped."""
+DRIFT: Final = 0.001
+"""Most by which two clocks go apart; adjtimex(2) has them go 500 ppm off to set them."""
 PENDING: Final = 5 * LEARN
 """Intervals that wait for a rhythm, to be counted by it once it is known."""
 FOLLOW: Final = 0.5
@@ -69,10 +71,10 @@ UNDECLARED: Final = Expectation()
 class Hearing(NamedTuple):
     """How some messages were heard."""
 
-    elapsed_s: float = 0.0
-    """Since the messages before them were sent, at most: since the drain before the one that took them."""
+    now_s: float = 0.0
+    """When they were taken, monotonic."""
     quiet_s: float = 0.0
-    """How long of that nothing came although it was asked for."""
+    """How long nothing came before them although it was asked for."""
     alone: bool = True
     """Whether one publisher of the topic is known."""
     gid: str = ''
@@ -113,6 +115,10 @@ class LossEstimator:
     """Whether messages come more often than was declared: it is learned then."""
     _phase: float = 0.0
     """How far the last message came after its time, in periods."""
+    _youngest_s: float | None = None
+    """The least time between the sending of a message and its taking, up to what is between their clocks."""
+    _taken_s: float = 0.0
+    """When that was known."""
     _intervals: list[int] = field(default_factory=list)
     """Since the rhythm was last seen to hold; without those that say nothing (another publisher, a restart, a step)."""
     _quiet: set[int] = field(default_factory=set)
@@ -139,6 +145,7 @@ class LossEstimator:
         self._messages += len(stamps)
         if self._is_regular(stamps, hearing):
             self.last = stamps[-1]
+            self._is_ahead(self.last, hearing.now_s)
         else:
             for stamp in stamps:
                 self._place(stamp, hearing, missed)
@@ -170,13 +177,9 @@ class LossEstimator:
     def _place(self, stamp: int, hearing: Hearing, missed: Counter[str]) -> None:
         last, inherited, self.inherited = self.last, self.inherited, False
         self.last = stamp
-        if last is None:
+        gap = 0 if last is None else self._gap(stamp, last)
+        if self._has_stepped(stamp, gap, hearing.now_s) or last is None:
             self._phase = 0.0
-            return
-        gap = self._gap(stamp, last)
-        most = (hearing.elapsed_s + STEP_S) * SECOND
-        if (gap < 0 and self.expected.wrap) or gap < -STEP_S * SECOND or not (inherited or self.expected.wrap or gap <= most):
-            self._phase = 0.0  # the counter began anew, or a clock stepped
             return
         if gap <= 0:
             self.last = last  # overtaken by others
@@ -198,6 +201,23 @@ class LossEstimator:
             return
         self._intervals.append(gap)
         self._count(count, SILENCE if hearing.quiet_s > SILENCE_S and count > BLOCK else TRANSPORT, missed)
+
+    def _has_stepped(self, stamp: int, gap: int, now_s: float) -> bool:
+        """Whether the counter began anew, or a clock stepped."""
+        if self.expected.wrap:
+            return gap < 0
+        if gap < -STEP_S * SECOND:
+            self._youngest_s = None
+        return self._is_ahead(stamp, now_s) or gap < -STEP_S * SECOND
+
+    def _is_ahead(self, stamp: int, now_s: float) -> bool:
+        """Whether the message is younger than one can be: not by what the node took late, but by a clock that stepped."""
+        age_s, youngest_s = now_s - stamp / SECOND, self._youngest_s
+        if youngest_s is not None:
+            youngest_s += DRIFT * (now_s - self._taken_s)
+        self._taken_s = now_s
+        self._youngest_s = age_s if youngest_s is None else min(age_s, youngest_s)
+        return youngest_s is not None and age_s < youngest_s - STEP_S
 
     def _gap(self, stamp: int, last: int) -> int:
         wrap = self.expected.wrap

@@ -36,7 +36,6 @@ class Ear:
 
     estimator: LossEstimator = field(default_factory=LossEstimator)
     now_s: float = 0.0
-    sent_s: float = 0.0
     heard_s: float = 0.0
     looked_s: float = 0.0
     received: int = 0
@@ -52,9 +51,9 @@ class Ear:
             batch = [stamp for stamp in waiting if stamp <= self.now_s * SECOND]
             if batch:
                 del waiting[: len(batch)]
-                heard = Hearing(self.now_s - self.sent_s, max(0.0, self.looked_s - self.heard_s))._replace(**hearing)  # type: ignore[arg-type]
+                heard = Hearing(self.now_s, max(0.0, self.looked_s - self.heard_s))._replace(**hearing)  # type: ignore[arg-type]
                 found = self.estimator.observe([stamp + shift for stamp in batch], heard)
-                self.heard_s, self.sent_s = self.now_s, self.looked_s
+                self.heard_s = self.now_s
                 self.received += len(batch)
                 self.covered += found.covered
                 self.missed.update(found.missed)
@@ -144,6 +143,18 @@ def test_a_node_that_stands_still() -> None:
     assert ear.missed == {TRANSPORT: 130}
 
 
+def test_what_the_network_held_for_a_node_that_stood_still() -> None:
+    """It comes in several drains. The gap may be longer than the time between these, and is no step of a clock."""
+    sent = even(1000)
+    ear = Ear().hear(sent[:500])
+    held, later = sent[500:550], sent[650:]
+    ear.now_s += 3.0
+    for batch in (held[:20], held[20:], [stamp for stamp in later if stamp <= ear.now_s * SECOND]):
+        ear.missed.update(ear.estimator.observe(batch, Hearing(ear.now_s)).missed)
+        ear.now_s += 0.01
+    assert ear.missed == {TRANSPORT: 100}
+
+
 @pytest.mark.parametrize('pause_s', [3, 60])
 def test_a_pause_is_marked(pause_s: int) -> None:
     """Whether the publisher paused or the network was away, nobody knows: the cause says so."""
@@ -206,6 +217,16 @@ def test_a_step_of_a_clock_is_no_loss(step_s: int) -> None:
     assert ear.lost == 0
 
 
+@pytest.mark.parametrize('drift', [-0.0005, 0.0005])
+def test_a_clock_that_drifts(drift: float) -> None:
+    """A step is still told from loss after hours, in which the clocks have gone apart by more than that."""
+    estimator = LossEstimator(Expectation(period=10 * SECOND))
+    for second in range(0, 15_000, 10):
+        estimator.observe([int(second * (1 + drift) * SECOND)], Hearing(second))
+    found = estimator.observe([int(15_000 * (1 + drift) * SECOND) + 6 * SECOND], Hearing(15_000))
+    assert found.missed == {}
+
+
 def test_a_small_step_forward_looks_like_loss() -> None:
     """That much is said in docs/formats.md."""
     first = even(500)
@@ -218,7 +239,7 @@ def test_overtaken_messages_fill_their_gap() -> None:
     estimator = LossEstimator(Expectation(period=PERIOD))
     missed: Counter[str] = Counter()
     for places in ([0, 1, 4], [2, 3, 5, 6]):
-        missed.update(estimator.observe([place * PERIOD for place in places], Hearing(elapsed_s=1.0)).missed)
+        missed.update(estimator.observe([place * PERIOD for place in places], Hearing()).missed)
     assert missed.total() == 0
 
 
@@ -278,7 +299,7 @@ def test_one_of_a_crowd_is_not_counted() -> None:
     """While several publish, and nobody knows who, nothing is claimed; with the last one the rhythm goes on."""
     estimate = TopicEstimate()
     sent = even(1000, jitter=0.0)
-    alone, crowd = Hearing(elapsed_s=60.0, gid='a'), Hearing(elapsed_s=60.0, alone=False, crowded=True)
+    alone, crowd = Hearing(gid='a'), Hearing(alone=False, crowded=True)
     assert estimate.observe({'': sent[:300]}, alone).covered == 300
     found = estimate.observe({'': sent[300:400]}, crowd)
     assert (found.covered, found.lost, estimate.known) == (0, None, False)
@@ -290,7 +311,7 @@ def test_one_of_a_crowd_is_not_counted() -> None:
 def test_publishers_that_are_told_apart_have_rhythms_of_their_own() -> None:
     """Whatever their rates, and whether the graph knows several."""
     estimate = TopicEstimate()
-    hearing = Hearing(elapsed_s=60.0, alone=False, crowded=True)
+    hearing = Hearing(alone=False, crowded=True)
     stamps = {'p': without(even(500), (300, 320)), 'q': even(300, 3 * PERIOD)}
     found = estimate.observe(stamps, hearing)
     assert (found.covered, found.missed) == (780, {TRANSPORT: 20})
@@ -300,7 +321,7 @@ def test_the_next_session_goes_on() -> None:
     """With the rhythm and the last stamp: what was sent meanwhile was missed by the restart."""
     before = TopicEstimate()
     sent = even(600)
-    before.observe({'': sent[:300]}, Hearing(elapsed_s=60.0, gid='a'))
+    before.observe({'': sent[:300]}, Hearing(gid='a'))
     after = TopicEstimate(before=before.row('/odom'))
     assert after.observe({'': sent[450:460]}, Hearing(gid='a')).missed == {RESTART: 150}
     another = TopicEstimate(before=before.row('/odom'))

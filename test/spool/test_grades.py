@@ -21,7 +21,7 @@ from shadowhound_data_logger.spool.spool import Spool
 
 TOPIC = '/odom'
 PERIOD_NS = SECOND // 100
-ALONE = Hearing(elapsed_s=3600.0, gid='a')
+ALONE = Hearing(gid='a')
 VERSION_3 = Path(__file__).with_name('index_version_3.sql')
 """What a node of the version before left: an exact session, and one whose losses its middleware reported."""
 
