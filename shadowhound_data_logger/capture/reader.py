@@ -157,8 +157,15 @@ class Reader:
         """Raises TypeUnavailable when the message package is missing, SubscriptionRefused when the middleware does not do it."""
         self.plan = plan
         self._node = node
+        self._group = group
         self._class = message_class(plan.type)
         self._names: dict[bytes, str] = {}
+        self._is_stuck = self._has_told = False
+        self._subscription = self._subscribe()
+        self._taker = librcl.Taker() if takes_through_librcl(node) else None
+
+    def _subscribe(self) -> Any:
+        plan = self.plan
         profile = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
             depth=plan.depth,
@@ -166,13 +173,12 @@ class Reader:
             durability=DurabilityPolicy.TRANSIENT_LOCAL if plan.transient_local else DurabilityPolicy.VOLATILE,
         )
         try:
-            self._subscription = node.create_subscription(
-                self._class, plan.topic, _never_called, profile, callback_group=group, raw=True,
+            return self._node.create_subscription(
+                self._class, plan.topic, _never_called, profile, callback_group=self._group, raw=True,
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             )  # fmt: skip
         except (rclpy_implementation.RCLError, InvalidTopicNameException) as error:
             raise SubscriptionRefused(f'no subscription of type {plan.type} can be made ({error})') from error
-        self._taker = librcl.Taker() if takes_through_librcl(node) else None
 
     def matched(self) -> int:
         """Number of publishers it is matched with."""
@@ -187,12 +193,34 @@ class Reader:
         handle = self._subscription.handle
         with handle:
             waiting = self._through_rclpy(handle) if self._taker is None else self._through_librcl(handle, self._taker)
-            return list(islice(waiting, MAX_TAKES))
+            taken = list(islice(waiting, MAX_TAKES))
+        if self._is_stuck:
+            self._renew()
+        return taken
+
+    def _renew(self) -> None:
+        """Listen by another subscription: this one gives an empty message again and again, and nothing that waits behind it.
+
+        Fast DDS (2.6 to 3.6) forgets a message that came in parts when its RELIABLE publisher has no more of them to send, and
+        leaves it in the list of those to be taken (ReaderHistory::remove_fragmented_changes_until; Fast-DDS pull request 2239).
+        """
+        stuck = self._subscription
+        self._subscription = self._subscribe()
+        self._node.destroy_subscription(stuck)
+        self._is_stuck = False
+        if not self._has_told:
+            log.warning(
+                '%s: listening anew: the middleware gives nothing more since a part of a message was lost', self.plan.topic
+            )
+            self._has_told = True
 
     def _through_rclpy(self, handle: Any) -> Iterator[Taken]:
         take, message_type = handle.take_message, self._class
         while (taken := take(message_type, True)) is not None:
             cdr, info = taken
+            if not cdr:
+                self._is_stuck = True
+                return
             gid = info.get('publisher_gid')  # Jazzy and older do not tell it
             yield Taken(
                 cdr, info['source_timestamp'], None if gid is None else self._name(gid['data']),
@@ -203,6 +231,9 @@ class Reader:
         take, pointer = taker.take, ctypes.c_void_p(handle.pointer)
         while (taken := take(pointer)) is not None:
             cdr, source_ns, received_ns, number, gid, _ = taken
+            if not cdr:
+                self._is_stuck = True
+                return
             yield Taken(cdr, source_ns, self._name(gid), number, received_ns or _came_ns(source_ns))
 
     def close(self) -> None:

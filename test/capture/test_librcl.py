@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator
 from operator import attrgetter
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -113,6 +114,45 @@ def test_takes_through_librcl_are_proved_once(node: Any, caplog: pytest.LogCaptu
     until(lambda: not [name for name, _ in node.get_topic_names_and_types() if '_take_' in name], 'the topic is gone')
     for each in readers:
         each.close()
+
+
+@needs_fast_dds
+@pytest.mark.parametrize('version', [(), (99,)])
+def test_an_empty_message_is_none(
+    node: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, version: tuple[int, ...]
+) -> None:
+    """Fast DDS gives one without end where it lost its place: the reader goes on with another subscription, and says so once."""
+    monkeypatch.setattr(reader, 'TELLS_PUBLISHERS', version)
+    found = read(node, '/stuck')
+    publisher = node.create_publisher(String, '/stuck', 10)
+    for turn in range(2):
+        until(lambda: found.matched() == 1, 'it is matched')
+        publisher.publish(cdr := serialize_message(String(data=str(turn))))
+        assert [taken.cdr for taken in drained(found, 1)] == [cdr]
+        stuck = found._subscription
+        with monkeypatch.context() as patch:
+            patch.setattr(librcl.Taker, 'take', lambda *_: (b'', 0, 0, 0, bytes(16), 0))
+            found._subscription = SimpleNamespace(handle=EmptyHandle())
+            assert found.drain() == []
+        assert found._subscription.handle.pointer
+        node.destroy_subscription(stuck)
+    assert [record.levelname for record in caplog.records].count('WARNING') == 1
+    found.close()
+
+
+class EmptyHandle:
+    """Of a subscription that is stuck."""
+
+    pointer = 1
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def take_message(self, *_: object) -> tuple[bytes, dict[str, Any]]:
+        return b'', {'source_timestamp': 0, 'received_timestamp': 1, 'publication_sequence_number': 0}
 
 
 WRONG = {
