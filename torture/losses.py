@@ -46,9 +46,10 @@ model.Taken = Taken
 """
 """What a node sees of messages that nobody numbers; rclpy is not imported before the node has chosen a middleware."""
 STOPPED_S: Final = 3.0
-STARVED_S: Final = 3.0
-STARVED_TURN_S: Final = 0.03
-"""A starved node has so long of each half second."""
+STARVED_S: Final = 4.5
+STARVED_TURN_S: Final = 0.05
+STARVED_EACH_S: Final = 1.5
+"""A starved node has its turn so seldom: more comes between two than buffers hold."""
 KILLED_S: Final = 1.0
 STEADY_S: Final = 2.0
 """Between two disturbances; at the beginning the rhythm of a topic has to be learned, 200 intervals of it."""
@@ -60,7 +61,7 @@ OPEN_S: Final = BATCH_S + 1.5
 """A kill takes at most what was received for so long; 0.3 s beyond the batch where the machine has nothing else to do."""
 ESTIMATE: Final = 0.05
 """How far an estimate may be off, and so many messages for each disturbance besides."""
-ESTIMATE_SLACK: Final = 3
+ESTIMATE_SLACK: Final = 1
 
 
 Sent = dict[tuple[str, str], 'int | None']
@@ -156,7 +157,7 @@ class Nodes:
         end = time.monotonic() + STARVED_S
         while time.monotonic() < end:
             self._signal(signal.SIGSTOP)
-            time.sleep(0.5 - STARVED_TURN_S)
+            time.sleep(STARVED_EACH_S - STARVED_TURN_S)
             self._signal(signal.SIGCONT)
             time.sleep(STARVED_TURN_S)
 
