@@ -95,10 +95,15 @@ def left(store: S3Store) -> list[str]:
         return [upload['Key'] for upload in client.list_multipart_uploads(Bucket=BUCKET).get('Uploads', ())]
 
 
+MORE = pytest.mark.long('more faults at more requests')
+
+
 @pytest.mark.parametrize(('fault', 'request_name'), [
     *((Fault.RESET, name) for name in REQUESTS),
-    (Fault.ACK_LOST, 'begin'), (Fault.ACK_LOST, 'part 2'), (Fault.ACK_LOST, 'complete'),
-    (Fault.SLOW_DOWN, 'list'), (Fault.SLOW_DOWN, 'part 3'), (Fault.SLOW_DOWN, 'complete'),
+    (Fault.ACK_LOST, 'part 2'), (Fault.ACK_LOST, 'complete'), (Fault.SLOW_DOWN, 'part 3'),
+    *(pytest.param(*each, marks=MORE) for each in (
+        (Fault.ACK_LOST, 'begin'), (Fault.SLOW_DOWN, 'list'), (Fault.SLOW_DOWN, 'complete'),
+    )),
 ])  # fmt: skip
 def test_a_fault_at_any_request(
     store: S3Store, front: Front, seaweed: Tower, item: SpooledObject, fault: Fault, request_name: str
@@ -125,7 +130,10 @@ def test_a_fault_at_any_request(
     assert sent <= len(CONTENT) + len('makes the bucket') * 2 + PART
 
 
-@pytest.mark.parametrize('fault', [Fault.REFUSED, Fault.CUT, Fault.SKEWED, Fault.PORTAL, Fault.NO_CONDITION])
+@pytest.mark.parametrize(
+    'fault',
+    [Fault.CUT, Fault.NO_CONDITION, *(pytest.param(fault, marks=MORE) for fault in (Fault.REFUSED, Fault.SKEWED, Fault.PORTAL))],
+)
 def test_a_bad_day(store: S3Store, front: Front, item: SpooledObject, fault: Fault) -> None:
     """With the same fault at every third request it gets there, whole and once."""
     front.script = Script([fault if number % 3 == 2 else Fault.NONE for number in range(14)])

@@ -57,17 +57,20 @@ def mcap(chunk: bytes, compression: str, claim: int) -> bytes:
     return MAGIC + record(Opcode.HEADER, text('ros2'), text('evil')) + body + record(Opcode.DATA_END, bytes(4)) + footer + MAGIC
 
 
-@pytest.mark.parametrize('claim', [100, 1 << 20, HUGE, (1 << 63) - 1])
 @pytest.mark.parametrize('compression', ['zstd', 'lz4'])
-def test_a_chunk_that_lies_about_its_size_is_damaged(tmp_path: Path, compression: str, claim: int) -> None:
+def test_a_chunk_that_lies_about_its_size_is_damaged(tmp_path: Path, compression: str) -> None:
     """In a tenth of the memory that it would take, whether it says too little or the truth."""
-    path = tmp_path / 'evil.mcap'
-    path.write_bytes(mcap(zeros(compression), compression, claim))
+    chunk, claims = zeros(compression), (100, 1 << 20, HUGE, (1 << 63) - 1)
+    for claim in claims:
+        path = tmp_path / f'{claim}.mcap'
+        path.write_bytes(mcap(chunk, compression, claim))
+        with pytest.raises(BagDamaged, match='cannot be unpacked'):
+            list(messages_of([path]))
     ran = in_2_gb('bag', 'verify', '--deep', str(tmp_path), '--json')
     assert (ran.returncode, 'Traceback' in ran.stderr) == (1, False), ran.stderr
-    assert 'cannot be unpacked' in json.loads(ran.stdout)['checks'][0]['finding']
-    with pytest.raises(BagDamaged, match='cannot be unpacked'):
-        list(messages_of([path]))
+    findings = [check['finding'] for check in json.loads(ran.stdout)['checks']]
+    assert [finding for finding in findings if 'cannot be unpacked' in finding] == findings
+    assert len(findings) == len(claims)
 
 
 def in_2_gb(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from stores.asking import settings_for
-from stores.spooled import QUICK, Spool
+from stores.spooled import MOTO, QUICK, Spool
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.sim.tower import Tower
@@ -17,7 +17,7 @@ from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.memory import MemoryStore
 from shadowhound_data_logger.stores.s3 import S3Store
 
-STORES = ('memory', 'directory', 'moto', pytest.param('seaweed', marks=pytest.mark.seaweedfs))
+STORES = ('memory', 'directory', MOTO, pytest.param('seaweed', marks=pytest.mark.seaweedfs))
 
 
 @pytest.fixture

@@ -7,9 +7,13 @@ from collections.abc import Mapping
 from itertools import count
 from pathlib import Path
 
+import pytest
+
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.model import SpooledObject
 
+MOTO = pytest.param('moto', marks=pytest.mark.long('a second S3 server, a slow one'))
+"""The request for moto beside SeaweedFS."""
 QUICK = UploadSettings(threads=8, connect_timeout_s=2.0, read_timeout_s=20.0)
 
 

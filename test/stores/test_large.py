@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from stores.spooled import QUICK, Spool
+from stores.spooled import MOTO, QUICK, Spool
 
 from shadowhound_data_logger.config import StoreSettings
 from shadowhound_data_logger.errors import ForeignObject, ObjectRefused
@@ -39,7 +39,7 @@ def item(spool: Spool) -> SpooledObject:
     return spool(KEY, CONTENT, content_type='application/x-mcap', metadata={'bag': 'patrol', 'slice': '0'})
 
 
-@pytest.fixture(params=['moto', pytest.param('seaweed', marks=pytest.mark.seaweedfs)])
+@pytest.fixture(params=[MOTO, pytest.param('seaweed', marks=pytest.mark.seaweedfs)])
 def server(request: pytest.FixtureRequest, opened: Callable[..., S3Store]) -> S3Store:
     """A store on an S3 server."""
     found: StoreSettings | Tower = request.getfixturevalue(request.param)
