@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import pytest
 from domains import free_domain
 from e2e.processes import Processes
 from e2e.reading import Objects
+from e2e.session import Session
 from e2e.station import Station
 
 from shadowhound_data_logger.config import UploadSettings
@@ -81,6 +82,17 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
     """Processes that the tests of a module share, each test with topics of its own."""
     with running(tmp_path_factory.mktemp('shared')) as started:
         yield started
+
+
+@pytest.fixture(scope='session')
+def session(tmp_path_factory: pytest.TempPathFactory, seaweed: Tower) -> Session:
+    """Of a simulated Go2, for those who look at its sensors and those who look at its bag."""
+    with (
+        running(tmp_path_factory.mktemp('session')) as processes,
+        closing(S3Store(seaweed.store_settings(), UploadSettings())) as store,
+    ):
+        store.open()
+        return Session.of(processes, seaweed, store)
 
 
 @pytest.fixture(scope='module')

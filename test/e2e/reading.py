@@ -45,6 +45,11 @@ class Objects:
         infos = {key: store.head(bucket, key) for key in keys}
         return cls({key: store.get(bucket, key) for key in keys}, {key: info for key, info in infos.items() if info})
 
+    def without(self, prefix: str) -> Objects:
+        """The others."""
+        keys = [key for key in self.contents if not key.startswith(prefix)]
+        return Objects({key: self.contents[key] for key in keys}, {key: self.infos[key] for key in keys if key in self.infos})
+
     def sensor(self, name: str) -> dict[str, bytes]:
         return {key: body for key, body in self.contents.items() if key.split('/')[1] == name}
 

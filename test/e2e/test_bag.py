@@ -2,48 +2,23 @@
 
 from __future__ import annotations
 
-import signal
 import sqlite3
 from typing import Any
 
 import pytest
-from e2e.bag_reading import BUCKET, Bag, bags, by_topic
-from e2e.processes import LONG, Node, Processes, published, until
+from e2e.bag_reading import BUCKET, bags
+from e2e.processes import Processes, until
 from e2e.reading import STRING, TYPES, decode, texts
+from e2e.session import DURATION_S, SLICE_S, Session
 from e2e.station import Station
-from e2e.witness import recorded
 
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.base import ObjectStore
 
-DURATION_S = 60.0 if LONG else 6.0
-SLICE_S = 2.0
 SOON_NS = 10 * 10**9
 """From the end of a slice to its delivery."""
-BEST_EFFORT = {'/point_cloud2', '/camera/camera_info'}
 
 pytestmark = pytest.mark.timeout(120 + 2 * DURATION_S)
-
-
-class Session:
-    """One run of robot, witness and a node that records from its start on."""
-
-    def __init__(self, node: Node, bag: Bag, ledger: dict[str, Any], heard: dict[str, list[Any]], said: dict[str, int]) -> None:
-        self.node, self.bag, self.ledger, self.heard, self.said = node, bag, ledger, heard, said
-        self.messages = by_topic(bag.messages())
-
-
-@pytest.fixture(scope='module')
-def session(shared: Processes, seaweed: Tower, store: ObjectStore) -> Session:
-    node = shared.node(seaweed.environment(), {'bag.record': 'always', 'bag.slice_s': SLICE_S})
-    recording = shared.folder / 'witness'
-    witness = shared.witness(TYPES, recording, best_effort=BEST_EFFORT)
-    said = published(shared.sim(f'duration_s:={DURATION_S}'), DURATION_S + 60)
-    ledger = node.stop()
-    witness.signal(signal.SIGTERM)
-    assert witness.wait() == 0
-    (bag,) = bags(store, shared.robot, shared.folder / 'bags')
-    return Session(node, bag, ledger, by_topic(recorded(recording)), said)
 
 
 def test_the_bag_is_whole_to_every_reader(session: Session) -> None:
@@ -76,7 +51,7 @@ def test_bags_are_a_sink_of_their_own_in_the_ledger(session: Session) -> None:
     assert camera['skipped'] == camera['received'] - camera['stored']
 
 
-def test_slices_are_delivered_while_the_next_one_records(session: Session, store: ObjectStore, shared: Processes) -> None:
+def test_slices_are_delivered_while_the_next_one_records(session: Session, store: ObjectStore) -> None:
     """The first is in the store before the last one begins, and carries what a listing has to know."""
     assert len(session.bag.slices) >= DURATION_S / SLICE_S * 0.8 - 1  # a slice ends with the first sync after its time
     first, last = session.bag.manifest['slices'][0], session.bag.manifest['slices'][-1]
@@ -84,13 +59,13 @@ def test_slices_are_delivered_while_the_next_one_records(session: Session, store
     assert info is not None
     assert {'robot', 'bag', 'slice', 'messages', 't_start_ns', 't_end_ns', 'sha256'} <= set(info.metadata)
     assert info.metadata['sha256'] == first['sha256']
-    row = _row(shared, first['key'])
+    row = _row(session, first['key'])
     assert row['settled_ns'] < last['t_start_ns'] + SOON_NS // 2
     assert row['settled_ns'] - first['t_end_ns'] < SOON_NS
 
 
-def _row(processes: Processes, key: str) -> dict[str, Any]:
-    with sqlite3.connect(processes.folder / 'home' / 'spool' / 'index.db') as db:
+def _row(session: Session, key: str) -> dict[str, Any]:
+    with sqlite3.connect(session.folder / 'home' / 'spool' / 'index.db') as db:
         db.row_factory = sqlite3.Row
         return dict(db.execute('SELECT * FROM objects WHERE key = ?', (key,)).fetchone())
 

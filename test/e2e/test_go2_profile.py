@@ -4,25 +4,15 @@ from __future__ import annotations
 
 import io
 import re
-import signal
-from collections import defaultdict
-from collections.abc import Callable
 from datetime import datetime, timezone
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pypcd4
 import pytest
-from e2e.processes import LONG, Node, Processes, published
-from e2e.reading import TYPES, Objects, assert_same, decode, stamp_ns
-from e2e.witness import Heard, recorded
-
-from shadowhound_data_logger.sim.tower import Tower
+from e2e.reading import TYPES, assert_same
+from e2e.session import DURATION_S, Session
 
 SECOND = 10**9
-DURATION_S = 60.0 if LONG else 7.0
-BEST_EFFORT = {'/point_cloud2', '/camera/camera_info'}
 SENSORS = {
     '/camera/compressed': 'camera', '/camera/camera_info': 'camera_info', '/point_cloud2': 'lidar', '/imu': 'imu',
     '/odom': 'odom', '/go2_states': 'states', '/joint_states': 'joints', '/lowstate': 'lowstate',
@@ -33,41 +23,6 @@ KEYS = {
     'camera_info': r'camera_info/\d{8}/\d{6}_front\.json',
     **{name: rf'{name}/\d{{8}}/\d{{6}}_{name}\.json' for name in ('imu', 'states', 'joints', 'lowstate')},
 }  # fmt: skip
-
-Messages = dict[str, dict[int, Heard]]
-"""Topic -> stamp -> what the witness heard; the stamp is the header's, else the publisher's."""
-
-
-class Session:
-    """One run of robot, witness and node."""
-
-    def __init__(self, node: Node, said: dict[str, int], ledger: dict[str, Any], heard: Messages, objects: Objects) -> None:
-        self.node, self.said, self.ledger, self.heard, self.objects = node, said, ledger, heard, objects
-
-    def decoded(self, topic: str, stamp: int) -> Any:
-        return decode(TYPES[topic], self.heard[topic][stamp].cdr)
-
-
-def by_stamp(path: Path) -> Messages:
-    heard: Messages = defaultdict(dict)
-    for message in recorded(path):
-        decoded = decode(TYPES[message.topic], message.cdr)
-        stamp = stamp_ns(decoded) if hasattr(decoded, 'header') else message.source_ns
-        heard[message.topic][stamp] = message
-    return heard
-
-
-@pytest.fixture(scope='module')
-def session(shared: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> Session:
-    node = shared.node(seaweed.environment())
-    recording = shared.folder / 'witness'
-    witness = shared.witness(TYPES, recording, best_effort=BEST_EFFORT)
-    said = published(shared.sim(f'duration_s:={DURATION_S}'), DURATION_S + 30)
-    ledger = node.stop()
-    witness.signal(signal.SIGTERM)
-    assert witness.wait() == 0
-    return Session(node, said, ledger, by_stamp(recording), stored(shared.robot))
-
 
 pytestmark = pytest.mark.timeout(120 + 2 * DURATION_S)
 
@@ -99,13 +54,13 @@ def test_default_profile_in_the_store_is_what_is_stored(session: Session) -> Non
         assert len(session.objects.samples(name)) == session.ledger['topics'][topic]['stored']
 
 
-def test_default_profile_keys(session: Session, shared: Processes) -> None:
+def test_default_profile_keys(session: Session) -> None:
     """Objects have the documented keys, in the UTC second of their first sample, and a type and hash."""
     for key, info in session.objects.infos.items():
         sensor = key.split('/')[1]
         first = re.sub(r'_\d(?=\.\w+$)', '', key)  # what a stalled machine delivers after its batch gets a key of its own
         assert first == key or first in session.objects.infos
-        assert re.fullmatch(f'{shared.robot}/{KEYS[sensor]}', first)
+        assert re.fullmatch(f'{session.robot}/{KEYS[sensor]}', first)
         when = datetime.fromtimestamp(int(info.metadata['t_start_ns']) // SECOND, timezone.utc)
         assert f'{when:%Y%m%d}/{when:%H%M%S}_' in key
         assert info.metadata['sha256']
@@ -116,7 +71,7 @@ def test_default_profile_keys(session: Session, shared: Processes) -> None:
 def test_default_profile_every_sample_is_there(session: Session, topic: str) -> None:
     """Of a topic without downsampling every message is in the store, once, under its own time."""
     stamps = [sample['stamp_ns'] for sample in session.objects.samples(SENSORS[topic])]
-    assert sorted(stamps) == sorted(session.heard[topic])
+    assert sorted(stamps) == sorted(session.by_stamp[topic])
     assert len(stamps) == session.said[topic]
 
 
@@ -131,7 +86,7 @@ def test_default_profile_batches_are_what_was_published(session: Session, topic:
 def test_default_profile_keeps_the_first_of_each_second(session: Session, topic: str) -> None:
     """At 1 Hz the first message of each whole second of UTC is kept, and no other."""
     firsts: dict[int, int] = {}
-    for stamp in sorted(session.heard[topic]):
+    for stamp in sorted(session.by_stamp[topic]):
         firsts.setdefault(stamp // SECOND, stamp)
     if topic == '/lowstate':
         kept = [sample['stamp_ns'] for sample in session.objects.samples('lowstate')]

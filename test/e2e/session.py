@@ -1,0 +1,70 @@
+"""One run of the simulated Go2 whose sensors and bags several files of tests look at."""
+
+from __future__ import annotations
+
+import signal
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from e2e.bag_reading import Bag, Recorded, bags, by_topic
+from e2e.processes import LONG, Node, Processes, published
+from e2e.reading import TYPES, Objects, decode, stamp_ns
+from e2e.witness import Heard, recorded
+
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.base import ObjectStore
+
+DURATION_S = 60.0 if LONG else 7.0
+SLICE_S = 2.0
+BEST_EFFORT = {'/point_cloud2', '/camera/camera_info'}
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """Robot, witness and a node with the default settings that records from its start on; all of them have ended."""
+
+    node: Node
+    folder: Path
+    robot: str
+    said: dict[str, int]
+    """Topic -> messages, as the robot counted them."""
+    ledger: dict[str, Any]
+    heard: dict[str, list[Heard]]
+    """By the witness, in order."""
+    by_stamp: dict[str, dict[int, Heard]]
+    """The same by stamp, which is the header's, else the publisher's."""
+    objects: Objects
+    """Of the sensors."""
+    bag: Bag
+    messages: dict[str, list[Recorded]]
+    """Of the bag."""
+
+    @classmethod
+    def of(cls, processes: Processes, seaweed: Tower, store: ObjectStore) -> Session:
+        node = processes.node(seaweed.environment(), {'bag.record': 'always', 'bag.slice_s': SLICE_S})
+        recording = processes.folder / 'witness'
+        witness = processes.witness(TYPES, recording, best_effort=BEST_EFFORT)
+        said = published(processes.sim(f'duration_s:={DURATION_S}'), DURATION_S + 60)
+        ledger = node.stop()
+        witness.signal(signal.SIGTERM)
+        assert witness.wait() == 0
+        heard = by_topic(recorded(recording))
+        (bag,) = bags(store, processes.robot, processes.folder / 'bags')
+        objects = Objects.of(store, 'sensor-data', processes.robot).without(f'{processes.robot}/rosbags/')
+        return cls(
+            node, processes.folder, processes.robot, said, ledger, heard, _by_stamp(heard), objects, bag, by_topic(bag.messages())
+        )
+
+    def decoded(self, topic: str, stamp: int) -> Any:
+        return decode(TYPES[topic], self.by_stamp[topic][stamp].cdr)
+
+
+def _by_stamp(heard: dict[str, list[Heard]]) -> dict[str, dict[int, Heard]]:
+    found: dict[str, dict[int, Heard]] = defaultdict(dict)
+    for topic, messages in heard.items():
+        for message in messages:
+            decoded = decode(TYPES[topic], message.cdr)
+            found[topic][stamp_ns(decoded) if hasattr(decoded, 'header') else message.source_ns] = message
+    return found
