@@ -118,7 +118,16 @@ def test_qos_in_words_becomes_numbers() -> None:
     assert first == yaml.safe_load(IN_WORDS)[0] | {'history': 3, 'reliability': 1, 'durability': 1, 'liveliness': 3}
     assert second == {'history': 1, 'depth': 7, 'reliability': 2, 'durability': 2, 'liveliness': 1}
     numbers = offered_qos([profile()])
-    for text in (numbers, '', 'history: of a robot', '- [', '\x00'):
+    assert yaml.safe_load(in_numbers('- {"durability": "volatile"}  # reliability: reliable')) == [{'durability': 2}]
+    for text in (
+        numbers,
+        '',
+        'history: of a robot',
+        '- [',
+        '\x00',
+        '- durability: volatile\n  on: 2025-10-18',
+        '- &a {history: *a}',
+    ):
         assert in_numbers(text) == text
 
 
