@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 
 from shadowhound_data_logger.bags.queue import QUEUE_FULL, BagQueue, Lot
 from shadowhound_data_logger.capture.extra_topics import TopicChoice
@@ -80,11 +81,11 @@ class BagConsumer(Consumer):
         """What the publishers of the topic offer, as it was when the recording first heard of it."""
         qos = self._qos.get((topic, type_name))
         if qos is None:
-            qos = self._qos[topic, type_name] = qos_offered(self._node, topic, type_name)
+            qos = self._qos[topic, type_name] = offered_qos(profiles_offered(self._node, topic, type_name))
         return qos
 
 
-def qos_offered(node: Node, topic: str, type_name: str) -> str:
-    """By the publishers of a topic with this type, as rosbag2 writes it."""
+def profiles_offered(node: Node, topic: str, type_name: str) -> list[QoSProfile]:
+    """By the publishers of a topic with this type."""
     found = node.get_publishers_info_by_topic(topic)
-    return offered_qos(info.qos_profile for info in found if info.topic_type == type_name)
+    return [info.qos_profile for info in found if info.topic_type == type_name]

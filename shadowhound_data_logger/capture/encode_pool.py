@@ -30,6 +30,7 @@ PATIENCE_S: Final = 60.0
 """A batch that takes longer is stuck: the largest images and clouds take a second on a Jetson."""
 Mark = Callable[[DataObject], DataObject]
 """Gives an object more metadata, or another name; from any thread."""
+Observe = Callable[[Batch, 'DataObject | None'], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,10 +133,10 @@ class EncodePool:
     """New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake."""
 
     def __init__(self, settings: Settings, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,
-                 writer: SpoolWriter, marks: Sequence[Mark], observe: Callable[[Batch], None]) -> None:  # fmt: skip
+                 writer: SpoolWriter, marks: Sequence[Mark], observe: Observe) -> None:  # fmt: skip
         """``sensors`` are the settings in force. An object goes through the ``marks`` one after the other, then to ``writer``.
 
-        ``observe`` is shown each batch after its object is on its way; what it raises loses nothing.
+        ``observe`` is shown each batch and its object, if there is one, once that is on its way; what it raises loses nothing.
         """
         self._queue = queue
         self._sensors = sensors
@@ -189,7 +190,7 @@ class EncodePool:
             except BaseException:
                 self._accounts.reject(batch.topic, {ENCODER_FAILED: encoding.object.samples})
                 raise
-        self._observe(batch)
+        self._observe(batch, encoding.object)
 
     def _spool(self, item: DataObject) -> None:
         for mark in self._marks:

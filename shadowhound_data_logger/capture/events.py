@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from shadowhound_data_logger.bags.claims import Claims
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
@@ -19,21 +19,20 @@ from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.ring import Held, Ring
 from shadowhound_data_logger.bags.salvage import Salvage
-from shadowhound_data_logger.capture.bags import qos_offered
+from shadowhound_data_logger.capture.bags import profiles_offered
 from shadowhound_data_logger.capture.extra_topics import TopicChoice
 from shadowhound_data_logger.capture.stream import Consumer, Drained
 from shadowhound_data_logger.capture.triggers import EventWatch, Inbox
 from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.mcap.rosbag2_metadata import offered_qos
 from shadowhound_data_logger.options import EventSettings
 from shadowhound_data_logger.spool.accounts import PAUSED
 from shadowhound_data_logger.worker import Worker
 
 MAX_QOS: Final = 1000
 """Publishers whose offers are remembered."""
-LATCHED: Final = f'durability: {int(DurabilityPolicy.TRANSIENT_LOCAL)}\n'
-"""In what rosbag2 writes of a topic with such a publisher (``mcap.rosbag2_metadata``)."""
 
 
 class EventConsumer(Consumer):
@@ -49,7 +48,7 @@ class EventConsumer(Consumer):
         self._node = node
         self._ring = ring
         self._claims = claims
-        self._qos: dict[tuple[str, str, str | None], str] = {}
+        self._offers: dict[tuple[str, str, str | None], tuple[str, bool]] = {}
 
     def take(self, drained: Drained) -> None:
         """Take in messages; repeats are left out by whoever writes them."""
@@ -58,29 +57,32 @@ class EventConsumer(Consumer):
             self.inbox.put(topic, drained.type, messages, now_s)
         if topic in self._unkept:
             return
-        lot = Lot(topic, drained.type, self._qos_of(topic, drained.type, messages[-1].publisher), messages)
+        qos, is_latched = self._offered(topic, drained.type, messages[-1].publisher)
+        lot = Lot(topic, drained.type, qos, messages)
         if not drained.paused:
-            if gone := self._ring.put(lot, drained.lost, now_s, self._latched(topic, drained.type, lot.qos)):
+            latched = self._latched(topic, drained.type) if is_latched else 0
+            if gone := self._ring.put(lot, drained.lost, now_s, latched):
                 self._claims.lose(gone)
         elif self._ring.claimed:
             self._claims.lose([Held(lot, drained.lost, now_s, 0)], PAUSED)
 
-    def _qos_of(self, topic: str, type_name: str, publisher: str | None) -> str:
-        """What the publishers of the topic offered when this one was first heard."""
+    def _offered(self, topic: str, type_name: str, publisher: str | None) -> tuple[str, bool]:
+        """What the publishers of the topic offered when this one was first heard, and whether one of them was latched."""
         key = topic, type_name, publisher
-        if key not in self._qos:
-            if len(self._qos) >= MAX_QOS:
-                self._qos.clear()
-            self._qos[key] = qos_offered(self._node, topic, type_name)
-        return self._qos[key]
+        if key not in self._offers:
+            if len(self._offers) >= MAX_QOS:
+                self._offers.clear()
+            profiles = profiles_offered(self._node, topic, type_name)
+            self._offers[key] = offered_qos(profiles), any(map(_is_latched, profiles))
+        return self._offers[key]
 
-    def _latched(self, topic: str, type_name: str, qos: str) -> int:
+    def _latched(self, topic: str, type_name: str) -> int:
         """How many publishers of the topic are latched; asked again with each of their few messages."""
-        if LATCHED not in qos:
-            return 0
-        found = self._node.get_publishers_info_by_topic(topic)
-        durabilities = [int(info.qos_profile.durability) for info in found if info.topic_type == type_name]
-        return max(1, durabilities.count(int(DurabilityPolicy.TRANSIENT_LOCAL)))
+        return max(1, sum(map(_is_latched, profiles_offered(self._node, topic, type_name))))
+
+
+def _is_latched(profile: QoSProfile) -> bool:
+    return int(profile.durability) == int(DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class EventBuffer:

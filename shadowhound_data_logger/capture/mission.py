@@ -98,11 +98,11 @@ class MissionWatch:
             return replace(item, metadata={**item.metadata, **last[1]})
         return item
 
-    def observe(self, batch: Batch) -> None:
-        """Take from a batch what is logged."""
+    def observe(self, batch: Batch, item: DataObject | None) -> None:
+        """Take from a batch what is logged; ``item`` is what it was encoded as."""
         node_log = self._log
         if node_log is not None:
-            for fact in self._tap.facts(batch):
+            for fact in self._tap.facts(batch, item):
                 node_log.add(fact)
 
     # -- the thread ------------------------------------------------------------------------------------------------

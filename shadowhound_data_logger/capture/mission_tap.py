@@ -22,7 +22,7 @@ from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.missions.node_log import Cloud, Fact, Frame, Reading
 from shadowhound_data_logger.missions.odometer import Pose
 from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE
-from shadowhound_data_logger.model import Batch, Sample
+from shadowhound_data_logger.model import Batch, DataObject, Sample
 from shadowhound_data_logger.options import POINT_CLOUD
 
 log = logging.getLogger(__name__)
@@ -57,8 +57,8 @@ class MissionTap:
         self._periods: dict[tuple[str, int], int] = {}
         self._told: set[str] = set()
 
-    def facts(self, batch: Batch) -> Iterator[Fact]:
-        """What there is to log of a batch."""
+    def facts(self, batch: Batch, item: DataObject | None = None) -> Iterator[Fact]:
+        """What there is to log of a batch; ``item`` is the object that was made of it, None where there is none."""
         try:
             if batch.topic == self._odometry and batch.type == ODOMETRY:
                 yield from (self._pose(sample) for sample in batch.samples)
@@ -70,11 +70,18 @@ class MissionTap:
                 yield from (cloud for sample in self._some(batch, SECOND) if (cloud := self._cloud(sample)))
             if batch.sensor == self._frames:
                 for sample in self._some(batch, self._frame_ns):
-                    payload = encode_jpeg(Job(batch, self._sensors[batch.sensor], self._robot, self._types), sample)
-                    if payload.content_type == JPEG:
-                        yield Frame(sample.stamp_ns, payload.body, self._marks(sample.stamp_ns))
+                    picture = self._jpeg(batch, sample, item)
+                    if picture is not None:
+                        yield Frame(sample.stamp_ns, picture, self._marks(sample.stamp_ns))
         except Rejected as error:
             self._tell(batch.topic, str(error))
+
+    def _jpeg(self, batch: Batch, sample: Sample, item: DataObject | None) -> bytes | None:
+        """The one that was just made of the message for the sensor's own object, else one of its own; None for no JPEG."""
+        if item is not None and len(batch.samples) == 1 and item.content_type == JPEG and isinstance(item.body, bytes):
+            return item.body
+        payload = encode_jpeg(Job(batch, self._sensors[batch.sensor], self._robot, self._types), sample)
+        return payload.body if payload.content_type == JPEG else None
 
     def _some(self, batch: Batch, period_ns: int) -> Iterator[Sample]:
         """The first message of each period."""

@@ -23,7 +23,7 @@ STAMP_NS = 1_760_788_800 * 10**9
 class Outcome:
     """What the pool handed on: it stands for the spool's writer, its spool and the accounts. Thread-safe enough."""
 
-    def __init__(self, threads: int = 2, observe: Callable[[Batch], None] = lambda _: None) -> None:
+    def __init__(self, threads: int = 2, observe: Callable[[Batch, DataObject | None], None] = lambda *_: None) -> None:
         self.queue = BatchQueue(QueueSettings())
         self.objects: list[DataObject] = []
         self.rejected: Counter[str] = Counter()
@@ -84,7 +84,9 @@ def test_an_observer_with_a_fault_costs_nothing() -> None:
     """Each batch is shown to it after its object is on its way; what it raises is counted as the thread's failure."""
     seen = []
 
-    def observe(batch: Batch) -> None:
+    def observe(batch: Batch, item: DataObject | None) -> None:
+        assert item is not None
+        assert item.body == outcome.objects[-1].body
         seen.append((batch, outcome.samples))
         raise ZeroDivisionError('a fault')
 

@@ -20,6 +20,7 @@ from shadowhound_data_logger.capture.encode_pool import BatchQueue
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_tap import MissionTap
 from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.encode.registry import encode
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.folder import Run, missions
@@ -175,7 +176,8 @@ def test_what_the_robot_says_is_journalled(tmp_path: Path, opened: ExitStack) ->
     until(setting.watch.status, 'the mission is noticed')
     (folder,) = missions(tmp_path)
     start_ns = int(journal.first(folder.journal)['t'])
-    setting.watch.observe(batch('odom', '/odom', 'nav_msgs/msg/Odometry', odometry(0, 0), odometry(0.3, 1.0), start_ns=start_ns))
+    poses = odometry(0, 0), odometry(0.3, 1.0)
+    setting.watch.observe(batch('odom', '/odom', 'nav_msgs/msg/Odometry', *poses, start_ns=start_ns), None)
     until(lambda: time.time_ns() > start_ns + SECOND // 10, 'the second pose is of the mission')
     logger.end_mission(True, 1.0, 1.0)
     until(lambda: not setting.watch.status(), 'the end is noticed')
@@ -189,7 +191,7 @@ def test_it_joins_only_when_it_is_asked_to(tmp_path: Path, opened: ExitStack) ->
     setting, logger = watching(opened, tmp_path, join=False)
     logger.start_mission('patrol', '')
     until(setting.watch.status, 'the mission is noticed')
-    setting.watch.observe(batch('odom', '/odom', 'nav_msgs/msg/Odometry', odometry(0, 0)))
+    setting.watch.observe(batch('odom', '/odom', 'nav_msgs/msg/Odometry', odometry(0, 0)), None)
     (folder,) = missions(tmp_path)
     assert not folder.node.path.exists()
 
@@ -234,3 +236,31 @@ def test_a_picture_is_taken_every_few_seconds() -> None:
     found = [fact for one in batches for fact in tap.facts(one)]
     assert found == [Frame(NOON_NS + second * SECOND, JPEG) for second in (0, 5, 10)]
     assert list(tap.facts(batch('other', '/c', kind, image))) == []
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'again'), [({}, 0), ({'camera.format': 'png'}, 1), ({'camera.format': 'zip', 'camera.batch_s': 1.0}, 1)]
+)
+def test_a_raw_picture_is_encoded_once(monkeypatch: pytest.MonkeyPatch, parameters: dict[str, object], again: int) -> None:
+    """The mission has the JPEG that was made for the sensor; it makes one of its own only where the sensor's object is none."""
+    made: list[int] = []
+
+    def counting(*given: Any, **options: Any) -> bytes:
+        made.append(1)
+        return simplejpeg_encode(*given, **options)
+
+    simplejpeg_encode = simplejpeg.encode_jpeg
+    monkeypatch.setattr(simplejpeg, 'encode_jpeg', counting)
+    settings = Settings.load({'robot': 'thor', **parameters}, {})
+    camera = next(sensor for sensor in settings.sensors if sensor.name == 'camera')
+    pixels = np.arange(64 * 48 * 3, dtype=np.uint32).astype(np.uint8)
+    raw = STORE.types['sensor_msgs/msg/Image'](a_header(), 48, 64, 'bgr8', 0, 64 * 3, pixels)
+    taken = batch('camera', '/c', 'sensor_msgs/msg/Image', raw)
+    item = encode(taken, camera, 'thor', MessageTypes()).object
+    assert item is not None
+    of_sensor = len(made)
+    tap = MissionTap(settings.mission, {'camera': camera}, 'thor', MessageTypes(), lambda topic: f'/{topic}')
+    (frame,) = tap.facts(taken, item)
+    assert isinstance(frame, Frame)
+    assert simplejpeg.is_jpeg(frame.body)
+    assert (frame.body == item.body, len(made) - of_sensor) == (not again, again)
