@@ -77,6 +77,7 @@ class Commands:
             'mission': _Command(self._tell_mission, quiet=True),
             'diagnostics': _Command(self._diagnose, quiet=True),
             'describe': _Command(self._describe, quiet=True),
+            'compare': _Command(self._compare, {'found': dict}, quiet=True),
         }
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
@@ -177,6 +178,11 @@ class Commands:
 
     def _describe(self) -> dict[str, Any]:
         return {'node': self._node, 'pid': os.getpid(), 'version': self._status.version, 'commands': list(self._known)}
+
+    def _compare(self, found: Mapping[str, Any] | None = None) -> Answer | dict[str, Any]:
+        """Of the front: the publishers that the robot's RMW finds beyond ours."""
+        unheard = self._stages.unheard
+        return unheard.compare(found or {}) if unheard is not None else (False, 'the node listens through the RMW of the robot')
 
 
 _KINDS: Final[Mapping[type, str]] = {str: 'a string', list: 'a list', dict: 'an object'}

@@ -2,8 +2,9 @@
 
 Levels: WARN for what needs a look (messages missed, dropped or rejected lately, whatever the watchdog finds to stand still,
 the store away, a spool that fills up, a clock that is not set or stepped lately), ERROR for what needs a hand (a thread that
-fails or failed lately, objects in quarantine lately, credentials that are refused), STALE for a topic that nobody publishes.
-Plain values; ``interface`` makes the message of them, while somebody listens.
+fails or failed lately, objects in quarantine lately, credentials that are refused, publishers that the robot finds and the node
+does not), STALE for a topic that nobody publishes. Plain values; ``interface`` makes the message of them,
+while somebody listens.
 """
 
 from __future__ import annotations
@@ -33,9 +34,14 @@ def entries(status: Mapping[str, Any], earlier: Mapping[str, Any]) -> Iterator[E
     """All that is to be said of a status."""
     stalls = status['stalls']
     yield _node(status)
+    unheard = status['middleware']['unheard'] or {}
     for topic, row in status['topics'].items():
         level, text = _topic(row, earlier['topics'].get(topic, row), stalls.get(topic, ''))
+        if topic in unheard:
+            level, text = ERROR, unheard[topic]['text']
         yield topic, level, text, row
+    for topic in unheard.keys() - status['topics'].keys():
+        yield topic, ERROR, unheard[topic]['text'], {'publishers': unheard[topic]['publishers']}
     yield _bag(status['bag'], earlier['bag'])
     yield _events(status['events'], earlier['events'])
     yield _spool(status['spool'])

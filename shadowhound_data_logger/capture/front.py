@@ -28,12 +28,18 @@ from rclpy.parameter import Parameter
 
 from shadowhound_data_logger.capture.interface import Interface
 from shadowhound_data_logger.capture.parameters import Described, declare, parameter, plain
+from shadowhound_data_logger.capture.reader import endpoints
 from shadowhound_data_logger.config import FOREIGN
 from shadowhound_data_logger.errors import DataLoggerError, NodeUnavailable
 from shadowhound_data_logger.ros_arguments import NODE
 from shadowhound_data_logger.spool.control import Connection
 from shadowhound_data_logger.worker import Worker
 
+COMPARE_S: Final = 2.0
+"""How often it looks at the publishers of what is logged, or more seldom: it takes at most so much of the time."""
+COMPARE_SHARE: Final = 0.05
+MOST_REPORTED, MOST_OF_TOPIC, MOST_LETTERS = 64, 8, 150
+"""Publishers in a report, of all topics and of one, and letters of a name: together they fit into a request."""
 LOOK_S: Final = 1.0
 """How often it asks what is new, and so finds out that the node is no more."""
 STEADY_S: Final = 60.0
@@ -112,6 +118,9 @@ class PublicNode:
         """Why the node cannot be asked any more; empty while it can."""
         self._follows = False
         self._mission: Mapping[str, Any] = {}
+        self._topics: Sequence[str] = ()
+        self._gids: frozenset[str] = frozenset()
+        self._compare_s = 0.0
         described: list[Described] = connection.ask('parameters')['parameters']
         self._live = [each['name'] for each in described if not each['read_only']]
         for each in described:
@@ -129,7 +138,25 @@ class PublicNode:
         answer = self._ask({'do': 'get', 'names': self._live})
         if answer['ok']:
             self._follow(answer['values'])
+        if time.monotonic() >= self._compare_s:
+            self._compare()
         self._interface.publish_diagnostics()
+
+    def _compare(self) -> None:
+        """Tell the node which publishers of its topics it has not found, as far as that is known here."""
+        began_s = time.monotonic()
+        found: dict[str, list[list[str]]] = {}
+        room = MOST_REPORTED
+        for topic in self._topics:
+            others = sorted((each.gid, _ascii(each.type), _ascii(each.node)) for each in endpoints(self._node, topic)
+                            if each.gid not in self._gids)[: min(room, MOST_OF_TOPIC)]  # fmt: skip
+            room -= len(others)
+            if others:
+                found[topic] = [list(other) for other in others]
+        answer = self._ask({'do': 'compare', 'found': found})
+        if answer['ok']:
+            self._topics, self._gids = answer['topics'], frozenset(answer['gids'])
+        self._compare_s = began_s + max(COMPARE_S, (time.monotonic() - began_s) / COMPARE_SHARE)
 
     def _ask(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         """As ``Commands.answer``; that nobody answers is an answer as well."""
@@ -155,6 +182,11 @@ class PublicNode:
                 self._node.set_parameters([parameter(name, values[name]) for name in changed])
             finally:
                 self._follows = False
+
+
+def _ascii(name: str) -> str:
+    """As ROS has names; who is no ROS may have others."""
+    return name[:MOST_LETTERS].encode('ascii', 'replace').decode()
 
 
 def main() -> int:

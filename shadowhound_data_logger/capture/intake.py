@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Final
@@ -66,6 +66,11 @@ class Intake:
     def topics(self) -> Sequence[str]:
         """The resolved topics of sensors that it listens to, or would."""
         return [subscriber.topic for subscriber in self._subscribers if subscriber.sensor.enabled]
+
+    @property
+    def wanted(self) -> Mapping[str, str]:
+        """All resolved topics of the sensors that are enabled, with the type that the settings name for each, or nothing."""
+        return {topic: name for one in self._subscribers if one.sensor.enabled for topic, name in one.wanted.items()}
 
     @property
     def _unsampled(self) -> Sequence[Subscriber]:

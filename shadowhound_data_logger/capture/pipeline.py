@@ -33,8 +33,10 @@ from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_tap import MissionTap
 from shadowhound_data_logger.capture.parameters import Parameters, live
 from shadowhound_data_logger.capture.pose_track import RobotTrack
+from shadowhound_data_logger.capture.reader import endpoints
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
+from shadowhound_data_logger.capture.unheard import Unheard
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.clock_watch import ClockWatch
@@ -138,7 +140,7 @@ class Pipeline:
         self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
                                        self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,
-                                       self._ros.front)  # fmt: skip
+                                       self._ros.front, self._make_unheard())  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
         self._commands = Commands(stages, self._parameters, self._status, settings.robot, self._ros.name)
         self._interface = Interface(self._node, self._commands.answer) if not self._ros.middleware.is_foreign else None
@@ -247,6 +249,14 @@ class Pipeline:
         self.intake.update(settings.sensors)
         self.uploader.set_max_mbps(settings.upload.max_mbps)
         self.event_buffer.update(settings.events)
+
+    def _make_unheard(self) -> Unheard | None:
+        """None where nobody listens through another RMW beside the node."""
+        middleware, node = self._ros.middleware, self._node
+        if self._ros.front is None:
+            return None
+        return Unheard(middleware.rmw, middleware.robot, lambda: self.intake.wanted,
+                       lambda topic: {publisher.gid for publisher in endpoints(node, topic)})  # fmt: skip
 
     def _tell_mission(self, mission: Mapping[str, Any]) -> None:
         if self._interface is not None:

@@ -26,6 +26,7 @@ from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.middleware import Middleware
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.subscriber import SubscriberStatus
+from shadowhound_data_logger.capture.unheard import Unheard
 from shadowhound_data_logger.capture.watchdog import Watchdog
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.clock_watch import ClockWatch
@@ -63,6 +64,8 @@ class Stages:
     control: ControlSocket
     middleware: Middleware
     front: Front | None = None
+    unheard: Unheard | None = None
+    """None where the node listens through the RMW of the robot."""
 
     @property
     def workers(self) -> Sequence[Worker]:
@@ -112,7 +115,7 @@ class Status:
         status = {
             'robot': self._settings.robot, 'version': self.version, 'pid': os.getpid(), 'boot_id': self._clock.boot_id,
             'boot_ns': boot_ns, 'time': iso(self._clock.wall_ns()), 'uptime_s': round((boot_ns - self._began_ns) / SECOND, 1),
-            'paused': self._stages.intake.paused, 'ended': ended, 'middleware': self._stages.middleware.status(),
+            'paused': self._stages.intake.paused, 'ended': ended, 'middleware': self._middleware(),
             'mission': self._stages.mission.status(), 'bag': self._bag(), 'events': self._events(), 'topics': self._topics(now_s),
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
             'spool': {'path': str(self._stages.spool.root), **asdict(piles), **asdict(self._settings.spool)},
@@ -162,6 +165,10 @@ class Status:
                 row['rate_hz'] = round(_slope(news, now_s - then_s), 2)
                 break
         return row | asdict(totals)
+
+    def _middleware(self) -> dict[str, Any]:
+        unheard = self._stages.unheard
+        return {**self._stages.middleware.status(), 'unheard': unheard.rows() if unheard is not None else None}
 
     def _bag(self) -> dict[str, Any]:
         """What is recorded, with the messages of this session by topic."""

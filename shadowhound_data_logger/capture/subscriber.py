@@ -184,6 +184,11 @@ class Subscriber:
         """The topic it listens to, or would."""
         return self._chosen
 
+    @property
+    def wanted(self) -> dict[str, str]:
+        """Its topics in the order of preference, with the type that the settings name for each, or nothing."""
+        return {topic: self._types_expected.get(topic, '') for topic in self._topics}
+
     def status(self) -> SubscriberStatus:
         """From any thread: each of its figures is replaced as a whole."""
         return SubscriberStatus(self.sensor.name, self._chosen, self.sensor.enabled, self._publishers, self._last_received_s,

@@ -104,7 +104,7 @@ def view(found: Mapping[str, Any], console: Console) -> list[RenderableType]:
     live = found['state'] != NOT_RUNNING
     parts: list[RenderableType] = [_head(found), '']
     if live:
-        parts += [*_topics(found['topics']), '']
+        parts += [*_topics(found['topics'], found['middleware']['unheard'] or {}), '']
     if live or found['spool']:
         parts += [_way(found, console, live=live), '']
     if not live and found['spool']:
@@ -146,10 +146,10 @@ def _ended(session: Mapping[str, Any] | None) -> str:
     return f'; session of {began} UTC cut off, or just beginning'
 
 
-def _topics(topics: Mapping[str, Any]) -> Iterator[RenderableType]:
+def _topics(topics: Mapping[str, Any], unheard_of: Mapping[str, Any]) -> Iterator[RenderableType]:
     """The table of what arrives, and the names of what does not."""
     unheard = {topic: row for topic, row in topics.items() if not row['received']}
-    silent = [topic for topic, row in unheard.items() if row['enabled'] and not row['publishers']]
+    silent = [topic for topic, row in unheard.items() if row['enabled'] and not row['publishers'] and topic not in unheard_of]
     off = [topic for topic, row in unheard.items() if not row['enabled']]
     rows = {topic: row for topic, row in topics.items() if topic not in (*silent, *off)}
     losses = [name for name in LOSSES if any(row[name] for row in rows.values())]

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.capture.unheard import REMEDY
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.doctor.machine import command, lock_holder
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
@@ -95,13 +96,44 @@ def _node(found: Mapping[str, Any], folder: Path) -> Iterator[Result]:
             store['last_error'] or 'the node does not say why',
             STORE,
         )
+    yield from _unheard(found['middleware']['unheard'] or {})
+    yield from _front(found)
     missed = {
         topic: (row['missed'] or row['missed_estimated'] or 0) + row['dropped'] + row['rejected']
         for topic, row in found['topics'].items()
     }
+    said = tuple(row['text'] for row in (found['middleware']['unheard'] or {}).values())
     for text in found['findings']:
-        if not text.startswith('delivery:'):
+        if not text.startswith(('delivery:', 'front fails:', *said)):
             yield warning('node.status', text, 'said by the node itself', _status_remedy(text), lost=sum(missed.values()))
+
+
+def _unheard(topics: Mapping[str, Any]) -> Iterator[Result]:
+    for row in topics.values():
+        yield error(
+            'node.unheard',
+            f'{row["text"]}, for {row["seconds"]} s now',
+            'the profile of the node looks at other interfaces or peers than programs of the robot do, or a firewall is between',
+            f'{REMEDY[0].upper()}{REMEDY[1:]}',
+            publishers=row['publishers'],
+            nodes=row['nodes'],
+        )
+
+
+def _front(found: Mapping[str, Any]) -> Iterator[Result]:
+    """What stands for a node that listens through another RMW than the robot's."""
+    middleware, front = found['middleware'], found['workers'].get('front')
+    cause = (
+        f'programs of the robot ({middleware["robot"]}) find no services, parameters and /diagnostics of the node, and '
+        'nobody compares whom the robot finds; messages are logged all the same'
+    )
+    if front is not None and front['failing']:
+        remedy = 'journalctl -u shadowhound-data-logger | grep front  # what it said last; meanwhile: shadowhound-data node'
+        yield error('node.front', f'the front fails, {front["failures"]:,} times so far: {front["last_error"]}', cause, remedy)
+    elif front is None and middleware['rmw'] != middleware['robot']:
+        package = f'ros-$ROS_DISTRO-{middleware["robot"].replace("_", "-")}'
+        seen = f'no front runs: {middleware["robot"]} is not installed here'
+        yield warning('node.front', seen, cause, f'sudo apt install {package}  # or use: shadowhound-data node')
 
 
 def _status_remedy(text: str) -> str:

@@ -41,6 +41,8 @@ _SECTIONS: Final[dict[str, dict[str, Any]]] = {
               'oldest_age_s': None, 'min_free_bytes': None, 'remember_days': None},
     'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
               'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
+    'middleware': {'rmw': '', 'robot': '', 'why': '', 'asked': '', 'network': '', 'receive_bytes': None, 'dropped_datagrams': 0,
+                   'unheard': None},
     'clock': {'is_set': True, 'gave_up': False, 'unset_s': 0.0, 'steps': 0, 'last_step_s': None, 'last_step_age_s': None},
 }  # fmt: skip
 _WORKER: Final[dict[str, Any]] = {
@@ -185,6 +187,7 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
     yield from (f'bucket {name} takes nothing: {reason}' for name, reason in store['blocked_buckets'].items())
     yield from (f'{name} fails: {row["last_error"]}' for name, row in found['workers'].items() if row['failing'])
     yield from (f'{name}: {text}' for name, text in found['stalls'].items())
+    yield from (row['text'] for row in (found['middleware']['unheard'] or {}).values())
     for what in ('missed', 'dropped', 'rejected'):
         lost = {topic: row[what] for topic, row in found['topics'].items() if row[what]}
         if lost:

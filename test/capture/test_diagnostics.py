@@ -22,6 +22,7 @@ STATUS: dict[str, Any] = {
     'robot': 'thor', 'version': '0.1.0', 'pid': 7, 'uptime_s': 12.3, 'paused': False, 'topics': {'/imu': TOPIC},
     'events': {'enabled': True, 'seconds': 30.0, 'bytes': 10, 'max_bytes': 100, 'bag': '', 'refused': '', 'triggers': 1,
                'written': 1, 'last': {'name': 'fall', 'by': 'log_event'}, 'topics': {'/imu': {'dropped': 2}}},
+    'middleware': {'unheard': None},
     'bag': {'recording': True, 'paused': False, 'bag': 'patrol_1', 'dropped': 3, 'refused': '', 'topics': {}},
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'max_messages': 10, 'max_bytes': 100},
     'spool': {'path': '/s', 'pending': 3, 'held': 0, 'quarantined': 1, 'bytes': 10, 'max_bytes': 100, 'free_bytes': 5,
@@ -51,6 +52,15 @@ def told(name: str, **values: Any) -> tuple[Any, str]:
     """Level and words of an entry, after a while in which everything was fine."""
     found = {entry[0]: entry for entry in entries(changed(**values), STATUS)}
     return found[name][1], found[name][2]
+
+
+def test_publishers_that_are_not_heard() -> None:
+    """Say so at their topic, which has an entry of its own then whether anything was heard of it or not."""
+    unheard = {
+        topic: {'publishers': 1, 'nodes': [], 'seconds': 40, 'text': f'{topic} is not all heard'} for topic in ('/imu', '/odom')
+    }
+    for topic in unheard:
+        assert told(topic, middleware__unheard=unheard) == (ERROR, f'{topic} is not all heard')
 
 
 def test_all_is_fine() -> None:

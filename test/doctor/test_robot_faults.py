@@ -161,6 +161,20 @@ def stuck_mission(_: Path) -> list[dict[str, object]]:
     return [{'complete': False, 'last_error': error, 'remedy': remedy, 'refused_by_server': [], 'mission_id': 'm'}]
 
 
+def beside(**middleware: object) -> dict[str, object]:
+    """The middleware of a node that listens through Fast DDS beside a robot with Cyclone DDS."""
+    return {'rmw': 'rmw_fastrtps_cpp', 'robot': 'rmw_cyclonedds_cpp', **middleware}
+
+
+def unheard(scene: Scene) -> None:
+    rows = {'/imu': {'publishers': 2, 'nodes': ['/go2_driver'], 'seconds': 41, 'text': '/imu is not all heard'}}
+    scene.run_node(middleware=beside(unheard=rows), workers={'front': {}})
+
+
+def failing_front(scene: Scene) -> None:
+    scene.run_node(middleware=beside(), workers={'front': {'failing': True, 'failures': 3, 'last_error': 'it ended by signal 9'}})
+
+
 FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
     'no endpoint': (without('AWS_ENDPOINT_URL'), 'environment', 'environment.endpoint', ('export AWS_ENDPOINT_URL=http://',)),
     'no keys': (without('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY'), 'environment', 'environment.credentials',
@@ -200,6 +214,9 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
                                                         'sockets.driver', ('export FASTRTPS_DEFAULT',)),
     'node not running': (not_running, 'spool', 'node.running', ('sensor_logger_node',)),
     'node that is paused': (lambda scene: scene.run_node(paused=True), 'spool', 'node.status', ('/pause ', '{data: false}')),
+    'publishers that the node does not hear': (unheard, 'spool', 'node.unheard', ('capture.rmw: robot', 'CYCLONEDDS_URI')),
+    'a front that fails': (failing_front, 'spool', 'node.front', ('journalctl', 'shadowhound-data node')),
+    'no front': (lambda scene: scene.run_node(middleware=beside()), 'spool', 'node.front', ('rmw-cyclonedds-cpp',)),
     'node that does not deliver': (no_delivery, 'spool', 'node.delivery', ('doctor --only s3',)),
     'node of another version': (lambda scene: scene.run_node(version='0.0.1'), 'versions', 'versions.node', ('restart',)),
     'clock that was never set': (patched('clock.EARLIEST_SANE_NS', 1 << 62), 'clock', 'clock.set', ('timedatectl',)),

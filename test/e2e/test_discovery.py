@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,25 +14,11 @@ from typing import Any
 
 import pytest
 from e2e.finding import TOPICS
-from e2e.processes import HERE, WAIT_S
+from e2e.machines import OTHER, ROBOT, Machines
+from e2e.processes import WAIT_S
 
 pytestmark = pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')  # imported by children
 
-ROBOT, OTHER, SECOND = '10.77.0.1', '10.77.0.2', '10.78.0.1'
-MAKE = f"""
-set -e
-ip link set lo up
-ip link add eth0 type veth peer name eth1
-ip link set eth1 netns "$1"
-ip addr add {ROBOT}/24 dev eth0
-ip link set eth0 up
-ip link add wlan0 type veth peer name nobody
-ip addr add {SECOND}/24 dev wlan0
-ip link set wlan0 up
-ip link set nobody up
-"""
-"""The robot has a second interface, with nobody on it."""
-JOIN = f'set -e; ip link set lo up; ip addr add {OTHER}/24 dev eth1; ip link set eth1 up'
 MORE_S = 2.0
 """For somebody who is not to be found to be found all the same."""
 BOTH, ONE, NONE = ['/here', '/there'], ['/here'], list[str]()
@@ -84,55 +69,6 @@ if os.environ.get('ROS_DISTRO') == 'humble':  # whose librcl knows no range, and
         for name, (robot, other, topics) in CASES.items()
         if 'AS_HUMBLE' in robot or robot.keys().isdisjoint(RANGES)
     }
-
-
-class Machines:
-    """Two of them, in a user namespace of their own where this user is not root; both end with ``stack``."""
-
-    def __init__(self, stack: ExitStack) -> None:
-        """Skips where this user may make none."""
-        self._stack = stack
-        user = [] if os.geteuid() == 0 else ['--user', '--map-root-user']
-        self._robot = self._hold(['unshare', *user, '--net'])
-        self._other = self._hold([*self._inside(self._robot), 'unshare', '--net'])
-        self._run(self._robot, MAKE, str(self._other))
-        self._run(self._other, JOIN)
-
-    def start(self, *arguments: str, other: bool = False) -> subprocess.Popen[str]:
-        """finding.py there; returns once it is ready."""
-        command = [*self._inside(self._other if other else self._robot), sys.executable, str(HERE / 'finding.py'), *arguments]
-        path = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get('PYTHONPATH')])])
-        own = ('CYCLONEDDS_', 'ROS_LOCALHOST', 'ROS_AUTO', 'ROS_STATIC', 'RMW_', 'FASTDDS_', 'FASTRTPS_')
-        environ = {name: value for name, value in os.environ.items() if not name.startswith(own)} | {'PYTHONPATH': path}
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environ)
-        self._stack.callback(_end, process)
-        return process
-
-    def _hold(self, command: Sequence[str]) -> int:
-        """A process that is there; its number, which unshare and nsenter keep."""
-        holder = subprocess.Popen([*command, 'sh', '-c', 'echo there; exec cat'], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                                  stderr=subprocess.PIPE, text=True)  # fmt: skip
-        self._stack.callback(_end, holder)
-        assert holder.stdout is not None
-        if holder.stdout.readline() != 'there\n':
-            pytest.skip(f'no namespaces here: {holder.communicate()[1]}')
-        return holder.pid
-
-    @staticmethod
-    def _inside(pid: int) -> list[str]:
-        user = [] if os.geteuid() == 0 else ['--user', '--preserve-credentials']
-        return ['nsenter', '--target', str(pid), *user, '--net']
-
-    def _run(self, pid: int, script: str, *arguments: str) -> None:
-        command = [*self._inside(pid), 'sh', '-c', script, 'sh', *arguments]
-        ran = subprocess.run(command, capture_output=True, text=True, check=False)
-        if ran.returncode:
-            pytest.skip(f'no network of our own here: {ran.stderr}')
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    process.kill()
-    process.communicate()
 
 
 def ready(process: subprocess.Popen[str]) -> subprocess.Popen[str]:

@@ -1,0 +1,83 @@
+"""Two machines in one network, made of namespaces; the one that is the robot has a second interface, with nobody on it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+import pytest
+from e2e.processes import HERE
+
+ROBOT, OTHER, SECOND = '10.77.0.1', '10.77.0.2', '10.78.0.1'
+MAKE = f"""
+set -e
+ip link set lo up
+ip link add eth0 type veth peer name eth1
+ip link set eth1 netns "$1"
+ip addr add {ROBOT}/24 dev eth0
+ip link set eth0 up
+ip link add wlan0 type veth peer name nobody
+ip addr add {SECOND}/24 dev wlan0
+ip link set wlan0 up
+ip link set nobody up
+"""
+"""The robot has a second interface, with nobody on it."""
+JOIN = f'set -e; ip link set lo up; ip addr add {OTHER}/24 dev eth1; ip link set eth1 up'
+
+
+class Machines:
+    """Two of them, in a user namespace of their own where this user is not root; both end with ``stack``."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        """Skips where this user may make none."""
+        self._stack = stack
+        user = [] if os.geteuid() == 0 else ['--user', '--map-root-user']
+        self.robot = self._hold(['unshare', *user, '--net'])
+        """A process there, for ``inside``."""
+        self._other = self._hold([*inside(self.robot), 'unshare', '--net'])
+        self._run(self.robot, MAKE, str(self._other))
+        self._run(self._other, JOIN)
+
+    def join_networks(self) -> None:
+        """From now on the other machine reaches the robot's second interface as well."""
+        self._run(self._other, f'ip route add {SECOND} via {ROBOT}')
+
+    def start(self, *arguments: str, other: bool = False) -> subprocess.Popen[str]:
+        """finding.py there; returns once it is ready."""
+        command = [*inside(self._other if other else self.robot), sys.executable, str(HERE / 'finding.py'), *arguments]
+        path = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get('PYTHONPATH')])])
+        own = ('CYCLONEDDS_', 'ROS_LOCALHOST', 'ROS_AUTO', 'ROS_STATIC', 'RMW_', 'FASTDDS_', 'FASTRTPS_')
+        environ = {name: value for name, value in os.environ.items() if not name.startswith(own)} | {'PYTHONPATH': path}
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environ)
+        self._stack.callback(_end, process)
+        return process
+
+    def _hold(self, command: Sequence[str]) -> int:
+        """A process that is there; its number, which unshare and nsenter keep."""
+        holder = subprocess.Popen([*command, 'sh', '-c', 'echo there; exec cat'], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                                  stderr=subprocess.PIPE, text=True)  # fmt: skip
+        self._stack.callback(_end, holder)
+        assert holder.stdout is not None
+        if holder.stdout.readline() != 'there\n':
+            pytest.skip(f'no namespaces here: {holder.communicate()[1]}')
+        return holder.pid
+
+    def _run(self, pid: int, script: str, *arguments: str) -> None:
+        command = [*inside(pid), 'sh', '-c', script, 'sh', *arguments]
+        ran = subprocess.run(command, capture_output=True, text=True, check=False)
+        if ran.returncode:
+            pytest.skip(f'no network of our own here: {ran.stderr}')
+
+
+def inside(pid: int) -> list[str]:
+    """What a command begins with that runs in the network of that process."""
+    user = [] if os.geteuid() == 0 else ['--user', '--preserve-credentials']
+    return ['nsenter', '--target', str(pid), *user, '--net']
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.communicate()
