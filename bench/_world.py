@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
@@ -183,6 +183,16 @@ class World:
     def received(self, name: str) -> int:
         """Messages of a topic that are durably accounted for."""
         return int(self.topic(name).get('received', 0))
+
+
+def lost(rows: Iterable[Mapping[str, Any]]) -> int:
+    """What topics of a ledger missed and dropped. Raises Failed where it is not known what was missed."""
+    total = 0
+    for row in rows:
+        if row['missed'] is None:
+            raise Failed(f'what was missed of {row["type"]} is not known: {row["accounting"]}')
+        total += row['missed'] + sum(row['dropped'].values())
+    return total
 
 
 def make_bucket(tower: Tower) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from _report import Bar, Report, main, progress, ratio
-from _world import Failed, Program, World, until
+from _world import Failed, Program, World, lost, until
 
 ROUNDS = 5
 SENSORS = ('camera', 'camera_info', 'lidar', 'imu', 'odom', 'states', 'joints', 'lowstate')
@@ -64,16 +64,12 @@ def profile(folder: Path, seconds: float) -> dict[str, Any]:
                     switch(switcher, 'stop')
         sim.stop()
         node.stop()
-        rows = world.ledger()['bags'].values()
+        rows = list(world.ledger()['bags'].values())
         size = world.ledger()['bytes']['spooled']
     return {
         'intake_us': used[False], 'recording_us': used[True], 'bytes': size, 'balanced': world_balances(rows),
-        'recorded': sum(row['stored'] for row in rows), 'lost': lost(rows),
+        'recorded': sum(row['stored'] for row in rows), 'lost': lost(rows) + sum(row['open'] for row in rows),
     }  # fmt: skip
-
-
-def lost(rows: Any) -> int:
-    return sum((row['missed'] or 0) + sum(row['dropped'].values()) + row['open'] for row in rows)
 
 
 def world_balances(rows: Any) -> bool:

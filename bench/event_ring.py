@@ -16,7 +16,7 @@ from typing import Any
 
 import _proc
 from _report import Bar, Report, main, progress
-from _world import ROBOT, Program, World, until
+from _world import ROBOT, Program, World, lost, until
 
 from shadowhound_data_logger.spool.status import file
 
@@ -76,12 +76,6 @@ def run(folder: Path, limit: int, seconds: float) -> dict[str, Any]:
     return {'memory': memory, 'most': most, 'kept': kept, 'began_s': began_s, 'ledger': ledger, 'bag_bytes': size, **told}
 
 
-def lost(ledger: dict[str, Any]) -> int:
-    """In the event and in what the sensors keep."""
-    rows = [row for sink in ('topics', 'events') for row in ledger[sink].values()]
-    return sum((row['missed'] or 0) + sum(row['dropped'].values()) for row in rows)
-
-
 def measure(options: argparse.Namespace) -> Report:
     progress('a ring of 4 MiB')
     small = run(options.folder, SMALL, options.seconds / 4)
@@ -91,7 +85,7 @@ def measure(options: argparse.Namespace) -> Report:
     began, ended = max(large['writing'], key=lambda span: span[1] - span[0])
     before = sorted(took for at, took in large['rounds'] if large['began_s'] - options.seconds / 4 < at < large['began_s'])
     meanwhile = sorted(took for at, took in large['rounds'] if began - 0.2 <= at <= ended)
-    gone = lost(large['ledger'])
+    gone = lost(row for sink in ('topics', 'events') for row in large['ledger'][sink].values())
     figures = {
         'ring_seconds': large['kept']['seconds'], 'ring_bytes': large['kept']['bytes'], 'writing_s': ended - began,
         'bag_bytes': large['bag_bytes'], 'memory_small': small['memory'], 'memory_large': large['memory'],

@@ -43,6 +43,7 @@ STEPS: Final = (
     Step('node_cpu', ('--seconds', '30'), ('--seconds', '8')),
     Step('intake', ('--seconds', '20'), ('--seconds', '5')),
     Step('take', ('--seconds', '20'), ('--seconds', '4')),
+    Step('vendors', ('--seconds', '60'), ('--seconds', '10')),
     Step('small_messages', ('--seconds', '10'), ('--seconds', '3')),
     Step('full_rate', ('--seconds', '60', '--away', '300'), ('--seconds', '10', '--away', '10')),
     Step('bag_recording', ('--seconds', '40'), ('--seconds', '10')),

@@ -13,7 +13,7 @@ from typing import Any
 
 import _proc
 from _report import Bar, Report, main, progress
-from _world import World
+from _world import World, lost
 
 BAR_HZ = 5000
 RATES_HZ = (5000, 10_000, 15_000, 20_000)
@@ -46,17 +46,17 @@ def run(folder: Path, rate_hz: int, seconds: float) -> dict[str, Any]:
         node.stop()
         found = world.ledger()
     row = found['topics'][TOPIC]
-    lost = (row['missed'] or 0) + sum(row['dropped'].values()) + sum(row['rejected'].values())
+    gone = lost([row]) + sum(row['rejected'].values())
     reached = told['published'] / told['seconds']
     kept_up = told['published'] == round(rate_hz * seconds) and reached >= KEPT_UP * rate_hz
     closes = found['balanced'] and row['accounting'] == 'exact' and row['stored'] == row['received'] == row['published']
     return {
         'asked_hz': rate_hz, 'reached_hz': reached, 'seconds': told['seconds'], 'published': warm + told['published'],
-        'received': row['received'], 'stored': row['stored'], 'lost': lost, 'balanced': found['balanced'],
+        'received': row['received'], 'stored': row['stored'], 'lost': gone, 'balanced': found['balanced'],
         'accounting': row['accounting'], 'node_us': 1e6 * cpu / told['published'],
         'publisher_us': 1e6 * told['cpu_s'] / told['published'], 'cores_busy': busy,
         'mb_per_s': found['bytes']['delivered'] / 1e6 / (told['seconds'] + WARM_S),
-        'holds': kept_up and closes and lost == 0,
+        'holds': kept_up and closes and gone == 0,
     }  # fmt: skip
 
 
