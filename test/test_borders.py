@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from shadowhound_data_logger import metadata_words
+
 PACKAGE = 'shadowhound_data_logger'
 ROOT = Path(__file__).parents[1] / PACKAGE
 ORDER = ('contracts', 'stores', 'mcap', 'encode', 'spool', 'ship', 'catalogue', 'missions', 'face', 'bags', 'capture', 'lake',
@@ -112,6 +114,14 @@ print([name for name in ('daft', 'obstore', 'pyarrow') if name in sys.modules])
 """
     ran = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60)
     assert ran.stdout.strip() == '[]'
+
+
+def test_the_words_of_metadata_are_told() -> None:
+    """Each word is defined once, and the page on formats says what it means."""
+    words = {name: word for name, word in vars(metadata_words).items() if name.isupper()}
+    page = (ROOT.parent / 'docs' / 'formats.md').read_text(encoding='utf-8')
+    assert len(set(words.values())) == len(words)
+    assert [word for word in words.values() if f'`{word}`' not in page] == []
 
 
 PROGRAM = f"""

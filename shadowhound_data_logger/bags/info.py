@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.description import Description, of_metadata, of_slices, slice_info
 from shadowhound_data_logger.bags.local import LocalFile as Waiting
 from shadowhound_data_logger.bags.local import local_files
@@ -110,6 +111,6 @@ def _slice(source: Ranged) -> SliceInfo:
 def _tags(store: Listing, bag: RemoteBag, waiting: Mapping[str, Waiting]) -> Mapping[str, str]:
     """What was written beside one slice: enough to tell whose it is."""
     for file in waiting.values():
-        return file.metadata or {'bag': bag.name}
+        return file.metadata or {words.BAG: bag.name}
     held = store.head(BUCKET, bag.slices[0].key) if bag.slices and not bag.file(MANIFEST) else None
     return held.metadata if held else {}

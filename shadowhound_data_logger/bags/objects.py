@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, RECOVERED, Manifest, Missing, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, slice_number
 from shadowhound_data_logger.bags.notes import Notes
@@ -34,8 +35,8 @@ def slice_object(notes: Notes, info: SliceInfo, priority: int) -> DataObject:
     is_event = notes.event is not None
     file, (start_ns, end_ns) = notes.final(info.path.name), _times(notes, info.t_start_ns, info.t_end_ns)
     metadata = {
-        **_marks(notes), 'slice': str(slice_number(notes.bag, file)), 'messages': str(info.messages),
-        **({'t_start_ns': str(start_ns), 't_end_ns': str(end_ns)} if _is_dated(notes) else {}),
+        **_marks(notes), words.SLICE: str(slice_number(notes.bag, file)), words.MESSAGES: str(info.messages),
+        **({words.T_START_NS: str(start_ns), words.T_END_NS: str(end_ns)} if _is_dated(notes) else {}),
         **_clock_marks(notes, info.t_start_ns, info.t_end_ns),
     }  # fmt: skip
     return DataObject(
@@ -87,11 +88,12 @@ def _small(notes: Notes, file: str, body: bytes, content_type: str, span: tuple[
 
 
 def _marks(notes: Notes) -> dict[str, str]:
-    marks = {'robot': notes.robot, 'bag': notes.bag}
+    marks = {words.ROBOT: notes.robot, words.BAG: notes.bag}
     if notes.event is not None:
-        marks['event'] = notes.event.name
+        marks[words.EVENT] = notes.event.name
     if notes.mission is not None:
-        marks |= {name: value for name in ('mission_id', 'run_id') if (value := getattr(notes.mission, name))}
+        ids = {words.MISSION_ID: notes.mission.mission_id, words.RUN_ID: notes.mission.run_id}
+        marks |= {word: value for word, value in ids.items() if value}
     return marks
 
 
@@ -117,8 +119,8 @@ def _clock_marks(notes: Notes, *times_ns: int) -> dict[str, str]:
     clock = notes.clock
     if clock is None:
         return {}
-    marks = {'clock': clock.known, 'boot_id': clock.boot_id}
+    marks = {words.CLOCK: clock.known, words.BOOT_ID: clock.boot_id}
     if clock.offset_ns is not None:
-        marks['clock_offset_ns'] = str(clock.offset_ns)
+        marks[words.CLOCK_OFFSET_NS] = str(clock.offset_ns)
     boot = (str(max(0, time_ns - clock.wall_ns + clock.boot_ns)) for time_ns in times_ns)
-    return {**marks, **dict(zip(('boot_start_ns', 'boot_end_ns'), boot, strict=False))}
+    return {**marks, **dict(zip((words.BOOT_START_NS, words.BOOT_END_NS), boot, strict=False))}

@@ -9,6 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.description import of_metadata
 from shadowhound_data_logger.bags.local import LocalFile, given_up, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
@@ -148,7 +149,7 @@ def _tags(store: Listing, bag: RemoteBag, local: Iterable[LocalFile]) -> dict[st
     found: dict[str, Mapping[str, str]] = {file.name: file.metadata for file in local if file.metadata}
     for file in bag.slices:
         held = store.head(BUCKET, file.key)
-        if held is None or 'bag' not in held.metadata:
+        if held is None or words.BAG not in held.metadata:
             break
         found[file.name] = held.metadata
     return found
@@ -166,13 +167,13 @@ def _facts(store: Listing, bag: RemoteBag, manifest: Manifest | None, tags: Iter
         told = of_metadata(document(store, file), file.key)
         return _span(told.messages, len({topic.name for topic in told.topics}), [(told.t_start_ns, told.t_end_ns)])
     try:
-        told_of = [{name: int(tag[name]) for name in ('messages', 't_start_ns', 't_end_ns')} for tag in tags]
+        told_of = [tuple(int(tag[word]) for word in (words.MESSAGES, words.T_START_NS, words.T_END_NS)) for tag in tags]
     except (KeyError, ValueError):
         return _Facts()
-    if not all(0 <= value < 1 << 63 for each in told_of for value in each.values()):
+    if not all(0 <= value < 1 << 63 for each in told_of for value in each):
         return _Facts()
-    spans = [(each['t_start_ns'], each['t_end_ns']) for each in told_of if each['messages']]
-    return _span(sum(each['messages'] for each in told_of), None, spans) if told_of else _Facts()
+    spans = [(start_ns, end_ns) for messages, start_ns, end_ns in told_of if messages]
+    return _span(sum(messages for messages, _, _ in told_of), None, spans) if told_of else _Facts()
 
 
 def _span(messages: int, topics: int | None, spans: list[tuple[int, int]]) -> _Facts:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Final, cast
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.description import Description, Part, of_metadata, slice_info
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, RecordedTopic, SliceEntry
 from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, prefix_of
@@ -114,7 +115,7 @@ def archive_of(folder: Path, robot: str, bag: str, work: Path) -> Parcel:
         for file in sorted(each for each in folder.rglob('*') if each.is_file()):
             archive.add(file, f'{bag}/{file.relative_to(folder)}', recursive=False, filter=_nobodys)
     key = check_key(f'{prefix_of(robot)}{name}')
-    metadata = {'robot': robot, 'bag': bag, 'messages': str(described.messages)}
+    metadata = {words.ROBOT: robot, words.BAG: bag, words.MESSAGES: str(described.messages)}
     item = Outgoing(name, key, path, *fingerprint(path), metadata, described.t_start_ns, described.t_end_ns)
     return Parcel(robot, bag, folder, (item,))
 
@@ -127,7 +128,7 @@ def _nobodys(member: tarfile.TarInfo) -> tarfile.TarInfo:
 
 def _outgoing(path: Path, name: str, robot: str, bag: str) -> Outgoing:
     key = check_key(f'{prefix_of(robot, bag)}{name}')
-    return Outgoing(name, key, path, *fingerprint(path), {'robot': robot, 'bag': bag})
+    return Outgoing(name, key, path, *fingerprint(path), {words.ROBOT: robot, words.BAG: bag})
 
 
 def _marked(file: Outgoing, part: Part | None, robot: str, bag: str) -> Outgoing:
@@ -136,8 +137,9 @@ def _marked(file: Outgoing, part: Part | None, robot: str, bag: str) -> Outgoing
         return file
     number = _NUMBER.search(file.name)
     start_ns, end_ns = part.t_start_ns or 0, part.t_end_ns or 0
-    told = {'messages': part.messages, 't_start_ns': start_ns, 't_end_ns': end_ns} | ({'slice': int(number[1])} if number else {})
-    metadata = {'robot': robot, 'bag': bag, **{name: str(value) for name, value in told.items()}}
+    told = {words.MESSAGES: part.messages, words.T_START_NS: start_ns, words.T_END_NS: end_ns}
+    told |= {words.SLICE: int(number[1])} if number else {}
+    metadata = {words.ROBOT: robot, words.BAG: bag, **{name: str(value) for name, value in told.items()}}
     return replace(file, metadata=metadata, t_start_ns=start_ns, t_end_ns=end_ns)
 
 
@@ -163,7 +165,7 @@ def _entries(files: list[Outgoing], described: Description) -> Iterator[SliceEnt
     """``counts`` are those of the slice where it tells them, or where it is the only one."""
     for file in files:
         counts = {topic.name: topic.messages for topic in described.topics} if len(files) == 1 else {}
-        messages = int(file.metadata.get('messages', sum(counts.values())))
+        messages = int(file.metadata.get(words.MESSAGES, sum(counts.values())))
         t_start_ns, t_end_ns = file.t_start_ns or described.t_start_ns, file.t_end_ns or described.t_end_ns
         if file.name.endswith('.mcap'):
             index = read_index(LocalFile(file.path))

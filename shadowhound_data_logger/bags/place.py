@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import ClockOf
 from shadowhound_data_logger.bags.naming import BUCKET, UNSYNCED, bag_name, key_of, slice_file, unsynced_name
 from shadowhound_data_logger.bags.notes import Notes
@@ -21,8 +22,6 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock
 from shadowhound_data_logger.missions.dating import Dating
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
-SET_LATER, UNSET = 'set_later', 'unset'
-"""How the date of such a bag is known, in the words of spool/redating.py."""
 _LATEST: Final = 1 << 63
 
 
@@ -48,7 +47,7 @@ class Place:
         wall_ns, boot_ns = self.clock.wall_ns(), self.clock.boot_ns()
         if wall_ns >= EARLIEST_SANE_NS:
             return None
-        return ClockOf(UNSET, self.clock.boot_id, max(0, boot_ns - age_ns), max(0, wall_ns - age_ns), None)
+        return ClockOf(words.UNSET, self.clock.boot_id, max(0, boot_ns - age_ns), max(0, wall_ns - age_ns), None)
 
     def name(self, what: str, unset: ClockOf | None, age_ns: int = 0) -> str:
         """A name for a bag that begins, which no other has."""
@@ -74,7 +73,7 @@ class Place:
             return False
         if offset_ns:
             began_ns = clock.boot_ns + offset_ns
-            clock = replace(clock, known=SET_LATER, offset_ns=began_ns - clock.wall_ns)
+            clock = replace(clock, known=words.SET_LATER, offset_ns=began_ns - clock.wall_ns)
             notes.set_name(bag_name(notes.bag.rpartition(UNSYNCED)[0], began_ns, self._is_taken), clock)
         else:
             notes.set_name(notes.bag, clock)

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, prefix_of
 from shadowhound_data_logger.errors import BagError
@@ -130,7 +131,7 @@ def state_of(bag: RemoteBag, manifest: Manifest | None, slice_metadata: Mapping[
     """The state; ``slice_metadata`` is that of any of its slices, where there is no manifest."""
     if manifest is not None:
         return GROWING if missing_of(bag, manifest) else manifest.state
-    return GROWING if 'bag' in slice_metadata and not bag.file(METADATA) else FOREIGN
+    return GROWING if words.BAG in slice_metadata and not bag.file(METADATA) else FOREIGN
 
 
 def _ordered(files: Iterable[RemoteFile]) -> tuple[RemoteFile, ...]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.fetch import Told, on_disk
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.parcel import Outgoing, Parcel, archive_of, finished, parcel_of
@@ -92,7 +93,7 @@ def upload_now(store: ObjectStore, sent: Parcel, *, deadline_s: float, told: Tol
     def put(place: int) -> None:
         file = sent.files[place]
         item = SpooledObject(place, BUCKET, file.key, file.path, file.size, file.sha256, file.content_type,
-                             {**file.metadata, 'sha256': file.sha256}, PRIORITY, 0)  # fmt: skip
+                             {**file.metadata, words.SHA256: file.sha256}, PRIORITY, 0)  # fmt: skip
         _steadily(lambda: store.put(item), end_s, sent.bag)
         told.have(file.size)
 
@@ -192,7 +193,7 @@ def _check_names(spool: Spool, sent: Parcel) -> None:
 
 
 def _object(file: Outgoing, path: Path) -> DataObject:
-    is_slice = file.name != MANIFEST and 'messages' in file.metadata
+    is_slice = file.name != MANIFEST and words.MESSAGES in file.metadata
     return DataObject(
         bucket=BUCKET, key=file.key, body=FileBody(path, file.size, file.sha256), content_type=file.content_type,
         sensor='rosbags', topic=None, type='', samples=0, t_start_ns=file.t_start_ns, t_end_ns=file.t_end_ns,

@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.capture.encode_pool import BatchQueue
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.mission_tap import MissionTap
@@ -84,7 +85,7 @@ class MissionWatch:
         mission = self._mission
         if mission is None:
             return {}
-        return {'mission_id': mission.id, 'run_id': self._marks.get('run_id'), 'type': mission.mission_type,
+        return {'mission_id': mission.id, 'run_id': self._marks.get(words.RUN_ID), 'type': mission.mission_type,
                 'started': iso(mission.start_ns)}  # fmt: skip
 
     # -- for the encoders ------------------------------------------------------------------------------------------
@@ -114,7 +115,7 @@ class MissionWatch:
                 self._leave(before)
             if found is not None:
                 self._join(found)
-        elif found is not None and 'run_id' not in self._marks and self._find_run(found):
+        elif found is not None and words.RUN_ID not in self._marks and self._find_run(found):
             self._tell(self.status())
         if self._log is not None and time.monotonic() >= self._due_s:
             self._due_s = time.monotonic() + WRITE_S
@@ -123,7 +124,7 @@ class MissionWatch:
 
     def _join(self, mission: Active) -> None:
         """From now on; what was taken before is closed first, so that no object is of before and of the mission."""
-        self._marks = {'mission_id': mission.id, 'mission_type': safe_type(mission.mission_type)}
+        self._marks = {words.MISSION_ID: mission.id, words.MISSION_TYPE: safe_type(mission.mission_type)}
         self._find_run(mission)
         if self._settings.join:
             node_log = NodeLog(mission, max(1, round(self._settings.period_s * SECOND)), self._settings.max_speed_mps)
@@ -162,5 +163,5 @@ class MissionWatch:
     def _find_run(self, mission: Active) -> bool:
         run = mission.folder.run()
         if run is not None:
-            self._marks = {**self._marks, 'run_id': run.run_id}
+            self._marks = {**self._marks, words.RUN_ID: run.run_id}
         return run is not None

@@ -15,6 +15,7 @@ from typing import Any
 
 from rclpy.node import Node
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.naming import FOLDER
 from shadowhound_data_logger.bags.place import Place
 from shadowhound_data_logger.bags.queue import BagQueue
@@ -309,5 +310,5 @@ class Pipeline:
         return DataObject(
             bucket=LEDGER_BUCKET, key=dated(pattern, now_ns), key_pattern=pattern,
             body=json.dumps(content, indent=1).encode(), content_type='application/json', sensor='_ledger', topic=None,
-            type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns, priority=0, protected=True, metadata={'robot': robot},
+            type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns, priority=0, protected=True, metadata={words.ROBOT: robot},
         )  # fmt: skip

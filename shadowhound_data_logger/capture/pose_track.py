@@ -16,12 +16,12 @@ from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.capture.mission_tap import number_at, yaw_of
 from shadowhound_data_logger.capture.stream import Consumer, Drained
-from shadowhound_data_logger.catalogue.schema import BATTERY, POSE
 from shadowhound_data_logger.clock import SECOND, Clock, stamp_of
 from shadowhound_data_logger.config import MissionSettings
 from shadowhound_data_logger.encode.records import ODOMETRY
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.errors import Rejected
+from shadowhound_data_logger.metadata_words import BATTERY, POSE
 from shadowhound_data_logger.model import DataObject
 
 SPAN_NS: Final = 60 * SECOND

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, utc
 
@@ -54,9 +55,6 @@ message, the middle of a batch. ``clock`` is how well the times are known (spool
 ``clock_offset_ns`` is to be added to the times in the content, with ``set_later``.
 """
 REQUIRED: Final = ('bucket', 'key', 'bytes', 'format_version')
-POSE: Final = 'pose'
-"""Metadata: ``x y yaw frame``, as in ``3.214 -1.502 0.7854 odom``."""
-BATTERY: Final = 'battery_pct'
 UNDATED: Final = '1970-01-01'
 SENSOR: Final = '_catalog'
 """Of the catalogue's own objects, and their folder."""
@@ -91,34 +89,34 @@ def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mappin
     ``robot`` is that of its key, whatever the object says; ``sensor`` of one that tells nothing too.
     """
     parts = key.split('/')
-    start_ns, end_ns = _int(metadata, 't_start_ns', 'boot_start_ns'), _int(metadata, 't_end_ns', 'boot_end_ns')
-    pose = metadata.get(POSE, '').split(' ')
+    start_ns, end_ns = _int(metadata, words.T_START_NS, words.BOOT_START_NS), _int(metadata, words.T_END_NS, words.BOOT_END_NS)
+    pose = metadata.get(words.POSE, '').split(' ')
     x, y, yaw = (_number(value) for value in (pose[:3] if len(pose) == 4 else ('', '', '')))
     known = None not in (x, y, yaw)
     return {
-        'robot': (parts[0] if len(parts) > 1 else metadata.get('robot')) or None,
-        'sensor': metadata.get('sensor') or (parts[1] if len(parts) > 2 else None),
-        'topic': metadata.get('topic') or None,
-        'type': metadata.get('type') or None,
+        'robot': (parts[0] if len(parts) > 1 else metadata.get(words.ROBOT)) or None,
+        'sensor': metadata.get(words.SENSOR) or (parts[1] if len(parts) > 2 else None),
+        'topic': metadata.get(words.TOPIC) or None,
+        'type': metadata.get(words.TYPE) or None,
         'bucket': bucket,
         'key': key,
         'bytes': size,
-        'sha256': metadata.get('sha256') or None,
+        'sha256': metadata.get(words.SHA256) or None,
         't_start': _micros(start_ns),
         't_end': _micros(end_ns),
         't_start_ns': start_ns,
         't_end_ns': end_ns,
-        'count': _int(metadata, 'count', 'messages'),
-        'mission_id': metadata.get('mission_id') or None,
-        'run_id': metadata.get('run_id') or None,
-        'mission_type': metadata.get('mission_type') or None,
+        'count': _int(metadata, words.COUNT, words.MESSAGES),
+        'mission_id': metadata.get(words.MISSION_ID) or None,
+        'run_id': metadata.get(words.RUN_ID) or None,
+        'mission_type': metadata.get(words.MISSION_TYPE) or None,
         'x': x if known else None,
         'y': y if known else None,
         'yaw': yaw if known else None,
         'pose_frame': pose[3] if known else None,
-        'battery_pct': _number(metadata.get(BATTERY, '')),
-        'clock': metadata.get('clock') or None,
-        'clock_offset_ns': _int(metadata, 'clock_offset_ns'),
+        'battery_pct': _number(metadata.get(words.BATTERY, '')),
+        'clock': metadata.get(words.CLOCK) or None,
+        'clock_offset_ns': _int(metadata, words.CLOCK_OFFSET_NS),
         'content_type': content_type or None,
         'format_version': FORMAT_VERSION,
     }

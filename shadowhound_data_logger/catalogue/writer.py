@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue import parts
 from shadowhound_data_logger.catalogue.schema import BUCKET, SENSOR, Row, part_key, row_of
 from shadowhound_data_logger.clock import Clock, utc
@@ -76,7 +77,8 @@ class CatalogueWriter:
         return DataObject(
             bucket=BUCKET, key=part_key(robot, date, name), body=parts.encode(rows), content_type=parts.CONTENT_TYPE,
             sensor=SENSOR, topic=None, type='', samples=0, t_start_ns=min(times), t_end_ns=max(times), priority=PRIORITY,
-            protected=True, metadata={'robot': robot, 'count': str(len(rows))}, catalogues=tuple(number for number, _ in found),
+            protected=True, metadata={words.ROBOT: robot, words.COUNT: str(len(rows))},
+            catalogues=tuple(number for number, _ in found),
         )  # fmt: skip
 
     def _named(self, robot: str | None) -> str:

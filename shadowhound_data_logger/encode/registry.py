@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.archive import archive, pack_tar, pack_zip
 from shadowhound_data_logger.encode.image import encode_jpeg, encode_png
@@ -67,13 +68,13 @@ def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, 
     start_ns = min(sample.stamp_ns for sample in payload.kept)
     end_ns = max(sample.stamp_ns for sample in payload.kept)
     metadata = {
-        'robot': robot,
-        'sensor': sensor.name,
-        'topic': batch.topic,
-        'type': batch.type,
-        'count': str(len(payload.kept)),
-        't_start_ns': str(start_ns),
-        't_end_ns': str(end_ns),
+        words.ROBOT: robot,
+        words.SENSOR: sensor.name,
+        words.TOPIC: batch.topic,
+        words.TYPE: batch.type,
+        words.COUNT: str(len(payload.kept)),
+        words.T_START_NS: str(start_ns),
+        words.T_END_NS: str(end_ns),
     }
     return DataObject(
         bucket=sensor.bucket,

@@ -8,6 +8,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue.parts import CONTENT_TYPE
 from shadowhound_data_logger.catalogue.schema import BUCKET, SENSOR
 from shadowhound_data_logger.errors import ForeignObject
@@ -20,7 +21,7 @@ def put_part(store: ObjectStore, key: str, robot: str, body: bytes, rows: int) -
     with tempfile.TemporaryDirectory(prefix='shadowhound-lake-') as folder:
         path = Path(folder, 'part.parquet')
         path.write_bytes(body)
-        metadata = {'robot': robot, 'sensor': SENSOR, 'count': str(rows)}
+        metadata = {words.ROBOT: robot, words.SENSOR: SENSOR, words.COUNT: str(rows)}
         item = SpooledObject(
             id=0, bucket=BUCKET, key=key, path=path, size=len(body), sha256=hashlib.sha256(body).hexdigest(),
             content_type=CONTENT_TYPE, metadata=metadata, priority=5, created_ns=time.time_ns(),

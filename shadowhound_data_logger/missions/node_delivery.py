@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of
@@ -160,5 +161,5 @@ class NodeDelivery:
 
 def _of(item: Item, mission: MissionFolder) -> Item:
     """An object with the mission's own id."""
-    metadata = {**item.content.metadata, 'mission_id': mission.mission_id}
+    metadata = {**item.content.metadata, words.MISSION_ID: mission.mission_id}
     return Item(replace(item.content, metadata=metadata), item.path, item.is_done_with)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
@@ -58,12 +59,12 @@ def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: Miss
     """
     kind, robot = record.get('k'), start['robot']
     home = f'{robot}/missions/{run.run_id if run else folder.mission_id}'
-    metadata = {'robot': robot, 'mission_id': folder.mission_id, 'mission_type': safe_type(start['type'])}
-    metadata |= {'run_id': run.run_id} if run else {}
+    metadata = {words.ROBOT: robot, words.MISSION_ID: folder.mission_id, words.MISSION_TYPE: safe_type(start['type'])}
+    metadata |= {words.RUN_ID: run.run_id} if run else {}
     time_ns = int(record.get('t', 0))
     if kind == 'frame':
         number, path = int(record['id']), folder.files / record['file']
-        key, more = f'{home}/camera/frame_{number:06d}.jpg', {**record.get('marks', {}), **metadata, 'frame_id': str(number)}
+        key, more = f'{home}/camera/frame_{number:06d}.jpg', {**record.get('marks', {}), **metadata, words.FRAME_ID: str(number)}
         yield from _item(path, BUCKET, key, time_ns, more, is_done_with=not record.get('artifact'))
     elif kind == 'trajectory':
         yield from _trajectory(folder.files / record['file'], home, start, time_ns, metadata)
@@ -89,7 +90,7 @@ def _item(path: Path, bucket: str, key: str, time_ns: int, metadata: Mapping[str
         bucket=bucket, key=key, body=body, content_type=CONTENT_TYPES[extension], sensor='missions', topic=None, type='',
         samples=0, t_start_ns=time_ns, t_end_ns=time_ns, priority=FRAME_PRIORITY if is_frame else 1,
         protected=not is_frame, metadata=metadata,
-        held=None if 'run_id' in metadata else held_reason(metadata['mission_id']),
+        held=None if words.RUN_ID in metadata else held_reason(metadata[words.MISSION_ID]),
     )  # fmt: skip
     yield Item(content, path, is_done_with)
 
@@ -130,7 +131,7 @@ class Shelf:
             found = spool.held(held_reason(mission_id))
             spool.bind([
                 Binding(item.id, item.key.replace(f'/missions/{mission_id}/', f'/missions/{run_id}/', 1),
-                        {**item.metadata, 'run_id': run_id}, item.t_start_ns, item.t_end_ns)
+                        {**item.metadata, words.RUN_ID: run_id}, item.t_start_ns, item.t_end_ns)
                 for item in found
             ])  # fmt: skip
         except (OSError, sqlite3.Error) as error:

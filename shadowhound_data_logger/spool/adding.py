@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.spool.binding import free_key
@@ -35,7 +36,7 @@ class Adding:
             state, reason = State.QUARANTINED, MISSING
         key = free_key(self._index, item.bucket, check_key(item.key))
         sha256 = content_sha256(item.body)
-        metadata = {**facts(item), 'sha256': sha256}
+        metadata = {**facts(item), words.SHA256: sha256}
         if state is State.PENDING:
             holder = self._repeats.holder(self._index, item, sha256)
             if holder is not None:
@@ -78,6 +79,6 @@ class Adding:
 
     def _add_repeat(self, item: DataObject, key: str, metadata: Mapping[str, str]) -> None:
         sha256 = content_sha256(item.body)
-        said = {**metadata, 'sha256': sha256}
+        said = {**metadata, words.SHA256: sha256}
         number = self._index.insert(item, key, sha256, State.PENDING, None, said, self._now_ns)
         self._index.move([number], State.DEDUPLICATED, None, self._now_ns)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_key, check_name
@@ -169,14 +170,14 @@ def _described(bucket: str, key: str, body: FileBody) -> DataObject | None:
         return None
     changed_ns = body.path.stat().st_mtime_ns
     metadata = said.get('metadata')
-    words = metadata.items() if isinstance(metadata, dict) else ()
+    own = metadata.items() if isinstance(metadata, dict) else ()
     return DataObject(
         bucket=bucket, key=key, body=body, content_type=_word(said, 'content_type', 'application/octet-stream'),
         sensor=_word(said, 'sensor', 'unknown'), topic=_word(said, 'topic', '') or None, type=_word(said, 'type', ''),
         samples=_number(said, 'samples', 0), t_start_ns=_number(said, 't_start_ns', changed_ns),
         t_end_ns=_number(said, 't_end_ns', changed_ns), priority=min(_number(said, 'priority', 5), 9),
         protected=said.get('protected') is True,
-        metadata={**{name: value for name, value in words if isinstance(value, str)}, 'sha256': sha256}, counts=_counts(said),
+        metadata={**{name: value for name, value in own if isinstance(value, str)}, words.SHA256: sha256}, counts=_counts(said),
     )  # fmt: skip
 
 

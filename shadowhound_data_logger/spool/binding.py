@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.keys import check_key, unique
 from shadowhound_data_logger.model import Binding, HeldObject, SpooledObject, State
@@ -108,7 +109,7 @@ def _held_path(tree: Tree, row: sqlite3.Row) -> Path:
 
 def _change(index: Index, row: sqlite3.Row, binding: Binding, now_ns: int) -> None:
     key = free_key(index, row['bucket'], binding.key, row['key'])
-    metadata = {**binding.metadata, 'sha256': row['sha256']}
+    metadata = {**binding.metadata, words.SHA256: row['sha256']}
     created_ns = row['created_ns']
     if created_ns < EARLIEST_SANE_NS <= now_ns:  # spooled before the clock was set: for how long it waits is told from this
         created_ns = binding.t_end_ns if EARLIEST_SANE_NS <= binding.t_end_ns <= now_ns else now_ns

@@ -25,6 +25,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.model import DataObject, FileBody, State
@@ -222,11 +223,11 @@ def content_sha256(body: bytes | FileBody) -> str:
 
 def facts(item: DataObject) -> dict[str, str]:
     """What an object says of itself in the store, in its own words first: enough to make its row of the catalogue again."""
-    said = {'sensor': item.sensor}
+    said = {words.SENSOR: item.sensor}
     if item.topic is not None:
-        said |= {'topic': item.topic, 'type': item.type, 'count': str(item.samples)}
+        said |= {words.TOPIC: item.topic, words.TYPE: item.type, words.COUNT: str(item.samples)}
     if item.t_start_ns >= EARLIEST_SANE_NS:
-        said |= {'t_start_ns': str(item.t_start_ns), 't_end_ns': str(item.t_end_ns)}
+        said |= {words.T_START_NS: str(item.t_start_ns), words.T_END_NS: str(item.t_end_ns)}
     return {**said, **item.metadata}
 
 

@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.errors import NameRefused
@@ -32,9 +33,7 @@ CLOCK: Final = 'clock'
 """Why an object is held."""
 STEP: Final = 256
 """Objects named in one go: some 30 ms."""
-SET, PUBLISHER, SET_LATER, UNSET = 'set', 'publisher', 'set_later', 'unset'
-_PATTERN, _OFFSET = 'key_pattern', 'clock_offset_ns'
-_TIMES: Final = ('t_start_ns', 't_end_ns')
+_TIMES: Final = (words.T_START_NS, words.T_END_NS)
 
 
 class Redating:
@@ -52,12 +51,13 @@ class Redating:
         start_ns, end_ns = item.t_start_ns, item.t_end_ns
         if start_ns >= EARLIEST_SANE_NS:
             away_ns = offset_ns if offset_ns is not None else end_ns - self._watch.boot_ns()
-            clock = SET if offset_ns is not None else PUBLISHER
+            clock = words.SET if offset_ns is not None else words.PUBLISHER
             return replace(
-                item, metadata={**item.metadata, **_boot(boot_id, start_ns - away_ns, end_ns - away_ns), 'clock': clock}
+                item, metadata={**item.metadata, **_boot(boot_id, start_ns - away_ns, end_ns - away_ns), words.CLOCK: clock}
             )
         known = {name: value for name, value in item.metadata.items() if name not in _TIMES}
-        metadata = {**known, **_boot(boot_id, start_ns, end_ns), 'clock': UNSET, _PATTERN: item.key_pattern or item.key}
+        metadata = {**known, **_boot(boot_id, start_ns, end_ns), words.CLOCK: words.UNSET}
+        metadata[words.KEY_PATTERN] = item.key_pattern or item.key
         if offset_ns is not None:
             key, metadata = _final(metadata, start_ns, end_ns, offset_ns)
             return replace(item, key=key, metadata=metadata, t_start_ns=start_ns + offset_ns, t_end_ns=end_ns + offset_ns)
@@ -78,14 +78,14 @@ class Redating:
 
     def _binding(self, item: HeldObject) -> Binding | None:
         """What becomes of a held object now; None where it has to wait."""
-        offset_ns = self._offset_of(item.metadata.get('boot_id', ''))
+        offset_ns = self._offset_of(item.metadata.get(words.BOOT_ID, ''))
         if offset_ns is not None and item.t_start_ns < EARLIEST_SANE_NS:
             try:
                 key, metadata = _final(item.metadata, item.t_start_ns, item.t_end_ns, offset_ns)
                 return Binding(item.id, key, metadata, item.t_start_ns + offset_ns, item.t_end_ns + offset_ns)
             except (NameRefused, LookupError, ValueError) as error:
                 log.warning('%s cannot be dated: %s', item.key, error)
-        elif offset_ns is None and item.metadata.get('boot_id') == self._watch.boot_id and not self._watch.state().gave_up:
+        elif offset_ns is None and item.metadata.get(words.BOOT_ID) == self._watch.boot_id and not self._watch.state().gave_up:
             return None
         return Binding(item.id, item.key, item.metadata, item.t_start_ns, item.t_end_ns)
 
@@ -94,12 +94,12 @@ class Redating:
 
 
 def _boot(boot_id: str, start_ns: int, end_ns: int) -> dict[str, str]:
-    return {'boot_id': boot_id, 'boot_start_ns': str(start_ns), 'boot_end_ns': str(end_ns)}
+    return {words.BOOT_ID: boot_id, words.BOOT_START_NS: str(start_ns), words.BOOT_END_NS: str(end_ns)}
 
 
 def _final(metadata: Mapping[str, str], start_ns: int, end_ns: int, offset_ns: int) -> tuple[str, dict[str, str]]:
     """Key and metadata of an object that is re-dated. Raises NameRefused, LookupError or ValueError where they make no sense."""
-    times = {'t_start_ns': str(start_ns + offset_ns), 't_end_ns': str(end_ns + offset_ns)}
-    rest = {name: value for name, value in metadata.items() if name != _PATTERN}
-    key = dated(metadata[_PATTERN], start_ns + offset_ns)
-    return key, {**rest, **times, 'clock': SET_LATER, _OFFSET: str(offset_ns)}
+    times = {words.T_START_NS: str(start_ns + offset_ns), words.T_END_NS: str(end_ns + offset_ns)}
+    rest = {name: value for name, value in metadata.items() if name != words.KEY_PATTERN}
+    key = dated(metadata[words.KEY_PATTERN], start_ns + offset_ns)
+    return key, {**rest, **times, words.CLOCK: words.SET_LATER, words.CLOCK_OFFSET_NS: str(offset_ns)}

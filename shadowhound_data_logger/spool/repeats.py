@@ -14,15 +14,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.model import DataObject, FileBody, Likeness, State
 from shadowhound_data_logger.spool.index import Index
 
-CONTENT_KEY: Final = 'content_key'
-"""Metadata of a repeat: the key of the object that holds its content, in the same bucket."""
-DISTANCE: Final = 'content_distance'
-"""Metadata of a repeat that only looks like that object: how many of 64 bits differ (``encode.likeness``)."""
-REPEATS, REPEATS_OF, REPEATS_UNTIL = 'repeats', 'repeats_of', 'repeats_until_ns'
-"""Metadata of the object after repeats: how many there were, of which key, and when the last one ended."""
 _HOLDS: Final = frozenset({State.PENDING.value, State.DELIVERED.value})
 
 
@@ -75,7 +70,7 @@ class Repeats:
             return None  # evicted, say
         index.protect(item.bucket, last.key)  # else an outage that fills the disk would cost all its repeats as well
         self._next[_source(item)] = replace(last, repeats=last.repeats + 1, until_ns=item.t_end_ns)
-        said = {CONTENT_KEY: last.key} if last.sha256 == sha256 else {CONTENT_KEY: last.key, DISTANCE: str(distance)}
+        said = {words.CONTENT_KEY: last.key} | ({} if last.sha256 == sha256 else {words.CONTENT_DISTANCE: str(distance)})
         return Holder(FileBody(Path(last.key), rows[0]['bytes'], last.sha256), said)
 
     def stored(self, item: DataObject, key: str, sha256: str) -> Mapping[str, str]:
@@ -86,7 +81,7 @@ class Repeats:
         self._next[_source(item)] = _Last(key, sha256, item.likeness)
         if last is None or not last.repeats:
             return {}
-        return {REPEATS: str(last.repeats), REPEATS_OF: last.key, REPEATS_UNTIL: str(last.until_ns)}
+        return {words.REPEATS: str(last.repeats), words.REPEATS_OF: last.key, words.REPEATS_UNTIL_NS: str(last.until_ns)}
 
 
 def _distance(one: Likeness | None, other: Likeness | None) -> int | None:

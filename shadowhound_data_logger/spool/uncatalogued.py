@@ -12,8 +12,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.repeats import CONTENT_KEY
 
 
 class Delivered(NamedTuple):
@@ -36,7 +36,7 @@ def waiting(spool: Path, limit: int) -> list[Delivered]:
             ' ORDER BY id LIMIT ?', (limit,),
         ).fetchall()  # fmt: skip
     said = [json.loads(metadata) for *_, metadata in rows]
-    return [Delivered(number, bucket, metadata.get(CONTENT_KEY, key), size, content_type, metadata)
+    return [Delivered(number, bucket, metadata.get(words.CONTENT_KEY, key), size, content_type, metadata)
             for (number, bucket, key, size, content_type, _), metadata in zip(rows, said, strict=True)]  # fmt: skip
 
 

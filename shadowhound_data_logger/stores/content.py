@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.errors import ForeignObject, NameRefused, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.keys import check_key, check_name
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
@@ -77,7 +78,7 @@ def opened(item: SpooledObject) -> Iterator[int]:
 
 def object_metadata(item: SpooledObject) -> dict[str, str]:
     """What a store keeps beside the content: the object's own metadata, ``sha256`` always among it."""
-    return {**item.metadata, 'sha256': item.sha256}
+    return {**item.metadata, words.SHA256: item.sha256}
 
 
 def identical_or_foreign(item: SpooledObject, held: ObjectInfo, content_sha256: Callable[[], str]) -> Put:

@@ -10,9 +10,9 @@ import pytest
 from spool.conftest import Open
 from spool.making import BUCKET, NOON_NS, assert_whole, files, make, put, receive, rows, settle
 
+from shadowhound_data_logger.metadata_words import CONTENT_DISTANCE, CONTENT_KEY
 from shadowhound_data_logger.model import DataObject, Likeness, State
 from shadowhound_data_logger.spool import uncatalogued
-from shadowhound_data_logger.spool.repeats import CONTENT_KEY, DISTANCE
 from shadowhound_data_logger.spool.spool import Spool
 
 
@@ -141,7 +141,7 @@ def test_what_looks_like_it_is_a_repeat_where_that_is_asked_for(spool: Spool, ro
     stored, repeat = rows(root)
     assert (repeat['state'], repeat['bytes'], repeat['sha256']) == ('deduplicated', 3, stored['sha256'])
     said = json.loads(repeat['metadata'])
-    assert (said[CONTENT_KEY], said[DISTANCE], said['sha256']) == (stored['key'], '2', stored['sha256'])
+    assert (said[CONTENT_KEY], said[CONTENT_DISTANCE], said['sha256']) == (stored['key'], '2', stored['sha256'])
     (item,) = put(spool, picture(2, b'far', likeness=Likeness(0b1000, 2)))
     assert item.metadata['repeats'] == '1'
     assert_whole(root)

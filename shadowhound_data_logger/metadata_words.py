@@ -1,0 +1,55 @@
+"""The words of an object's S3 metadata, each defined here alone. What they mean stands in docs/formats.md.
+
+Beside them an encoder's facts of the content (``width``, ``points``, ...) become metadata, under the names that it gives them.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+# Where it comes from.
+ROBOT: Final = 'robot'
+SENSOR: Final = 'sensor'
+TOPIC: Final = 'topic'
+TYPE: Final = 'type'
+COUNT: Final = 'count'
+SHA256: Final = 'sha256'
+
+# The mission that it began in, and what the robot was doing then.
+MISSION_ID: Final = 'mission_id'
+MISSION_TYPE: Final = 'mission_type'
+RUN_ID: Final = 'run_id'
+FRAME_ID: Final = 'frame_id'
+POSE: Final = 'pose'
+"""``x y yaw frame``, as in ``3.214 -1.502 0.7854 odom``."""
+BATTERY: Final = 'battery_pct'
+
+# Its time, by both clocks, and how well it is known.
+T_START_NS: Final = 't_start_ns'
+T_END_NS: Final = 't_end_ns'
+BOOT_ID: Final = 'boot_id'
+BOOT_START_NS: Final = 'boot_start_ns'
+BOOT_END_NS: Final = 'boot_end_ns'
+CLOCK: Final = 'clock'
+SET: Final = 'set'
+PUBLISHER: Final = 'publisher'
+SET_LATER: Final = 'set_later'
+UNSET: Final = 'unset'
+"""The four values of ``clock``."""
+CLOCK_OFFSET_NS: Final = 'clock_offset_ns'
+KEY_PATTERN: Final = 'key_pattern'
+
+# Repeats of the content before it.
+CONTENT_KEY: Final = 'content_key'
+"""Of a repeat, in the index alone: the key of the object that holds its content, in the same bucket."""
+CONTENT_DISTANCE: Final = 'content_distance'
+"""Of a repeat that only looks like that object, in the index alone: how many of 64 bits differ (``encode.likeness``)."""
+REPEATS: Final = 'repeats'
+REPEATS_OF: Final = 'repeats_of'
+REPEATS_UNTIL_NS: Final = 'repeats_until_ns'
+
+# A file of a bag.
+BAG: Final = 'bag'
+SLICE: Final = 'slice'
+MESSAGES: Final = 'messages'
+EVENT: Final = 'event'
