@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from shadowhound_data_logger.capture.sensor_logger_node import main
+
+
+@pytest.fixture(autouse=True)
+def variables(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The RMW that the node would listen through is not that of the tests after it."""
+    monkeypatch.setattr(os, 'environ', os.environ.copy())
 
 
 @pytest.mark.parametrize('arguments', [['--params-file', 'my.yaml'], ['camera.rate_hz:=2.0', '--ros-args', '-r', '__ns:=/a']])

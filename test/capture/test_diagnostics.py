@@ -141,7 +141,7 @@ def test_every_figure_fits_its_message() -> None:
     """What rclpy refuses in a message would end the node: levels are bytes, values text, and what is unknown is empty."""
     for name, level, text, figures in entries(changed(store__blocked_buckets={'b': 'why'}), STATUS):
         values = [KeyValue(key=key, value=_text(value)) for key, value in figures.items()]
-        message = DiagnosticStatus(name=name, level=level, message=text, values=values)
-        assert message.level in {OK, WARN, ERROR, STALE}
+        message = DiagnosticStatus(name=name, level=bytes([level]), message=text, values=values)
+        assert message.level[0] in {OK, WARN, ERROR, STALE}
     assert _text(None) == ''
     assert _text({'b': 'why'}) == 'b: why'

@@ -16,6 +16,7 @@ import pytest
 from doctor.scene import Scene, expect
 from spool.making import make, put, settle
 
+from shadowhound_data_logger.capture.middleware import PROFILE_FILES
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.doctor import disk, environment
 from shadowhound_data_logger.doctor.checks import CHECKS
@@ -46,7 +47,7 @@ def wrong(name: str, value: str, **more: str) -> Inject:
 
 
 def without(*names: str) -> Inject:
-    return lambda scene: [scene.environ.pop(name) for name in names] and None
+    return lambda scene: [scene.environ.pop(name, None) for name in names] and None
 
 
 def readable_by_all(scene: Scene) -> None:
@@ -207,7 +208,7 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
                                                   ('unset ROS_AUTOMATIC', 'export ROS_LOCALHOST_ONLY=1')),
     'Cyclone DDS that does not start': (greedy_buffers, 'sockets', 'sockets.cyclone', ('rmem_max', 'min="default" max="10MB"')),
     'small socket buffers': (small_buffers, 'sockets', 'sockets.buffer', ('net.core.rmem_max', 'sysctl')),
-    'small shared memory': (without('FASTDDS_DEFAULT_PROFILES_FILE'), 'sockets', 'sockets.profile', ('fastdds_shm.xml',)),
+    'small shared memory': (without(*PROFILE_FILES), 'sockets', 'sockets.profile', ('fastdds_shm.xml',)),
     'small shared memory of the driver': (driver_with_small_memory(), 'sockets', 'sockets.driver',
                                           ('start the driver again', 'export FASTDDS_DEFAULT')),
     'small shared memory of a driver with Fast DDS 2': (driver_with_small_memory(ROS_DISTRO='humble'), 'sockets',

@@ -129,7 +129,8 @@ def test_no_go2_interfaces(scene: Scene, domain: int, tmp_path: Path) -> None:
     """In the doctor's own process for ROS, with a workspace that was not sourced."""
     (tmp_path / 'go2_interfaces').mkdir()
     (tmp_path / 'go2_interfaces/__init__.py').write_text("raise ImportError('not sourced')")
-    scene.environ |= {'PYTHONPATH': str(tmp_path), 'ROS_DOMAIN_ID': str(domain)}
+    path = os.pathsep.join(filter(None, [str(tmp_path), scene.environ.get('PYTHONPATH')]))
+    scene.environ |= {'PYTHONPATH': path, 'ROS_DOMAIN_ID': str(domain)}
     scene.parameters |= SENSORS
     found = {result.check: result for result in scene.ask('ros')}
     assert found['ros.types'].severity is Severity.ERROR

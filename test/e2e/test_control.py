@@ -195,7 +195,8 @@ def test_a_parameter_is_judged_alike(operated: Operated, name: str, value: Any) 
     assert done is (not reason)
     assert words == f'{full} = {value}' if done else words.startswith(reason)
     assert ('start the node again' in words) is (name == 'batch_s')
-    assert operated.station.get(full) == by_ros == (value if done else before)
+    until(lambda: operated.station.get(full) == by_ros, 'a front follows')
+    assert by_ros == (value if done else before)
 
 
 def test_diagnostics_tell_each_part(operated: Operated) -> None:

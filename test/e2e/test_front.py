@@ -33,7 +33,7 @@ ENDS_S = 10.0
 """It takes a second and a half at most on a machine that is idle."""
 SENSORS: dict[str, Any] = {
     'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 3600.0,
-    'events.topics': ['talk'], 'events.post_s': 0.1,
+    'events.topics': ['talk'], 'events.post_s': 0.1, 'capture.rmw': 'robot',
 }  # fmt: skip
 
 

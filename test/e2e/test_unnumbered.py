@@ -13,9 +13,10 @@ from e2e.reading import STRING, texts
 
 LEAVE_OUT = """
 from shadowhound_data_logger import model
-from shadowhound_data_logger.capture import reader
-reader.Taken = lambda cdr, source_ns, publisher, number, received_ns: model.Taken(cdr, source_ns, None, None, received_ns)
+Taken = model.Taken
+model.Taken = lambda cdr, source_ns, publisher, number, received_ns: Taken(cdr, source_ns, None, None, received_ns)
 """
+"""Before the reader is imported: on Humble that loads the RMW, which is not chosen yet."""
 UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 """What nobody takes from its socket buffers is overrun by what follows."""
 COUNT = 100

@@ -6,15 +6,13 @@ were sent, by a driver on the same machine, and received.
 
 import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
-from shadowhound_data_logger.capture.reader import Reader
+from shadowhound_data_logger import model
 from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.model import Taken
 
 behind = Path(os.environ['WRONG_CLOCK'])
-drain = Reader.drain
+Taken = model.Taken
 
 
 def behind_ns() -> int:
@@ -24,11 +22,10 @@ def behind_ns() -> int:
         return 0
 
 
-def drain_behind(reader: Reader) -> Iterator[Taken]:
+def taken_behind(cdr: bytes, source_ns: int, publisher: str | None, number: int | None, received_ns: int) -> Taken:
     shift_ns = behind_ns()
-    for one in drain(reader):
-        yield one._replace(source_ns=one.source_ns - shift_ns, received_ns=one.received_ns - shift_ns)
+    return Taken(cdr, source_ns - shift_ns, publisher, number, received_ns - shift_ns)
 
 
 SystemClock.wall_ns = lambda _: time.time_ns() - behind_ns()  # type: ignore[method-assign]
-Reader.drain = drain_behind  # type: ignore[method-assign]
+model.Taken = taken_behind  # type: ignore[misc, assignment]  # the reader, which loads the RMW, is imported later
