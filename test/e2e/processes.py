@@ -94,6 +94,11 @@ class Node(Process):
         """Whether it listens through a middleware that numbers messages: what is missed is known exactly then."""
         return 'listening by rmw_fastrtps' in self.log
 
+    @property
+    def is_beside(self) -> bool:
+        """Whether the robot speaks another RMW: what is published comes through UDP then, which may lose large messages."""
+        return "(the robot's is " in self.log
+
     def known(self, count: int) -> int | None:
         """As the ledger tells a figure that only numbers let it know: None without them."""
         return count if self.hears_numbers else None

@@ -1,4 +1,7 @@
-"""A camera whose driver publishes raw images only, and one that is compressed later: nothing is missed on either way."""
+"""A camera whose driver publishes raw images only, and one that is compressed later: nothing is missed on either way.
+
+That is so through shared memory. What UDP loses of raw images, beside a robot with another RMW, is counted.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +49,11 @@ def test_raw_images_are_not_missed(processes: Processes, seaweed: Tower, stored:
     assert sim.wait() == 0
     ledger = node.stop()
     raw, compressed = ledger['topics'][RAW_TOPIC], ledger['topics'][JPEG_TOPIC]
-    assert (raw['missed'], raw['rejected'], raw['dropped']) == (node.known(0), {}, {})
+    if node.is_beside:
+        assert raw['missed'] == raw['published'] - raw['received']
+    else:
+        assert raw['missed'] == node.known(0)
+    assert (raw['rejected'], raw['dropped']) == ({}, {})
     assert (raw['accounting'] == 'exact') is node.hears_numbers
     assert (compressed['missed'], compressed['received'], compressed['published']) == (node.known(0), 60, node.known(60))
     objects = stored(processes.robot)
