@@ -30,6 +30,8 @@ IDLE_S: Final = 60.0
 READ_S: Final = 5.0
 """Within which it reads an answer."""
 BACKLOG: Final = 64
+CANCEL_S: Final = 0.2
+"""For a client to read that the node closes."""
 OPEN_S: Final = 2.0
 """For how long the start of the node waits for the socket; on a disk that takes it that lasts a few milliseconds."""
 LOCK: Final = 'control.lock'
@@ -110,9 +112,10 @@ class ControlSocket:
                 await self._over.wait()
         finally:
             server.close()
-            for client in self._clients:
-                client.cancel()
-            await asyncio.gather(*self._clients, return_exceptions=True)
+            while self._clients:  # until Python 3.12 wait_for forgets a cancellation that comes together with its result
+                for client in self._clients:
+                    client.cancel()
+                await asyncio.wait(set(self._clients), timeout=CANCEL_S)
 
     async def _begin(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """A client, from its first line to its end."""

@@ -249,6 +249,25 @@ def test_clients_are_told_when_it_closes(serve: Callable[..., Serving]) -> None:
         connect(serving.spool)
 
 
+def test_it_closes_while_it_answers(serve: Callable[..., Serving], caplog: pytest.LogCaptureFixture) -> None:
+    """Also where the answer and the end come together."""
+    serving = serve()
+    gate, client = threading.Event(), raw(serving)
+    with closing(client):
+        with serving.hold:
+            client.sendall(b'{"do": "flush"}\n')
+            while not serving.control._waiting:
+                time.sleep(0.01)
+            assert serving.control._loop is not None
+            serving.control._loop.call_soon_threadsafe(gate.wait)
+        while not serving.asked:
+            time.sleep(0.01)
+        threading.Timer(SHORT_S, gate.set).start()
+        serving.control.close()
+        assert heard(client)[0]['ok']
+    assert not caplog.records
+
+
 def test_a_node_that_dies_is_noticed(tmp_path: Path) -> None:
     """A client whose node goes away in the middle of an answer is told so."""
     with socket.socket(socket.AF_UNIX) as listener:
