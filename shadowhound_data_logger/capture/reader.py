@@ -205,7 +205,11 @@ class Reader:
         leaves it in the list of those to be taken (ReaderHistory::remove_fragmented_changes_until; Fast-DDS pull request 2239).
         """
         stuck = self._subscription
-        self._subscription = self._subscribe()
+        try:
+            self._subscription = self._subscribe()
+        except SubscriptionRefused as error:  # what was taken before counts; the next drain tries again
+            log.warning('%s', error)
+            return
         self._node.destroy_subscription(stuck)
         self._is_stuck = False
         if not self._has_told:

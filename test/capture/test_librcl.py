@@ -19,7 +19,7 @@ from std_msgs.msg import String
 
 from shadowhound_data_logger.capture import librcl, reader
 from shadowhound_data_logger.capture.endpoints import Plan
-from shadowhound_data_logger.capture.reader import PolledGroup, Reader
+from shadowhound_data_logger.capture.reader import PolledGroup, Reader, SubscriptionRefused
 from shadowhound_data_logger.model import Taken
 
 pytestmark = pytest.mark.ros
@@ -137,6 +137,30 @@ def test_an_empty_message_is_none(
         assert found._subscription.handle.pointer
         node.destroy_subscription(stuck)
     assert [record.levelname for record in caplog.records].count('WARNING') == 1
+    found.close()
+
+
+def test_what_came_before_an_empty_message_is_taken(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where no other subscription can be made, which the next drain tries again."""
+    found = read(node, '/refused')
+    kept = found._subscription
+    waiting = [Taken(b'cdr', 1, None, None, 1)]
+
+    def stuck(_: object, *__: object) -> Iterator[Taken]:
+        found._is_stuck = True
+        yield from waiting
+
+    def refused() -> None:
+        raise SubscriptionRefused('not now')
+
+    monkeypatch.setattr(found, '_through_rclpy', stuck)
+    monkeypatch.setattr(found, '_through_librcl', stuck)
+    with monkeypatch.context() as patch:
+        patch.setattr(found, '_subscribe', refused)
+        assert found.drain() == waiting
+        assert found._subscription is kept
+    assert found.drain() == waiting
+    assert found._subscription is not kept
     found.close()
 
 
