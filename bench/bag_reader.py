@@ -24,7 +24,7 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
 from shadowhound_data_logger.mcap.index import read_index
-from shadowhound_data_logger.mcap.messages import Wanted, read_messages
+from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile
 
 ROUNDS = 5
@@ -33,7 +33,7 @@ EVER = 1 << 64
 
 def ours(path: Path) -> Iterator[int]:
     source = LocalFile(path)
-    for message in read_messages(source, read_index(source), Wanted(0, EVER, lambda _: True)):
+    for message in read_messages(source, read_index(source), MessageFilter(0, EVER, lambda _: True)):
         yield len(message.cdr)
 
 

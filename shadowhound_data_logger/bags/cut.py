@@ -25,7 +25,7 @@ from shadowhound_data_logger.bags.remote import Listing, RemoteBag, document, na
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
-from shadowhound_data_logger.mcap.messages import Message, Wanted
+from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, StoredFile, read_whole
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.mcap.slice_info import Channel
@@ -69,7 +69,7 @@ class Cut:
     """Slices with something of that time that are not there."""
 
 
-class Material(Protocol):
+class CutSource(Protocol):
     """Where the messages come from."""
 
     def span(self) -> tuple[int, int]:
@@ -77,7 +77,7 @@ class Material(Protocol):
 
     def topics(self) -> set[str]: ...
 
-    def messages(self, wanted: Wanted) -> Iterator[Message]: ...
+    def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]: ...
 
 
 def cut_remote(store: Listing, bag: RemoteBag, out: Path, choice: Choice) -> Cut:
@@ -119,7 +119,7 @@ def _packed(folder: Path, told: Description | None) -> Packed:
     return Packed(folder, told)
 
 
-def _cut(source: Material, folder: Path, out: Path, choice: Choice, meter: Meter, bag_bytes: int,
+def _cut(source: CutSource, folder: Path, out: Path, choice: Choice, meter: Meter, bag_bytes: int,
          others: Sequence[Part] = ()) -> Cut:  # fmt: skip
     """``others`` are slices that are not there."""
     first_ns, last_ns = source.span()
@@ -131,7 +131,7 @@ def _cut(source: Material, folder: Path, out: Path, choice: Choice, meter: Meter
         raise SettingError('--end', choice.end, f'a time after --start, which is {iso(start_ns)}')
     writer = SliceWriter(folder / f'{out.name}_0.mcap', mode=0o666)
     try:
-        for message in source.messages(Wanted(start_ns, end_ns, _chosen(choice))):
+        for message in source.messages(MessageFilter(start_ns, end_ns, _chosen(choice))):
             writer.write(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
         info = writer.close()
     finally:
@@ -157,7 +157,7 @@ def _overlaps(part: Part, start_ns: int, end_ns: int) -> bool:
     return part.t_start_ns < end_ns and part.t_end_ns >= start_ns
 
 
-def _absent(source: Material, choice: Choice) -> tuple[str, ...]:
+def _absent(source: CutSource, choice: Choice) -> tuple[str, ...]:
     topics = source.topics() if choice.topics else set()
     return tuple(name for name in choice.topics if '/' + name.lstrip('/') not in topics)
 
@@ -174,7 +174,7 @@ def _chosen(choice: Choice) -> Callable[[Channel], bool]:
     return lambda channel: channel.topic in names or (pattern is not None and pattern.search(channel.topic) is not None)
 
 
-def _nothing(source: Material, choice: Choice, start_ns: int, end_ns: int) -> BagError:
+def _nothing(source: CutSource, choice: Choice, start_ns: int, end_ns: int) -> BagError:
     """Says which topics there are, or which times."""
     topics = sorted(source.topics())
     first_ns, last_ns = source.span()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
@@ -18,7 +18,7 @@ _LATEST_NS: Final = 1 << 63
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class DescribedTopic:
     """One topic of one type."""
 
     name: str
@@ -48,7 +48,7 @@ class Description:
     compression: str
     """Of files or messages, as rosbag2 does it outside the storage: ``zstd file``; empty without."""
     distro: str
-    topics: tuple[Topic, ...]
+    topics: tuple[DescribedTopic, ...]
     parts: tuple[Part, ...]
     messages: int
     t_start_ns: int
@@ -70,17 +70,17 @@ def of_metadata(content: bytes, name: str) -> Description:
 def of_slices(slices: Sequence[SliceInfo]) -> Description:
     """From what the slices themselves say."""
     counts: dict[tuple[str, str], int] = {}
-    found: dict[tuple[str, str], Topic] = {}
+    found: dict[tuple[str, str], DescribedTopic] = {}
     for one in slices:
         types = [channel.topic for channel in one.channels]
         for channel in one.channels:
             key = (channel.topic, channel.type)
             counts[key] = counts.get(key, 0) + one.counts.get(channel.topic, 0) // types.count(channel.topic)
-            found.setdefault(key, Topic(*key, 0, profiles(channel.qos), channel.type_hash))
+            found.setdefault(key, DescribedTopic(*key, 0, profiles(channel.qos), channel.type_hash))
     filled = [one for one in slices if one.messages]
     return Description(
         storage='mcap', compression='', distro='',
-        topics=tuple(Topic(topic.name, topic.type, counts[key], topic.qos, topic.type_hash) for key, topic in found.items()),
+        topics=tuple(replace(topic, messages=counts[key]) for key, topic in found.items()),
         parts=tuple(Part(one.path.name, one.messages, one.t_start_ns, one.t_end_ns) for one in slices),
         messages=sum(one.messages for one in slices),
         t_start_ns=min((one.t_start_ns for one in filled), default=0), t_end_ns=max((one.t_end_ns for one in filled), default=0),
@@ -121,10 +121,10 @@ def _described(found: Mapping[str, Any]) -> Description:
     )  # fmt: skip
 
 
-def _topics(found: Iterable[Mapping[str, Any]]) -> Iterable[Topic]:
+def _topics(found: Iterable[Mapping[str, Any]]) -> Iterable[DescribedTopic]:
     for each in found:
         told = each['topic_metadata']
-        yield Topic(
+        yield DescribedTopic(
             _text(told['name']), _text(told['type']), _whole(each, 'message_count'), profiles(told.get('offered_qos_profiles')),
             _text(told.get('type_description_hash') or ''),
         )  # fmt: skip

@@ -37,7 +37,7 @@ CAP_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Fetched:
+class FetchedBag:
     """What came of it."""
 
     folder: Path
@@ -64,7 +64,7 @@ class Told:
         """So many more are here, downloaded or there already; negative where they turned out wrong."""
 
 
-def fetch(store: Listing, bag: RemoteBag, to: Path, *, threads: int = THREADS, told: Told | None = None) -> Fetched:
+def fetch(store: Listing, bag: RemoteBag, to: Path, *, threads: int = THREADS, told: Told | None = None) -> FetchedBag:
     """Raises BagError, BagDamaged for what does not arrive as it was sent, StoreError, OSError; what is whole by then stays."""
     with on_disk(to):
         return _fetch(store, bag, to, threads, told or Told())
@@ -80,7 +80,7 @@ def on_disk(folder: Path) -> Iterator[None]:
         raise BagError(f'{where} cannot be used: {error.strerror}', remedy='is there space, and may you write there?') from error
 
 
-def _fetch(store: Listing, bag: RemoteBag, to: Path, threads: int, told: Told) -> Fetched:
+def _fetch(store: Listing, bag: RemoteBag, to: Path, threads: int, told: Told) -> FetchedBag:
     folder = to if bag.is_archive else path_below(to, bag.name)
     folder.mkdir(parents=True, exist_ok=True)
     meter = Meter()
@@ -100,7 +100,7 @@ def _fetch(store: Listing, bag: RemoteBag, to: Path, threads: int, told: Told) -
     missing = tuple(missing_of(bag, manifest)) if manifest is not None else ()
     if not bag.is_archive and (missing or not bag.file(METADATA)):
         _describe(folder, bag)
-    return Fetched(
+    return FetchedBag(
         folder / bag.files[0].name if bag.is_archive else folder, len(bag.files), bag.size, meter.bytes,
         is_complete=manifest is not None and not missing,
         unverified=tuple(name for name, known in checksums.items() if not known), missing=missing,

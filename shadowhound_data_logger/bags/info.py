@@ -10,8 +10,7 @@ from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.description import Description, of_metadata, of_slices, slice_info
-from shadowhound_data_logger.bags.local import LocalFile as Waiting
-from shadowhound_data_logger.bags.local import local_files
+from shadowhound_data_logger.bags.local import UnsentFile, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.remote import (
@@ -108,7 +107,7 @@ def _slice(source: Ranged) -> SliceInfo:
     return slice_info(read_index(source), Path(source.name), source.size)
 
 
-def _tags(store: Listing, bag: RemoteBag, waiting: Mapping[str, Waiting]) -> Mapping[str, str]:
+def _tags(store: Listing, bag: RemoteBag, waiting: Mapping[str, UnsentFile]) -> Mapping[str, str]:
     """What was written beside one slice: enough to tell whose it is."""
     for file in waiting.values():
         return file.metadata or {words.BAG: bag.name}

@@ -25,7 +25,7 @@ RECORDING: Final = 'recording'
 
 
 @dataclass(frozen=True, slots=True)
-class LocalFile:
+class UnsentFile:
     """A file of a bag that the store does not have yet."""
 
     bag: str
@@ -42,7 +42,7 @@ class LocalFile:
         return self.name.endswith(OPEN)
 
 
-def local_files(home: Path, robot: str) -> dict[tuple[str, str], LocalFile]:
+def local_files(home: Path, robot: str) -> dict[tuple[str, str], UnsentFile]:
     """By bag and name; what lies in the spool and in the recording folder is in the spool. Raises SpoolError."""
     found = {(file.bag, file.name): file for folder in (FOLDER, RECORDS) for file in _recording(home / folder / robot)}
     try:
@@ -60,21 +60,21 @@ def given_up(home: Path, robot: str) -> Counter[str]:
         raise _unreadable(home, error) from error
 
 
-def _recording(folder: Path) -> Iterator[LocalFile]:
+def _recording(folder: Path) -> Iterator[UnsentFile]:
     for path in sorted(folder.glob('*/*')):
         if path.name.endswith(('.mcap', f'.mcap{OPEN}')):
             try:
-                yield LocalFile(path.parent.name, path.name, RECORDING, path.stat().st_size, path=path)
+                yield UnsentFile(path.parent.name, path.name, RECORDING, path.stat().st_size, path=path)
             except FileNotFoundError:
                 continue  # closed or spooled meanwhile
 
 
-def _spooled(spool: Path, robot: str) -> Iterator[LocalFile]:
+def _spooled(spool: Path, robot: str) -> Iterator[UnsentFile]:
     for bag, name, row in _rows(spool, robot, "'pending', 'held', 'quarantined'"):
         is_refused = row['state'] == 'quarantined'
         path = None if is_refused else spool / 'ready' / BUCKET / row['key']
         where = QUARANTINE if is_refused else SPOOL
-        yield LocalFile(bag, name, where, row['bytes'], json.loads(row['metadata']), path)
+        yield UnsentFile(bag, name, where, row['bytes'], json.loads(row['metadata']), path)
 
 
 def _rows(spool: Path, robot: str, states: str) -> Iterator[tuple[str, str, sqlite3.Row]]:

@@ -11,7 +11,7 @@ from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.description import of_metadata
-from shadowhound_data_logger.bags.local import LocalFile, given_up, local_files
+from shadowhound_data_logger.bags.local import UnsentFile, given_up, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.remote import (
@@ -86,7 +86,7 @@ class NoStore:
 def overview(store: Listing, robot: str, home: Path, *, since_ns: int = 0) -> list[BagRow]:
     """All bags of a robot that began at ``since_ns`` or later, the newest last. Raises StoreError, SpoolError."""
     remote = {bag.name: bag for bag in find_bags(store, robot)}
-    local: dict[str, list[LocalFile]] = {}
+    local: dict[str, list[UnsentFile]] = {}
     for file in local_files(home, robot).values():
         local.setdefault(file.bag, []).append(file)
     lost = given_up(home, robot)
@@ -110,7 +110,7 @@ def named_ns(bag: str) -> int | None:
     return int(when.timestamp()) * SECOND
 
 
-def _row(store: Listing, bag: RemoteBag, local: list[LocalFile], given_up: int) -> BagRow:
+def _row(store: Listing, bag: RemoteBag, local: list[UnsentFile], given_up: int) -> BagRow:
     kept = [file for file in local if bag.file(file.name) is None]  # delivered already: the spool is about to let go of it
     files = RemoteBag(bag.robot, bag.name, (*bag.files, *(RemoteFile(file.name, '', file.size) for file in kept)))
     finding = '; '.join(f'{file.name} is refused by the store' for file in kept if file.where == 'quarantine')
@@ -134,7 +134,7 @@ def _row(store: Listing, bag: RemoteBag, local: list[LocalFile], given_up: int) 
                   facts.messages, facts.topics, facts.t_start_ns, facts.t_end_ns, places, finding)  # fmt: skip
 
 
-def _manifest(store: Listing, bag: RemoteBag, local: Iterable[LocalFile]) -> Manifest | None:
+def _manifest(store: Listing, bag: RemoteBag, local: Iterable[UnsentFile]) -> Manifest | None:
     for file in local:
         if file.name == MANIFEST and file.path is not None:
             try:
@@ -144,7 +144,7 @@ def _manifest(store: Listing, bag: RemoteBag, local: Iterable[LocalFile]) -> Man
     return read_manifest(store, bag)
 
 
-def _tags(store: Listing, bag: RemoteBag, local: Iterable[LocalFile]) -> dict[str, Mapping[str, str]]:
+def _tags(store: Listing, bag: RemoteBag, local: Iterable[UnsentFile]) -> dict[str, Mapping[str, str]]:
     """What was written beside each slice, by its name; of a foreign bag nothing is, so one of its slices is asked for."""
     found: dict[str, Mapping[str, str]] = {file.name: file.metadata for file in local if file.metadata}
     for file in bag.slices:

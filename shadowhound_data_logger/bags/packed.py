@@ -21,7 +21,7 @@ from shadowhound_data_logger.bags.definitions import describe
 from shadowhound_data_logger.bags.description import Description
 from shadowhound_data_logger.bags.plain import Plain
 from shadowhound_data_logger.errors import BagDamaged, DataLoggerError
-from shadowhound_data_logger.mcap.messages import Message, Wanted
+from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage
 from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, path_below, unpacked
@@ -47,7 +47,7 @@ class Packed:
     def topics(self) -> set[str]:
         return {topic.name for topic in self._told.topics}
 
-    def messages(self, wanted: Wanted) -> Iterator[Message]:
+    def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
         is_by_message = 'message' in self._told.compression
         for part in self._told.parts:
             with self._unpacked(part.name) as path:
@@ -109,7 +109,7 @@ def channel_of(connection: Connection) -> Channel:
     return Channel(connection.topic, connection.msgtype, encoding, definition, type_hash, qos)
 
 
-def _stored(path: Path, wanted: Wanted) -> Iterator[Message]:
+def _stored(path: Path, wanted: MessageFilter) -> Iterator[RecordedMessage]:
     check_tables(path)
     try:
         with Reader(path) as reader:
@@ -123,14 +123,14 @@ def _stored(path: Path, wanted: Wanted) -> Iterator[Message]:
         raise BagDamaged(f'{path} cannot be read: {error}', path=str(path)) from error
 
 
-def _message(channel: Channel, log_ns: object, cdr: object) -> Message:
+def _message(channel: Channel, log_ns: object, cdr: object) -> RecordedMessage:
     """SQLite keeps whatever it is given in any column."""
     if type(log_ns) is not int or not 0 <= log_ns < 1 << 63 or not isinstance(cdr, (bytes, bytearray, memoryview)):
         raise TypeError('a message has no time or no content')
-    return Message(channel, log_ns, log_ns, 0, bytes(cdr))
+    return RecordedMessage(channel, log_ns, log_ns, 0, bytes(cdr))
 
 
-def _plain(message: Message, path: Path) -> Message:
+def _plain(message: RecordedMessage, path: Path) -> RecordedMessage:
     try:
         return message._replace(cdr=unpacked('zstd', message.cdr))
     except ValueError as error:

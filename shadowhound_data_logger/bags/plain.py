@@ -9,7 +9,7 @@ from typing import Final
 
 from shadowhound_data_logger.bags.description import Description, Part
 from shadowhound_data_logger.mcap.index import McapIndex, read_index
-from shadowhound_data_logger.mcap.messages import Message, Wanted, read_messages
+from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage, read_messages
 from shadowhound_data_logger.mcap.ranges import Ranged
 
 THREADS: Final = 8
@@ -45,7 +45,7 @@ class Plain:
         self._open(places)
         return {channel.topic for place in places for channel in self._index(place).channels.values()}
 
-    def messages(self, wanted: Wanted) -> Iterator[Message]:
+    def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
         places = [place for place in range(len(self._sources)) if self._may_have(place, wanted)]
         self._open(places)
         for place in places:
@@ -56,7 +56,7 @@ class Plain:
         with ThreadPoolExecutor(THREADS, 'bag-open') as pool:
             list(pool.map(self._index, places))
 
-    def _may_have(self, place: int, wanted: Wanted) -> bool:
+    def _may_have(self, place: int, wanted: MessageFilter) -> bool:
         part = self._times[place]
         if part is None or part.t_start_ns is None or part.t_end_ns is None:
             return part is None or part.messages != 0

@@ -31,7 +31,7 @@ PIECE_BYTES: Final = 8 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class FileCheck:
     """One file; ``finding`` is empty when it is sound."""
 
     name: str
@@ -41,18 +41,18 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True)
-class Verified:
+class VerifiedBag:
     """What came of it."""
 
     bag: str
     state: str
-    checks: tuple[Check, ...]
+    checks: tuple[FileCheck, ...]
     read_bytes: int
     missing: tuple[Missing, ...]
     """What the manifest says that the recording could not get in: no finding, since the bag is as it was recorded."""
 
     @property
-    def findings(self) -> tuple[Check, ...]:
+    def findings(self) -> tuple[FileCheck, ...]:
         return tuple(check for check in self.checks if check.finding)
 
     @property
@@ -74,25 +74,25 @@ class _Expected:
     messages: int | None
 
 
-def verify_remote(store: Listing, bag: RemoteBag, *, deep: bool = False, told: Telling = lambda _: None) -> Verified:
+def verify_remote(store: Listing, bag: RemoteBag, *, deep: bool = False, told: Telling = lambda _: None) -> VerifiedBag:
     """``deep`` reads everything; else what the store says of each file is compared. Raises StoreError."""
     meter = Meter()
     manifest, described, early = _writers_word(lambda name: _stored(store, bag, name))
     expected = _expected(manifest, described, {file.name: file.size for file in bag.files})
 
-    def one(each: _Expected) -> Check:
+    def one(each: _Expected) -> FileCheck:
         file = bag.file(each.name)
         if file is None:
-            return Check(each.name, 'is not in the store', 'presence')
+            return FileCheck(each.name, 'is not in the store', 'presence')
         return _check_remote(store, file, each, meter, deep, told)
 
     with ThreadPoolExecutor(THREADS, 'bag-verify') as pool:
         checks = tuple(pool.map(one, expected))
     tags = {} if manifest or described else _tags(store, bag)
-    return Verified(bag.name, state_of(bag, manifest, tags), (*early, *checks), meter.bytes, _missing(manifest))
+    return VerifiedBag(bag.name, state_of(bag, manifest, tags), (*early, *checks), meter.bytes, _missing(manifest))
 
 
-def verify_folder(folder: Path, *, deep: bool = False, told: Telling = lambda _: None) -> Verified:
+def verify_folder(folder: Path, *, deep: bool = False, told: Telling = lambda _: None) -> VerifiedBag:
     """Reads every file that a manifest knows. Raises BagError where there is no bag."""
     files = {str(path.relative_to(folder)): path.stat().st_size for path in sorted(folder.rglob('*')) if path.is_file()}
     if not files:
@@ -103,28 +103,28 @@ def verify_folder(folder: Path, *, deep: bool = False, told: Telling = lambda _:
         raise BagError(f'{folder} holds no bag: neither {METADATA} nor a slice is in it', path=str(folder))
     checks = [_check_local(folder, each, deep, told) for each in _expected(manifest, described, files)]
     state = state_of(bag, manifest, {}) if manifest else FOREIGN
-    return Verified(folder.name, state, (*early, *checks), sum(files.values()), _missing(manifest))
+    return VerifiedBag(folder.name, state, (*early, *checks), sum(files.values()), _missing(manifest))
 
 
 def _missing(manifest: Manifest | None) -> tuple[Missing, ...]:
     return manifest.missing if manifest else ()
 
 
-def _writers_word(get: Callable[[str], bytes | None]) -> tuple[Manifest | None, Description | None, tuple[Check, ...]]:
+def _writers_word(get: Callable[[str], bytes | None]) -> tuple[Manifest | None, Description | None, tuple[FileCheck, ...]]:
     """Manifest and metadata, and what is wrong with them."""
     manifest, described, findings = None, None, []
     try:
         if (content := get(MANIFEST)) is not None:
             manifest = Manifest.from_json(content, MANIFEST)
     except BagDamaged as error:
-        findings.append(Check(MANIFEST, str(error), 'content'))
+        findings.append(FileCheck(MANIFEST, str(error), 'content'))
     try:
         if (content := get(METADATA)) is not None:
             described = of_metadata(content, METADATA)
         elif manifest is not None:
-            findings.append(Check(METADATA, 'is missing', 'presence'))
+            findings.append(FileCheck(METADATA, 'is missing', 'presence'))
     except BagDamaged as error:
-        findings.append(Check(METADATA, str(error), 'content'))
+        findings.append(FileCheck(METADATA, str(error), 'content'))
     return manifest, described, tuple(findings)
 
 
@@ -140,29 +140,29 @@ def _expected(manifest: Manifest | None, described: Description | None, there: M
     return [*found.values(), *(_Expected(file.name, None, None, None) for file in slices if file.name not in found)]
 
 
-def _check_remote(store: Listing, file: RemoteFile, expected: _Expected, meter: Meter, deep: bool, told: Telling) -> Check:
+def _check_remote(store: Listing, file: RemoteFile, expected: _Expected, meter: Meter, deep: bool, told: Telling) -> FileCheck:
     if expected.size is not None and file.size != expected.size:
-        return Check(file.name, f'has {file.size} bytes, {expected.size} were recorded', 'size')
+        return FileCheck(file.name, f'has {file.size} bytes, {expected.size} were recorded', 'size')
     held = store.head(BUCKET, file.key)
     if held is None:
-        return Check(file.name, 'is not in the store', 'presence')
+        return FileCheck(file.name, 'is not in the store', 'presence')
     if held.sha256 and expected.sha256 and held.sha256 != expected.sha256:
-        return Check(file.name, f'has the SHA-256 {held.sha256}, {expected.sha256} was recorded', 'sha256')
+        return FileCheck(file.name, f'has the SHA-256 {held.sha256}, {expected.sha256} was recorded', 'sha256')
     source = StoredFile(store, BUCKET, file.key, file.size, meter)
     if deep:
         return _check_content(source, replace(expected, sha256=expected.sha256 or held.sha256), deep, told)
     return _check_summary(source, expected, 'sha256' if held.sha256 else 'size')
 
 
-def _check_local(folder: Path, expected: _Expected, deep: bool, told: Telling) -> Check:
+def _check_local(folder: Path, expected: _Expected, deep: bool, told: Telling) -> FileCheck:
     if not is_path(expected.name):
-        return Check(expected.name, 'is the name of no file', 'presence')
+        return FileCheck(expected.name, 'is the name of no file', 'presence')
     path = folder / expected.name
     if not path.is_file():
-        return Check(expected.name, 'is missing', 'presence')
+        return FileCheck(expected.name, 'is missing', 'presence')
     size = path.stat().st_size
     if expected.size is not None and size != expected.size:
-        return Check(expected.name, f'has {size} bytes, {expected.size} were recorded', 'size')
+        return FileCheck(expected.name, f'has {size} bytes, {expected.size} were recorded', 'size')
     source = LocalFile(path)
     if deep or expected.sha256:
         found = _check_content(source, expected, deep, told)
@@ -171,19 +171,19 @@ def _check_local(folder: Path, expected: _Expected, deep: bool, told: Telling) -
     return _check_sqlite(path, expected) if path.suffix == '.db3' else _check_summary(source, expected, 'summary')
 
 
-def _check_summary(source: Ranged, expected: _Expected, checked: str) -> Check:
+def _check_summary(source: Ranged, expected: _Expected, checked: str) -> FileCheck:
     if not expected.name.endswith('.mcap'):
-        return Check(expected.name, '', checked)
+        return FileCheck(expected.name, '', checked)
     try:
         index = read_index(source)
     except BagDamaged as error:
-        return Check(expected.name, str(error), checked)
+        return FileCheck(expected.name, str(error), checked)
     if index.is_indexed and expected.messages not in {None, index.messages}:
-        return Check(expected.name, f'has {index.messages} messages, {expected.messages} were recorded', checked)
-    return Check(expected.name, '', checked)
+        return FileCheck(expected.name, f'has {index.messages} messages, {expected.messages} were recorded', checked)
+    return FileCheck(expected.name, '', checked)
 
 
-def _check_content(source: Ranged, expected: _Expected, deep: bool, told: Telling) -> Check:
+def _check_content(source: Ranged, expected: _Expected, deep: bool, told: Telling) -> FileCheck:
     """Reads all of it once; ``deep`` unpacks every chunk on the way, which checks its CRC-32, and counts."""
     once = _Once(source, told)
     checked = 'content' if expected.sha256 else 'size'
@@ -193,14 +193,14 @@ def _check_content(source: Ranged, expected: _Expected, deep: bool, told: Tellin
             index = read_index(source)
             count = sum(_messages(kind, start, content, source.name) for kind, start, content in walk(once, index.data_end))
         except BagDamaged as error:
-            return Check(expected.name, str(error), checked)
+            return FileCheck(expected.name, str(error), checked)
         promised = expected.messages if expected.messages is not None else index.messages if index.is_indexed else count
         if count != promised:
-            return Check(expected.name, f'has {count} messages, {promised} were recorded', checked)
+            return FileCheck(expected.name, f'has {count} messages, {promised} were recorded', checked)
     found = once.rest()
     if expected.sha256 and found != expected.sha256:
-        return Check(expected.name, f'has content of the SHA-256 {found}, {expected.sha256} was recorded', checked)
-    return Check(expected.name, '', checked)
+        return FileCheck(expected.name, f'has content of the SHA-256 {found}, {expected.sha256} was recorded', checked)
+    return FileCheck(expected.name, '', checked)
 
 
 def _messages(kind: int, start: int, content: memoryview, name: str) -> int:
@@ -237,23 +237,23 @@ class _Once:
         return self._digest.hexdigest()
 
 
-def _check_sqlite(path: Path, expected: _Expected) -> Check:
+def _check_sqlite(path: Path, expected: _Expected) -> FileCheck:
     try:
         check_tables(path)
     except BagDamaged as error:
-        return Check(expected.name, f'is no SQLite bag: {error}', 'content')
+        return FileCheck(expected.name, f'is no SQLite bag: {error}', 'content')
     try:
         with sqlite3.connect(f'{path.absolute().as_uri()}?mode=ro&immutable=1', uri=True) as database:
             answer = database.execute('PRAGMA quick_check(1)').fetchone()[0]
             count = database.execute('SELECT count(*) FROM messages').fetchone()[0]
         database.close()
     except sqlite3.Error as error:
-        return Check(expected.name, f'is no SQLite bag: {error}', 'content')
+        return FileCheck(expected.name, f'is no SQLite bag: {error}', 'content')
     if answer != 'ok':
-        return Check(expected.name, f'is damaged: {answer}', 'content')
+        return FileCheck(expected.name, f'is damaged: {answer}', 'content')
     if expected.messages not in {None, count}:
-        return Check(expected.name, f'has {count} messages, {expected.messages} were recorded', 'content')
-    return Check(expected.name, '', 'content')
+        return FileCheck(expected.name, f'has {count} messages, {expected.messages} were recorded', 'content')
+    return FileCheck(expected.name, '', 'content')
 
 
 def _stored(store: Listing, bag: RemoteBag, name: str) -> bytes | None:

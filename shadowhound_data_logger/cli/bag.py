@@ -22,7 +22,7 @@ from shadowhound_data_logger.bags.overview import BagRow, NoStore, overview
 from shadowhound_data_logger.bags.record import DEADLINE_S, record
 from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
 from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, parcel, spool_parcel, upload_now
-from shadowhound_data_logger.bags.verify import Verified, verify_folder, verify_remote
+from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, verify_remote
 from shadowhound_data_logger.bags.watch import Step, Watch
 from shadowhound_data_logger.cli.common import as_json, robot_name, the_home, the_store
 from shadowhound_data_logger.cli.output import (
@@ -428,7 +428,7 @@ def _info_json(found: BagInfo) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _verdict(found: Verified) -> Iterator[RenderableType]:
+def _verdict(found: VerifiedBag) -> Iterator[RenderableType]:
     for check in found.findings:
         yield plain(f'{check.name} {check.finding}', 'red')
     sound = [check for check in found.checks if not check.finding]

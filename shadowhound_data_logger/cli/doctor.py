@@ -18,9 +18,9 @@ from shadowhound_data_logger.cli.common import as_json
 from shadowhound_data_logger.cli.output import plain, print_json, progress
 from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make
-from shadowhound_data_logger.doctor.fixes import fix as mend
 from shadowhound_data_logger.doctor.model import Check, Context, Result, Role, Severity
 from shadowhound_data_logger.doctor.run import TIMEOUT_S, Examination
+from shadowhound_data_logger.doctor.run import fix as mend
 from shadowhound_data_logger.ros_arguments import ParametersUnreadable
 
 STYLES: Final = {

@@ -1,7 +1,14 @@
-"""All checks, in the order in which a person would ask: the guide's checklist, from the shell to the store."""
+"""All checks, in the order in which a person would ask: the guide's checklist, from the shell to the store.
+
+As a program, ``python -m shadowhound_data_logger.doctor.checks NAME``, it is the process of one check: context on standard input,
+results out.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import sys
 from typing import Final
 
 from shadowhound_data_logger.doctor import (
@@ -18,9 +25,9 @@ from shadowhound_data_logger.doctor import (
     secrets,
     sockets,
     spool,
-    tower,
     versions,
 )
+from shadowhound_data_logger.doctor.context import from_child
 from shadowhound_data_logger.doctor.model import THOR, TOWER, Check
 
 CHECKS: Final = (
@@ -33,7 +40,7 @@ CHECKS: Final = (
     Check(name='s3', run=s3.check, deadline_s=8.0, after=('network.s3',)),
     Check(name='seaweedfs', run=seaweedfs.check, after=('network.s3',)),
     Check(name='mlflow', run=mlflow.check, deadline_s=8.0, after=('network.mlflow',)),
-    Check(name='tower', run=tower.check, roles=TOWER),
+    Check(name='tower', run=network.check_tower, roles=TOWER),
     Check(name='ros.environment', run=ros_environment.check, roles=THOR),
     Check(name='ros', run=ros.check, roles=THOR, deadline_s=11.5, apart=True),
     Check(name='sockets', run=sockets.check, roles=THOR),
@@ -41,3 +48,18 @@ CHECKS: Final = (
     Check(name='spool', run=spool.check, roles=THOR, deadline_s=6.0, after=('s3',)),
     Check(name='missions', run=missions.check, roles=THOR),
 )
+
+
+def main() -> None:
+    """One line of JSON for each result. What libraries print on standard output goes to standard error."""
+    answers = os.fdopen(os.dup(1), 'w', encoding='utf-8')
+    os.dup2(2, 1)
+    context = from_child(sys.stdin.buffer.read())
+    check = next(check for check in CHECKS if check.name == sys.argv[1])
+    for result in check.run(context):
+        answers.write(json.dumps(result.as_dict()) + '\n')
+        answers.flush()
+
+
+if __name__ == '__main__':
+    main()

@@ -17,7 +17,7 @@ from urllib.error import HTTPError, URLError
 from urllib.parse import quote, urlencode
 from urllib.request import Request, urlopen
 
-from shadowhound_data_logger.doctor.services import ANSWER_S, Service
+from shadowhound_data_logger.doctor.services import ANSWER_S, TowerService
 from shadowhound_data_logger.errors import TrackingError, TrackingRefused, TrackingUnavailable
 
 LOGIN: Final = ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD')
@@ -28,7 +28,7 @@ TEXT: Final = 300
 class MlflowRest:
     """One server. Raises TrackingUnavailable without an answer, TrackingRefused (data: status, code, text) after others."""
 
-    def __init__(self, service: Service, environ: Mapping[str, str], home: Path) -> None:
+    def __init__(self, service: TowerService, environ: Mapping[str, str], home: Path) -> None:
         """``home`` is the user's, where MLflow's clients look for a user and a password that are not in the environment."""
         self._url = service.url
         self.user, password = login(environ, home)

@@ -1,4 +1,7 @@
-"""The way to Tower: its name, its ports, and whether its certificate can be trusted. Nothing is sent but the TLS greeting."""
+"""The way to Tower: its name, its ports, whether its certificate can be trusted, and on Tower itself who can reach what listens.
+
+Nothing is sent but the TLS greeting.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from shadowhound_data_logger.doctor import services
-from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok
-from shadowhound_data_logger.doctor.services import CONNECT_S, Service
+from shadowhound_data_logger.doctor.machine import listening
+from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
+from shadowhound_data_logger.doctor.services import CONNECT_S, TowerService
 
 GLANCE_S: Final = 0.5
 """For a port that is only a guess."""
@@ -39,7 +43,7 @@ def check_mlflow(context: Context) -> Iterator[Result]:
     yield from _check(services.mlflow(context), 'network.mlflow', context)
 
 
-def _check(service: Service | None, check: str, context: Context) -> Iterator[Result]:
+def _check(service: TowerService | None, check: str, context: Context) -> Iterator[Result]:
     if service is None:
         return
     try:
@@ -72,7 +76,7 @@ def _check(service: Service | None, check: str, context: Context) -> Iterator[Re
         )
 
 
-def _resolve(service: Service) -> list[str]:
+def _resolve(service: TowerService) -> list[str]:
     """Its addresses, the preferred one first."""
     found = socket.getaddrinfo(service.host, service.port, type=socket.SOCK_STREAM)
     return list(dict.fromkeys(str(each[4][0]) for each in found))
@@ -91,7 +95,7 @@ def _reach(addresses: Sequence[str], port: int) -> tuple[str, OSError | None]:
     return addresses[0], problems[0]
 
 
-def _unreachable(service: Service, address: str, check: str, problem: OSError) -> Result:
+def _unreachable(service: TowerService, address: str, check: str, problem: OSError) -> Result:
     where = f'{service.host}:{service.port}'
     if isinstance(problem, ConnectionRefusedError):
         others = [port for port in service.usual_ports if port != service.port and _answers(address, port)]
@@ -124,12 +128,12 @@ def _answers(address: str, port: int) -> bool:
     return True
 
 
-def bundle(service: Service, context: Context) -> tuple[str, str]:
+def bundle(service: TowerService, context: Context) -> tuple[str, str]:
     """Variable and path of the authorities that the client of this service trusts; empty for those of the system."""
     return next(((name, path) for name in CA_FILES[service.name] if (path := context.environ.get(name))), ('', ''))
 
 
-def _greet(service: Service, address: str, check: str, context: Context) -> Result:
+def _greet(service: TowerService, address: str, check: str, context: Context) -> Result:
     """A TLS handshake, as the client of this service will do it."""
     variable, trusted = bundle(service, context)
     try:
@@ -156,7 +160,7 @@ def _greet(service: Service, address: str, check: str, context: Context) -> Resu
         )
 
 
-def _untrusted(service: Service, check: str, problem: ssl.SSLCertVerificationError, trusted: str) -> Result:
+def _untrusted(service: TowerService, check: str, problem: ssl.SSLCertVerificationError, trusted: str) -> Result:
     shown = f'openssl s_client -connect {service.host}:{service.port} </dev/null 2>/dev/null | openssl x509 -noout'
     reasons: dict[int, Callable[[], Result]] = {
         EXPIRED: lambda: error(
@@ -182,3 +186,26 @@ def _untrusted(service: Service, check: str, problem: ssl.SSLCertVerificationErr
         f'the authority that signed it is not in {trusted}' if trusted else 'an authority of its own has signed it',
         f'copy the certificate of that authority here and: export {names[0]}=/etc/shadowhound/ca.pem',
     )
+
+
+def check_tower(context: Context) -> Iterator[Result]:
+    """On Tower: whether others can reach what listens here."""
+    there = listening(context.root)
+    for service in filter(None, (services.s3(context), services.mlflow(context))):
+        only = {is_loopback for is_loopback, port in there if port == service.port}
+        if not only and service.is_local:
+            yield info('tower.listen', f'nothing listens on port {service.port} in this network namespace')
+        elif only == {True}:
+            yield warning(
+                'tower.listen',
+                f'{service.title} listens on 127.0.0.1:{service.port} only',
+                'Thor and Spark cannot reach it',
+                'start it with 0.0.0.0 (docker: ports: "9000:9000"), and: '
+                f'sudo ufw allow from 192.168.0.0/16 to any port {service.port} proto tcp',
+            )
+        elif only:
+            yield ok(
+                'tower.listen',
+                f'{service.title} listens on port {service.port} for others as well',
+                firewall=f'sudo ufw status | grep {service.port}',
+            )

@@ -4,16 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from shadowhound_data_logger.config import SensorSettings
-from shadowhound_data_logger.doctor.expected import STREAMS, UNKNOWN, Stream
 from shadowhound_data_logger.doctor.machine import domains, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, domain_of
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.doctor.ros_watch import Heard
+
+
+class Stream(NamedTuple):
+    """A topic as it should be."""
+
+    rate_hz: float
+    reliable: bool | None = None
+    """None where either will do."""
+    optional: bool = False
+    """Whether many robots do without."""
+
+
+STREAMS: Final = {
+    'camera/image_raw': Stream(30.0),
+    'camera/compressed': Stream(30.0),
+    'camera/camera_info': Stream(30.0),
+    'point_cloud2': Stream(10.0),
+    'imu': Stream(100.0, reliable=True),
+    'odom': Stream(50.0, reliable=True),
+    'go2_states': Stream(20.0, reliable=True),
+    'joint_states': Stream(50.0, reliable=True),
+    'lowstate': Stream(20.0, optional=True),
+    'utlidar/voxel_map_compressed': Stream(10.0, optional=True),
+}
+"""By the topic's name in the settings."""
+UNKNOWN: Final = Stream(0.0)
+"""Nothing is expected of it."""
+
 
 NAME: Final = 'ros'
 WINDOW_S: Final = 2.5

@@ -1,4 +1,7 @@
-"""Runs checks side by side. Guarantees: it ends in time, and what hangs, crashes or is not reached is in the answer as well."""
+"""Runs checks side by side, and mends what ``--fix`` may: modes of files with keys, and buckets that are missing.
+
+It ends in time; what hangs, crashes or is not reached is in the answer as well.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +14,20 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.doctor.context import to_child
 from shadowhound_data_logger.doctor.model import Check, Context, Result, Severity, error
+from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S
+from shadowhound_data_logger.errors import DataLoggerError
 
 TIMEOUT_S: Final = 12.0
 """With the start of Python, a run on a dead network ends within 15 s."""
-CHILD: Final = 'shadowhound_data_logger.doctor.child'
+CHILD: Final = 'shadowhound_data_logger.doctor.checks'
 _Message = tuple[str, 'Result | None']
 """Name of a check and a result of it; None is its end."""
 
@@ -171,3 +179,33 @@ def in_child(running: Running, context: Context) -> Iterator[Result]:
             log.seek(0)
             last = (log.read().decode(errors='replace').strip().splitlines() or ['it said nothing'])[-1]
             yield crashed(check, f'its process ended with {child.returncode}: {last}')
+
+
+def fix(results: Sequence[Result], context: Context) -> Iterator[tuple[Result, str]]:
+    """Each result that could be mended with what was done; where it failed, the words begin with ``not``."""
+    done: set[tuple[str, ...]] = set()
+    for result in results:
+        if result.fix and result.fix not in done:
+            done.add(result.fix)
+            yield result, _fixed(result.fix, context)
+
+
+def _fixed(what: tuple[str, ...], context: Context) -> str:
+    kind, name, *rest = what
+    try:
+        if kind == 'mode':
+            Path(name).chmod(int(rest[0], 8))
+            return f'chmod {rest[0]} {name}'
+        _create(name, context)
+    except (OSError, DataLoggerError) as problem:
+        return f'not done: {problem}'
+    return f'created the bucket {name}'
+
+
+def _create(bucket: str, context: Context) -> None:
+    from shadowhound_data_logger.stores.s3_requests import S3Requests  # noqa: PLC0415 - botocore costs half a second
+
+    upload = UploadSettings(threads=1, connect_timeout_s=CONNECT_S, read_timeout_s=ANSWER_S)
+    with closing(S3Requests(context.settings.store, upload)) as requests:
+        requests.open()
+        requests.create_bucket(bucket)

@@ -21,7 +21,7 @@ from urllib.request import Request, urlopen
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.doctor import network, s3_put, services
 from shadowhound_data_logger.doctor.model import Context, Result, Role, Severity, error, info, of_error, ok, skipped, warning
-from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S, Service
+from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S, TowerService
 from shadowhound_data_logger.errors import (
     AccessDenied,
     BucketMissing,
@@ -88,7 +88,7 @@ def _away(problem: StoreError) -> Result:
     return of_error('s3.answer', problem, 'the connection is bad, or the server is overloaded')
 
 
-def _greeting(service: Service, context: Context) -> Iterator[Result]:
+def _greeting(service: TowerService, context: Context) -> Iterator[Result]:
     """What the server says to somebody without keys: its name, its time, and that it says no more."""
     trust = ssl.create_default_context(cafile=network.bundle(service, context)[1] or None) if service.tls else None
     asked = Request(service.url, headers={'User-Agent': 'shadowhound-doctor'})  # noqa: S310 - http(s), see services
@@ -112,7 +112,7 @@ def _greeting(service: Service, context: Context) -> Iterator[Result]:
         )
 
 
-def _no_answer(service: Service, reason: object) -> Result:
+def _no_answer(service: TowerService, reason: object) -> Result:
     remedy = 'on Tower: docker compose logs --tail 50 ; docker compose restart ; df -h'
     if isinstance(reason, TimeoutError):
         seen = f'{service.url} accepts the connection and gives no answer within {ANSWER_S:g} s'
@@ -120,7 +120,7 @@ def _no_answer(service: Service, reason: object) -> Result:
     return error('s3.answer', f'{service.url} does not speak HTTP: {reason}', 'something else listens on this port', remedy)
 
 
-def _named(server: str, service: Service) -> Result:
+def _named(server: str, service: TowerService) -> Result:
     if 'minio' in server.lower():
         return info('s3.server', f'{service.url} is {server}', MINIO, 'plan to move to SeaweedFS: docs/tower.md', server=server)
     return ok('s3.server', f'{service.url} is {server or "a server that does not say what it is"}', server=server)

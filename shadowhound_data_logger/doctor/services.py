@@ -16,7 +16,7 @@ LOCAL: Final = frozenset({'localhost', '127.0.0.1', '::1'})
 
 
 @dataclass(frozen=True, slots=True)
-class Service:
+class TowerService:
     """A server by its URL."""
 
     name: str
@@ -41,12 +41,12 @@ class Service:
         return f'{"https" if self.tls else "http"}://{host}:{port}'
 
 
-def s3(context: Context) -> Service | None:
+def s3(context: Context) -> TowerService | None:
     """The S3 server; None where data go to a folder."""
     return _service('s3', 'the S3 server', 'AWS_ENDPOINT_URL', context.settings.store.endpoint_url or '', (9000, 8333))
 
 
-def mlflow(context: Context) -> Service | None:
+def mlflow(context: Context) -> TowerService | None:
     """The MLflow server; None where there is none."""
     return _service('mlflow', 'MLflow', 'MLFLOW_TRACKING_URI', context.environ.get('MLFLOW_TRACKING_URI', ''), (5001, 5000))
 
@@ -56,7 +56,7 @@ def shown(url: str) -> str:
     return re.sub('//.*@', '//', url)
 
 
-def _service(name: str, title: str, variable: str, given: str, usual: tuple[int, ...]) -> Service | None:
+def _service(name: str, title: str, variable: str, given: str, usual: tuple[int, ...]) -> TowerService | None:
     try:
         url = urlsplit(given)
         if url.scheme not in {'http', 'https'} or not url.hostname:
@@ -64,4 +64,4 @@ def _service(name: str, title: str, variable: str, given: str, usual: tuple[int,
         port = url.port or (443 if url.scheme == 'https' else 80)
     except ValueError:
         return None
-    return Service(name, title, variable, shown(given).rstrip('/'), url.hostname, port, url.scheme == 'https', usual)
+    return TowerService(name, title, variable, shown(given).rstrip('/'), url.hostname, port, url.scheme == 'https', usual)

@@ -40,7 +40,7 @@ _BROKEN: Final = (ValueError, KeyError, IndexError, TypeError, OSError, EOFError
 """What the readers raise for content that is no such thing; RuntimeError is a zip with a password, SyntaxError Pillow's."""
 
 
-class Member(NamedTuple):
+class ArchiveMember(NamedTuple):
     """One message of an archive; that of a repeat has the content of the file that it repeats."""
 
     stamp_ns: int
@@ -141,7 +141,7 @@ def records(body: bytes) -> list[dict[str, Any]]:
         raise LakeError(f'this is no JSON of a sensor: {error}') from error
 
 
-def members(body: bytes, extension: str) -> list[Member]:
+def members(body: bytes, extension: str) -> list[ArchiveMember]:
     """The messages of a tar or zip in their order, repeats among them. Raises LakeError."""
     try:
         return list(_members(dict(_tar(body) if extension == 'tar' else _zip(body))))
@@ -149,7 +149,7 @@ def members(body: bytes, extension: str) -> list[Member]:
         raise LakeError(f'this is no {extension} that can be read: {error}') from error
 
 
-def _members(files: dict[str, bytes]) -> Iterator[Member]:
+def _members(files: dict[str, bytes]) -> Iterator[ArchiveMember]:
     contents = {name.partition('.')[0]: name for name in files if not name.endswith('.json')}
     for name, body in files.items():
         if name.endswith('.json'):
@@ -157,7 +157,7 @@ def _members(files: dict[str, bytes]) -> Iterator[Member]:
             if not isinstance(told, dict) or not _is_stamp(told['stamp_ns']):
                 raise ValueError(f'{name} has no stamp')
             holder = told.get('repeat_of') or contents[name[:-5]]
-            yield Member(told['stamp_ns'], files[holder], extension_of(holder))
+            yield ArchiveMember(told['stamp_ns'], files[holder], extension_of(holder))
 
 
 def _tar(body: bytes) -> Iterator[tuple[str, bytes]]:

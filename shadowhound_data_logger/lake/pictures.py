@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake.source import Source
-from shadowhound_data_logger.missions.contact_sheet import MOST, Frame, contact_sheet
+from shadowhound_data_logger.missions.contact_sheet import MOST, LoggedFrame, contact_sheet
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
 
 IMAGES: Final = ('.jpg', '.jpeg', '.png')
@@ -39,14 +39,14 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Source
         images[round(place * (len(images) - 1) / max(1, min(MOST, len(images)) - 1))] for place in range(min(MOST, len(images)))
     ]
 
-    def save(numbered: tuple[int, Mapping[str, Any]]) -> Frame | None:
+    def save(numbered: tuple[int, Mapping[str, Any]]) -> LoggedFrame | None:
         number, row = numbered
         path = Path(folder, str(number))
         try:
             path.write_bytes(open_bucket(row['bucket']).read(row['key'], MOST_OBJECT_BYTES))
         except ObjectRefused:  # the catalogue outlives what is deleted
             return None
-        return Frame(row.get('t_start_ns') or 0, number, path)
+        return LoggedFrame(row.get('t_start_ns') or 0, number, path)
 
     with tempfile.TemporaryDirectory(prefix='shadowhound-sheet-') as folder, ThreadPoolExecutor(THREADS) as pool:
         frames = [frame for frame in pool.map(save, chosen) if frame is not None]

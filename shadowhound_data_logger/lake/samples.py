@@ -14,7 +14,7 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bodies import Bodies
-from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, Member
+from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, ArchiveMember
 from shadowhound_data_logger.lake.numbers import Table, table
 from shadowhound_data_logger.lake.track import Object, Track
 
@@ -143,11 +143,11 @@ class Samples:
         with _naming(wanted):
             return ('cloud', decode.cloud(body)) if extension in CLOUDS else ('image', decode.image(body, self._selection.size))
 
-    def _members(self, wanted: Object) -> list[Member]:
-        def read() -> list[Member]:
+    def _members(self, wanted: Object) -> list[ArchiveMember]:
+        def read() -> list[ArchiveMember]:
             return decode.members(self._bodies.get(wanted), decode.extension_of(wanted.key))
 
-        found: list[Member] = self._once(('members', wanted.bucket, wanted.key), wanted, read)
+        found: list[ArchiveMember] = self._once(('members', wanted.bucket, wanted.key), wanted, read)
         return found
 
     def _aligned(self, sensor: str, how: Near | Window, robot: str, stamp_ns: int) -> Sample:
@@ -181,7 +181,7 @@ class Samples:
         return (None, None) if best is None else (best[1].copy(), best[0])
 
     def _nearest_cloud(self, how: Near, side: Track | None, stamp_ns: int) -> tuple[NDArray[np.float32], int | None]:
-        best: tuple[int, Object, Member | None] | None = None
+        best: tuple[int, Object, ArchiveMember | None] | None = None
         if side is None:
             return np.empty((0, 4), np.float32), None
         for least, number in side.nearest(stamp_ns, how.reach_ns[0]):
@@ -189,7 +189,7 @@ class Samples:
                 break
             wanted, offset = side.object(number), int(side.offset_ns[number])
             is_packed = decode.extension_of(wanted.key) in ARCHIVES
-            options: list[Member | None] = [*self._members(wanted)] if is_packed else [None]
+            options: list[ArchiveMember | None] = [*self._members(wanted)] if is_packed else [None]
             for one in options:
                 away = (int(side.start_ns[number]) if one is None else one.stamp_ns + offset) - stamp_ns
                 if abs(away) <= how.reach_ns[0] and (best is None or abs(away) < abs(best[0])):

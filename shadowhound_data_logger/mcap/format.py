@@ -53,7 +53,7 @@ def head() -> bytes:
 
 
 @dataclass(slots=True)
-class Track:
+class ChannelTrack:
     """A channel while its slice is written: messages of whole chunks, and the index of the open chunk (time, offset, ...)."""
 
     number: int
@@ -62,13 +62,13 @@ class Track:
     index: array[int] = field(default_factory=lambda: array('Q'))
 
 
-def span(tracks: Sequence[Track]) -> tuple[int, int]:
+def span(tracks: Sequence[ChannelTrack]) -> tuple[int, int]:
     """The first and the last log time in the open chunk, which has messages in each of these tracks."""
     return min(min(track.index[::2]) for track in tracks), max(max(track.index[::2]) for track in tracks)
 
 
 @dataclass(frozen=True, slots=True)
-class Packed:
+class ChunkPacking:
     """How a chunk's records lie in the file."""
 
     compression: str
@@ -80,7 +80,7 @@ class Packed:
 class Contents:
     """What a slice holds so far; becomes the summary at its end. Owned by the thread that writes the slice."""
 
-    tracks: dict[int, Track] = field(default_factory=dict)
+    tracks: dict[int, ChannelTrack] = field(default_factory=dict)
     schemas: dict[int, bytes] = field(default_factory=dict)
     """Record by schema id."""
     declared: dict[int, bytes] = field(default_factory=dict)
@@ -92,7 +92,7 @@ class Contents:
     t_end_ns: int = 0
     _schema_ids: dict[tuple[str, str, str], int] = field(default_factory=dict)
 
-    def declare(self, channel: Channel) -> tuple[Track, bytes]:
+    def declare(self, channel: Channel) -> tuple[ChannelTrack, bytes]:
         """A channel of its own, with the records that must precede its first message."""
         schema, records = (channel.type, channel.encoding, channel.definition), b''
         number = self._schema_ids.get(schema)
@@ -100,13 +100,13 @@ class Contents:
             number = self._schema_ids[schema] = len(self.schemas) + 1
             records = record(Opcode.SCHEMA, struct.pack('<H', number), *map(text, schema))
             self.schemas[number] = records
-        track = Track(len(self.tracks) + 1, channel)
+        track = ChannelTrack(len(self.tracks) + 1, channel)
         said = mapping({'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash})
         declared = record(Opcode.CHANNEL, struct.pack('<HH', track.number, number), text(channel.topic), text(CDR), said)
         self.tracks[track.number], self.declared[track.number] = track, declared
         return track, records + declared
 
-    def chunk(self, at: int, packed: Packed, tracks: Sequence[Track]) -> bytes:
+    def chunk(self, at: int, packed: ChunkPacking, tracks: Sequence[ChannelTrack]) -> bytes:
         """Take in a chunk that begins at the offset ``at``: the message index records that follow it, one for each track."""
         start, end = span(tracks)
         length = RECORD.size + CHUNK.size + 4 + len(packed.compression) + 8 + packed.compressed

@@ -36,7 +36,7 @@ MOST_RECORD_BYTES: Final = MOST_CHUNK_BYTES + 1024
 _MESSAGE = struct.Struct('<HIQQ')
 
 
-class Message(NamedTuple):
+class RecordedMessage(NamedTuple):
     """One message as it was recorded."""
 
     channel: Channel
@@ -48,7 +48,7 @@ class Message(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class MessageFilter:
     """Which messages: from ``start_ns``, before ``end_ns``, of the channels that ``channel`` says yes to."""
 
     start_ns: int
@@ -56,7 +56,7 @@ class Wanted:
     channel: Callable[[Channel], bool]
 
 
-def read_messages(source: Ranged, index: McapIndex, wanted: Wanted) -> Iterator[Message]:
+def read_messages(source: Ranged, index: McapIndex, wanted: MessageFilter) -> Iterator[RecordedMessage]:
     """Raises BagDamaged for a chunk that is not what its writer wrote."""
     if not index.is_indexed:
         yield from _scan(source, index, wanted)
@@ -111,20 +111,20 @@ def walk(source: Ranged, end: int) -> Iterator[tuple[int, int, memoryview]]:
         start, block = start + size, block[size:]
 
 
-def _in_chunk(content: memoryview, channels: dict[int, Channel], wanted: Wanted, name: str) -> Iterator[Message]:
+def _in_chunk(content: memoryview, channels: dict[int, Channel], wanted: MessageFilter, name: str) -> Iterator[RecordedMessage]:
     for kind, _, record in records(content, name):
         if kind == Opcode.MESSAGE and (found := _message(record, channels, wanted)):
             yield found
 
 
-def _message(record: memoryview, channels: dict[int, Channel], wanted: Wanted) -> Message | None:
+def _message(record: memoryview, channels: dict[int, Channel], wanted: MessageFilter) -> RecordedMessage | None:
     if len(record) < _MESSAGE.size:
         return None  # no message, whatever its first byte says
     number, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(record)
     channel = channels.get(number)
     if channel is None or not wanted.start_ns <= log_ns < wanted.end_ns:
         return None
-    return Message(channel, log_ns, publish_ns, sequence, bytes(record[_MESSAGE.size :]))
+    return RecordedMessage(channel, log_ns, publish_ns, sequence, bytes(record[_MESSAGE.size :]))
 
 
 def _read_chunks(source: Ranged, chunks: Sequence[Chunk]) -> Iterator[tuple[Chunk, memoryview]]:
@@ -160,7 +160,7 @@ def _spans(chunks: Sequence[Chunk]) -> Iterator[list[Chunk]]:
         yield span
 
 
-def _scan(source: Ranged, index: McapIndex, wanted: Wanted) -> Iterator[Message]:
+def _scan(source: Ranged, index: McapIndex, wanted: MessageFilter) -> Iterator[RecordedMessage]:
     """For a file without an index."""
     schemas = Schemas()
     known: dict[int, Channel] = {}

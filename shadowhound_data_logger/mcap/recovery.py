@@ -2,23 +2,242 @@
 
 A slice whose writer was killed, or whose disk lost power, ends where it was last synced or somewhere after: with a torn
 chunk, zeros, anything. What is kept is every chunk whose CRC-32 holds, up to the last of them; the file is mended where it
-lies, so a large slice takes neither memory nor a second copy. Every step can be cut short and done again.
+lies, so a large slice takes neither memory nor a second copy. Every step can be cut short and done again. Whatever the file
+claims, it takes the memory of a chunk packed and unpacked, each at most ``MOST_CHUNK_BYTES``, and of what goes into the
+summary, at most ``MOST_SUMMARY_BYTES`` before Python's overhead.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import struct
+import zlib
+from array import array
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
+
+from mcap.opcode import Opcode
+from mcap.records import Chunk
 
 from shadowhound_data_logger.disk import fingerprint, sync
-from shadowhound_data_logger.mcap.index import read_index
-from shadowhound_data_logger.mcap.messages import Wanted, read_messages
+from shadowhound_data_logger.mcap.format import (
+    CHUNK,
+    MESSAGE,
+    MESSAGE_FIELDS,
+    RECORD,
+    ChannelTrack,
+    ChunkPacking,
+    Contents,
+    head,
+    record,
+    span,
+    text,
+)
+from shadowhound_data_logger.mcap.index import UNREADABLE, Schemas, parsed, read_index
+from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.mcap.rosbag2_metadata import bagfile_information, to_yaml
-from shadowhound_data_logger.mcap.slice_info import SliceInfo
-from shadowhound_data_logger.mcap.survey import survey
+from shadowhound_data_logger.mcap.slice_info import Damage, SliceInfo
 from shadowhound_data_logger.mcap.writer import OPEN
+from shadowhound_data_logger.zstd import ZstdDecompressor, ZstdError
+
+MOST_CHUNK_BYTES: Final = 256 << 20
+MOST_SUMMARY_BYTES: Final = 64 << 20
+RETIRED: Final = 0x80
+"""Added to the first byte of a record that is damaged: what begins with 0x80 or more is skipped by every reader."""
+_DATA: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE_INDEX})
+_ENDING: Final = text('rosbag2')
+"""What the metadata record begins with that follows the last chunk of a slice that was being closed; it is written anew."""
+_SUSPECT_BYTES: Final = 200
+"""In memory, with its repair."""
+_INDEX_HEAD: Final = 6
+_INDEX_ENTRY: Final = 16
+
+
+@dataclass(slots=True)
+class Survey:
+    """What is whole in a file, and how it becomes a slice: write the repairs, cut it off at ``end``, append the ending."""
+
+    contents: Contents = field(default_factory=Contents)
+    end: int = 0
+    """Where the last whole record ends."""
+    repairs: list[tuple[int, bytes]] = field(default_factory=list)
+    """(offset, content)."""
+    tail_bytes: int = 0
+    lost_chunks: int = 0
+    lost_messages: int = 0
+
+    @property
+    def damage(self) -> Damage:
+        return Damage(self.tail_bytes, self.lost_chunks, self.lost_messages)
+
+
+class _Damaged(Exception):
+    """A record is not what its writer wrote."""
+
+
+def survey(file: int) -> Survey:
+    """Of an open file. Raises OSError alone."""
+    return _Surveyor(file).run()
+
+
+class _Surveyor:
+    """One pass over one file. What is damaged is a suspect until something whole follows it; at the end it is the torn tail."""
+
+    def __init__(self, file: int) -> None:
+        self._file = file
+        self._size = os.fstat(file).st_size
+        self._found = Survey()
+        self._tracks = self._found.contents.tracks
+        self._schemas = Schemas()
+        self._held_bytes = 0
+        self._suspects: list[tuple[int, int]] = []
+        """(offset, opcode) of records since the last whole one."""
+        self._suspect_messages = 0
+
+    def run(self) -> Survey:
+        at = self._found.end = self._header()
+        while at < self._size:
+            start = os.pread(self._file, RECORD.size, at)
+            op, length = RECORD.unpack(start) if len(start) == RECORD.size else (0, 0)
+            if op == Opcode.METADATA and _ENDING.startswith(os.pread(self._file, len(_ENDING), at + RECORD.size)):
+                break
+            after = at + RECORD.size + length
+            if after > self._size or op & ~RETIRED not in _DATA or self._held_bytes > MOST_SUMMARY_BYTES:
+                self._suspects.append((at, op))
+                at = self._size
+                break
+            at = self._record(op, at, length)
+        torn = self._suspects[0][0] if self._suspects else at
+        self._found.tail_bytes = max(at - torn, 0)
+        self._found.lost_messages += self._suspect_messages
+        return self._found
+
+    def _header(self) -> int:
+        """Where the records begin; a header that is damaged is written anew, for every slice has the same."""
+        wanted = head()
+        if os.pread(self._file, len(wanted), 0) != wanted:
+            self._found.repairs.append((0, wanted))
+        return len(wanted)
+
+    def _record(self, op: int, at: int, length: int) -> int:
+        """Take in one record; where the next one begins."""
+        after = at + RECORD.size + length
+        try:
+            if op == Opcode.CHUNK:
+                after = self._chunk(at, length)
+            elif op in {Opcode.SCHEMA, Opcode.CHANNEL}:
+                self._declare(op, at, length)
+            else:  # retired by a recovery before this one, or the index of a chunk that is not whole
+                self._suspect(op, at, length)
+                return after
+        except _Damaged:
+            self._suspect(op, at, length)
+            return after
+        self._accept(after)
+        return after
+
+    def _suspect(self, op: int, at: int, length: int) -> None:
+        self._suspects.append((at, op))
+        self._held_bytes += _SUSPECT_BYTES
+        if op & ~RETIRED == Opcode.MESSAGE_INDEX:
+            self._suspect_messages += max(length - _INDEX_HEAD, 0) // _INDEX_ENTRY
+
+    def _accept(self, after: int) -> None:
+        """All up to here stays: suspects in between are skipped from now on."""
+        found = self._found
+        found.repairs += [(at, bytes([op | RETIRED])) for at, op in self._suspects]
+        found.lost_chunks += sum(op & ~RETIRED == Opcode.CHUNK for _, op in self._suspects)
+        found.lost_messages += self._suspect_messages
+        found.end = after
+        self._suspects, self._suspect_messages = [], 0
+
+    def _declare(self, op: int, at: int, length: int) -> None:
+        """A schema or channel."""
+        if length > MOST_SUMMARY_BYTES:
+            raise _Damaged
+        content = self._read(at + RECORD.size, length)
+        contents = self._found.contents
+        known = contents.schemas if op == Opcode.SCHEMA else contents.declared
+        number, schema = int.from_bytes(content[:2], 'little'), int.from_bytes(content[2:4], 'little')
+        if number in known or (op == Opcode.CHANNEL and schema not in contents.schemas):
+            raise _Damaged
+        try:
+            self._schemas.add(op, content)
+        except UNREADABLE as error:
+            raise _Damaged from error
+        self._held_bytes += length
+        known[number] = record(op, content)
+        if op == Opcode.CHANNEL:
+            self._tracks[number] = ChannelTrack(number, self._schemas.channels[number])
+
+    def _chunk(self, at: int, length: int) -> int:
+        """A chunk with the message indexes behind it; where they end."""
+        if length > MOST_CHUNK_BYTES:
+            raise _Damaged
+        body = self._read(at + RECORD.size, length)
+        raw, packed = _unpack(body)
+        tracks = self._walk(raw)
+        if CHUNK.unpack_from(body)[:2] != (times := span(tracks)):
+            self._repair(at + RECORD.size, struct.pack('<QQ', *times))
+        after = at + RECORD.size + length
+        contents = self._found.contents
+        indexes = contents.chunk(at, packed, tracks)
+        self._held_bytes += len(contents.chunks[-1])
+        if os.pread(self._file, len(indexes), after) != indexes:
+            self._repair(after, indexes)
+        return after + len(indexes)
+
+    def _walk(self, raw: memoryview) -> list[ChannelTrack]:
+        """The tracks of a chunk's messages with their indexes, in the order in which the writer has them."""
+        indexes: dict[int, array[int]] = {}
+        at, end = 0, len(raw)
+        try:
+            while at < end:
+                op, length, number, _, log_ns, _ = MESSAGE.unpack_from(raw, at)
+                index = indexes.get(number)
+                if index is None:
+                    index = indexes[number] = array('Q')
+                index.append(log_ns)
+                index.append(at)
+                at += RECORD.size + length
+                if op != Opcode.MESSAGE or length < MESSAGE_FIELDS:
+                    raise _Damaged
+        except struct.error as error:
+            raise _Damaged from error
+        if at != end or not indexes or not indexes.keys() <= self._tracks.keys():
+            raise _Damaged
+        for number, index in indexes.items():
+            self._tracks[number].index = index
+        return [track for track in self._tracks.values() if track.index]
+
+    def _repair(self, at: int, content: bytes) -> None:
+        self._held_bytes += len(content)
+        self._found.repairs.append((at, content))
+
+    def _read(self, at: int, length: int) -> bytes:
+        body = os.pread(self._file, length, at)
+        if len(body) != length:
+            raise _Damaged
+        return body
+
+
+def _unpack(body: bytes) -> tuple[memoryview, ChunkPacking]:
+    """The records in a chunk, checked."""
+    try:
+        chunk = parsed(Chunk, body)
+        if chunk.uncompressed_size > MOST_CHUNK_BYTES or chunk.compression not in {'', 'zstd'}:
+            raise _Damaged
+        packed = ChunkPacking(chunk.compression, len(chunk.data), chunk.uncompressed_size)
+        raw = ZstdDecompressor().decompress(chunk.data, packed.size + 1) if chunk.compression else chunk.data
+    except (*UNREADABLE, ZstdError) as error:
+        raise _Damaged from error
+    if len(raw) != packed.size or zlib.crc32(raw) != chunk.uncompressed_crc:
+        raise _Damaged
+    return memoryview(raw), packed
+
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +290,7 @@ def read_info(path: Path, *, digest: bool = False) -> SliceInfo:
             counts[index.channels[number].topic] += count
     else:
         channels, messages, span, counts = [], 0, (0, 0), {}
-        for message in read_messages(source, index, Wanted(*_EVER, lambda _: True)):
+        for message in read_messages(source, index, MessageFilter(*_EVER, lambda _: True)):
             if message.channel.topic not in counts:
                 channels.append(message.channel)
             counts[message.channel.topic] = counts.get(message.channel.topic, 0) + 1

@@ -18,9 +18,9 @@ from shadowhound_data_logger.mcap.format import (
     MESSAGE,
     MESSAGE_FIELDS,
     RECORD,
+    ChannelTrack,
+    ChunkPacking,
     Contents,
-    Packed,
-    Track,
     head,
     span,
     text,
@@ -55,7 +55,7 @@ class SliceWriter:
         self._compression = compression if compression != 'none' else ''
         self._chunk_bytes = chunk_bytes
         self._contents = Contents()
-        self._tracks: dict[str, Track] = {}
+        self._tracks: dict[str, ChannelTrack] = {}
         self._chunk = bytearray(chunk_bytes)
         self._view = memoryview(self._chunk)
         self._used = 0
@@ -125,7 +125,7 @@ class SliceWriter:
             os.close(self._file)
             self._file = -1
 
-    def _declare(self, channel: Channel) -> Track:
+    def _declare(self, channel: Channel) -> ChannelTrack:
         """The track of a topic's type, which another type of the same topic may have taken the place of."""
         tracks = self._contents.tracks.values()
         track = next((one for one in tracks if (one.channel.topic, one.channel.type) == (channel.topic, channel.type)), None)
@@ -153,7 +153,7 @@ class SliceWriter:
             data, compression = raw, ''
         fields = CHUNK.pack(*span(tracks), len(raw), zlib.crc32(raw)) + text(compression) + struct.pack('<Q', len(data))
         at = self._written + len(self._declared)
-        indexes = self._contents.chunk(at, Packed(compression, len(data), len(raw)), tracks)
+        indexes = self._contents.chunk(at, ChunkPacking(compression, len(data), len(raw)), tracks)
         declared, self._declared = self._declared, b''
         self._used = 0
         self._append(declared + RECORD.pack(Opcode.CHUNK, len(fields) + len(data)) + fields, data, indexes)

@@ -21,7 +21,7 @@ Part = tuple[Sequence[Point], Mapping[str, str], Mapping[str, str]]
 
 
 @dataclass(slots=True)
-class Batch:
+class PointBatch:
     """What goes to the run in one request."""
 
     end: int
@@ -41,7 +41,7 @@ class Batches:
         """Up to here the story knows the journal."""
         self._folder = folder
         self._story = story
-        self._batch: Batch | None = None
+        self._batch: PointBatch | None = None
 
     def recall(self, sent: int) -> None:
         """After a restart: tell the story what was sent before. Raises OSError."""
@@ -52,14 +52,14 @@ class Batches:
                 if self.told >= sent:
                     break
 
-    def next(self, sent: int, is_node_over: Callable[[], bool]) -> Batch | None:
+    def next(self, sent: int, is_node_over: Callable[[], bool]) -> PointBatch | None:
         """The next records, the same until ``sent`` is beyond them; the end waits for that of the node. Raises OSError."""
         if self._batch is None or self._batch.end <= sent:
             self._batch = self._made(sent, is_node_over)
         return self._batch
 
-    def _made(self, sent: int, is_node_over: Callable[[], bool]) -> Batch | None:
-        batch, story = Batch(self.told), self._story
+    def _made(self, sent: int, is_node_over: Callable[[], bool]) -> PointBatch | None:
+        batch, story = PointBatch(self.told), self._story
         for line in self._folder.lines(self.told):
             kind = (line.record or {}).get('k')
             if kind == 'end' and not is_node_over():

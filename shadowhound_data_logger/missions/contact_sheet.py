@@ -22,7 +22,7 @@ INK: Final = '#22303c'
 PALE: Final = '#6b7884'
 
 
-class Frame(NamedTuple):
+class LoggedFrame(NamedTuple):
     """A frame that was logged."""
 
     time_ns: int
@@ -31,11 +31,11 @@ class Frame(NamedTuple):
 
 
 class _Thumb(NamedTuple):
-    frame: Frame
+    frame: LoggedFrame
     image: Image.Image
 
 
-def contact_sheet(frames: Sequence[Frame], title: str, start_ns: int, target: Path) -> str:
+def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, target: Path) -> str:
     """Write the JPEG; what there is to say about it: '' or how many frames are no pictures. Raises ValueError for none."""
     if not frames:
         raise ValueError('no camera frame was sampled')
@@ -69,7 +69,7 @@ def _columns(count: int) -> int:
     return {1: 1, 2: 2, 4: 2}.get(count, 3 if count <= 9 else 4)
 
 
-def _thumbs(frames: Sequence[Frame], width: int) -> tuple[list[_Thumb], int]:
+def _thumbs(frames: Sequence[LoggedFrame], width: int) -> tuple[list[_Thumb], int]:
     """The frames at a sheet's size, and how many of them could not be read."""
     thumbs: list[_Thumb] = []
     for frame in frames:
@@ -83,7 +83,7 @@ def _thumbs(frames: Sequence[Frame], width: int) -> tuple[list[_Thumb], int]:
     return thumbs, len(frames) - len(thumbs)
 
 
-def _caption(pen: ImageDraw.ImageDraw, place: tuple[int, int], width: int, frame: Frame, start_ns: int) -> None:
+def _caption(pen: ImageDraw.ImageDraw, place: tuple[int, int], width: int, frame: LoggedFrame, start_ns: int) -> None:
     """The id at the left, the time (UTC, and since the start where there is room) at the right."""
     font = _font(12)
     seconds = max(0, frame.time_ns - start_ns) // SECOND

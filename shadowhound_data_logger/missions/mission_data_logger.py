@@ -20,10 +20,9 @@ from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import home as home_of
 from shadowhound_data_logger.errors import NameRefused, SettingError
 from shadowhound_data_logger.keys import check_name
-from shadowhound_data_logger.missions.beginning import Beginning
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import MissionFolder
-from shadowhound_data_logger.missions.recorder import Mission
+from shadowhound_data_logger.missions.recorder import Beginning, Mission
 from shadowhound_data_logger.missions.report import Report, has_arrived, report, sizes
 from shadowhound_data_logger.missions.story import FAILED, KILLED
 from shadowhound_data_logger.missions.values import text

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.missions.contact_sheet import Frame, contact_sheet
+from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet
 from shadowhound_data_logger.missions.drawing import CHARGE, SHEET, TRAJECTORY
 from shadowhound_data_logger.missions.folder import MissionFolder, write_json
 from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE
@@ -37,7 +37,7 @@ class Material:
     """What the pictures are made of."""
 
     start_ns: int = 0
-    frames: list[Frame] = field(default_factory=list)
+    frames: list[LoggedFrame] = field(default_factory=list)
     states: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {BATTERY: [], TEMPERATURE: []})
     """Of each metric: seconds since the start, and the value."""
     trajectory: Path | None = None
@@ -47,7 +47,7 @@ class Material:
         if kind == 'start':
             self.start_ns = self.start_ns or time_ns
         elif kind == 'frame' and record.get('artifact'):
-            self.frames.append(Frame(time_ns, int(record['id']), files / record['file']))
+            self.frames.append(LoggedFrame(time_ns, int(record['id']), files / record['file']))
         elif kind == 'trajectory':
             self.trajectory = files / record['file']
         elif kind == 'metrics':

@@ -26,7 +26,7 @@ from shadowhound_data_logger.sim.textures import (
     WALL_SCALE,
     Atlas,
 )
-from shadowhound_data_logger.sim.world import Pose, World
+from shadowhound_data_logger.sim.world import BodyPose, World
 
 WIDTH: Final = 640
 HEIGHT: Final = 480
@@ -82,7 +82,7 @@ class Camera:
         np.right_shift(bar, 2, out=bar)
         glyphs.write(out, caption, 8, HEIGHT - _BAR + (_BAR - glyphs.HEIGHT) // 2, (225, 240, 245))
 
-    def _look(self, pose: Pose) -> _View:
+    def _look(self, pose: BodyPose) -> _View:
         cos, sin = math.cos(pose.yaw), math.sin(pose.yaw)
         x, y = pose.x + MOUNT[0] * cos, pose.y + MOUNT[0] * sin
         dx = (cos + sin * self._across).astype(np.float32)

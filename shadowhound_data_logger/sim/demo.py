@@ -104,7 +104,7 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
     console.print(f'Starting the node and the robot (ROS_DOMAIN_ID={environ["ROS_DOMAIN_ID"]}, this machine only) ...')
     with (
         demo_processes.start_logger(folder, environ) as node,
-        demo_run.Outage(tower, (duration_s - outage_s) / 2, outage_s) as outage,
+        demo_run.StoreOutage(tower, (duration_s - outage_s) / 2, outage_s) as outage,
     ):
         if outage_s:
             console.print(f'In the middle the S3 server goes away for {outage_s:g} s.\n')

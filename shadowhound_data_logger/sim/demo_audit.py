@@ -57,7 +57,7 @@ class Messages:
 
 
 @dataclass(frozen=True, slots=True)
-class Audit:
+class DemoAudit:
     """What was found."""
 
     ledger: Mapping[str, Any]
@@ -75,7 +75,7 @@ class Audit:
     """One sentence for each thing that is not as it should be."""
 
 
-def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectStore) -> Audit:
+def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectStore) -> DemoAudit:
     """Raises StoreError when the server cannot be read, SpoolError for the spool."""
     found = ledger.read(spool, robot)
     index = Index(spool / 'index.db', read_only=True)
@@ -97,7 +97,9 @@ def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectSt
     problems = [*ledger.imbalances(found), *_unread(delivered, bodies), *_unaccounted(messages), *_undelivered(found)]
     catalogue = _catalogued(bodies)
     problems += [*_uncounted(found, samples), *_uncatalogued(catalogue, bodies)]
-    return Audit(found, messages, _piles(rows), len(bodies), sum(samples.values()), bodies, catalogue.total(), tuple(problems))
+    return DemoAudit(
+        found, messages, _piles(rows), len(bodies), sum(samples.values()), bodies, catalogue.total(), tuple(problems)
+    )
 
 
 def _messages(published: int, before: int, account: Mapping[str, Any] | None) -> Messages:

@@ -16,9 +16,9 @@ from rich.text import Text
 
 from shadowhound_data_logger.cli.ledger import verdict
 from shadowhound_data_logger.cli.output import figure, number, plain_table, print_page, volume
-from shadowhound_data_logger.sim.demo_audit import BUCKET, Audit
+from shadowhound_data_logger.sim.demo_audit import BUCKET, DemoAudit
 from shadowhound_data_logger.sim.demo_processes import OUR_VARIABLE
-from shadowhound_data_logger.sim.demo_run import Reading, Record, Show
+from shadowhound_data_logger.sim.demo_run import Record, Show, SpoolReading
 
 LINE_EVERY_S: Final = 5.0
 """Without a terminal."""
@@ -37,7 +37,7 @@ def progress(console: Console, duration_s: float) -> Iterator[Show]:
         return
     with Live(console=console, auto_refresh=False) as live:
 
-        def show(reading: Reading) -> None:
+        def show(reading: SpoolReading) -> None:
             bar = ProgressBar(
                 total=duration_s,
                 completed=min(reading.t, duration_s),
@@ -57,10 +57,10 @@ class Lines:
         self._console = console
         self._next_s = 0.0
         self._tower = ''
-        self._unsaid: Reading | None = None
+        self._unsaid: SpoolReading | None = None
         console.print(HEADING)
 
-    def show(self, reading: Reading) -> None:
+    def show(self, reading: SpoolReading) -> None:
         self._unsaid = reading
         if reading.t >= self._next_s or TOWER[reading.tower] != self._tower:
             self.end()
@@ -74,7 +74,7 @@ class Lines:
             self._unsaid = None
 
 
-def line(reading: Reading) -> str:
+def line(reading: SpoolReading) -> str:
     """One reading under HEADING."""
     return (
         f'{reading.t:>3.0f} s  {reading.room:<9}{reading.messages:>9,}{reading.spooled:>9,}{reading.delivered:>11,}'
@@ -82,7 +82,7 @@ def line(reading: Reading) -> str:
     )
 
 
-def show_result(audit: Audit, record: Record, console: Console) -> None:
+def show_result(audit: DemoAudit, record: Record, console: Console) -> None:
     """The tables, what they leave to say, and the verdicts."""
     print_page(messages_table(audit), '', objects_table(audit), console=console)
     console.print()
@@ -100,7 +100,7 @@ def show_result(audit: Audit, record: Record, console: Console) -> None:
         console.print(Text(f'  {record.errors[0]}', style='red'))
 
 
-def _remarks(audit: Audit, record: Record) -> Iterator[str]:
+def _remarks(audit: DemoAudit, record: Record) -> Iterator[str]:
     before = sum(row.before_match or 0 for row in audit.messages.values())
     if before:
         yield f'{before:,} messages went out before the node had found their publishers: the ledger begins after them.'
@@ -113,7 +113,7 @@ def _remarks(audit: Audit, record: Record) -> Iterator[str]:
         yield f'The S3 server was away for {length_s:.0f} s: {record.backlog:,} objects waited, {end}.'
 
 
-def messages_table(audit: Audit) -> Table:
+def messages_table(audit: DemoAudit) -> Table:
     """A row a topic: what the robot says it published, and what became of it."""
     fates = ('received', 'stored', 'skipped', 'missed')
     has_before = any(row.before_match for row in audit.messages.values())
@@ -125,7 +125,7 @@ def messages_table(audit: Audit) -> Table:
     return table
 
 
-def objects_table(audit: Audit) -> Table:
+def objects_table(audit: DemoAudit) -> Table:
     """A row a sensor: the objects that lie in the S3 server, and what they are called."""
     columns = ('objects', 'delivered', 'size', 'the latest one')
     table = plain_table('What lies in the S3 server', columns, left=columns[-1:])
@@ -164,7 +164,7 @@ def show_where(folder: Path, pictures: list[Path], environ: Mapping[str, str], c
     console.print(f'  SHADOWHOUND_HOME={place}/home {prefix}shadowhound-data ledger', soft_wrap=True)
 
 
-def _styled(reading: Reading) -> Text:
+def _styled(reading: SpoolReading) -> Text:
     style = {'AWAY': 'yellow', 'going away': 'yellow', 'up again': 'green'}.get(TOWER[reading.tower], '')
     text = Text(line(reading))
     text.stylize(style, len(text) - len(TOWER[reading.tower]))

@@ -27,7 +27,7 @@ CATCH_UP_S: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class SpoolReading:
     """What the spool said at one moment."""
 
     t: float
@@ -49,7 +49,7 @@ class Record:
 
     published: Mapping[str, int]
     """Messages by topic, as the simulated robot itself says."""
-    readings: tuple[Reading, ...]
+    readings: tuple[SpoolReading, ...]
     outage: tuple[float, float] | None
     """From when until when the S3 server was away, seconds since the robot was first heard."""
     errors: tuple[str, ...] = ()
@@ -81,7 +81,7 @@ class Patrolled:
         return self._plan.room_at(motion.x, motion.y)
 
 
-class Outage:
+class StoreOutage:
     """Takes the S3 server away for a while, on a thread of its own: stopping and starting a server takes a second."""
 
     def __init__(self, tower: Tower, begin_s: float, length_s: float) -> None:
@@ -123,10 +123,10 @@ class Outage:
         return (self.away_s, self.back_s) if self.away_s is not None and self.back_s is not None else None
 
 
-Show = Callable[[Reading], None]
+Show = Callable[[SpoolReading], None]
 
 
-def patrol(folder: Path, node: Child, outage: Outage, environ: Mapping[str, str], duration_s: float, show: Show) -> Record:
+def patrol(folder: Path, node: Child, outage: StoreOutage, environ: Mapping[str, str], duration_s: float, show: Show) -> Record:
     """Let the robot walk and the node log; returns when everything is delivered, or the time for that is over."""
     arguments = ['--ros-args', '-p', f'duration_s:={duration_s}']
     with Child('shadowhound_data_logger.sim.sim_go2_node', arguments, environ, folder / 'sim.log') as sim:
@@ -140,7 +140,7 @@ def patrol(folder: Path, node: Child, outage: Outage, environ: Mapping[str, str]
     return Record(published, tuple(readings), outage.span)
 
 
-def _follow(spool: Path, processes: tuple[Child, Child], outage: Outage, show: Show) -> Iterable[Reading]:
+def _follow(spool: Path, processes: tuple[Child, Child], outage: StoreOutage, show: Show) -> Iterable[SpoolReading]:
     """A reading every LOOK_S from the first message on, until the robot has stopped and nothing waits any more."""
     node, sim = processes
     patrolled = Patrolled()
@@ -163,7 +163,7 @@ def _follow(spool: Path, processes: tuple[Child, Child], outage: Outage, show: S
             t = now - began
             outage.look(t, is_last=stopped_s is not None)
             objects = found['objects']
-            reading = Reading(t, messages, objects['spooled'], objects['delivered'], objects['pending'],
+            reading = SpoolReading(t, messages, objects['spooled'], objects['delivered'], objects['pending'],
                               found['bytes']['spooled'], patrolled.room(t), outage.state)  # fmt: skip
             show(reading)
             yield reading

@@ -12,7 +12,7 @@ from typing import Any, Final
 from go2_interfaces.msg import IMU, Go2State, LowState
 
 from shadowhound_data_logger.sim import gait
-from shadowhound_data_logger.sim.messages import Source, Topic
+from shadowhound_data_logger.sim.messages import SimulatedSensor, SimulatedTopic
 from shadowhound_data_logger.sim.world import Imu, World
 
 TROT: Final = 3
@@ -23,7 +23,7 @@ class ImuSource:
     """``imu``."""
 
     rate_hz = 100.0
-    topics = (Topic('imu', IMU),)
+    topics = (SimulatedTopic('imu', IMU),)
 
     def __init__(self, world: World) -> None:
         self._world, self._imu = world, IMU()
@@ -37,7 +37,7 @@ class StateSource:
     """``go2_states``: position and velocity in ``odom``, feet in the frame of the body."""
 
     rate_hz = 20.0
-    topics = (Topic('go2_states', Go2State),)
+    topics = (SimulatedTopic('go2_states', Go2State),)
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -61,7 +61,7 @@ class LowStateSource:
     """``lowstate`` at the rate of the robot's low-frequency topic (``rt/lf/lowstate``), with the battery."""
 
     rate_hz = 20.0
-    topics = (Topic('lowstate', LowState),)
+    topics = (SimulatedTopic('lowstate', LowState),)
 
     def __init__(self, world: World) -> None:
         self._world, self._low = world, LowState(level_flag=0xFF)
@@ -89,7 +89,7 @@ class LowStateSource:
         yield low
 
 
-def go2_sources(world: World) -> list[Source]:
+def go2_sources(world: World) -> list[SimulatedSensor]:
     """The sensors that only a machine with go2_interfaces can publish."""
     return [ImuSource(world), StateSource(world), LowStateSource(world)]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shadowhound_data_logger.sim.floor_plan import CEILING, REFLECTIVITY
 from shadowhound_data_logger.sim.raycast import Crossings, cross
-from shadowhound_data_logger.sim.world import Pose, World
+from shadowhound_data_logger.sim.world import BodyPose, World
 
 AZIMUTHS: Final = 800
 RINGS: Final = 25
@@ -35,7 +35,7 @@ class Lidar:
         self.reflectivity = np.array([REFLECTIVITY[box.material] for box in world.plan.boxes], np.float32)
         self.partial = np.flatnonzero(~world.plan.is_full)
 
-    def origin(self, pose: Pose) -> tuple[float, float, float]:
+    def origin(self, pose: BodyPose) -> tuple[float, float, float]:
         """Where the sensor is in ``odom``."""
         return pose.x + MOUNT[0] * math.cos(pose.yaw), pose.y + MOUNT[0] * math.sin(pose.yaw), pose.z + MOUNT[1]
 

@@ -30,7 +30,7 @@ DRIVER_ORDER: Final = (1, 0, 3, 2)
 """The driver publishes joints as FL, FR, RL, RR; the robot itself counts FR, FL, RR, RL."""
 
 
-class Topic(NamedTuple):
+class SimulatedTopic(NamedTuple):
     """A topic relative to the namespace; all are VOLATILE and KEEP_LAST."""
 
     name: str
@@ -39,14 +39,14 @@ class Topic(NamedTuple):
     depth: int = 10
 
 
-class Source(Protocol):
+class SimulatedSensor(Protocol):
     """One sensor: what it publishes, how often, and how its messages are made."""
 
     @property
     def rate_hz(self) -> float: ...
 
     @property
-    def topics(self) -> tuple[Topic, ...]: ...
+    def topics(self) -> tuple[SimulatedTopic, ...]: ...
 
     def fill(self, t: float, stamp_ns: int, /) -> Iterator[Any]:
         """One message for each of ``topics``, in their order: the world ``t`` seconds after the start."""
@@ -60,9 +60,9 @@ class CameraSource:
     def __init__(self, world: World, *, image_raw: bool, compressed: bool) -> None:
         self._world, self._camera, self._frames = world, Camera(world), 0
         self._raw, self._compressed = image_raw, compressed
-        raw = (Topic('camera/image_raw', Image, False, 1),) if image_raw else ()
-        jpeg = (Topic('camera/compressed', CompressedImage),) if compressed else ()
-        self.topics: tuple[Topic, ...] = (*raw, Topic('camera/camera_info', CameraInfo, False, 1), *jpeg)
+        raw = (SimulatedTopic('camera/image_raw', Image, False, 1),) if image_raw else ()
+        jpeg = (SimulatedTopic('camera/compressed', CompressedImage),) if compressed else ()
+        self.topics: tuple[SimulatedTopic, ...] = (*raw, SimulatedTopic('camera/camera_info', CameraInfo, False, 1), *jpeg)
         self._image = Image(height=camera.HEIGHT, width=camera.WIDTH, encoding='bgr8', step=camera.WIDTH * 3)
         self._image.data = array('B', bytes(camera.WIDTH * camera.HEIGHT * 3))
         # Drawn in place, into the array that the message holds: which may be a copy of the one it was given.
@@ -93,7 +93,7 @@ class CloudSource:
     """``point_cloud2``: x, y, z, intensity as float32 in the frame ``odom``."""
 
     rate_hz = 10.0
-    topics = (Topic('point_cloud2', PointCloud2, False, 1),)
+    topics = (SimulatedTopic('point_cloud2', PointCloud2, False, 1),)
 
     def __init__(self, world: World) -> None:
         self._lidar = Lidar(world)
@@ -116,7 +116,7 @@ class OdometrySource:
     """``odom``: a pose without a twist, as the driver has it."""
 
     rate_hz = 50.0
-    topics = (Topic('odom', Odometry),)
+    topics = (SimulatedTopic('odom', Odometry),)
 
     def __init__(self, world: World) -> None:
         self._world, self._odom = world, Odometry(child_frame_id='base_link')
@@ -135,7 +135,7 @@ class JointSource:
     """``joint_states``: twelve positions; the driver knows no velocities or efforts."""
 
     rate_hz = 50.0
-    topics = (Topic('joint_states', JointState),)
+    topics = (SimulatedTopic('joint_states', JointState),)
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -149,7 +149,7 @@ class JointSource:
         yield self._joints
 
 
-def sources(world: World, *, image_raw: bool, compressed: bool) -> list[Source]:
+def sources(world: World, *, image_raw: bool, compressed: bool) -> list[SimulatedSensor]:
     """The sensors whose messages every ROS 2 machine has."""
     return [
         OdometrySource(world),

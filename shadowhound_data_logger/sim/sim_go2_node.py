@@ -26,7 +26,7 @@ from rclpy.utilities import remove_ros_args
 
 from shadowhound_data_logger.config import FOREIGN
 from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.sim.messages import Source, Topic, sources
+from shadowhound_data_logger.sim.messages import SimulatedSensor, SimulatedTopic, sources
 from shadowhound_data_logger.sim.schedule import schedule
 from shadowhound_data_logger.sim.world import World
 
@@ -77,7 +77,7 @@ def _checked(name: str, value: Any, default: Any, metadata: Mapping[str, Any]) -
 class SimulatedGo2:
     """The publishers of one robot and how much each has published. Owned by one thread."""
 
-    def __init__(self, node: Node, robot: Sequence[Source]) -> None:
+    def __init__(self, node: Node, robot: Sequence[SimulatedSensor]) -> None:
         self.published: dict[str, int] = {}
         self._sources = {source.topics[0].name: source for source in robot}
         self._publishers = {name: [_publisher(node, topic) for topic in source.topics] for name, source in self._sources.items()}
@@ -155,7 +155,7 @@ def _say(text: str) -> None:
     print(f'sim_go2_node: {text}', file=sys.stderr, flush=True)
 
 
-def _sources(settings: SimSettings) -> list[Source]:
+def _sources(settings: SimSettings) -> list[SimulatedSensor]:
     """All sensors, those of go2_interfaces first, where it is installed."""
     world = World.of(settings.seed)
     common = sources(world, image_raw=settings.image_raw, compressed=settings.compressed)
@@ -167,7 +167,7 @@ def _sources(settings: SimSettings) -> list[Source]:
     return [*go2_sources(world), *common]
 
 
-def _publisher(node: Node, topic: Topic) -> Publisher:
+def _publisher(node: Node, topic: SimulatedTopic) -> Publisher:
     reliability = QoSReliabilityPolicy.RELIABLE if topic.is_reliable else QoSReliabilityPolicy.BEST_EFFORT
     profile = QoSProfile(reliability=reliability, history=QoSHistoryPolicy.KEEP_LAST, depth=topic.depth)
     return node.create_publisher(topic.type, topic.name, profile)

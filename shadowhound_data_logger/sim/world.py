@@ -28,7 +28,7 @@ RANGE_LIMIT: Final = 6.0
 _IMU, _FOOT, _POWER = range(3)
 
 
-class Pose(NamedTuple):
+class BodyPose(NamedTuple):
     """The body in ``odom``: position in m, angles in rad, quaternion as (w, x, y, z)."""
 
     x: float
@@ -87,11 +87,11 @@ class World:
         motion = self.patrol.at(t)
         return self.plan.room_at(motion.x, motion.y)
 
-    def pose(self, t: float) -> Pose:
+    def pose(self, t: float) -> BodyPose:
         """The pose of the body, with the sway of the trot."""
         motion, sway = self.patrol.at(t), gait.sway(t)
         quaternion = _quaternion(sway.roll, sway.pitch, motion.yaw)
-        return Pose(motion.x, motion.y, sway.height, sway.roll, sway.pitch, motion.yaw, quaternion)
+        return BodyPose(motion.x, motion.y, sway.height, sway.roll, sway.pitch, motion.yaw, quaternion)
 
     def imu(self, t: float) -> Imu:
         """What the IMU in the body reads; specific force, so that a robot at rest reads +9.81 upwards."""

@@ -25,7 +25,7 @@ TELL_EVERY_NS: Final = 60 * SECOND
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
+class RoomNeeded:
     """What a group of new objects costs."""
 
     given_up: frozenset[int] = frozenset()
@@ -34,7 +34,7 @@ class Room:
 
 
 def make_room(index: Index, tree: Tree, settings: SpoolSettings, objects: Sequence[DataObject], leaving: int,
-              now_ns: int) -> Room:  # fmt: skip
+              now_ns: int) -> RoomNeeded:  # fmt: skip
     """Take in as many of the objects as fit, the most important first, and evict what is not more important for them.
 
     Of what is equally important the oldest goes. Protected objects are always taken in, and nothing is evicted in vain.
@@ -44,7 +44,7 @@ def make_room(index: Index, tree: Tree, settings: SpoolSettings, objects: Sequen
     needed = sum(map(_cost, objects))
     there = sum(len(item.body) for item in objects if isinstance(item.body, FileBody))
     if needed <= leaving or (over := _over(index, tree, settings, needed - leaving, there)) <= 0:
-        return Room()
+        return RoomNeeded()
     free, evictable = needed - over, index.evictable_bytes()
     taken, given_up = 0, set[int]()
     for place in sorted(range(len(objects)), key=lambda place: (not objects[place].protected, objects[place].priority, -place)):
@@ -57,7 +57,7 @@ def make_room(index: Index, tree: Tree, settings: SpoolSettings, objects: Sequen
     evicted = 0
     if taken and taken - free <= sum(evictable.values()):
         evicted = _evict(index, tree, settings, taken - leaving, there, now_ns)
-    return Room(frozenset(given_up), evicted)
+    return RoomNeeded(frozenset(given_up), evicted)
 
 
 def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, there: int, now_ns: int) -> int:
@@ -95,7 +95,7 @@ class Shortage:
         self._lost = 0
         self._lost_ns = self._told_ns = 0
 
-    def note(self, room: Room, now_ns: int) -> None:
+    def note(self, room: RoomNeeded, now_ns: int) -> None:
         """What one commit cost."""
         lost = room.evicted + len(room.given_up)
         if lost:

@@ -19,10 +19,10 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, SpooledObject, State
-from shadowhound_data_logger.spool import binding, carrying
+from shadowhound_data_logger.spool import binding
 from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
-from shadowhound_data_logger.spool.adding import Adding
+from shadowhound_data_logger.spool.adding import Adding, remove_sources, staged
 from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.ballast import Ballast
 from shadowhound_data_logger.spool.files import Tree, flock
@@ -31,8 +31,7 @@ from shadowhound_data_logger.spool.piles import Piles, look
 from shadowhound_data_logger.spool.recovery import open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, make_room
-from shadowhound_data_logger.spool.session import Session
-from shadowhound_data_logger.spool.staging import remove_sources, staged
+from shadowhound_data_logger.spool.session import Session, carry
 from shadowhound_data_logger.spool.uncatalogued import take
 
 log = logging.getLogger(__name__)
@@ -168,7 +167,7 @@ class Spool:
         with self._lock:
             if self._session is not None:
                 with self._index.transaction():
-                    rows = carrying.carry(self._index, self._session.number, self._robot, sink)
+                    rows = carry(self._index, self._session.number, self._robot, sink)
                 self.accounts.carry(rows)
 
     def held(self, reason: str, limit: int = 256) -> list[HeldObject]:

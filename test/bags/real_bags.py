@@ -13,7 +13,7 @@ from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, SliceEntry
 from shadowhound_data_logger.bags.naming import BUCKET, prefix_of
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.mcap.index import read_index
-from shadowhound_data_logger.mcap.messages import Message, Wanted, read_messages
+from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
@@ -27,7 +27,7 @@ STEP_NS = 10_000_000
 IMU = Channel('/imu', 'std_msgs/msg/String', 'ros2msg', 'string data\n', 'RIHS01_' + 'a' * 64, '')
 BLOB = Channel('/camera/blob', 'nowhere/msg/Blob', '', '', '', '')
 """Of a type that nobody knows."""
-EVER = Wanted(0, 1 << 63, lambda _: True)
+EVER = MessageFilter(0, 1 << 63, lambda _: True)
 NAME = 'patrol_20251018_120000'
 
 
@@ -82,7 +82,7 @@ def put_item(path: Path, key: str, bag: str, place: int) -> SpooledObject:
     return SpooledObject(place, BUCKET, key, path, path.stat().st_size, sha256, 'application/octet-stream', metadata, 5, 0)
 
 
-def messages_of(paths: Sequence[Path]) -> Iterator[Message]:
+def messages_of(paths: Sequence[Path]) -> Iterator[RecordedMessage]:
     """All messages of MCAP files, in their order."""
     for path in paths:
         source = LocalFile(path)

@@ -17,7 +17,7 @@ from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
-from shadowhound_data_logger.mcap.messages import Message
+from shadowhound_data_logger.mcap.messages import RecordedMessage
 from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
@@ -46,7 +46,7 @@ def store(origin: Path) -> MemoryStore:
     return found
 
 
-def source(origin: Path, wanted: Callable[[Message], bool]) -> list[Message]:
+def source(origin: Path, wanted: Callable[[RecordedMessage], bool]) -> list[RecordedMessage]:
     return [one for one in messages_of([origin / f'{NAME}_{number}.mcap' for number in range(3)]) if wanted(one)]
 
 

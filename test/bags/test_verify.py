@@ -13,7 +13,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
-from shadowhound_data_logger.bags.verify import Verified, verify_folder, verify_remote
+from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, verify_remote
 from shadowhound_data_logger.errors import BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore
@@ -29,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
     return found
 
 
-def remotely(folder: Path, *, deep: bool) -> Verified:
+def remotely(folder: Path, *, deep: bool) -> VerifiedBag:
     store = DirectoryStore(folder.parents[3])
     return verify_remote(store, find_bag(store, 'thor', folder.name), deep=deep)
 

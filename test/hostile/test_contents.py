@@ -29,7 +29,7 @@ from shadowhound_data_logger.lake.numbers import table
 from shadowhound_data_logger.lake.query import _summary
 from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.lake.track import Object
-from shadowhound_data_logger.missions.contact_sheet import Frame, contact_sheet
+from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, MOST_PIXELS, from_json, from_yaml, unpacked
 
 SIDE = 12_000
@@ -86,7 +86,7 @@ def test_a_picture_that_is_too_large_is_refused_by_its_header(tmp_path: Path, ma
     ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, env=environ)
     assert 'it claims 12,000 x 12,000 pixels' in ran.stdout, ran.stderr
     with pytest.raises(ValueError, match='none of 1 frames'):
-        contact_sheet([Frame(NOON_NS, 1, tmp_path / 'evil')], '', NOON_NS, tmp_path / 'sheet.jpg')
+        contact_sheet([LoggedFrame(NOON_NS, 1, tmp_path / 'evil')], '', NOON_NS, tmp_path / 'sheet.jpg')
     assert MOST_PIXELS >= 7680 * 4320, '8K is no bomb'
 
 

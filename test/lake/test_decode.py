@@ -67,7 +67,7 @@ def test_archives_of_the_node(tmp_path: Path, kind: str) -> None:
     made = still.one(COMPRESSED, stamps, [still.frame(number) for number in (1, 1, 2, 2)], format=kind, batch_s=1.0, dedup=True)
     assert isinstance(made.body, bytes)
     assert decode.members(made.body, kind) == [
-        decode.Member(stamp, jpeg(number), 'jpg') for stamp, number in zip(stamps, (1, 1, 2, 2), strict=True)
+        decode.ArchiveMember(stamp, jpeg(number), 'jpg') for stamp, number in zip(stamps, (1, 1, 2, 2), strict=True)
     ]
 
 

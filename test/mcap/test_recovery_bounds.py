@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
-from shadowhound_data_logger.mcap import survey
+from shadowhound_data_logger.mcap import recovery
 from shadowhound_data_logger.mcap.format import CHUNK, Contents, head, record, text
 from shadowhound_data_logger.mcap.recovery import recover
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
@@ -109,7 +109,7 @@ def test_a_chunk_as_large_as_its_file(tmp_path: Path) -> None:
 
 def test_a_summary_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Endless tiny chunks, an endless schema, endless broken records: what would take too much memory is cut off."""
-    monkeypatch.setattr(survey, 'MOST_SUMMARY_BYTES', 3000)
+    monkeypatch.setattr(recovery, 'MOST_SUMMARY_BYTES', 3000)
     writer = SliceWriter(tmp_path / 'bag_1.mcap', compression='none')
     written = fill(writer, messages(90), sync_every=1)
     writer.abort()

@@ -23,14 +23,14 @@ from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.sim import demo, demo_processes, demo_report
-from shadowhound_data_logger.sim.demo_audit import Audit, audit
-from shadowhound_data_logger.sim.demo_run import Outage, Reading, Record
+from shadowhound_data_logger.sim.demo_audit import DemoAudit, audit
+from shadowhound_data_logger.sim.demo_run import Record, SpoolReading, StoreOutage
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.memory import MemoryStore
 
 CAMERA, IMU, RAW = '/camera/compressed', '/imu', '/camera/image_raw'
 IMU_KEY = 'thor/imu/20251018/120000_imu.json'
-READING = Reading(30.0, 12_345, 412, 398, 14, 25_300_000, 'corridor', 'away')
+READING = SpoolReading(30.0, 12_345, 412, 398, 14, 25_300_000, 'corridor', 'away')
 
 
 class Scene:
@@ -64,7 +64,7 @@ class Scene:
         for part in self.spool.commit(CatalogueWriter(self.root, CatalogueSettings(), 'thor', FakeClock()).parts()):
             self.deliver(part)
 
-    def audit(self) -> Audit:
+    def audit(self) -> DemoAudit:
         return audit(self.root, 'thor', self.published, self.store)
 
 
@@ -152,7 +152,7 @@ def test_what_is_not_delivered_is_a_problem(scene: Scene) -> None:
     assert '4 objects are pending' in problems
 
 
-def said(found: Audit, record: Record) -> str:
+def said(found: DemoAudit, record: Record) -> str:
     output = io.StringIO()
     demo_report.show_result(found, record, Console(file=output, width=80, highlight=False))
     return output.getvalue()
@@ -210,7 +210,7 @@ class FakeTower:
         self.calls.append('start')
 
 
-def look_until(outage: Outage, t: float, state: str, *, is_last: bool = False) -> None:
+def look_until(outage: StoreOutage, t: float, state: str, *, is_last: bool = False) -> None:
     """The outage's own thread needs a moment to report; pytest's timeout is the deadline."""
     while outage.state != state:
         outage.look(t, is_last=is_last)
@@ -220,7 +220,7 @@ def look_until(outage: Outage, t: float, state: str, *, is_last: bool = False) -
 def test_the_s3_server_goes_away_once_and_comes_back() -> None:
     """It goes at its time, stays away for its length, and its span is remembered."""
     tower = FakeTower()
-    with Outage(tower, 25.0, 10.0) as outage:  # type: ignore[arg-type]
+    with StoreOutage(tower, 25.0, 10.0) as outage:  # type: ignore[arg-type]
         outage.look(24.9)
         assert outage.state == 'up'
         look_until(outage, 25.0, 'away')
@@ -236,7 +236,7 @@ def test_the_s3_server_goes_away_once_and_comes_back() -> None:
 def test_the_s3_server_comes_back_at_the_end_whatever_the_time() -> None:
     """When the robot has stopped the outage is over, so that everything can be delivered."""
     tower = FakeTower()
-    with Outage(tower, 1.0, 1000.0) as outage:  # type: ignore[arg-type]
+    with StoreOutage(tower, 1.0, 1000.0) as outage:  # type: ignore[arg-type]
         look_until(outage, 2.0, 'away')
         look_until(outage, 3.0, 'back', is_last=True)
     assert tower.calls == ['stop', 'start']
