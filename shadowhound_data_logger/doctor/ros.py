@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from shadowhound_data_logger.capture.middleware import Middleware
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.doctor.machine import domains, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
-from shadowhound_data_logger.doctor.ros_environment import DRIVERS, domain_of
+from shadowhound_data_logger.doctor.ros_environment import DRIVERS, domain_of, middleware
+from shadowhound_data_logger.errors import SettingError
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.doctor.ros_watch import Heard
@@ -64,21 +69,40 @@ def check(context: Context) -> Iterator[Result]:
             '. /opt/ros/humble/setup.bash && . ~/ros2_ws/install/setup.bash',
         )
         return
+    listener = _listener(context)
+    if listener is not None:
+        listener.enter(os.environ)  # before ROS is loaded, as the node does
     from shadowhound_data_logger.doctor import ros_watch  # noqa: PLC0415 - rclpy: a second, and not installed everywhere
 
     sensors = [sensor for sensor in context.settings.sensors if sensor.enabled]
     yield from _types(sensors)
-    with ros_watch.node(namespace=context.namespace) as node:
+    with _profiled(listener), ros_watch.node(namespace=context.namespace) as node:
         resolved = {topic: node.resolve_topic_name(topic) for sensor in sensors for topic in sensor.topics}
         names = list(dict.fromkeys(resolved.values()))
         found = ros_watch.discover(node, names)
         types = {resolved[topic]: name for sensor in sensors for topic, name in zip(sensor.topics, sensor.types, strict=False)}
         heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S, types)} if any(found.values()) else {}
     if not heard:
-        yield from _nobody(context, names)
+        yield from _nobody(context, names, listener)
         return
     for sensor in sensors:
         yield from _sensor(sensor, [heard[resolved[topic]] for topic in sensor.topics], context.rates_hz)
+
+
+def _listener(context: Context) -> Middleware | None:
+    """How the node listens, where that is through another RMW than the robot's."""
+    try:
+        found = middleware(context)
+    except SettingError:  # said by ros.listener
+        return None
+    return found if found.is_foreign else None
+
+
+def _profiled(listener: Middleware | None, domain: int | None = None) -> AbstractContextManager[None]:
+    """While a participant is made, in the domain of the environment or another one."""
+    if listener is None:
+        return nullcontext()
+    return (listener if domain is None else replace(listener, domain=domain)).profiled(os.environ)
 
 
 def _types(sensors: Sequence[SensorSettings]) -> Iterator[Result]:
@@ -100,13 +124,13 @@ def _types(sensors: Sequence[SensorSettings]) -> Iterator[Result]:
         yield ok('ros.types', 'all message types can be received')
 
 
-def _nobody(context: Context, topics: Sequence[str]) -> Iterator[Result]:
+def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None) -> Iterator[Result]:
     """None of the topics is there: another domain, or no driver."""
     ours = domain_of(context.environ)
     theirs = [domain_of(driver.environ) for driver in processes(context.root, *DRIVERS) if driver.environ]
     others = [int(domain) for domain in dict.fromkeys([*theirs, *map(str, domains(context.root))]) if domain != ours]
     for domain in others[:MOST_PEEKS]:
-        if there := _peek(domain, topics):
+        if there := _peek(domain, topics, listener):
             yield error(
                 'ros.domain',
                 f'nobody publishes in domain {ours}, but {len(there)} of the topics are in domain {domain} ({there[0]}, ...)',
@@ -122,11 +146,11 @@ def _nobody(context: Context, topics: Sequence[str]) -> Iterator[Result]:
     )
 
 
-def _peek(domain: int, topics: Sequence[str]) -> list[str]:
+def _peek(domain: int, topics: Sequence[str], listener: Middleware | None) -> list[str]:
     """Which of the topics are published in another domain."""
     from shadowhound_data_logger.doctor import ros_watch  # noqa: PLC0415 - rclpy
 
-    with ros_watch.node(domain) as node:
+    with _profiled(listener, domain), ros_watch.node(domain) as node:
         return [topic for topic, publishers in ros_watch.discover(node, topics, PEEK_S).items() if publishers]
 
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from shadowhound_data_logger.capture.middleware import Middleware, choose
+from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.doctor.machine import MAX_DOMAIN, Process, processes
-from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
+from shadowhound_data_logger.doctor.model import Context, Result, error, info, of_error, ok, warning
+from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.spool import status
 
 NAME: Final = 'ros.environment'
 DRIVERS: Final = ('go2_driver', 'sim_go2_node')
@@ -24,12 +28,39 @@ def check(context: Context) -> Iterator[Result]:
     yield _domain(environ)
     yield from _range(environ)
     yield from _middleware(environ)
+    yield _listens(context)
     yield from _driver(context)
 
 
 def domain_of(environ: Mapping[str, str]) -> str:
     """As it was given; 0 where nothing is."""
     return environ.get('ROS_DOMAIN_ID') or '0'
+
+
+def middleware(context: Context) -> Middleware:
+    """By which RMW a node listens that is started here with these settings; raises SettingError."""
+    return choose(context.settings.capture.rmw, context.environ)
+
+
+def running(context: Context) -> Mapping[str, Any] | None:
+    """The middleware of the node that runs, as its status has it; None where none runs that says so."""
+    found = status.read(context.settings.spool_path, context.settings.robot, SystemClock.of_this_machine())
+    return found['middleware'] if found['running'] and found['middleware']['rmw'] else None
+
+
+def _listens(context: Context) -> Result:
+    """By which RMW, and why."""
+    name, node = 'ros.listener', running(context)
+    try:
+        here = middleware(context)
+    except SettingError as problem:
+        return of_error(name, problem, 'the node does not start with it')
+    rmw, robot, why, asked = (
+        (here.rmw, here.robot, here.why, here.asked) if node is None else (node[key] for key in ('rmw', 'robot', 'why', 'asked'))
+    )
+    because = f"the robot's is {robot}: {why}" if rmw != robot else why
+    verb = 'listens' if node is not None else 'would listen'
+    return ok(name, f'the node {verb} by {rmw} ({because}); capture.rmw is {asked}', rmw=rmw, robot=robot, asked=asked)
 
 
 def _domain(environ: Mapping[str, str]) -> Result:

@@ -6,17 +6,20 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from shadowhound_data_logger.doctor.machine import Process, number, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
-from shadowhound_data_logger.doctor.ros_environment import DRIVERS
+from shadowhound_data_logger.doctor.ros_environment import DRIVERS, middleware, running
+from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.options import IMAGE, POINT_CLOUD
 
 NAME: Final = 'sockets'
 PROFILES: Final = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 """Of Fast DDS 3, and of Fast DDS 2."""
 PROFILE_FILE: Final = '$(ros2 pkg prefix shadowhound_data_logger)/share/shadowhound_data_logger/launch_configs/fastdds_shm.xml'
+LEAST_BUFFER: Final = 1 << 20
+"""Bytes with which all of 105 raw images at 15 Hz arrived; into the default of kernels, 208 KB, not one of them fits."""
 ENOUGH_BUFFER: Final = 8 << 20
 """net.core.rmem_max: a second of clouds of 320 KB at 10 Hz twice over, or eight raw images (docs/thor.md, Middleware)."""
 ENOUGH_SEGMENT: Final = 4 << 20
@@ -40,9 +43,12 @@ def check(context: Context) -> Iterator[Result]:
         yield ok('sockets.need', 'no sensor with large messages is logged')
         return
     driver = processes(context.root, *DRIVERS)
-    if 'cyclone' in context.environ.get('RMW_IMPLEMENTATION', ''):
-        yield _buffer(context, 'Cyclone DDS sends everything over UDP')
-        yield from _cyclone(context)
+    robot = context.environ.get('RMW_IMPLEMENTATION', '')
+    node = running(context)
+    rmw = node['rmw'] if node is not None else _rmw(context)
+    if 'cyclone' in robot or 'cyclone' in rmw:
+        yield _obtained(context, node)
+        yield from _cyclone(context, listens='cyclone' in rmw)
         return
     yield _profile(context)
     yield from _memory(context, driver)
@@ -53,6 +59,39 @@ def check(context: Context) -> Iterator[Result]:
         yield ok(found.check, f'{found.seen}; not needed, as the driver runs here') if found.is_finding else found
     else:
         yield _buffer(context, 'where the driver is on another machine, everything comes over UDP', needed=False)
+
+
+def _rmw(context: Context) -> str:
+    """By which a node would listen; empty where it would not start, which is said by ros.listener."""
+    try:
+        return middleware(context).rmw
+    except SettingError:
+        return ''
+
+
+def _obtained(context: Context, node: Mapping[str, Any] | None) -> Result:
+    """The receive buffer of the node that runs, else what the kernel would give, where a driver with Cyclone DDS is heard."""
+    name, limit = 'sockets.buffer', number(context.root / 'proc/sys/net/core/rmem_max')
+    cause = (
+        'Cyclone DDS sends all over UDP: clouds and raw images are cut into fragments, and one that finds no room costs all of it'
+    )
+    size = (node or {}).get('receive_bytes') or limit
+    if size is None:
+        return info(name, 'net.core.rmem_max cannot be read here')
+    figures: dict[str, Any] = {'rmem_max': limit}
+    if node is not None and node['receive_bytes']:
+        seen = f'the node has a receive buffer of {size:,} bytes ({node["rmw"]})'
+        figures |= {'receive_bytes': size, 'dropped_datagrams': node['dropped_datagrams']}
+        if node['dropped_datagrams']:
+            seen += f', in which {node["dropped_datagrams"]:,} datagrams found no room since its start'
+    else:
+        seen = f'net.core.rmem_max is {size:,} bytes'
+    if size < LEAST_BUFFER <= (limit or 0):
+        remedy = f'start the node again: sudo systemctl restart shadowhound-data-logger  # net.core.rmem_max is {limit:,} now'
+        return warning(name, seen, cause, remedy, **figures)
+    if size < LEAST_BUFFER:
+        return warning(name, seen, cause, f'{SYSCTL} ; then start the node again', **figures)
+    return ok(name, seen, **figures) if size >= ENOUGH_BUFFER else info(name, seen, cause, SYSCTL, **figures)
 
 
 def _buffer(context: Context, why: str, *, needed: bool = True) -> Result:
@@ -68,8 +107,11 @@ def _buffer(context: Context, why: str, *, needed: bool = True) -> Result:
     return warning('sockets.buffer', seen, cause, SYSCTL, rmem_max=size)
 
 
-def _cyclone(context: Context) -> Iterator[Result]:
-    """The kernel's limit is no use to a socket that asks for the default."""
+def _cyclone(context: Context, *, listens: bool) -> Iterator[Result]:
+    """Whether Cyclone DDS starts here, for the node or for its front.
+
+    What it asks for matters where the node ``listens`` through it: the kernel's limit is no use to who asks for the default.
+    """
     uri = context.environ.get('CYCLONEDDS_URI', '')
     try:
         text = Path(uri.removeprefix('file://')).read_text(encoding='utf-8') if uri and '<' not in uri else uri
@@ -89,6 +131,8 @@ def _cyclone(context: Context) -> Iterator[Result]:
             'Cyclone DDS does not start then',
             f'{SYSCTL}  # or: SocketReceiveBufferSize min="default" max="10MB"',
         )
+    elif not listens:
+        return
     elif 'SocketReceiveBufferSize' in text:
         yield ok('sockets.cyclone', 'CYCLONEDDS_URI asks for a receive buffer')
     else:

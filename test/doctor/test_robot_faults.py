@@ -69,6 +69,23 @@ def small_buffers(scene: Scene) -> None:
     (scene.root / 'proc/sys/net/core/rmem_max').write_text('212992\n')
 
 
+def small_buffers_of_fast_dds(scene: Scene) -> None:
+    """The robot speaks Cyclone DDS, and is told nothing of it; the node would listen through Fast DDS."""
+    scene.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
+    (scene.root / 'proc/sys/net/core/rmem_max').write_text('212992\n')
+
+
+def small_buffers_of_the_node(scene: Scene) -> None:
+    """The kernel would give more by now."""
+    scene.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
+    scene.run_node(middleware=beside(receive_bytes=212_992, dropped_datagrams=17))
+
+
+def refused_middleware(scene: Scene) -> None:
+    scene.parameters['capture.rmw'] = 'fastrtps'
+    scene.environ.update(RMW_IMPLEMENTATION='rmw_connextdds', AMENT_PREFIX_PATH='')
+
+
 def greedy_buffers(scene: Scene) -> None:
     small_buffers(scene)
     (scene.root / 'proc/sys/net/core/rmem_max').write_text(f'{8 * MEBI}\n')
@@ -208,6 +225,9 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
                                                   ('unset ROS_AUTOMATIC', 'export ROS_LOCALHOST_ONLY=1')),
     'Cyclone DDS that does not start': (greedy_buffers, 'sockets', 'sockets.cyclone', ('rmem_max', 'min="default" max="10MB"')),
     'small socket buffers': (small_buffers, 'sockets', 'sockets.buffer', ('net.core.rmem_max', 'sysctl')),
+    'small socket buffers of Fast DDS': (small_buffers_of_fast_dds, 'sockets', 'sockets.buffer', ('net.core.rmem_max', 'sysctl')),
+    'small socket buffers of the node': (small_buffers_of_the_node, 'sockets', 'sockets.buffer', ('systemctl restart',)),
+    'a middleware that the node refuses': (refused_middleware, 'ros.environment', 'ros.listener', ()),
     'small shared memory': (without(*PROFILE_FILES), 'sockets', 'sockets.profile', ('fastdds_shm.xml',)),
     'small shared memory of the driver': (driver_with_small_memory(), 'sockets', 'sockets.driver',
                                           ('start the driver again', 'export FASTDDS_DEFAULT')),
@@ -242,6 +262,18 @@ def test_a_fault_is_found_and_named(robot: Scene, inject: Inject, asked: str, na
     if name == 'tower.listen':
         found = found[:1]  # both addresses are of one port here
     expect(found, name, *words)
+
+
+def test_a_robot_with_cyclone_dds_is_judged_by_how_it_is_heard(robot: Scene) -> None:
+    """Through Fast DDS, whose buffer is as large as the kernel gives, whatever Cyclone DDS would ask for itself."""
+    robot.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
+    assert robot.findings('sockets') == []
+    (told,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')
+    assert told.seen.startswith("the node would listen by rmw_fastrtps_cpp (the robot's is rmw_cyclonedds_cpp: Fast DDS hands on")
+    robot.run_node(middleware=beside(rmw='rmw_cyclonedds_cpp', why="the robot's own", asked='robot', receive_bytes=MEBI))
+    (told,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')
+    assert told.seen == "the node listens by rmw_cyclonedds_cpp (the robot's own); capture.rmw is robot"
+    assert [result.check for result in robot.findings('sockets')] == ['sockets.cyclone']
 
 
 def test_a_parameter_file_for_another_node(robot: Scene, tmp_path: Path) -> None:

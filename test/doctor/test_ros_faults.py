@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -137,3 +138,27 @@ def test_no_go2_interfaces(scene: Scene, domain: int, tmp_path: Path) -> None:
     assert 'go2_interfaces/msg/IMU' in found['ros.types'].seen
     assert 'colcon build --packages-select go2_interfaces' in found['ros.types'].remedy
     assert 'ros.topics' in found  # and all else was asked as well
+
+
+def test_a_robot_with_cyclone_dds_is_heard_as_the_node_hears_it(scene: Scene, domain: int) -> None:
+    """Through Fast DDS, with numbers, though the variables of the shell name an RMW that numbers nothing."""
+    pytest.importorskip('cyclonedds')
+    driver = Path(__file__).parents[1] / 'e2e/finding.py'
+    own = {'ROS_DOMAIN_ID': str(domain)}
+    path = os.pathsep.join([str(driver.parents[1]), *filter(None, [os.environ.get('PYTHONPATH')])])
+    robot = subprocess.Popen([sys.executable, str(driver), 'publish', '/talk', json.dumps([own])], stdin=subprocess.PIPE,
+                             stdout=subprocess.PIPE, env={**os.environ, 'PYTHONPATH': path})  # fmt: skip
+    scene.stack.enter_context(robot)
+    scene.stack.callback(robot.kill)
+    assert robot.stdout
+    assert robot.stdout.readline() == b'ready\n'
+    scene.environ |= {**own, 'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
+    scene.parameters |= {
+        'sensors': ['talk'],
+        'talk.topics': ['/talk'],
+        'talk.types': ['std_msgs/msg/String'],
+        'talk.rate_hz': 20.0,
+    }
+    (rate,) = (result for result in scene.ask('ros') if result.check.startswith(('ros.rate', 'ros.loss')))
+    assert rate.data['topic'] == '/talk'
+    assert rate.data['sent'] >= rate.data['received'] > 0
