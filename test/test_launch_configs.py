@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import yaml
-from shadowhound_data_logger.capture.gate import EveryMessage, gate_for
 
+from shadowhound_data_logger.capture.sampling import EveryMessage, rule_for
 from shadowhound_data_logger.config import Settings, default_parameters
 
 FOLDER = Path(__file__).parents[1] / 'launch_configs'
@@ -46,7 +46,7 @@ def test_the_full_rate_keeps_every_message() -> None:
     for sensor in settings.sensors:
         assert sensor.enabled, sensor.name
         assert sensor.batch_s == 1.0, sensor.name
-        assert isinstance(gate_for(sensor, has_header=True, last_kept_ns=0), EveryMessage), sensor.name
+        assert isinstance(rule_for(sensor, has_header=True, last_kept_ns=0), EveryMessage), sensor.name
 
 
 def test_the_full_rate_says_only_what_differs() -> None:

@@ -12,7 +12,6 @@ import zlib
 from pathlib import Path
 
 import pytest
-from backports import zstd
 from bags.slices import TALK, check, fill, in_order, messages
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -23,6 +22,11 @@ from shadowhound_data_logger.mcap.format import CHUNK, Contents, head, record, t
 from shadowhound_data_logger.mcap.recovery import recover
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.mcap.writer import SliceWriter
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 LONG = bool(os.environ.get('SHADOWHOUND_TEST_LONG'))
 MEBI = 1 << 20
