@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import botocore.loaders
+import profiles
 import pytest
 from domains import free_domain
 
@@ -47,6 +48,7 @@ def pytest_configure() -> None:
     """
     os.environ.update(THIS_MACHINE)
     botocore.loaders.create_loader = lru_cache(botocore.loaders.create_loader)  # whose descriptions of S3 each store would read
+    profiles.load()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -76,12 +78,15 @@ def has_robot(nodeid: str) -> bool:
     return nodeid.startswith(ONE_ROBOT_AT_A_TIME)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The longest group first; with it a worker of its own that is not nice yet. Long tests only where they are asked for."""
-    if not os.environ.get('SHADOWHOUND_TEST_LONG'):
-        for item in items:
-            if marker := item.get_closest_marker('long'):
-                item.add_marker(pytest.mark.skip(reason=f'{marker.args[0]}: set SHADOWHOUND_TEST_LONG=1'))
+    for item in items:
+        if profiles.LONG:
+            if getattr(getattr(item, 'function', None), 'is_hypothesis_test', False):
+                item.add_marker(pytest.mark.long('all that hypothesis tries'))
+        elif marker := item.get_closest_marker('long'):
+            item.add_marker(pytest.mark.skip(reason=f'{marker.args[0]}: set SHADOWHOUND_TEST_LONG=1'))
     if hasattr(config, 'workerinput'):
         items.sort(key=lambda item: not has_robot(item.nodeid))
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from profiles import examples
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import Settings, default_parameters
@@ -42,7 +43,7 @@ def loaded(parameters: dict[str, Any], environ: dict[str, str], namespace: str =
     return None
 
 
-@settings(derandomize=True, deadline=None, max_examples=400)
+@settings(derandomize=True, deadline=None, max_examples=examples(400))
 @given(st.dictionaries(NAMES, VALUES, max_size=4))
 @example({'camera.rate_hz': 10**400})
 @example({'spool.max_bytes': 10**400})
@@ -61,7 +62,7 @@ def test_any_parameters(parameters: dict[str, Any]) -> None:
             assert check_key(key).startswith(f'{found.robot}/')
 
 
-@settings(derandomize=True, deadline=None, max_examples=200)
+@settings(derandomize=True, deadline=None, max_examples=examples(200))
 @given(st.dictionaries(st.sampled_from(VARIABLES), TEXT, max_size=5), TEXT)
 @example({'SHADOWHOUND_HOME': '~nobody-of-this-name/x'}, '/')
 def test_any_environment(environ: dict[str, str], namespace: str) -> None:
@@ -72,7 +73,7 @@ def test_any_environment(environ: dict[str, str], namespace: str) -> None:
         check_name(found.robot, 'the robot')
 
 
-@settings(derandomize=True, deadline=None, max_examples=600)
+@settings(derandomize=True, deadline=None, max_examples=examples(600))
 @given(name=st.sampled_from(KNOWN), value=VALUES)
 def test_any_value_of_each_parameter(name: str, value: Any) -> None:
     """Each parameter that there is takes a value of its kind, or refuses it by its name."""

@@ -15,6 +15,7 @@ import pyarrow.parquet
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from profiles import examples
 
 from shadowhound_data_logger.catalogue import parquet, parts, schema
 from shadowhound_data_logger.lake import reading
@@ -63,7 +64,7 @@ def some(count: int) -> list[schema.Row]:
     return rows
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 @given(ROWS)
 def test_every_value_reads_back(rows: list[schema.Row]) -> None:
     """Also nulls, the largest numbers, -0.0, infinities and text of any script; in the schema that is promised."""

@@ -129,6 +129,9 @@ def test_bags_of_a_clock_that_is_set_later(robot: Robot, tmp_path: Path) -> None
     began_ns.append(time.time_ns())
     robot.start(**{'bag.record': 'always'})
     robot.publish()
+    until(
+        lambda: {row['received'] for row in robot.node.ledger()['bags'].values()} == {2 * GROUP}, 'the bag has what was published'
+    )
     robot.set_clock()
     began_ns.append(time.time_ns())
     until(lambda: 'the clock was set' in robot.node.log, 'the node knows')

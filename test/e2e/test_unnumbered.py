@@ -8,7 +8,7 @@ import signal
 import time
 from pathlib import Path
 
-from e2e.processes import Node, Processes
+from e2e.processes import Node, Processes, until
 from e2e.reading import STRING, texts
 
 LEAVE_OUT = """
@@ -62,6 +62,7 @@ def test_what_is_lost_is_estimated(processes: Processes, tmp_path: Path) -> None
     publisher.matched('/lossy')
     publisher.begin('/lossy', STRING, PERIOD_S, SIZE)
     node.received('/lossy', COUNT)
+    until(lambda: node.topic('/lossy')['accounting'] == 'estimated', 'the rate is believed')
     node.signal(signal.SIGSTOP)
     time.sleep(2.0)
     node.signal(signal.SIGCONT)
@@ -92,6 +93,7 @@ def test_what_a_dead_publisher_did_not_publish_is_not_lost(processes: Processes,
         before = node.topic('/calm').get('received', 0)
         publisher.begin('/calm', STRING, PERIOD_S)
         node.received('/calm', before + COUNT)
+        until(lambda: node.topic('/calm')['accounting'] == 'estimated', 'the rate is believed')
         publisher.kill()
         time.sleep(2.0)
     row = node.stop()['topics']['/calm']

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from profiles import examples
 from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.config import FORMATS
@@ -160,7 +161,7 @@ def test_every_truncation(ros: Any, type_name: str, little_endian: bool) -> None
 
 
 @pytest.mark.parametrize('type_name', [*SENSOR_OF, 'visualization_msgs/msg/Marker', 'tf2_msgs/msg/TFMessage'])
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(derandomize=True, deadline=None, max_examples=examples(60))
 @given(data=st.data())
 def test_hostile_bytes(ros: Any, type_name: str, data: st.DataObject) -> None:
     """Random bytes, and valid messages with random changes, raise nothing and are all accounted for."""

@@ -7,6 +7,7 @@ from typing import Any
 from encode.hostile import TYPES, Fuzzer
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from profiles import examples
 
 from shadowhound_data_logger.encode.types import header_frame_id, header_stamp_ns
 
@@ -34,7 +35,7 @@ def test_lengths_that_lie_at_every_word(ros: Any) -> None:
                 ros.encode(type_name, cdr[:at] + b'\xff\xff\xff\xff' + cdr[at + 4 :], sensor='imu', format='json')
 
 
-@settings(derandomize=True, deadline=None, max_examples=200)
+@settings(derandomize=True, deadline=None, max_examples=examples(200))
 @given(
     st.one_of(
         st.binary(max_size=40), st.builds(bytes.__add__, st.sampled_from([b'\0\1\0\0', b'\0\0\0\0']), st.binary(max_size=60))

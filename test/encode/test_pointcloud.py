@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from profiles import examples
 from pypcd4.pypcd4 import PointCloud
 
 CLOUD = 'sensor_msgs/msg/PointCloud2'
@@ -178,7 +179,7 @@ def test_clouds_that_lie(ros: Any, changes: dict[str, Any], reason: str) -> None
     assert result.rejected == {reason: 1}
 
 
-@settings(derandomize=True, deadline=None, max_examples=120)
+@settings(derandomize=True, deadline=None, max_examples=examples(120))
 @given(data=st.data())
 def test_any_layout(ros: Any, data: st.DataObject) -> None:
     """Any mix of datatypes, counts, gaps, order of fields, row padding and byte order reads back bit for bit."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from profiles import examples
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shadowhound_data_logger.config import SensorSettings
@@ -247,7 +248,7 @@ def test_the_one_float_that_short_decimals_lose(ros: Any) -> None:
     assert np.float32(power) == np.float32(awkward)
 
 
-@settings(derandomize=True, deadline=None, max_examples=150)
+@settings(derandomize=True, deadline=None, max_examples=examples(150))
 @given(
     words=st.lists(st.integers(0, 2**32 - 1), min_size=4, max_size=4),
     longs=st.lists(st.integers(0, 2**64 - 1), max_size=5),

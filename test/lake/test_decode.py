@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from lake.making import NOON_NS, folder_store
 from lake.training import COMPRESSED, Drive, jpeg
 from PIL import Image
+from profiles import examples
 from pypcd4 import Encoding, PointCloud
 
 from shadowhound_data_logger.errors import LakeError
@@ -84,7 +85,7 @@ def test_records_become_numbers() -> None:
         table(found, 'some/msg/Type', ('nothing',), 0)
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(derandomize=True, deadline=None, max_examples=examples(60))
 @given(st.binary(max_size=80), st.sampled_from(['', 'ffd8ffe0', '89504e470d0a1a0a', '49492a00']))
 def test_rubbish_is_an_error_of_ours(body: bytes, magic: str) -> None:
     """Whatever reader it is given to."""

@@ -13,13 +13,14 @@ import pytest
 from bags.slices import check, closed, fill, in_order, indexed, messages
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from profiles import examples
 
 from shadowhound_data_logger.mcap.recovery import recover
 from shadowhound_data_logger.mcap.slice_info import Damage, SliceInfo
 from shadowhound_data_logger.mcap.writer import SliceWriter
 
 COUNT, A_CHUNK = 60, 12
-HOSTILE = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+HOSTILE = settings(max_examples=examples(60), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture(autouse=True)

@@ -16,6 +16,7 @@ from bags.slices import TALK, check, fill, in_order, messages
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
+from profiles import examples
 
 from shadowhound_data_logger.mcap import recovery
 from shadowhound_data_logger.mcap.format import CHUNK, Contents, head, record, text
@@ -30,7 +31,7 @@ else:
 
 LONG = bool(os.environ.get('SHADOWHOUND_TEST_LONG'))
 MEBI = 1 << 20
-HOSTILE = settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+HOSTILE = settings(max_examples=examples(80), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 NUMBERS = st.sampled_from([0, 1, 22, 1 << 15, 1 << 31, 1 << 32, 1 << 62, (1 << 64) - 1])
 
 

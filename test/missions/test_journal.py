@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from profiles import examples
 
 from shadowhound_data_logger.missions.journal import Journal, abandoned, finish, line_of, read
 
@@ -64,7 +65,7 @@ def test_a_record_after_a_full_disk_is_whole(journal: Journal, monkeypatch: pyte
     assert records(journal.path) == [{'a': 1}, None, {'c': 3}]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(0, 400), st.integers(1, 255))
 def test_rot_is_seen(tmp_path_factory: pytest.TempPathFactory, place: int, flip: int) -> None:
     """Of a journal with a changed byte, every record that is read is one that was written, and at most two are missing."""

@@ -146,7 +146,9 @@ def test_death_at_any_time(opened: Open, root: Path) -> None:
     rng = random.Random(11)
     durable: dict[str, str] = {}
     delivered: set[str] = set()
-    for _ in range(12):
+    kills = 0
+    while kills < 12 or len(durable) <= 50:  # a busy machine has done little when it is killed so soon
+        kills += 1
         with started('load', root) as child:
             assert child.stdout is not None
             lines = [child.stdout.readline()]
@@ -159,7 +161,6 @@ def test_death_at_any_time(opened: Open, root: Path) -> None:
         spool = opened()
         check(root, durable, delivered)
         spool.close()
-    assert len(durable) > 50
     topic = assert_whole(root)['topics']['/camera']
     assert topic['open'] == 0
     assert topic['accounting'] == 'exact'

@@ -11,6 +11,7 @@ from itertools import accumulate
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from profiles import examples
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.spool.estimator import (
@@ -89,7 +90,7 @@ STREAMS = st.tuples(
 )  # fmt: skip
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(STREAMS)
 def test_a_block_of_loss_is_known_to_5_percent(stream: tuple[int, float, bool, int, int, int, float]) -> None:
     """With jitter up to 10 %, of a timer or of a loop, whatever the rate, and with single losses beside it."""
@@ -103,7 +104,7 @@ def test_a_block_of_loss_is_known_to_5_percent(stream: tuple[int, float, bool, i
     assert abs(ear.lost - lost) <= max(2, 0.05 * lost)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(STREAMS)
 def test_what_is_not_lost_is_not_called_lost(stream: tuple[int, float, bool, int, int, int, float]) -> None:
     """Jitter alone makes no loss: under one in a hundred, of loops that drift; none of a timer to speak of."""

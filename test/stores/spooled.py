@@ -3,18 +3,37 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import StoreUnavailable
 from shadowhound_data_logger.model import SpooledObject
 
 MOTO = pytest.param('moto', marks=pytest.mark.long('a second S3 server, a slow one'))
 """The request for moto beside SeaweedFS."""
 QUICK = UploadSettings(threads=8, connect_timeout_s=2.0, read_timeout_s=20.0)
+
+
+BUSY_S = 30.0
+"""More than enough for SeaweedFS to find room for a new bucket on a busy machine; it answers 500 meanwhile."""
+
+
+def with_room(ask: Callable[[], Any]) -> Any:
+    """What is asked first of a new bucket of SeaweedFS: again while the server answers 500."""
+    end = time.monotonic() + BUSY_S
+    while True:
+        try:
+            return ask()
+        except StoreUnavailable as error:
+            if '500 InternalError' not in str(error) or time.monotonic() > end:
+                raise
+        time.sleep(0.1)
 
 
 class Spool:

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from profiles import examples
 from stores.spooled import Spool
 
 from shadowhound_data_logger.errors import ForeignObject, ObjectRefused
@@ -186,7 +187,7 @@ def test_open_and_close_may_be_repeated(store: ObjectStore, spool: Spool, bucket
     assert store.get(bucket, 'a') == b'x'
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(20), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=st.binary(max_size=4096))
 def test_any_content_survives(store: ObjectStore, spool: Spool, bucket: str, content: bytes) -> None:
     """No byte is special on the way."""

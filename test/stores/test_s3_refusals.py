@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from stores.asking import SECRET, error_of, settings_for
 from stores.fake_s3 import FakeS3, served
-from stores.spooled import QUICK, Spool
+from stores.spooled import QUICK, Spool, with_room
 
 from shadowhound_data_logger.config import StoreSettings
 from shadowhound_data_logger.errors import (
@@ -128,7 +128,7 @@ def test_denied_is_not_missing(opened: Callable[..., S3Store], seaweed: Tower, s
 def test_a_key_that_is_a_folder(opened: Callable[..., S3Store], seaweed: Tower, spool: Spool) -> None:
     """Where a server cannot hold both ``a`` and ``a/b``, ``a`` is refused instead of waiting for ever."""
     store = opened(seaweed.store_settings())
-    store.put(spool('a/b', b'x'))
+    with_room(lambda: store.put(spool('a/b', b'x')))
     assert 'is a folder' in error_of(ObjectRefused, lambda: store.put(spool('a', b'x')))
 
 
