@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import random
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from torture import losses
 
-pytest.importorskip('cyclonedds')
+pytestmark = pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')  # imported by children
 
 
 @pytest.mark.long('a minute of losses')
