@@ -6,6 +6,7 @@ import json
 import os
 import signal
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
 from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.missions.mission_data_logger import MissionDataLogger
+from shadowhound_data_logger.spool.control import connect
+from shadowhound_data_logger.spool.status import read
 
 FRONTED = (str(HERE / 'fronted_node.py'),)
 FRONT = 'shadowhound_data_logger.capture.front'
@@ -186,6 +190,19 @@ def test_the_front_tells_how_the_node_is(nodes: dict[str, Node], stations: dict[
     assert entries[BESIDE] - {'/talk'} == entries[DIRECT] - {'/talk'}
     assert {entry.hardware_id for name, entry in heard.items() if name.startswith('beside')} == {nodes[BESIDE].robot}
     assert all(isinstance(pair.value, str) for entry in heard.values() for pair in entry.values)
+
+
+def test_whom_the_robot_finds_is_compared_by_a_front_alone(nodes: dict[str, Node]) -> None:
+    """A node that listens through the RMW of the robot compares nothing, and says that it does not."""
+
+    def unheard(space: str) -> Any:
+        node = nodes[space]
+        return read(node.home / 'spool', node.robot, SystemClock.of_this_machine())['middleware']['unheard']
+
+    until(lambda: unheard(BESIDE) == {}, 'the front has reported, and all is heard')
+    assert unheard(DIRECT) is None
+    with closing(connect(nodes[DIRECT].home / 'spool')) as connection:
+        assert not connection.ask('compare', found={})['ok']
 
 
 def test_the_front_tells_of_missions(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
