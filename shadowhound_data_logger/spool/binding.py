@@ -12,6 +12,7 @@ import sqlite3
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
@@ -19,6 +20,9 @@ from shadowhound_data_logger.keys import check_key, unique
 from shadowhound_data_logger.model import Binding, HeldObject, SpooledObject, State
 from shadowhound_data_logger.spool.files import Tree, describe
 from shadowhound_data_logger.spool.index import MISSING, Index, spooled
+
+Row = Mapping[str, Any]
+"""Of an object in the index, with ``counts``: messages by account, where it holds those of several."""
 
 
 def held(index: Index, reason: str, limit: int) -> list[HeldObject]:
@@ -39,7 +43,7 @@ def bind(index: Index, tree: Tree, bindings: Sequence[Binding], now_ns: int) -> 
     """
     for binding in bindings:
         check_key(binding.key)
-    before: list[sqlite3.Row] = []
+    before: list[Row] = []
     with index.transaction(undo=lambda: _put_back(tree, before)):
         for binding in bindings:
             row = _row(index, binding.id)
@@ -90,24 +94,27 @@ def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:
     return False
 
 
-def _row(index: Index, number: int) -> sqlite3.Row | None:
+def _row(index: Index, number: int) -> Row | None:
     cursor = index.db.execute('SELECT * FROM objects WHERE id = ?', (number,))
     cursor.row_factory = sqlite3.Row
     row: sqlite3.Row | None = cursor.fetchone()
-    return row
+    if row is None:
+        return None
+    counts = dict(index.db.execute('SELECT topic, samples FROM contents WHERE id = ?', (number,)).fetchall())
+    return {**dict(row), 'counts': counts}
 
 
-def _to_part(tree: Tree, row: sqlite3.Row) -> bool:
+def _to_part(tree: Tree, row: Row) -> bool:
     """Whether a held file does not lie under its provisional name any more. One that is gone is the uploader's to notice."""
     path = _held_path(tree, row)
     return tree.place(path, tree.part(row['id'])) or tree.size(path) is None
 
 
-def _held_path(tree: Tree, row: sqlite3.Row) -> Path:
+def _held_path(tree: Tree, row: Row) -> Path:
     return tree.path(State.HELD, row['reason'], row['bucket'], row['key'])
 
 
-def _change(index: Index, row: sqlite3.Row, binding: Binding, now_ns: int) -> None:
+def _change(index: Index, row: Row, binding: Binding, now_ns: int) -> None:
     key = free_key(index, row['bucket'], binding.key, row['key'])
     metadata = {**binding.metadata, words.SHA256: row['sha256']}
     created_ns = row['created_ns']
@@ -119,7 +126,7 @@ def _change(index: Index, row: sqlite3.Row, binding: Binding, now_ns: int) -> No
     )  # fmt: skip
 
 
-def _put_back(tree: Tree, before: Sequence[sqlite3.Row]) -> None:
+def _put_back(tree: Tree, before: Sequence[Row]) -> None:
     """After a failure, with the transaction still open. What fails here as well is found in its part."""
     for row in before:
         with suppress(OSError):
@@ -127,13 +134,13 @@ def _put_back(tree: Tree, before: Sequence[sqlite3.Row]) -> None:
         tree.place(tree.part(row['id']), _held_path(tree, row))
 
 
-def _describe(path: Path, row: sqlite3.Row) -> None:
+def _describe(path: Path, row: Row) -> None:
     said: Mapping[str, object] = {
         'bucket': row['bucket'], 'key': row['key'], 'sha256': row['sha256'], 'content_type': row['content_type'],
         'sensor': row['sensor'], 'topic': row['topic'], 'type': row['type'], 'samples': row['samples'],
         't_start_ns': row['t_start_ns'], 't_end_ns': row['t_end_ns'], 'priority': row['priority'],
         'protected': bool(row['protected']), 'held': row['reason'] if row['state'] == State.HELD.value else None,
-        'metadata': json.loads(row['metadata']),
+        'metadata': json.loads(row['metadata']), **({'counts': row['counts']} if row['counts'] else {}),
     }  # fmt: skip
     with suppress(FileNotFoundError):
         describe(path, said)

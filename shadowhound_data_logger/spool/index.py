@@ -15,7 +15,7 @@ from heapq import merge
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.errors import SpoolError
@@ -293,7 +293,7 @@ class Index:
         return self.db.execute('SELECT topic, state, objects, bytes, samples FROM tally').fetchall()
 
 
-def spooled(row: sqlite3.Row, path: Path) -> SpooledObject:
+def spooled(row: sqlite3.Row | Mapping[str, Any], path: Path) -> SpooledObject:
     """The object of a row."""
     return SpooledObject(
         id=row['id'], bucket=row['bucket'], key=row['key'], path=path, size=row['bytes'], sha256=row['sha256'],

@@ -68,6 +68,16 @@ def test_what_is_bound_counts_as_before(spool: Spool, root: Path) -> None:
     assert (stored['held'], stored['pending'], stored['delivered']) == (1, 1, 1)
 
 
+def test_what_is_bound_still_says_whose_messages_it_holds(spool: Spool, root: Path) -> None:
+    """Under its final name too the file names the accounts: an index that is lost is made of files."""
+    (binding,) = hold(spool, 'a', topic=None, counts={'bag:/imu': 3, 'bag:/odom': 1})
+    before = description_of(root / HELD / 'thor/provisional/a')
+    (item,) = spool.bind([binding])
+    said = description_of(item.path)
+    assert said['counts'] == before['counts'] == {'bag:/imu': 3, 'bag:/odom': 1}
+    assert said.keys() == before.keys()
+
+
 def test_final_names_are_unique(spool: Spool) -> None:
     """A name that was given out, in the same call as well, is numbered; an object may keep the name that it has."""
     put(spool, make('thor/final/a'))
