@@ -31,7 +31,7 @@ from torch.utils.data import DataLoader
 
 from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.encode.archive import Member, pack_tar
+from shadowhound_data_logger.encode.archive import ArchiveFile, pack_tar
 from shadowhound_data_logger.lake import MissionDataset, query
 from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.sim.tower import Tower
@@ -67,7 +67,7 @@ def fill(store: S3Store, frames: int) -> int:
             (stamp, (('jpg', bodies[number % 16]), ('json', about)))
             for number, stamp, about in zip(numbers, stamps, told, strict=True)
         ]
-        packed = pack_tar(Member(f'{stamp:019d}.{kind}', stamp, body) for stamp, files in pairs for kind, body in files)
+        packed = pack_tar(ArchiveFile(f'{stamp:019d}.{kind}', stamp, body) for stamp, files in pairs for kind, body in files)
         puts.append(_object('tachi', 'tar', packed, stamps[0], stamps[-1], len(stamps)))
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda put: obstore.put(store, put[0], put[1]), puts))

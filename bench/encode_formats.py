@@ -21,7 +21,8 @@ import simplejpeg
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shadowhound_data_logger.config import SensorSettings, Settings
-from shadowhound_data_logger.encode import MessageTypes, encode
+from shadowhound_data_logger.encode.registry import encode
+from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, Sample
 
 INTERFACES = Path(__file__).parents[1] / 'interfaces' / 'go2_interfaces' / 'msg'

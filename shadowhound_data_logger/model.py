@@ -60,7 +60,7 @@ class Likeness(NamedTuple):
     """How a picture looks, and what looks the same."""
 
     hash: int
-    """64 bits (``encode.likeness``)."""
+    """64 bits (``encode.image``)."""
     within: int
     """So many of them may differ."""
 

@@ -17,13 +17,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from shadowhound_data_logger.bags.claims import Claims
 from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, MissionOf, TriggerOf
 from shadowhound_data_logger.bags.notes import Notes, discard
-from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.recorder import SYNC_S, Answer
 from shadowhound_data_logger.bags.recording import UNWRITABLE, Recording
-from shadowhound_data_logger.bags.ring import Ring
+from shadowhound_data_logger.bags.ring import Claims, Ring
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.missions.folder import safe_type
@@ -87,7 +86,7 @@ class Events:
     ``_lock`` guards which event goes on and what is asked of it; the writing belongs to the thread ``event-writer``.
     """
 
-    def __init__(self, settings: EventSettings, bag: BagSettings, place: Place, ring: Ring, salvage: Salvage,
+    def __init__(self, settings: EventSettings, bag: BagSettings, place: BagPlace, ring: Ring, salvage: Salvage,
                  poll_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
         """``poll_s``: how late the intake may take a message."""
         self._settings = settings

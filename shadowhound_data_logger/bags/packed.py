@@ -17,9 +17,9 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.metadata import dump_qos_v8
 
-from shadowhound_data_logger.bags.definitions import describe
 from shadowhound_data_logger.bags.description import Description
 from shadowhound_data_logger.bags.plain import Plain
+from shadowhound_data_logger.encode.definitions import describe
 from shadowhound_data_logger.errors import BagDamaged, DataLoggerError
 from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage
 from shadowhound_data_logger.mcap.ranges import LocalFile

@@ -25,7 +25,7 @@ from shadowhound_data_logger.spool.writer import SpoolWriter
 _LATEST: Final = 1 << 63
 
 
-class Place:
+class BagPlace:
     """New before anything is received; from any thread."""
 
     def __init__(self, root: Path, robot: str, clock: Clock, writer: SpoolWriter, hold_s: float = 0.0,

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.notes import Notes
-from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
 from shadowhound_data_logger.bags.recording import Recording
 from shadowhound_data_logger.bags.salvage import Salvage
@@ -72,7 +72,7 @@ class Recorder:
     ``_control`` makes each of these one step; the recording itself belongs to the thread ``bag-writer``.
     """
 
-    def __init__(self, settings: BagSettings, place: Place, queue: BagQueue, salvage: Salvage,
+    def __init__(self, settings: BagSettings, place: BagPlace, queue: BagQueue, salvage: Salvage,
                  listen: Callable[[bool, float], bool]) -> None:  # fmt: skip
         """``listen`` has the intake begin (True) or end, and says whether that was done within so many seconds."""
         self._settings = settings

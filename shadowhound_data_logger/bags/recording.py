@@ -15,14 +15,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.definitions import describe
 from shadowhound_data_logger.bags.manifest import Missing, MissionOf
 from shadowhound_data_logger.bags.naming import BUCKET, prefix_of, slice_file
 from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.objects import ending_objects, note_evicted, ros_distro, slice_object
-from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.encode.definitions import describe
 from shadowhound_data_logger.mcap.recovery import recover
 from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
 from shadowhound_data_logger.mcap.writer import OPEN, SliceWriter
@@ -41,7 +41,7 @@ _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 class Recording:
     """New; ``write``, ``tick`` and ``split`` any number of times; ``close`` once. Owned by the thread that writes bags."""
 
-    def __init__(self, notes: Notes, settings: BagSettings, place: Place, salvage: Salvage,
+    def __init__(self, notes: Notes, settings: BagSettings, place: BagPlace, salvage: Salvage,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
         """``salvage`` gets a bag that waits for its date."""
         self.notes = notes

@@ -8,18 +8,20 @@ last message of each publisher stays, however long ago it came, and each event b
 from __future__ import annotations
 
 import threading
-from collections import deque
-from collections.abc import Iterator
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.model import Taken
-from shadowhound_data_logger.spool.accounts import Losses
+from shadowhound_data_logger.spool.accounts import EVENT, Accounts, Losses
 
 MESSAGE_BYTES: Final = 256
 """What CPython needs for a message beside its content: a tuple of five, its bytes' head, three integers, a place in a list."""
 PIECE_BYTES: Final = 1 << 20
 """A lot that is larger is kept in pieces: what goes, goes by pieces, and what is written as well."""
+RING_FULL: Final = 'ring_full'
+"""Why messages are dropped that had to go from the ring before an event that asked for them could write them."""
 
 
 class Held(NamedTuple):
@@ -161,3 +163,43 @@ def _pieces(lot: Lot, lost: Losses, now_s: float) -> Iterator[Held]:
 def _is_of(message: Taken, kept: Taken) -> bool:
     """Whether a message takes the place of an earlier one: of the same sender, or the very same again."""
     return message.publisher == kept.publisher if message.publisher else message.cdr == kept.cdr
+
+
+class Claims:
+    """New; from any thread."""
+
+    def __init__(self, accounts: Accounts) -> None:
+        self._accounts = accounts
+        self._lost: deque[tuple[tuple[str, str], int]] = deque()
+
+    def begin(self) -> None:
+        """What was published since the last event was not asked for, and is not missed."""
+        self._accounts.rebase_all(EVENT)
+
+    def receive(self, held: Held) -> list[Taken]:
+        """An event has it now; what is no repeat of it."""
+        with self._accounts.entry(f'{EVENT}{held.lot.topic}') as account:
+            account.type = held.lot.type
+            if held.again:
+                for each in held.lot.messages:
+                    account.receive_again(each.publisher, each.number)
+                return list(held.lot.messages)
+            unknown = account.unknown
+            fresh = [each for each in held.lot.messages if account.receive(each.publisher, each.number)]
+            account.appraise(account.unknown - unknown, held.lost)
+        return fresh
+
+    def lose(self, held: Iterable[Held], reason: str = RING_FULL) -> None:
+        """An event asked for it and cannot have it."""
+        for each in held:
+            count = len(self.receive(each))
+            self._accounts.drop(f'{EVENT}{each.lot.topic}', reason, count)
+            self._lost.append(((each.lot.topic, reason), count))
+
+    def take_lost(self) -> Counter[tuple[str, str]]:
+        """What was lost since the last call, by topic and reason."""
+        found = Counter[tuple[str, str]]()
+        while self._lost:
+            what, count = self._lost.popleft()
+            found[what] += count
+        return found

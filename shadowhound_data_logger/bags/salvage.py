@@ -22,7 +22,7 @@ from shadowhound_data_logger.bags.manifest import Missing
 from shadowhound_data_logger.bags.naming import BUCKET, prefix_of, slice_number
 from shadowhound_data_logger.bags.notes import FILE, Notes
 from shadowhound_data_logger.bags.objects import ending_objects, note_evicted, ros_distro, slice_object
-from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.recovery import read_info, recover
 from shadowhound_data_logger.mcap.writer import OPEN
@@ -49,7 +49,7 @@ class Salvage:
     thread.
     """
 
-    def __init__(self, place: Place, priority: int) -> None:
+    def __init__(self, place: BagPlace, priority: int) -> None:
         self._place = place
         self._priority = priority
         self._lock = threading.Lock()

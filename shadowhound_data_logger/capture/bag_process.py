@@ -27,7 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 from shadowhound_data_logger.bags.local import RECORDS, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import MANIFEST
-from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.salvage import Salvage
@@ -130,7 +130,7 @@ def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: Sp
     queue = BagQueue(settings.bag.queue_bytes)
     bags = BagConsumer(node, settings.bag, accounts, queue)
     intake = Intake(node, {}, settings.intake, accounts, MessageTypes(), [bags])
-    place = Place(settings.home / RECORDS / settings.robot, settings.robot, clock, writer)
+    place = BagPlace(settings.home / RECORDS / settings.robot, settings.robot, clock, writer)
     salvage = Salvage(place, settings.bag.priority)
     recorder = Recorder(settings.bag, place, queue, salvage, partial(intake.listen, bags))
     writer.open()

@@ -13,11 +13,10 @@ from typing import Any, Final
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from shadowhound_data_logger.bags.claims import Claims
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
-from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
-from shadowhound_data_logger.bags.ring import Held, Ring
+from shadowhound_data_logger.bags.ring import Claims, Held, Ring
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.capture.bags import profiles_offered
 from shadowhound_data_logger.capture.extra_topics import TopicChoice
@@ -88,7 +87,7 @@ def _is_latched(profile: QoSProfile) -> bool:
 class EventBuffer:
     """Life: New; open once; ``close`` after the intake."""
 
-    def __init__(self, node: Node, settings: Settings, place: Place, salvage: Salvage,
+    def __init__(self, node: Node, settings: Settings, place: BagPlace, salvage: Salvage,
                  types: MessageTypes) -> None:  # fmt: skip
         options, home = settings.events, settings.home
         ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
@@ -129,7 +128,7 @@ class EventBuffer:
         if self._watch is not None:
             self._watch.on_mission(told)
 
-    def _make_watch(self, options: EventSettings, home: Path, place: Place, types: MessageTypes) -> EventWatch | None:
+    def _make_watch(self, options: EventSettings, home: Path, place: BagPlace, types: MessageTypes) -> EventWatch | None:
         if self.consumer is None:
             return None
         return EventWatch(self.consumer.inbox, types, home, place.clock, options.log_event, self.events.trigger)

@@ -44,7 +44,7 @@ class Bytes(ctypes.Structure):
     ]
 
 
-class Message(NamedTuple):
+class RclMessage(NamedTuple):
     """A serialized message with all that rmw knows of it."""
 
     cdr: bytes
@@ -71,7 +71,7 @@ def publisher_count(pointer: int) -> int:
 
 
 def implementation() -> int:
-    """Address of the name of the RMW in use, as ``Message.implementation`` has it. Raises AttributeError where none is told."""
+    """Address of the name of the RMW in use, as ``RclMessage.implementation`` has it. Raises AttributeError without one."""
     function = library().rmw_get_implementation_identifier
     function.restype = ctypes.c_void_p
     return int(function() or 0)
@@ -92,7 +92,7 @@ class Taker:
         self._places = ctypes.c_void_p(ctypes.addressof(self._message)), ctypes.c_void_p(ctypes.addressof(self._info))
 
     def take(self, pointer: ctypes.c_void_p) -> tuple[bytes, int, int, int | None, bytes, int] | None:
-        """The oldest message that waits, as the fields of a ``Message``; None where there is none. Raises OSError."""
+        """The oldest message that waits, as the fields of an ``RclMessage``; None where there is none. Raises OSError."""
         message, info = self._places
         code = self._take(pointer, message, info, None)
         if code == TAKE_FAILED:

@@ -13,17 +13,17 @@ from types import FrameType
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from shadowhound_data_logger.capture.front import Front
-from shadowhound_data_logger.capture.log_bridge import RosHandler
 from shadowhound_data_logger.capture.middleware import SETTING, Middleware
 from shadowhound_data_logger.capture.parameters import Parameters
 from shadowhound_data_logger.capture.pipeline import Pipeline, Ros
-from shadowhound_data_logger.capture.service import Service
+from shadowhound_data_logger.capture.service import SystemdService
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
 from shadowhound_data_logger.ros_arguments import NODE, rules_for
 
@@ -156,7 +156,7 @@ def make_node(arguments: Sequence[str], *, is_public: bool) -> tuple[Node, str]:
 
 def log_until(stop: StopSignals, ros: Ros) -> None:
     """Until a signal comes."""
-    service = Service(os.environ)
+    service = SystemdService(os.environ)
     node, middleware = ros.node, ros.middleware
     parameters = Parameters(node)
     given = parameters.load()
@@ -184,3 +184,22 @@ def log_until(stop: StopSignals, ros: Ros) -> None:
         node.get_logger().info('closing: open batches are finished and delivered')
         pipeline.close()
         executor.shutdown()
+
+
+class RosHandler(logging.Handler):
+    """Hands records on. Each severity has its own line below: rclpy ties a severity to the calling line."""
+
+    def __init__(self, logger: RcutilsLogger) -> None:
+        super().__init__()
+        self._logger = logger
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = self.format(record)
+        if record.levelno >= logging.ERROR:
+            self._logger.error(text)
+        elif record.levelno >= logging.WARNING:
+            self._logger.warning(text)
+        elif record.levelno >= logging.INFO:
+            self._logger.info(text)
+        else:
+            self._logger.debug(text)

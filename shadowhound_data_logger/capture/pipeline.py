@@ -17,7 +17,7 @@ from rclpy.node import Node
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.naming import FOLDER
-from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.salvage import Salvage
@@ -121,7 +121,7 @@ class Pipeline:
         self.writer = SpoolWriter(self.spool, settings.spool.commit_s, spooled=self.uploader.wake,
                                   settled=self.uploader.settled)  # fmt: skip
         accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
-        place = Place(settings.home / FOLDER / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
+        place = BagPlace(settings.home / FOLDER / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
                       self._record.offsets)  # fmt: skip
         salvage = Salvage(place, settings.bag.priority)
         self.event_buffer = EventBuffer(node, settings, place, salvage, types)

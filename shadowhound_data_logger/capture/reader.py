@@ -316,8 +316,8 @@ def _disproof(node: Node, topic: str, publisher: Any, pointer: ctypes.c_void_p) 
             taken = _within(PROOF_S, lambda: taker.take(pointer))
             if taken is None:
                 return 'a message of this node to itself does not come'
-            found = librcl.Message(*taken)
-            known = librcl.Message(cdr, found.source_ns, found.received_ns, number, gid, rmw)
+            found = librcl.RclMessage(*taken)
+            known = librcl.RclMessage(cdr, found.source_ns, found.received_ns, number, gid, rmw)
             if found != known or not first_ns <= found.source_ns <= last_ns:
                 said = found._replace(cdr=found.cdr[:16])
                 return f'message {number} of {gid.hex()}, {len(cdr)} bytes, sent from {first_ns} to {last_ns}, is told as {said}'

@@ -180,10 +180,12 @@ class Sampler(Consumer):
                     account.dropped[PAUSED] += len(messages)
                 else:
                     account.skipped += len(messages) - len(kept)
-        for sample in kept:
-            sampled.kept_ns = sample.stamp_ns
-            for batch in sampled.batcher.add(sample, drained.now_s):
-                self._offer(batch)
+        if kept:
+            sampled.kept_ns = kept[-1].stamp_ns
+            add, now_s = sampled.batcher.add, drained.now_s
+            for sample in kept:
+                for batch in add(sample, now_s):
+                    self._offer(batch)
 
     def leave(self, topic: str) -> None:
         sampled = self._sampled.pop(topic, None)

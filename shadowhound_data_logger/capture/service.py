@@ -18,7 +18,7 @@ PART: Final = 3
 """It says that it lives this many times within the time that systemd allows, so that one lost word is no death."""
 
 
-class Service:
+class SystemdService:
     """New; ``ready`` once; ``alive`` from the main loop, as often as it turns; ``stopping`` once."""
 
     def __init__(self, environ: MutableMapping[str, str]) -> None:

@@ -21,9 +21,8 @@ import orjson
 
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.encode.image import encode_jpeg
-from shadowhound_data_logger.encode.payload import Encoder, Job, OneMessage, Payload, Rejections
+from shadowhound_data_logger.encode.payload import Encoder, Job, OneMessage, Payload, Rejections, encode_cdr
 from shadowhound_data_logger.encode.pointcloud import encode_cloud
-from shadowhound_data_logger.encode.raw import encode_cdr
 from shadowhound_data_logger.encode.types import header_frame_id
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
@@ -38,7 +37,7 @@ _USTAR_SECONDS: Final = 8**11 - 1
 """Eleven octal digits."""
 
 
-class Member(NamedTuple):
+class ArchiveFile(NamedTuple):
     """One file of an archive."""
 
     name: str
@@ -46,7 +45,7 @@ class Member(NamedTuple):
     body: bytes
 
 
-def archive(pack: Callable[[Iterable[Member]], bytes], ext: str, content_type: str) -> Encoder:
+def archive(pack: Callable[[Iterable[ArchiveFile]], bytes], ext: str, content_type: str) -> Encoder:
     """An encoder that packs all messages of a batch; those that cannot be encoded are rejected, the rest goes on."""
 
     def encoder(job: Job, rejections: Rejections) -> Payload | None:
@@ -66,7 +65,7 @@ def archive(pack: Callable[[Iterable[Member]], bytes], ext: str, content_type: s
     return encoder
 
 
-def _members(job: Job, files: Sequence[Payload]) -> Iterator[Member]:
+def _members(job: Job, files: Sequence[Payload]) -> Iterator[ArchiveFile]:
     """Each file and its JSON, in the order of time; a second message of the same time is numbered."""
     same: Counter[int] = Counter()
     has_header = job.types.has_header(job.batch.type)
@@ -81,8 +80,8 @@ def _members(job: Job, files: Sequence[Payload]) -> Iterator[Member]:
             described |= {'repeat_of': last_name}
         else:
             last, last_name = file.body, f'{name}.{file.ext}'
-            yield Member(last_name, stamp_ns, file.body)
-        yield Member(f'{name}.json', stamp_ns, orjson.dumps(described))
+            yield ArchiveFile(last_name, stamp_ns, file.body)
+        yield ArchiveFile(f'{name}.json', stamp_ns, orjson.dumps(described))
 
 
 def _in_order(files: Sequence[Payload]) -> list[Payload]:
@@ -99,7 +98,7 @@ def _description(job: Job, sample: Sample, file: Payload, *, has_header: bool) -
     return {'stamp_ns': sample.stamp_ns, **frame, 'topic': job.batch.topic, 'type': job.batch.type, **file.facts}
 
 
-def pack_tar(members: Iterable[Member]) -> bytes:
+def pack_tar(members: Iterable[ArchiveFile]) -> bytes:
     """An uncompressed POSIX tar (ustar), which every reader knows; a file's time is its message's."""
     parts: list[bytes] = []
     for member in members:
@@ -110,7 +109,7 @@ def pack_tar(members: Iterable[Member]) -> bytes:
     return b''.join((*parts, bytes(2 * tarfile.BLOCKSIZE)))
 
 
-def pack_zip(members: Iterable[Member]) -> bytes:
+def pack_zip(members: Iterable[ArchiveFile]) -> bytes:
     """A zip without compression, which images and clouds would hardly gain by; a file's time is its message's, in UTC."""
     file = BytesIO()
     with ZipFile(file, 'w', ZIP_STORED, allowZip64=True) as packed:

@@ -1,4 +1,4 @@
-"""What messages look like, for readers that know nothing of the robot: rosbag2's message definitions and type hashes.
+"""Where definitions of messages are found, and what readers that know nothing of the robot are told: rosbag2's form of them.
 
 They come from the ``share/`` folders of the sourced workspaces, as rosbag2 takes them (rosbag2_cpp,
 local_message_definition_source.cpp): the ``.msg`` text, then that of every type it uses, or the same of the ``.idl``
@@ -12,7 +12,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -29,6 +29,20 @@ _PRIMITIVES: Final = frozenset({
 })  # fmt: skip
 
 
+def find(prefixes: Iterable[str | Path], type_name: str, extension: str = 'msg') -> Path:
+    """The file that defines a type, of the first workspace that has it. Raises FileNotFoundError.
+
+    ``prefixes`` are the entries of AMENT_PREFIX_PATH, in their order; empty ones are none.
+    """
+    named = _TYPE.fullmatch(type_name)
+    if named is not None:
+        for prefix in prefixes:
+            path = Path(prefix, 'share', named[1], 'msg', f'{named[2]}.{extension}')
+            if str(prefix) and path.is_file():
+                return path
+    raise FileNotFoundError(f'{type_name} has no .{extension}')
+
+
 def describe(type_name: str) -> tuple[str, str, str]:
     """(encoding, definition, type hash) of a message type such as ``sensor_msgs/msg/Imu``.
 
@@ -42,22 +56,22 @@ def _describe(type_name: str, prefixes: str) -> tuple[str, str, str]:
     named = _TYPE.fullmatch(type_name)
     if named is None:
         return '', '', ''
-    folders = [Path(prefix, 'share') for prefix in prefixes.split(os.pathsep) if prefix]
+    places = prefixes.split(os.pathsep)
     for extension, encoding in (('msg', 'ros2msg'), ('idl', 'ros2idl')):
         try:
-            definition = _collected(folders, type_name, extension)
+            definition = _collected(places, type_name, extension)
         except FileNotFoundError:
             continue
-        return encoding, definition, _hash(folders, type_name)
+        return encoding, definition, _hash(places, type_name)
     return _from_rosbags(f'{named[1]}/msg/{named[2]}')
 
 
-def _collected(folders: Sequence[Path], type_name: str, extension: str) -> str:
+def _collected(prefixes: Sequence[str], type_name: str, extension: str) -> str:
     """The text of a type and of all that it uses. Raises FileNotFoundError where one of them has none."""
     seen: set[str] = set()
 
     def collect(name: str) -> str:
-        text = _found(folders, name, extension).read_text(encoding='utf-8', errors='replace')
+        text = find(prefixes, name, extension).read_text(encoding='utf-8', errors='replace')
         package = name.partition('/')[0]
         for used in sorted(_used(text, package, extension) - seen):
             if used not in seen:  # by one before it in this very loop
@@ -79,19 +93,9 @@ def _used(text: str, package: str, extension: str) -> set[str]:
     return {name if '/' in name else f'{package}/{name}' for name in names}
 
 
-def _found(folders: Sequence[Path], name: str, extension: str) -> Path:
-    """The file of a type, of the first workspace that has it."""
-    named = _TYPE.fullmatch(name)
-    paths = [folder / named[1] / 'msg' / f'{named[2]}.{extension}' for folder in folders] if named else []
-    path = next((path for path in paths if path.is_file()), None)
-    if path is None:
-        raise FileNotFoundError(f'{name} has no .{extension}')
-    return path
-
-
-def _hash(folders: Sequence[Path], type_name: str) -> str:
+def _hash(prefixes: Sequence[str], type_name: str) -> str:
     try:
-        content = json.loads(_found(folders, type_name, 'json').read_bytes())
+        content = json.loads(find(prefixes, type_name, 'json').read_bytes())
         hashes = {one['type_name']: str(one['hash_string']) for one in content['type_hashes']}
     except (OSError, ValueError, LookupError, TypeError) as error:
         log.debug('%s has no type hash: %s', type_name, error)

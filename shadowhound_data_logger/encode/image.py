@@ -2,18 +2,23 @@
 
 ``jpeg`` makes JPEGs of 8-bit colours and greys, ``png`` PNGs without loss. Depth fits in neither JPEG nor, as float, in PNG:
 with both formats 16-bit images become 16-bit PNGs, and float32 images become TIFFs with every value as it was, NaN included.
+The sizes of JPEG and PNG files are read from their headers, without decoding them.
+
+How alike two pictures look is told by a difference hash of 64 bits, most of which are the same in pictures of the same scene. Of
+a grey picture of 9 x 8 cells, each bit says whether a cell is darker than the one to its right (dHash: N. Krawetz, "Kind of Like
+That", 2013). Noise and compression change a few of them, another scene about half.
 """
 
 from __future__ import annotations
 
 import struct
 from io import BytesIO
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import simplejpeg
 
-from shadowhound_data_logger.encode.image_header import JPEG_MAGIC, PNG_MAGIC, jpeg_size, png_size
 from shadowhound_data_logger.encode.payload import Fact, Job, Payload
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
@@ -21,6 +26,18 @@ from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+JPEG_MAGIC: Final = b'\xff\xd8\xff'
+PNG_MAGIC: Final = b'\x89PNG\r\n\x1a\n'
+_SOF: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers that begin a frame header; C4, C8 and CC in their midst are something else (ITU-T T.81, table B.1)."""
+_SOS: Final = 0xDA
+_CHUNK: Final = struct.Struct('>I4s')
+_IHDR: Final = struct.Struct('>I4sII')
+_PNG_SIDE: Final = (1 << 31) - 1
+_ROWS: Final = 8
+_COLUMNS: Final = 9
+_CONTRAST: Final = 4.0
+"""Grey levels between the darkest cell and the brightest: below it noise sets the bits, or none is set, of black as of white."""
 
 
 class _Pixel(NamedTuple):
@@ -163,3 +180,67 @@ def _pillow(message: Any, pixel: _Pixel, kind: str, **options: int) -> bytes:
     file = BytesIO()
     image.save(file, kind, **options)
     return file.getvalue()
+
+
+def jpeg_size(data: bytes) -> tuple[int, int]:
+    """Width and height of a JPEG whose headers are whole, in pixels; raises Rejected ``malformed`` for anything else.
+
+    Walks the marker segments up to the scan (ITU-T T.81, annex B). The scan itself is not judged: cameras do leave out
+    the EOI marker, and a decoder shows what there is.
+    """
+    size = None
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # a fill byte; any number may precede a marker
+            at += 1
+            continue
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], 'big')
+        if marker in _SOF and at + 9 <= end <= len(data):
+            size = int.from_bytes(data[at + 7 : at + 9], 'big'), int.from_bytes(data[at + 5 : at + 7], 'big')
+        elif marker == _SOS and size is not None and all(size) and end < len(data):
+            return size
+        at = end
+    raise Rejected('malformed', f'broken JPEG header at byte {at} of {len(data)}')
+
+
+def png_size(data: bytes) -> tuple[int, int]:
+    """Width and height of a PNG whose header is whole and whose image data has begun; raises Rejected ``malformed``.
+
+    Walks the chunks up to the first IDAT (https://www.w3.org/TR/png-3/#5Chunk-layout); the image data is not judged.
+    """
+    at = len(PNG_MAGIC)
+    if len(data) < at + _IHDR.size:
+        raise Rejected('malformed', f'a PNG of {len(data)} bytes')
+    length, kind, width, height = _IHDR.unpack_from(data, at)
+    if (length, kind) != (13, b'IHDR') or not 0 < width <= _PNG_SIDE or not 0 < height <= _PNG_SIDE:
+        raise Rejected('malformed', f'broken PNG header, {width} x {height} pixels')
+    while at + _CHUNK.size < len(data):
+        length, kind = _CHUNK.unpack_from(data, at)
+        if kind == b'IDAT':
+            return width, height
+        at += _CHUNK.size + length + 4  # the checksum
+    raise Rejected('malformed', f'a PNG of {len(data)} bytes without image data')
+
+
+def difference_hash(jpeg: bytes) -> int | None:
+    """64 bits, the top left one the highest; None of what is no JPEG, too small, or without contrast."""
+    try:
+        grey = simplejpeg.decode_jpeg(
+            jpeg, 'GRAY', fastdct=True, min_height=_ROWS, min_width=_COLUMNS, min_factor=8, strict=False
+        )
+    except ValueError:
+        return None
+    height, width = grey.shape[:2]
+    if height < _ROWS or width < _COLUMNS:
+        return None
+    cells = _means(_means(grey[:, :, 0].astype(np.float32), _ROWS, 0), _COLUMNS, 1)
+    if np.ptp(cells) < _CONTRAST:
+        return None
+    return int.from_bytes(np.packbits(cells[:, :-1] < cells[:, 1:]).tobytes(), 'big')
+
+
+def _means(values: NDArray[Any], count: int, axis: int) -> NDArray[Any]:
+    """The means of so many stretches of an axis, as equal as they can be."""
+    edges = [place * values.shape[axis] // count for place in range(count + 1)]
+    return np.stack([values.take(range(start, end), axis).mean(axis) for start, end in pairwise(edges)], axis)

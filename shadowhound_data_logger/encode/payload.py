@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from shadowhound_data_logger.config import SensorSettings
-from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.encode.types import ENCAPSULATION_BYTES, MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Batch, Sample
 
@@ -75,3 +75,10 @@ def one_message(encode: OneMessage) -> Encoder:
         return payload
 
     return encoder
+
+
+def encode_cdr(job: Job, sample: Sample) -> Payload:  # noqa: ARG001 - as every encoder of one message
+    """The bytes of one message; its definition is not needed. Raises Rejected ``malformed`` where there are too few for CDR."""
+    if len(sample.cdr) < ENCAPSULATION_BYTES:
+        raise Rejected('malformed', f'{len(sample.cdr)} bytes are no CDR')
+    return Payload(sample.cdr, (sample,), 'cdr', 'application/octet-stream')

@@ -9,11 +9,9 @@ from typing import Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.archive import archive, pack_tar, pack_zip
-from shadowhound_data_logger.encode.image import encode_jpeg, encode_png
-from shadowhound_data_logger.encode.likeness import difference_hash
-from shadowhound_data_logger.encode.payload import Encoder, Fact, Job, Payload, Rejections, one_message
+from shadowhound_data_logger.encode.image import difference_hash, encode_jpeg, encode_png
+from shadowhound_data_logger.encode.payload import Encoder, Fact, Job, Payload, Rejections, encode_cdr, one_message
 from shadowhound_data_logger.encode.pointcloud import encode_cloud
-from shadowhound_data_logger.encode.raw import encode_cdr
 from shadowhound_data_logger.encode.records import encode_records
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import NameRefused, Rejected

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
@@ -19,6 +20,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.encode.definitions import find
 from shadowhound_data_logger.errors import Rejected
 
 if TYPE_CHECKING:
@@ -204,11 +206,8 @@ class MessageTypes:
     def _find(self, type_name: str) -> Typesdict:
         if not _TYPE_NAME.fullmatch(type_name):
             raise LookupError(f'{type_name!r} is no message type')
-        package, _, name = type_name.split('/')
-        for prefix in self._prefixes:
-            path = prefix / 'share' / package / 'msg' / f'{name}.msg'
-            if path.is_file():
-                return get_types_from_msg(path.read_text(encoding='utf-8'), type_name)
+        with suppress(FileNotFoundError):
+            return get_types_from_msg(find(self._prefixes, type_name).read_text(encoding='utf-8'), type_name)
         if type_name not in self._shipped.fielddefs:
             raise LookupError(f'no definition of {type_name}: is its package installed and sourced?')
         return {type_name: self._shipped.fielddefs[type_name]}

@@ -13,7 +13,7 @@ from bags.recording import ROBOT, STRING, WAIT_S, BoundedSpool, manifest, messag
 from clocks import Clocks
 
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
-from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.ring import Ring
 from shadowhound_data_logger.bags.salvage import Salvage
@@ -99,7 +99,7 @@ def buffer(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator
     writer = SpoolWriter(spool, 0.01)
     writer.open()
     now_s, made = [1000.0], list[Buffer]()
-    place = Place(home / 'bags' / ROBOT, ROBOT, clocks, writer, 600.0)
+    place = BagPlace(home / 'bags' / ROBOT, ROBOT, clocks, writer, 600.0)
     ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
     salvage = Salvage(place, 8)
     events = Events(options, bag, place, ring, salvage, POLL_S, lambda: now_s[0])

@@ -13,7 +13,7 @@ from typing import Any
 from clocks import Clocks
 from mcap.reader import make_reader
 
-from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.salvage import Salvage
@@ -120,7 +120,7 @@ def desk(home: Path, clock: Clocks | None = None, *, offsets: Mapping[str, int] 
         made[0].listening.append(on)
         return True
 
-    place = Place(root, ROBOT, time, writer, HOLD_S, lambda: offsets or {})
+    place = BagPlace(root, ROBOT, time, writer, HOLD_S, lambda: offsets or {})
     recorder = Recorder(bag, place, queue, Salvage(place, bag.priority), listen)
     made.append(Desk(spool, writer, queue, recorder, home))
     try:

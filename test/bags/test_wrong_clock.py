@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from shadowhound_data_logger.bags.naming import slice_number
 from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.overview import NoStore, overview
-from shadowhound_data_logger.bags.place import Place
+from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.keys import unsynced
@@ -202,7 +202,7 @@ def test_a_name_that_was_decided_stays(tmp_path: Path) -> None:
         clock.set(NOON_NS + hour * 3600 * SECOND)
         notes = Notes.read(folder, ROBOT)
         assert notes.is_named is bool(hour)
-        assert Place(folder.parent, ROBOT, clock, nothing_known).settle(notes)
+        assert BagPlace(folder.parent, ROBOT, clock, nothing_known).settle(notes)
         assert notes.bag == 'recording_20251018_120000'
 
 

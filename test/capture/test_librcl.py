@@ -197,12 +197,12 @@ def test_what_is_told_wrong_is_not_trusted(
 ) -> None:
     """Messages are taken through rclpy then, and one warning says why."""
     take = librcl.Taker.take
-    monkeypatch.setattr(librcl.Taker, 'take', lambda *given: (told := take(*given)) and WRONG[what](librcl.Message(*told)))
+    monkeypatch.setattr(librcl.Taker, 'take', lambda *given: (told := take(*given)) and WRONG[what](librcl.RclMessage(*told)))
     readers = [read(node, f'/wrong{number}') for number in range(2)]
     assert [each._taker for each in readers] == [None, None]
     (record,) = caplog.records
     assert record.levelname == 'WARNING'
-    assert 'is told as Message(' in record.getMessage()
+    assert 'is told as RclMessage(' in record.getMessage()
     publisher = node.create_publisher(String, '/wrong0', 10)
     until(lambda: readers[0].matched() == 1, 'it is matched')
     publisher.publish(String(data='still'))

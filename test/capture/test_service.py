@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.capture.service import Service
+from shadowhound_data_logger.capture.service import SystemdService
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def _environ(receiver: socket.socket, **more: str) -> dict[str, str]:
 
 def test_it_says_that_it_is_ready_and_that_it_stops(systemd: socket.socket) -> None:
     """Readiness comes with what it logs, and the end is announced."""
-    service = Service(_environ(systemd))
+    service = SystemdService(_environ(systemd))
     service.ready('logging /odom')
     assert systemd.recv(1000) == b'READY=1\nSTATUS=logging /odom'
     service.stopping()
@@ -38,7 +38,7 @@ def test_it_says_that_it_lives_a_few_times_an_interval(systemd: socket.socket, m
     """Turning the loop fifty times in two thirds of the interval is told three times."""
     now = 100.0
     monkeypatch.setattr('shadowhound_data_logger.capture.service.time.monotonic', lambda: now)
-    service = Service(_environ(systemd, WATCHDOG_USEC='30000000', WATCHDOG_PID=str(os.getpid())))
+    service = SystemdService(_environ(systemd, WATCHDOG_USEC='30000000', WATCHDOG_PID=str(os.getpid())))
     for _ in range(50):
         service.alive()
         now += 0.42
@@ -52,7 +52,7 @@ def test_it_says_that_it_lives_a_few_times_an_interval(systemd: socket.socket, m
 @pytest.mark.parametrize('more', [{}, {'WATCHDOG_USEC': '30000000', 'WATCHDOG_PID': '1'}, {'WATCHDOG_USEC': 'soon'}])
 def test_it_is_quiet_where_nobody_watches(systemd: socket.socket, more: dict[str, str]) -> None:
     """Without a watchdog, or with one of another process, nothing is sent."""
-    service = Service(_environ(systemd, **more))
+    service = SystemdService(_environ(systemd, **more))
     service.alive()
     systemd.setblocking(False)
     with pytest.raises(BlockingIOError):
@@ -62,16 +62,16 @@ def test_it_is_quiet_where_nobody_watches(systemd: socket.socket, more: dict[str
 def test_its_children_do_not_speak_for_it(systemd: socket.socket) -> None:
     """The variables are gone from the environment that children inherit."""
     environ = _environ(systemd, WATCHDOG_USEC='1000000', WATCHDOG_PID=str(os.getpid()), HOME='/root')
-    Service(environ)
+    SystemdService(environ)
     assert environ == {'HOME': '/root'}
 
 
 def test_systemd_away_is_no_failure(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A socket that is gone is said once, and logging goes on; without systemd nothing is said at all."""
-    service = Service({'NOTIFY_SOCKET': str(tmp_path / 'gone')})
+    service = SystemdService({'NOTIFY_SOCKET': str(tmp_path / 'gone')})
     service.ready('x')
     service.stopping()
     assert [record.message for record in caplog.records if 'systemd' in record.message] != []
     assert len(caplog.records) == 1
-    Service({}).ready('x')
+    SystemdService({}).ready('x')
     assert len(caplog.records) == 1

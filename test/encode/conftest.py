@@ -12,7 +12,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.encode import Encoding, MessageTypes, encode
+from shadowhound_data_logger.encode.registry import Encoding, encode
+from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, Sample
 
 GO2_MESSAGES = Path(__file__).parents[2] / 'interfaces' / 'go2_interfaces' / 'msg'

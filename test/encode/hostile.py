@@ -19,8 +19,8 @@ from typing import Any, Final
 import numpy as np
 
 from shadowhound_data_logger.config import SensorSettings
-from shadowhound_data_logger.encode import Encoding, MessageTypes, encode
-from shadowhound_data_logger.encode.types import header_frame_id, header_stamp_ns
+from shadowhound_data_logger.encode.registry import Encoding, encode
+from shadowhound_data_logger.encode.types import MessageTypes, header_frame_id, header_stamp_ns
 from shadowhound_data_logger.model import Batch, Sample
 from shadowhound_data_logger.options import FORMATS
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shadowhound_data_logger.encode import MessageTypes
+from shadowhound_data_logger.encode.types import MessageTypes
 
 pytest.importorskip('rclpy')
 from rclpy.serialization import serialize_message

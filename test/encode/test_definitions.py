@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-from shadowhound_data_logger.bags.definitions import describe
+from shadowhound_data_logger.encode.definitions import describe
 
 LINE = '=' * 80
 HAS_ROS = any(Path(one, 'share/sensor_msgs/msg/Imu.msg').is_file() for one in os.environ.get('AMENT_PREFIX_PATH', '').split(':'))

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from shadowhound_data_logger.bags.definitions import describe
 from shadowhound_data_logger.catalogue.parts import encode
 from shadowhound_data_logger.catalogue.schema import row_of
+from shadowhound_data_logger.encode.definitions import describe
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.mcap.writer import SliceWriter

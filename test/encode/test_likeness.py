@@ -9,7 +9,7 @@ import pytest
 import simplejpeg
 
 from shadowhound_data_logger.encode import registry
-from shadowhound_data_logger.encode.likeness import difference_hash
+from shadowhound_data_logger.encode.image import difference_hash
 from shadowhound_data_logger.model import Likeness
 from shadowhound_data_logger.options import COMPRESSED_IMAGE as COMPRESSED
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from shadowhound_data_logger.encode import MessageTypes, header_stamp_ns
+from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.errors import Rejected
 
 IMU = 'go2_interfaces/msg/IMU'
@@ -152,7 +152,7 @@ def test_truncated_and_too_long(ros: Any) -> None:
 
 LYING = """
 import resource, sys
-from shadowhound_data_logger.encode import MessageTypes
+from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
 types = MessageTypes()
 names = ['sensor_msgs/msg/PointCloud2', 'sensor_msgs/msg/JointState', 'std_msgs/msg/Float64MultiArray', 'tf2_msgs/msg/TFMessage']

@@ -15,7 +15,8 @@ from profiles import examples
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shadowhound_data_logger.config import SensorSettings
-from shadowhound_data_logger.encode import MessageTypes, encode
+from shadowhound_data_logger.encode.registry import encode
+from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, Sample
 
 IMU = 'go2_interfaces/msg/IMU'
