@@ -29,6 +29,7 @@ from rclpy.parameter import Parameter
 from shadowhound_data_logger.capture.interface import Interface
 from shadowhound_data_logger.capture.parameters import Described, declare, parameter, plain
 from shadowhound_data_logger.capture.reader import endpoints
+from shadowhound_data_logger.capture.unheard import MOST_PUBLISHERS
 from shadowhound_data_logger.config import FOREIGN
 from shadowhound_data_logger.errors import DataLoggerError, NodeUnavailable
 from shadowhound_data_logger.ros_arguments import NODE
@@ -38,8 +39,8 @@ from shadowhound_data_logger.worker import Worker
 COMPARE_S: Final = 2.0
 """How often it looks at the publishers of what is logged, or more seldom: it takes at most so much of the time."""
 COMPARE_SHARE: Final = 0.05
-MOST_REPORTED, MOST_OF_TOPIC, MOST_LETTERS = 64, 8, 150
-"""Publishers in a report, of all topics and of one, and letters of a name: together they fit into a request."""
+MOST_REPORTED, MOST_LETTERS = 64, 150
+"""Publishers in a report, and letters of a name: together they fit into a request."""
 LOOK_S: Final = 1.0
 """How often it asks what is new, and so finds out that the node is no more."""
 STEADY_S: Final = 60.0
@@ -120,6 +121,8 @@ class PublicNode:
         self._mission: Mapping[str, Any] = {}
         self._topics: Sequence[str] = ()
         self._gids: frozenset[str] = frozenset()
+        self._reported: frozenset[str] = frozenset()
+        """Of these a report goes on to tell, however many others come meanwhile."""
         self._compare_s = 0.0
         described: list[Described] = connection.ask('parameters')['parameters']
         self._live = [each['name'] for each in described if not each['read_only']]
@@ -148,11 +151,13 @@ class PublicNode:
         found: dict[str, list[list[str]]] = {}
         room = MOST_REPORTED
         for topic in self._topics:
-            others = sorted((each.gid, _ascii(each.type), _ascii(each.node)) for each in endpoints(self._node, topic)
-                            if each.gid not in self._gids)[: min(room, MOST_OF_TOPIC)]  # fmt: skip
+            others = [each for each in endpoints(self._node, topic) if each.gid not in self._gids]
+            others.sort(key=lambda each: (each.gid not in self._reported, each.gid))
+            del others[min(room, MOST_PUBLISHERS) :]
             room -= len(others)
             if others:
-                found[topic] = [list(other) for other in others]
+                found[topic] = [[each.gid, _ascii(each.type), _ascii(each.node)] for each in others]
+        self._reported = frozenset(gid for each in found.values() for gid, _, _ in each)
         answer = self._ask({'do': 'compare', 'found': found})
         if answer['ok']:
             self._topics, self._gids = answer['topics'], frozenset(answer['gids'])

@@ -20,6 +20,8 @@ SETTLED_S: Final = 30.0
 by default with Cyclone DDS, 20 s with Fast DDS as ROS has it), and the two sides forget it at different moments."""
 SILENT_S: Final = 10.0
 """After a longer silence of the front nothing is known, and what is reported then begins anew; it reports every other second."""
+MOST_PUBLISHERS: Final = 8
+"""Of a topic, in a report: a crowd of them costs no more."""
 MOST_NODES: Final = 3
 MOST_LETTERS: Final = 200
 """Of a name, in what is said."""
@@ -80,7 +82,8 @@ class Unheard:
         nodes = sorted({node for _, node in publishers.values()} - {''})
         seconds = round(now_s - min(self._since_s[topic, gid] for gid in publishers))
         whose = f' (of {", ".join(nodes[:MOST_NODES])}{" and others" if len(nodes) > MOST_NODES else ""})' if nodes else ''
-        count, what = (f'{len(publishers)} publishers', 'they send') if len(publishers) > 1 else ('a publisher', 'it sends')
+        more = ' or more' if len(publishers) >= MOST_PUBLISHERS else ''
+        count, what = (f'{len(publishers)}{more} publishers', 'they send') if len(publishers) > 1 else ('a publisher', 'it sends')
         text = (f'{topic} is not all heard: {self._robot} finds {count}{whose} that {self._rmw}, by which the node listens, '
                 f'has not found; what {what} is not logged')  # fmt: skip
         self._rows[topic] = {'publishers': len(publishers), 'nodes': nodes, 'seconds': seconds, 'text': text}

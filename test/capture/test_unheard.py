@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from shadowhound_data_logger.capture.unheard import SETTLED_S, SILENT_S, Unheard
+from shadowhound_data_logger.capture.unheard import MOST_PUBLISHERS, SETTLED_S, SILENT_S, Unheard
 
 IMU = 'sensor_msgs/msg/Imu'
 STEP_S = 2.0
@@ -118,3 +118,15 @@ def test_the_front_is_told_what_is_known_already() -> None:
     robot = Robot(imu=IMU, odom='')
     robot.ours = {'/imu': {'bb', 'aa'}, '/odom': {'cc'}}
     assert robot.unheard.compare({}) == {'topics': ['/imu', '/odom'], 'gids': ['aa', 'bb', 'cc']}
+
+
+@pytest.mark.parametrize(('count', 'words'), [
+    (2, 'finds 2 publishers that'), (MOST_PUBLISHERS, f'finds {MOST_PUBLISHERS} or more publishers'),
+])  # fmt: skip
+def test_several_are_one_error(count: int, words: str, caplog: pytest.LogCaptureFixture) -> None:
+    """A report has no more of them than a limit, so the words claim no number then."""
+    robot = Robot(imu=IMU)
+    robot.theirs = {'/imu': [[f'{number}', IMU, ''] for number in range(count)]}
+    robot.wait(SETTLED_S + STEP_S)
+    assert words in (robot.texts or {})['/imu']
+    assert len(caplog.records) == 1
