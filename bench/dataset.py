@@ -33,7 +33,7 @@ from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.encode.archive import ArchiveFile, pack_tar
 from shadowhound_data_logger.lake import MissionDataset, query
-from shadowhound_data_logger.lake.source import open_source
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.sim.tower import Tower
 
 FIRST_NS: Final = 1_793_188_800 * SECOND
@@ -104,7 +104,7 @@ def guide(settings: Any, folder: Path) -> int:
 
 
 def ours(settings: Any, robot: str, *, by_number: bool, workers: int = WORKERS, context: str = 'fork') -> int:
-    source = open_source(settings, schema.BUCKET)
+    source = Bucket(settings, schema.BUCKET)
     dataset = MissionDataset(source, robot=robot)
     how: dict[str, Any] = {'batch_size': BATCH, 'num_workers': workers}
     if workers:
@@ -127,7 +127,7 @@ def measure(options: argparse.Namespace) -> Report:
                        client_options={'allow_http': True})  # fmt: skip
         size = fill(bare, options.frames)
         progress(f'{options.frames} frames of {size / options.frames / 1000:.0f} KB, once more in archives')
-        query.objects(open_source(settings, schema.BUCKET), robot='nobody').collect()  # Daft's first plan
+        query.objects(Bucket(settings, schema.BUCKET), robot='nobody').collect()  # Daft's first plan
         ways: dict[str, Callable[[], int]] = {
             'guide': lambda: guide(settings, folder / 'downloaded'),
             'streamed': lambda: ours(settings, 'thor', by_number=False),

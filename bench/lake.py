@@ -36,11 +36,11 @@ from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.lake import fetch as fetching
 from shadowhound_data_logger.lake import query
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
-from shadowhound_data_logger.lake.source import Source, open_source
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.sim.tower import Tower
-from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores import open_reader, open_store
 
 FIRST_NS: Final = 1_790_812_800 * SECOND
 """2026-10-01T00:00:00Z."""
@@ -110,17 +110,17 @@ def fill(settings: StoreSettings, days: int) -> tuple[int, int]:
 class Counting:
     """A source that counts what is read, by date."""
 
-    def __init__(self, inner: Source) -> None:
+    def __init__(self, inner: Bucket) -> None:
         self._inner = inner
         self.dates: dict[str, int] = {}
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._inner, name)
 
-    def read(self, key: str, most: int) -> bytes:
+    def get(self, key: str, most: int) -> bytes:
         date = key.split('/')[2]
         self.dates[date] = self.dates.get(date, 0) + 1
-        return self._inner.read(key, most)
+        return self._inner.get(key, most)
 
 
 def ask(source: Any, day: int) -> tuple[float, list[str]]:
@@ -153,7 +153,7 @@ def questions(settings: StoreSettings, days: int) -> tuple[list[Bar], dict[str, 
         'fill_s': round(time.perf_counter() - began, 1),
     }
     day, expected = days // 2, oracle(days // 2)
-    source = Counting(open_source(settings, schema.BUCKET))
+    source = Counting(Bucket(settings, schema.BUCKET))
     query.objects(source, robot='nobody').collect()  # Daft's threads and its first plan are part of importing it
     before = [_right(ask(source, day), expected) for _ in range(ROUNDS)]
     only = (
@@ -161,14 +161,14 @@ def questions(settings: StoreSettings, days: int) -> tuple[list[Bar], dict[str, 
     )
     began = time.perf_counter()
     with closing(open_store(settings, UploadSettings())) as store:
-        made = list(compact(open_source(settings, schema.BUCKET), store, grace=None))
+        made = list(compact(Bucket(settings, schema.BUCKET), store, grace=None))
     figures['compact_s'] = round(time.perf_counter() - began, 1)
     figures['compacted_bytes'] = sum(each.size for each in made)
     with closing(open_store(settings, UploadSettings())) as store:
         began = time.perf_counter()
-        list(compact(open_source(settings, schema.BUCKET), store, grace=timedelta(0)))
+        list(compact(Bucket(settings, schema.BUCKET), store, grace=timedelta(0)))
         figures['delete_s'] = round(time.perf_counter() - began, 1)
-    after = [_right(ask(open_source(settings, schema.BUCKET), day), expected) for _ in range(ROUNDS)]
+    after = [_right(ask(Bucket(settings, schema.BUCKET), day), expected) for _ in range(ROUNDS)]
     figures |= {'found': len(expected), 'before_s': before, 'after_s': after}
     slow, fast = statistics.median(before), statistics.median(after)
     what = f'one day of {days}, near a point, battery low; {count:,} rows'
@@ -198,10 +198,11 @@ def fetches(tower: Tower, settings: StoreSettings, folder: Path, objects: int) -
     with ThreadPoolExecutor(PUTS) as pool:
         list(pool.map(put, range(objects)))
     progress(f'{objects:,} objects to fetch')
-    source, to = open_source(settings, schema.BUCKET), _memory(folder) / 'fetched'
+    source, to = Bucket(settings, schema.BUCKET), _memory(folder) / 'fetched'
 
     def ours() -> fetching.Result:
-        return fetching.fetch(fetching.under(source, PREFIX), to, lambda _: source)
+        with closing(open_reader(settings)) as store:
+            return fetching.fetch(fetching.under(source, PREFIX), to, store)
 
     ways = {'fetch': ours, **_others(tower, folder, to)}
     took: dict[str, list[float]] = {name: [] for name in ways}

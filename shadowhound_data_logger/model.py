@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
@@ -169,6 +170,10 @@ class ObjectInfo:
     """From the object's metadata; None where a listing does not tell, or a foreign writer set none."""
     metadata: Mapping[str, str] = field(default_factory=dict)
     content_type: str = ''
+    etag: str = ''
+    """Of a listing: changes with the content; empty where the store has none."""
+    modified: datetime | None = None
+    """Of a listing."""
 
 
 class Put(str, Enum):

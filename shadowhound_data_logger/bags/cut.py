@@ -21,7 +21,7 @@ from shadowhound_data_logger.bags.fetch import fetch, on_disk
 from shadowhound_data_logger.bags.naming import BUCKET, METADATA
 from shadowhound_data_logger.bags.packed import Packed
 from shadowhound_data_logger.bags.plain import Plain, is_plain
-from shadowhound_data_logger.bags.remote import Listing, RemoteBag, document, natural
+from shadowhound_data_logger.bags.remote import RemoteBag, document, natural
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
@@ -30,6 +30,7 @@ from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, StoredFile, re
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.times import moment_in_bag
 
 UNFINISHED: Final = '.part'
@@ -80,7 +81,7 @@ class CutSource(Protocol):
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]: ...
 
 
-def cut_remote(store: Listing, bag: RemoteBag, out: Path, choice: Choice) -> Cut:
+def cut_remote(store: ObjectStore, bag: RemoteBag, out: Path, choice: Choice) -> Cut:
     """Into the new folder ``out``. Raises BagError, BagDamaged, SettingError, StoreError."""
     if bag.is_archive:
         raise BagError(f'{bag.name} is an archive, of which no part can be read', remedy='fetch it, unpack it and cut the folder')

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import random
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -19,21 +17,18 @@ from typing import Final
 from shadowhound_data_logger.bags.description import slice_info
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
-from shadowhound_data_logger.bags.remote import Listing, RemoteBag, RemoteFile, missing_of
+from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, missing_of
 from shadowhound_data_logger.disk import fingerprint
-from shadowhound_data_logger.errors import BagDamaged, BagError, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, check_document, read_whole
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.ship.retry import backoff
+from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import UNFINISHED, download
 from shadowhound_data_logger.untrusted import path_below
 
 THREADS: Final = 4
-TRIES: Final = 6
-CAP_S: Final = 5.0
-"""Of the pause between two tries: a store that is away for good is told within half a minute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +59,7 @@ class Told:
         """So many more are here, downloaded or there already; negative where they turned out wrong."""
 
 
-def fetch(store: Listing, bag: RemoteBag, to: Path, *, threads: int = THREADS, told: Told | None = None) -> FetchedBag:
+def fetch(store: ObjectStore, bag: RemoteBag, to: Path, *, threads: int = THREADS, told: Told | None = None) -> FetchedBag:
     """Raises BagError, BagDamaged for what does not arrive as it was sent, StoreError, OSError; what is whole by then stays."""
     with on_disk(to):
         return _fetch(store, bag, to, threads, told or Told())
@@ -80,7 +75,7 @@ def on_disk(folder: Path) -> Iterator[None]:
         raise BagError(f'{where} cannot be used: {error.strerror}', remedy='is there space, and may you write there?') from error
 
 
-def _fetch(store: Listing, bag: RemoteBag, to: Path, threads: int, told: Told) -> FetchedBag:
+def _fetch(store: ObjectStore, bag: RemoteBag, to: Path, threads: int, told: Told) -> FetchedBag:
     folder = to if bag.is_archive else path_below(to, bag.name)
     folder.mkdir(parents=True, exist_ok=True)
     meter = Meter()
@@ -116,7 +111,7 @@ def _side_by_side(one: Callable[[RemoteFile], str], files: Sequence[RemoteFile],
         pool.shutdown(cancel_futures=True)
 
 
-def _have(store: Listing, file: RemoteFile, folder: Path, promised: str | None, got: Meter, told: Told) -> str:
+def _have(store: ObjectStore, file: RemoteFile, folder: Path, promised: str | None, got: Meter, told: Told) -> str:
     """Make it be there; returns the SHA-256 that it was checked against, empty where none is known."""
     path = path_below(folder, file.name)
     sha256 = promised or _recorded(store, file)
@@ -126,18 +121,12 @@ def _have(store: Listing, file: RemoteFile, folder: Path, promised: str | None, 
     path.parent.mkdir(parents=True, exist_ok=True)
 
     def tell(count: int) -> None:
-        got.add(count)
+        got.add(max(count, 0))
         told.have(count)
 
     with _alone(path) as resumed:
         told.have(resumed)
-        try:
-            info = _steadily(lambda: download(store, BUCKET, file.key, path, tell=tell))
-        except ObjectRefused as error:
-            if not resumed or error.data.get('reason') != 'damaged':
-                raise
-            told.have(-file.size)  # a power cut may leave a file of the right length without its content
-            info = _steadily(lambda: download(store, BUCKET, file.key, path, tell=tell))
+        info = download(store, ObjectInfo(BUCKET, file.key, file.size, None), path, tell=tell).info
     if promised and info.sha256 != promised and fingerprint(path)[1] != promised:
         path.unlink()
         raise BagDamaged(f'{file.key} is not in the store what was recorded: its SHA-256 is not {promised}',
@@ -145,20 +134,9 @@ def _have(store: Listing, file: RemoteFile, folder: Path, promised: str | None, 
     return sha256
 
 
-def _recorded(store: Listing, file: RemoteFile) -> str:
+def _recorded(store: ObjectStore, file: RemoteFile) -> str:
     held = store.head(BUCKET, file.key)
     return (held.sha256 if held else None) or ''
-
-
-def _steadily(ask: Callable[[], ObjectInfo]) -> ObjectInfo:
-    """The answer, after a few tries where the store is away in passing; what arrived until then is kept."""
-    rng = random.Random()
-    for attempt in range(1, TRIES):
-        try:
-            return ask()
-        except StoreUnavailable:
-            time.sleep(backoff(attempt, CAP_S, rng))
-    return ask()
 
 
 @contextmanager

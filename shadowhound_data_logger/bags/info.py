@@ -16,7 +16,6 @@ from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.remote import (
     FOREIGN,
     GROWING,
-    Listing,
     RemoteBag,
     RemoteFile,
     find_bag,
@@ -28,6 +27,7 @@ from shadowhound_data_logger.errors import BagError
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
+from shadowhound_data_logger.stores.base import ObjectStore
 
 THREADS: Final = 8
 
@@ -54,7 +54,7 @@ class BagInfo:
         return sum(size for size, _ in self.files.values())
 
 
-def info_of(store: Listing, robot: str, name: str, home: Path) -> BagInfo:
+def info_of(store: ObjectStore, robot: str, name: str, home: Path) -> BagInfo:
     """Of a bag in the store or still on this robot. Raises BagError, BagDamaged, StoreError, SpoolError."""
     waiting = {file.name: file for file in local_files(home, robot).values() if file.bag == name}
     try:
@@ -107,7 +107,7 @@ def _slice(source: Ranged) -> SliceInfo:
     return slice_info(read_index(source), Path(source.name), source.size)
 
 
-def _tags(store: Listing, bag: RemoteBag, waiting: Mapping[str, UnsentFile]) -> Mapping[str, str]:
+def _tags(store: ObjectStore, bag: RemoteBag, waiting: Mapping[str, UnsentFile]) -> Mapping[str, str]:
     """What was written beside one slice: enough to tell whose it is."""
     for file in waiting.values():
         return file.metadata or {words.BAG: bag.name}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -17,7 +17,6 @@ from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.remote import (
     ARCHIVE,
     GROWING,
-    Listing,
     RemoteBag,
     RemoteFile,
     document,
@@ -27,8 +26,8 @@ from shadowhound_data_logger.bags.remote import (
     state_of,
 )
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import BagDamaged, ObjectRefused
-from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.stores.base import ObjectStore
 
 THREADS: Final = 8
 STORE: Final = 'store'
@@ -61,29 +60,7 @@ class _Facts:
     t_end_ns: int | None = None
 
 
-class NoStore:
-    """A store that is away, for who wants to see what is on this machine."""
-
-    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:  # noqa: ARG002
-        return iter(())
-
-    def head(self, bucket: str, key: str) -> ObjectInfo | None:  # noqa: ARG002
-        return None
-
-    def get(self, bucket: str, key: str) -> bytes:
-        raise ObjectRefused(f'there is no {bucket}/{key}', reason='missing')
-
-    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes:  # noqa: ARG002
-        return self.get(bucket, key)
-
-    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:  # noqa: ARG002
-        return iter((self.get(bucket, key),))
-
-    def describe(self) -> str:
-        return 'no store'
-
-
-def overview(store: Listing, robot: str, home: Path, *, since_ns: int = 0) -> list[BagRow]:
+def overview(store: ObjectStore, robot: str, home: Path, *, since_ns: int = 0) -> list[BagRow]:
     """All bags of a robot that began at ``since_ns`` or later, the newest last. Raises StoreError, SpoolError."""
     remote = {bag.name: bag for bag in find_bags(store, robot)}
     local: dict[str, list[UnsentFile]] = {}
@@ -110,7 +87,7 @@ def named_ns(bag: str) -> int | None:
     return int(when.timestamp()) * SECOND
 
 
-def _row(store: Listing, bag: RemoteBag, local: list[UnsentFile], given_up: int) -> BagRow:
+def _row(store: ObjectStore, bag: RemoteBag, local: list[UnsentFile], given_up: int) -> BagRow:
     kept = [file for file in local if bag.file(file.name) is None]  # delivered already: the spool is about to let go of it
     files = RemoteBag(bag.robot, bag.name, (*bag.files, *(RemoteFile(file.name, '', file.size) for file in kept)))
     finding = '; '.join(f'{file.name} is refused by the store' for file in kept if file.where == 'quarantine')
@@ -134,7 +111,7 @@ def _row(store: Listing, bag: RemoteBag, local: list[UnsentFile], given_up: int)
                   facts.messages, facts.topics, facts.t_start_ns, facts.t_end_ns, places, finding)  # fmt: skip
 
 
-def _manifest(store: Listing, bag: RemoteBag, local: Iterable[UnsentFile]) -> Manifest | None:
+def _manifest(store: ObjectStore, bag: RemoteBag, local: Iterable[UnsentFile]) -> Manifest | None:
     for file in local:
         if file.name == MANIFEST and file.path is not None:
             try:
@@ -144,7 +121,7 @@ def _manifest(store: Listing, bag: RemoteBag, local: Iterable[UnsentFile]) -> Ma
     return read_manifest(store, bag)
 
 
-def _tags(store: Listing, bag: RemoteBag, local: Iterable[UnsentFile]) -> dict[str, Mapping[str, str]]:
+def _tags(store: ObjectStore, bag: RemoteBag, local: Iterable[UnsentFile]) -> dict[str, Mapping[str, str]]:
     """What was written beside each slice, by its name; of a foreign bag nothing is, so one of its slices is asked for."""
     found: dict[str, Mapping[str, str]] = {file.name: file.metadata for file in local if file.metadata}
     for file in bag.slices:
@@ -155,7 +132,7 @@ def _tags(store: Listing, bag: RemoteBag, local: Iterable[UnsentFile]) -> dict[s
     return found
 
 
-def _facts(store: Listing, bag: RemoteBag, manifest: Manifest | None, tags: Iterable[Mapping[str, str]]) -> _Facts:
+def _facts(store: ObjectStore, bag: RemoteBag, manifest: Manifest | None, tags: Iterable[Mapping[str, str]]) -> _Facts:
     if manifest is not None:
         filled = [each for each in manifest.slices if each.messages]
         topics, messages = {topic for each in manifest.slices for topic in each.counts}, sum(each.messages for each in filled)

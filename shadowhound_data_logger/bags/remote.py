@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, prefix_of
 from shadowhound_data_logger.errors import BagError
 from shadowhound_data_logger.mcap.ranges import StoredFile, read_whole
-from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.stores.base import ObjectStore
 
 ARCHIVE: Final = '.tar.gz'
 GROWING: Final = 'growing'
@@ -25,22 +25,6 @@ FOREIGN: Final = 'foreign'
 """Not uploaded by this package: nothing says what should be in it."""
 SLICES: Final = ('.mcap', '.db3', '.zstd')
 """What the name of a file with messages ends with."""
-
-
-class Listing(Protocol):
-    """What is asked of a store (stores/base.py)."""
-
-    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]: ...
-
-    def head(self, bucket: str, key: str) -> ObjectInfo | None: ...
-
-    def get(self, bucket: str, key: str) -> bytes: ...
-
-    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes: ...
-
-    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]: ...
-
-    def describe(self) -> str: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +66,7 @@ class RemoteBag:
         return next((file for file in self.files if file.name == name), None)
 
 
-def find_bags(store: Listing, robot: str) -> list[RemoteBag]:
+def find_bags(store: ObjectStore, robot: str) -> list[RemoteBag]:
     """All bags of a robot, by name. Raises StoreError."""
     found: dict[str, list[RemoteFile]] = {}
     prefix = prefix_of(robot)
@@ -94,7 +78,7 @@ def find_bags(store: Listing, robot: str) -> list[RemoteBag]:
     return [RemoteBag(robot, bag, _ordered(files)) for bag, files in sorted(found.items())]
 
 
-def find_bag(store: Listing, robot: str, bag: str) -> RemoteBag:
+def find_bag(store: ObjectStore, robot: str, bag: str) -> RemoteBag:
     """One of them. Raises BagError naming similar ones where there is none, StoreError."""
     prefix = prefix_of(robot, bag)
     if bag.endswith(ARCHIVE):
@@ -110,13 +94,13 @@ def find_bag(store: Listing, robot: str, bag: str) -> RemoteBag:
     return RemoteBag(robot, bag, _ordered(files))
 
 
-def read_manifest(store: Listing, bag: RemoteBag) -> Manifest | None:
+def read_manifest(store: ObjectStore, bag: RemoteBag) -> Manifest | None:
     """None when there is none. Raises BagDamaged for one that says nothing, StoreError."""
     file = bag.file(MANIFEST)
     return Manifest.from_json(document(store, file), file.key) if file else None
 
 
-def document(store: Listing, file: RemoteFile) -> bytes:
+def document(store: ObjectStore, file: RemoteFile) -> bytes:
     """A manifest or a metadata.yaml. Raises BagDamaged for one that is larger than any, StoreError."""
     return read_whole(StoredFile(store, BUCKET, file.key, file.size))
 

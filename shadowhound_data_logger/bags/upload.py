@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import fcntl
 import os
-import random
 import shutil
 import sqlite3
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.fetch import Told, on_disk
@@ -22,15 +21,15 @@ from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.parcel import Outgoing, Parcel, archive_of, finished, parcel_of
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import BagError, ForeignObject, StoreUnavailable
-from shadowhound_data_logger.model import DataObject, FileBody, ObjectInfo, Put, SpooledObject, State
+from shadowhound_data_logger.errors import BagError, ForeignObject
+from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
 from shadowhound_data_logger.ship.delivering import delivering
-from shadowhound_data_logger.ship.retry import backoff
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import limits
 from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.retry import steadily
 
 SENDING: Final = 'sending'
 """The folder of bags on their way into the spool, in SHADOWHOUND_HOME."""
@@ -42,12 +41,6 @@ POLL_S: Final = 0.2
 CLOSE_S: Final = 5.0
 THREADS: Final = 4
 CAP_S: Final = 10.0
-
-
-class Heads(Protocol):
-    """What is asked of a store to know that it has something."""
-
-    def head(self, bucket: str, key: str) -> ObjectInfo | None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +87,10 @@ def upload_now(store: ObjectStore, sent: Parcel, *, deadline_s: float, told: Tol
         file = sent.files[place]
         item = SpooledObject(place, BUCKET, file.key, file.path, file.size, file.sha256, file.content_type,
                              {**file.metadata, words.SHA256: file.sha256}, PRIORITY, 0)  # fmt: skip
-        _steadily(lambda: store.put(item), end_s, sent.bag)
+        try:
+            steadily(lambda: store.put(item), tries=float('inf'), until_s=end_s, cap_s=CAP_S)
+        except ForeignObject as error:
+            raise _taken(sent.bag, str(error.data.get('key'))) from error
         told.have(file.size)
 
     with ThreadPoolExecutor(THREADS, 'bag-upload') as pool:
@@ -143,7 +139,7 @@ def deliver(settings: Settings, spool: Spool, sent: Parcel, *, deadline_s: float
         return _wait(spool, sent, uploader, time.monotonic() + deadline_s, told)
 
 
-def is_confirmed(store: Heads, files: Sequence[tuple[str, int, str]]) -> bool:
+def is_confirmed(store: ObjectStore, files: Sequence[tuple[str, int, str]]) -> bool:
     """Whether the store says of every (key, size, SHA-256) that it holds it. Raises StoreError."""
     for key, size, sha256 in files:
         held = store.head(BUCKET, key)
@@ -216,23 +212,6 @@ def _link_or_copy(source: Path, target: Path) -> None:
 def _taken(bag: str, key: str) -> BagError:
     remedy = f'is it another bag? then send it under another name: --name {bag}_b'
     return BagError(f'{key} is there already with other content', remedy=remedy, key=key)
-
-
-def _steadily(put: Callable[[], Put], end_s: float, bag: str) -> None:
-    """Try again while the store is away. Raises StoreError in the end, BagError where another bag has the name."""
-    rng, attempt = random.Random(), 0
-    while True:
-        try:
-            put()
-            return
-        except ForeignObject as error:
-            raise _taken(bag, str(error.data.get('key'))) from error
-        except StoreUnavailable:
-            attempt += 1
-            pause = backoff(attempt, CAP_S, rng)
-            if time.monotonic() + pause >= end_s:
-                raise
-            time.sleep(pause)
 
 
 def _sweep(sending: Path) -> None:

@@ -19,11 +19,12 @@ from shadowhound_data_logger.bags.description import Description, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest, Missing
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.packed import check_tables
-from shadowhound_data_logger.bags.remote import FOREIGN, Listing, RemoteBag, RemoteFile, document, state_of
+from shadowhound_data_logger.bags.remote import FOREIGN, RemoteBag, RemoteFile, document, state_of
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.mcap.index import read_index, records
 from shadowhound_data_logger.mcap.messages import unpack, walk
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
+from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.untrusted import is_path
 
 THREADS: Final = 4
@@ -74,7 +75,7 @@ class _Expected:
     messages: int | None
 
 
-def verify_remote(store: Listing, bag: RemoteBag, *, deep: bool = False, told: Telling = lambda _: None) -> VerifiedBag:
+def verify_remote(store: ObjectStore, bag: RemoteBag, *, deep: bool = False, told: Telling = lambda _: None) -> VerifiedBag:
     """``deep`` reads everything; else what the store says of each file is compared. Raises StoreError."""
     meter = Meter()
     manifest, described, early = _writers_word(lambda name: _stored(store, bag, name))
@@ -140,7 +141,7 @@ def _expected(manifest: Manifest | None, described: Description | None, there: M
     return [*found.values(), *(_Expected(file.name, None, None, None) for file in slices if file.name not in found)]
 
 
-def _check_remote(store: Listing, file: RemoteFile, expected: _Expected, meter: Meter, deep: bool, told: Telling) -> FileCheck:
+def _check_remote(store: ObjectStore, file: RemoteFile, expected: _Expected, meter: Meter, deep: bool, told: Telling) -> FileCheck:
     if expected.size is not None and file.size != expected.size:
         return FileCheck(file.name, f'has {file.size} bytes, {expected.size} were recorded', 'size')
     held = store.head(BUCKET, file.key)
@@ -256,7 +257,7 @@ def _check_sqlite(path: Path, expected: _Expected) -> FileCheck:
     return FileCheck(expected.name, '', 'content')
 
 
-def _stored(store: Listing, bag: RemoteBag, name: str) -> bytes | None:
+def _stored(store: ObjectStore, bag: RemoteBag, name: str) -> bytes | None:
     file = bag.file(name)
     return document(store, file) if file else None
 
@@ -265,6 +266,6 @@ def _local(path: Path) -> bytes | None:
     return read_whole(LocalFile(path)) if path.is_file() else None
 
 
-def _tags(store: Listing, bag: RemoteBag) -> Mapping[str, str]:
+def _tags(store: ObjectStore, bag: RemoteBag) -> Mapping[str, str]:
     held = store.head(BUCKET, bag.slices[0].key) if bag.slices else None
     return held.metadata if held else {}

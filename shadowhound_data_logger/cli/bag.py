@@ -18,7 +18,7 @@ from shadowhound_data_logger.bags.cut import COMES, Choice, Cut, cut_folder, cut
 from shadowhound_data_logger.bags.fetch import THREADS, fetch
 from shadowhound_data_logger.bags.info import BagInfo, info_folder, info_of
 from shadowhound_data_logger.bags.manifest import ClockOf, Missing
-from shadowhound_data_logger.bags.overview import BagRow, NoStore, overview
+from shadowhound_data_logger.bags.overview import BagRow, overview
 from shadowhound_data_logger.bags.record import DEADLINE_S, record
 from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
 from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, parcel, spool_parcel, upload_now
@@ -43,6 +43,7 @@ from shadowhound_data_logger.clock import SystemClock, iso
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import NameRefused, StoreUnavailable
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
+from shadowhound_data_logger.stores.memory import MemoryStore
 from shadowhound_data_logger.times import moment
 
 STORE_THREADS: Final = 8
@@ -105,7 +106,7 @@ def bag_list(*, since: str, robot: str, as_json: bool) -> int:
         try:
             rows = overview(store, robot, the_home(), since_ns=begin_ns)
         except StoreUnavailable as error:
-            rows, away = overview(NoStore(), robot, the_home(), since_ns=begin_ns), str(error)
+            rows, away = overview(MemoryStore(name='no store'), robot, the_home(), since_ns=begin_ns), str(error)
             click.echo(f'The store is away, so this is what is on this machine: {away}', err=True)
     if as_json:
         print_json([with_dates(asdict(row)) for row in rows])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +15,7 @@ from rich.text import Text
 from shadowhound_data_logger.cli.common import as_json, the_store_settings
 from shadowhound_data_logger.cli.output import duration, number, plain, print_json, print_lines, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
+from shadowhound_data_logger.stores import open_reader
 
 SHOWN: Final = 20
 """Of what could not be fetched; --json has all."""
@@ -39,7 +41,7 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
     with asking():
         from shadowhound_data_logger.lake import fetch as lake  # noqa: PLC0415
         from shadowhound_data_logger.lake import fetched_rows  # noqa: PLC0415
-        from shadowhound_data_logger.lake.source import open_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
 
         store = the_store_settings()
         begun_s = time.monotonic()
@@ -47,8 +49,9 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
         rows = [] if prefix is not None else _asked(flags, limit, left_out)
         wishes = list(dict.fromkeys(lake.Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows))
         if prefix is not None:
-            wishes = lake.under(open_source(store, bucket), prefix)
-    with progress(f'0 of {number(len(wishes))} objects', sum(wish.size for wish in wishes), of='bytes') as bar:
+            wishes = lake.under(Bucket(store, bucket), prefix)
+    size = sum(wish.size for wish in wishes)
+    with closing(open_reader(store)) as source, progress(f'0 of {number(len(wishes))} objects', size, of='bytes') as bar:
         here = 0
 
         def tell(size: int, objects: int) -> None:
@@ -57,7 +60,7 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
             bar.have(size)
             bar.say(f'{number(here)} of {number(len(wishes))} objects')
 
-        found = lake.fetch(wishes, to, lambda name: open_source(store, name), verify=verify, threads=threads, tell=tell)
+        found = lake.fetch(wishes, to, source, verify=verify, threads=threads, tell=tell)
         fetched_rows.keep(to, [row for row in rows if f'{row["bucket"]}/{row["key"]}' not in found.failed])
     took_s = time.monotonic() - begun_s
     if as_json:
@@ -66,7 +69,7 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
                 'took_s': round(took_s, 3)}  # fmt: skip
         print_json(told)
     else:
-        where = f'{"" if prefix is None else f"under {prefix} "}in {open_source(store, bucket).describe()}'
+        where = f'{"" if prefix is None else f"under {prefix} "}in {Bucket(store, bucket).describe()}'
         print_lines(*_report(found, len(wishes), took_s, to, where))
         tell_left_out(left_out)
     return 1 if found.failed or len(left_out) else 0

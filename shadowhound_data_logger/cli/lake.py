@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import asdict
 from datetime import timedelta
 from pathlib import Path
@@ -18,6 +19,7 @@ from shadowhound_data_logger.cli.output import duration, number, plain, plain_ta
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.ship.audit import KINDS, Audit, audit
+from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.times import moment
 
 if TYPE_CHECKING:
@@ -150,9 +152,8 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
         if not len(theirs) and catalogue:
             raise click.UsageError(f'there are no rows in {catalogue}: `shadowhound-data fetch ROBOT/_catalog/ --to {catalogue}`')
         rows, lacking = (theirs.joined(own), theirs.lacking(own)) if catalogue else (own, [])
-    with the_store() as target, progress('read back' if deep else 'asked for', len(rows), of='objects') as bar:
-        asked = library.Asked(store, target.probe)
-        found = audit(rows, asked, deep=deep, threads=threads, keys=None, tell=bar.have)
+    with closing(open_reader(store)) as target, progress('read back' if deep else 'asked for', len(rows), of='objects') as bar:
+        found = audit(rows, target, deep=deep, threads=threads, keys=None, tell=bar.have)
         where = target.describe()
     said = {'store': where, 'catalogue': catalogue and str(catalogue), **_said(rows, found, lacking, deep=deep)}
     said['took_s'] = round(time.monotonic() - begun_s, 3)

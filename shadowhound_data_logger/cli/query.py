@@ -128,11 +128,11 @@ def _pictures(source: Any, rows: Sequence[Mapping[str, Any]], flags: Mapping[str
               ground: Path | None) -> None:  # fmt: skip
     from shadowhound_data_logger.lake import pictures  # noqa: PLC0415
     from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415
+    from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
     from shadowhound_data_logger.lake.select import wanted  # noqa: PLC0415
-    from shadowhound_data_logger.lake.source import open_source  # noqa: PLC0415
 
     if sheet:
-        pictures.sheet(rows, lambda bucket: open_source(source.settings, bucket), question_text(flags), sheet)
+        pictures.sheet(rows, lambda bucket: Bucket(source.settings, bucket), question_text(flags), sheet)
         click.echo(f'Wrote {sheet}', err=True)
     if ground:
         around = {name: flags[name] for name in ('robot', 'since', 'until') if name in flags}

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from shadowhound_data_logger.errors import LakeError, NameRefused, ObjectRefused
-from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.lake.track import Object
-from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.download import damaged, twice
+from shadowhound_data_logger.stores.retry import steadily
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, path_below
 
 if TYPE_CHECKING:
@@ -24,8 +29,6 @@ if TYPE_CHECKING:
 
 Read = Callable[[str, str, int], bytes]
 """From bucket, key and size to content."""
-TRIES: Final = 3
-"""Of content that is damaged on its way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +41,12 @@ class Place:
 
     def read(self, bucket: str, key: str, most: int) -> bytes:
         """Raises StoreError; ObjectRefused where it is larger than it should be, of which nothing is read then."""
-        if self.folder is None and self.settings.endpoint_url:
-            from shadowhound_data_logger.stores import s3_get  # noqa: PLC0415 - a folder needs no botocore
-
-            return s3_get.read(self.settings, bucket, key, most)
+        if self.folder is None:
+            store = _of_this_process(self.settings, os.getpid())
+            return steadily(lambda: store.get(bucket, key, most))
         where: dict[str, Any] = {'bucket': bucket, 'key': key}
         try:
-            path = path_below(self.folder or self.settings.directory / check_name(bucket, 'the bucket'), key)
+            path = path_below(self.folder, key)
             with path.open('rb') as file:
                 body = file.read(most + 1)
         except NameRefused as error:
@@ -131,12 +133,23 @@ class Bodies:
         if not 0 < wanted.size <= MOST_OBJECT_BYTES:
             text = f'{wanted.bucket}/{wanted.key} has {wanted.size:,} bytes; more than {MOST_OBJECT_BYTES:,} are not decoded'
             raise LakeError(text, bucket=wanted.bucket, key=wanted.key)
-        for left in reversed(range(TRIES)):
+
+        def once() -> bytes:
             body = self._read(wanted.bucket, wanted.key, wanted.size)
             if not wanted.sha256 or hashlib.sha256(body).hexdigest() == wanted.sha256:
                 return body
-            if not left or self._over.is_set():
-                break
-        raise LakeError(
-            f'the content of {wanted.bucket}/{wanted.key} is not what was stored', bucket=wanted.bucket, key=wanted.key
-        )
+            raise damaged(wanted.bucket, wanted.key, 'its SHA-256 is another')
+
+        try:
+            return twice(once)
+        except ObjectRefused as error:
+            if error.data.get('reason') != 'damaged':
+                raise
+            text = f'the content of {wanted.bucket}/{wanted.key} is not what was stored'
+            raise LakeError(text, bucket=wanted.bucket, key=wanted.key) from error
+
+
+@lru_cache(maxsize=4)
+def _of_this_process(settings: StoreSettings, _process: int) -> ObjectStore:
+    """A forked process makes one of its own: no thread and no connection is taken over from the parent."""
+    return open_store(settings, UploadSettings())

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from shadowhound_data_logger.catalogue.parts import ABOUT
 from shadowhound_data_logger.errors import AccessDenied
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.putting import put_part
 from shadowhound_data_logger.lake.reading import THREADS, arrow_schema, whole
 from shadowhound_data_logger.lake.scan import unrepeated
-from shadowhound_data_logger.lake.source import Entry, Source
 from shadowhound_data_logger.lake.standing import (
     LEAVES,
     Day,
@@ -38,6 +38,7 @@ from shadowhound_data_logger.lake.standing import (
     name_of,
     robots,
 )
+from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 
 GRACE: Final = timedelta(hours=1)
@@ -70,7 +71,7 @@ class Compacted:
 
 
 def compact(  # noqa: PLR0913 - what is handed in
-    source: Source, store: ObjectStore, *, robot: str | None = None, before: str = '', grace: timedelta | None = GRACE,
+    source: Bucket, store: ObjectStore, *, robot: str | None = None, before: str = '', grace: timedelta | None = GRACE,
     findings: Findings | None = None,
     now: Callable[[], datetime] = lambda: datetime.now(timezone.utc), monotonic: Callable[[], float] = time.monotonic,
 ) -> Iterator[Compacted]:  # fmt: skip
@@ -92,7 +93,7 @@ def compact(  # noqa: PLR0913 - what is handed in
                         yield done
 
 
-def _merge(source: Source, store: ObjectStore, day: Day, findings: Findings, is_in_time: Callable[[], bool]) -> Compacted:
+def _merge(source: Bucket, store: ObjectStore, day: Day, findings: Findings, is_in_time: Callable[[], bool]) -> Compacted:
     nothing = Compacted(day.robot, day.date)
     if len(day.entries) < 2:
         return nothing
@@ -112,9 +113,9 @@ def _merge(source: Source, store: ObjectStore, day: Day, findings: Findings, is_
     return replace(nothing, merged=len(merged), rows=len(rows), size=len(body))
 
 
-def _rows(source: Source, day: Day, findings: Findings) -> tuple[list[Entry], pa.Table]:
+def _rows(source: Bucket, day: Day, findings: Findings) -> tuple[list[ObjectInfo], pa.Table]:
     """The parts that can be merged, and what is in them. Raises MemoryError for more than ``MOST_DAY_BYTES``."""
-    merged: list[Entry] = []
+    merged: list[ObjectInfo] = []
     found: list[pa.Table] = [arrow_schema().empty_table()]
     size = 0
     for entry, table in whole(source, day.entries, findings):
@@ -134,9 +135,10 @@ def _encoded(rows: pa.Table, leaves: frozenset[str]) -> bytes:
     return bytes(body.getvalue().to_pybytes())
 
 
-def _tidy(source: Source, day: Day, done: Compacted, grace: timedelta | None, now: datetime) -> Compacted:
+def _tidy(source: Bucket, day: Day, done: Compacted, grace: timedelta | None, now: datetime) -> Compacted:
     """Delete what is stood for since long enough; of a day that was merged just now, that is for a later run."""
-    fresh = [entry for entry in day.entries if is_compacted(entry.key) and (grace is None or now - entry.modified < grace)]
+    compacted = [entry.modified for entry in day.entries if is_compacted(entry.key)]
+    fresh = [modified for modified in compacted if grace is None or modified is None or now - modified < grace]
     if done.merged or fresh or not day.covered:
         return replace(done, kept=len(day.covered) + done.merged)
     deleted = 0
@@ -146,9 +148,9 @@ def _tidy(source: Source, day: Day, done: Compacted, grace: timedelta | None, no
     return replace(done, deleted=deleted, kept=len(day.covered) - deleted, denied=deleted < len(day.covered))
 
 
-def _delete(source: Source, entry: Entry) -> bool:
+def _delete(source: Bucket, entry: ObjectInfo) -> bool:
     try:
-        source.delete([entry.key])
+        source.delete(entry.key)
     except AccessDenied:
         return False
     return True

@@ -25,7 +25,7 @@ from shadowhound_data_logger.lake.track import Object, Track
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from shadowhound_data_logger.lake.source import Source
+    from shadowhound_data_logger.lake.bucket import Bucket
 
 THREADS: Final = 8
 """Requests on their way at a time, in each process."""
@@ -46,7 +46,7 @@ class MissionDataset:
     """
 
     def __init__(
-        self, source: Source | Path | str | None = None, *, anchor: str = 'camera',
+        self, source: Bucket | Path | str | None = None, *, anchor: str = 'camera',
         align: Mapping[str, float | Near | Window] | None = None, size: tuple[int, int] | None = None,
         drop_incomplete: bool = False, **flags: Any,
     ) -> None:  # fmt: skip

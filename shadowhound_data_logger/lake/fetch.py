@@ -6,7 +6,6 @@ It may be killed at any moment and goes on where it was. A file's place is its k
 from __future__ import annotations
 
 import errno
-import hashlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,8 +18,12 @@ from typing import Final
 
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import AccessDenied, BucketMissing, LakeError, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetched import FOLDER, Fetched, Verified
-from shadowhound_data_logger.lake.source import Source
+from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.download import download
+from shadowhound_data_logger.stores.retry import steadily
 from shadowhound_data_logger.untrusted import is_path
 
 THREADS: Final = 16
@@ -28,9 +31,7 @@ AHEAD: Final = 8
 """Objects that wait for each thread: enough that none is idle, few enough that an interrupt is prompt."""
 NOTE_S: Final = 1.0
 """What a kill can make it hash again."""
-TRIES: Final = 3
 _NO_DISK: Final = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
-_DAMAGED: Final = 'damaged'
 AWAY: Final = 8
 """Objects after one another that the store does not answer for: it is away, and the others need not try."""
 
@@ -70,15 +71,13 @@ class _Done:
     proved: bool
 
 
-def under(source: Source, prefix: str) -> list[Wish]:
+def under(source: Bucket, prefix: str) -> list[Wish]:
     """All whose keys begin so. Raises StoreError."""
-    return sorted(
-        (Wish(source.bucket, entry.key, entry.size, etag=entry.etag) for entry in source.list(prefix)), key=lambda wish: wish.key
-    )
+    return [Wish(source.name, entry.key, entry.size, etag=entry.etag) for entry in source.list(prefix)]
 
 
 def fetch(
-    wishes: Sequence[Wish], folder: Path, open_bucket: Callable[[str], Source], *, verify: bool = False, threads: int = THREADS,
+    wishes: Sequence[Wish], folder: Path, store: ObjectStore, *, verify: bool = False, threads: int = THREADS,
     tell: Callable[[int, int], None] = lambda _bytes, _objects: None,
 ) -> Result:  # fmt: skip
     """Put them there; ``verify`` reads what is there already once more. ``tell`` hears of bytes and objects, from any thread.
@@ -86,20 +85,19 @@ def fetch(
     Raises StoreError where the store as a whole refuses or is away, LakeError where the folder cannot be written.
     """
     with Fetched(folder) as fetched, ThreadPoolExecutor(threads, 'fetch') as pool:
-        return _Fetch(fetched, open_bucket, tell, verify=verify).run(wishes, pool, threads * AHEAD)
+        return _Fetch(fetched, store, tell, verify=verify).run(wishes, pool, threads * AHEAD)
 
 
 class _Fetch:
     """One run. The calling thread decides and notes; the pool moves."""
 
-    def __init__(self, fetched: Fetched, open_bucket: Callable[[str], Source], tell: Callable[[int, int], None], *,
+    def __init__(self, fetched: Fetched, store: ObjectStore, tell: Callable[[int, int], None], *,
                  verify: bool) -> None:  # fmt: skip
         self._fetched = fetched
-        self._open_bucket = open_bucket
+        self._store = store
         self._tell = tell
         self._verify = verify
         self._numbers = count()
-        self._folders: set[Path] = set()
         self._over = threading.Event()
         self._fresh: list[Verified] = []
         self._noted_s = time.monotonic()
@@ -144,7 +142,7 @@ class _Fetch:
         try:
             self._count(future.result())
         except (ObjectRefused, AccessDenied, BucketMissing) as error:
-            self._fail(wish, str(error))
+            self._fail(wish, error.data.get('why') or str(error))
         except StoreUnavailable as error:
             self._silent += 1
             if self._silent >= AWAY:
@@ -180,65 +178,50 @@ class _Fetch:
     # -- on the threads of the pool --------------------------------------------------------------------------------
 
     def _bring(self, wish: Wish) -> _Done:
-        source, path = self._open_bucket(wish.bucket), self._fetched.path(wish.key)
-        held = self._held(wish, source, path)
-        if held is not None:
-            self._tell(wish.size, 1)
-            return held
-        for left in reversed(range(TRIES)):
-            try:
-                return self._move(wish, source, path)
-            except (StoreUnavailable, ObjectRefused) as error:
-                passing = isinstance(error, StoreUnavailable) or error.data.get('reason') == _DAMAGED
-                if not (passing and left) or self._over.is_set():
-                    raise
-        raise AssertionError('unreachable')
+        path = self._fetched.path(wish.key)
+        held = self._held(wish, path)
+        if held is None:
+            return self._move(wish, path)
+        self._tell(wish.size, 1)
+        return held
 
-    def _held(self, wish: Wish, source: Source, path: Path) -> _Done | None:
+    def _held(self, wish: Wish, path: Path) -> _Done | None:
         """What is there already, if it is what was stored: left by a run that was killed, or by another program."""
         if not path.is_file() or path.stat().st_size != wish.size:
             return None
-        info = None if wish.sha256 else source.head(wish.key)
+        info = None if wish.sha256 else steadily(lambda: self._store.head(wish.bucket, wish.key), pause=self._pause)
         expected = wish.sha256 or (info and info.sha256)
         seen = path.stat()
         if expected is None or fingerprint(path)[1] != expected:
             return None
         return _Done(Verified(wish.key, wish.bucket, wish.size, seen.st_mtime_ns, expected, wish.etag), moved=False, proved=True)
 
-    def _move(self, wish: Wish, source: Source, path: Path) -> _Done:
+    def _move(self, wish: Wish, path: Path) -> _Done:
         part = self._fetched.parts / str(next(self._numbers))
-        moved, digest = 0, hashlib.sha256()
+        moved = 0
+
+        def tell(size: int) -> None:
+            nonlocal moved
+            if self._over.is_set():
+                raise LakeError('the fetch was broken off')
+            moved += size
+            self._tell(size, 0)
+
         try:
-            content = source.get(wish.key)
-            _check_size(wish, content.size)  # before a byte of it takes room
-            with part.open('wb') as file:
-                for piece in content.pieces:
-                    self._go_on()
-                    digest.update(piece)
-                    file.write(piece)
-                    moved += len(piece)
-                    self._tell(len(piece), 0)
-            sha256, expected = digest.hexdigest(), wish.sha256 or content.metadata.get('sha256')
-            _check(wish, moved, sha256, expected)
-            self._make_folder(path.parent)
-            part.replace(path)
+            wanted = ObjectInfo(wish.bucket, wish.key, wish.size, wish.sha256)
+            found = download(self._store, wanted, path, part=part, is_synced=False, tell=tell, pause=self._pause)
         except BaseException:
             self._tell(-moved, 0)
             part.unlink(missing_ok=True)
             raise
         self._tell(0, 1)
-        file_ = Verified(wish.key, wish.bucket, moved, path.stat().st_mtime_ns, sha256, wish.etag)
-        return _Done(file_, moved=True, proved=expected is not None)
+        file = Verified(wish.key, wish.bucket, wish.size, path.stat().st_mtime_ns, found.sha256, wish.etag)
+        return _Done(file, moved=True, proved=found.is_proved)
 
-    def _go_on(self) -> None:
-        """Raises StoreUnavailable where the run is over: nobody waits for this object any more."""
-        if self._over.is_set():
-            raise StoreUnavailable('the fetch was broken off')
-
-    def _make_folder(self, folder: Path) -> None:
-        if folder not in self._folders:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._folders.add(folder)
+    def _pause(self, seconds: float) -> None:
+        """Between two tries. Raises LakeError where the run is over: nobody waits for this object any more."""
+        if self._over.wait(seconds):
+            raise LakeError('the fetch was broken off')
 
 
 def _refusal(wish: Wish) -> str:
@@ -254,19 +237,3 @@ def _is(known: Verified, wish: Wish) -> bool:
     if wish.sha256 is not None:
         return same and known.sha256 == wish.sha256
     return same and (not wish.etag or not known.etag or known.etag == wish.etag)
-
-
-def _check(wish: Wish, size: int, sha256: str, expected: str | None) -> None:
-    """Raises ObjectRefused for content that is not what was stored."""
-    _check_size(wish, size)
-    if expected is not None and sha256 != expected:
-        raise _damaged(wish, f'its SHA-256 is {sha256[:12]}... instead of {expected[:12]}...')
-
-
-def _check_size(wish: Wish, size: int) -> None:
-    if size != wish.size:
-        raise _damaged(wish, f'it has {size} bytes instead of {wish.size}')
-
-
-def _damaged(wish: Wish, why: str) -> ObjectRefused:
-    return ObjectRefused(why, bucket=wish.bucket, key=wish.key, reason=_DAMAGED)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
-from shadowhound_data_logger.lake.source import Source
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.missions.contact_sheet import MOST, LoggedFrame, contact_sheet
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
 
@@ -27,7 +27,7 @@ DOTS: Final = 60
 """Area of an object on the ground, in square points, where there are few."""
 
 
-def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Source], title: str, target: Path) -> None:
+def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Bucket], title: str, target: Path) -> None:
     """A JPEG with up to twenty of the images among the rows, evenly chosen; a frame's number is its row's, from 1.
 
     Raises LakeError where there is none, StoreError.
@@ -43,7 +43,7 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Source
         number, row = numbered
         path = Path(folder, str(number))
         try:
-            path.write_bytes(open_bucket(row['bucket']).read(row['key'], MOST_OBJECT_BYTES))
+            path.write_bytes(open_bucket(row['bucket']).get(row['key'], MOST_OBJECT_BYTES))
         except ObjectRefused:  # the catalogue outlives what is deleted
             return None
         return LoggedFrame(row.get('t_start_ns') or 0, number, path)

@@ -23,11 +23,11 @@ from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.reading import THREADS
 from shadowhound_data_logger.lake.scan import Catalogue
 from shadowhound_data_logger.lake.select import Wanted, wanted
-from shadowhound_data_logger.lake.source import Source, open_source
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.untrusted import MOST_SUMMARY_BYTES, from_json
 
@@ -54,15 +54,15 @@ _SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
 class _Asked:
     """What is asked, and where what it leaves out is told."""
 
-    source: Source
+    source: Bucket
     findings: Findings
 
     @classmethod
-    def of(cls, source: Source | None, findings: Findings | None) -> _Asked:
+    def of(cls, source: Bucket | None, findings: Findings | None) -> _Asked:
         return cls(source or default_source(), Findings() if findings is None else findings)
 
 
-def objects(source: Source | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
+def objects(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
     """One row an object, with the columns of ``catalogue/schema.py``.
 
     ``flags`` are those of ``select.wanted``: ``sensor topic robot since until near mission mission_type success where``.
@@ -72,17 +72,17 @@ def objects(source: Source | None = None, *, findings: Findings | None = None, *
     return _objects(_Asked.of(source, findings), wanted(time.time_ns(), **flags))
 
 
-def missions(source: Source | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
+def missions(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
     """One row a mission that has objects among the wanted ones, and how it ended. Reads catalogue and summaries at once."""
     return _missions(_Asked.of(source, findings), wanted(time.time_ns(), **flags))
 
 
-def topics(source: Source | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
+def topics(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
     """One row a robot and topic: how many objects, bytes and messages, from when to when."""
     return _topics(_objects(_Asked.of(source, findings), wanted(time.time_ns(), **flags)))
 
 
-def sql(query: str, source: Source | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
+def sql(query: str, source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
     """SQL over the three views, each restricted by the flags. Raises LakeError for what is no SQL or names no column."""
     chosen, asked = _Asked.of(source, findings), wanted(time.time_ns(), **flags)
     rows = _objects(chosen, asked)
@@ -93,9 +93,9 @@ def sql(query: str, source: Source | None = None, *, findings: Findings | None =
         return daft.sql(query, register_globals=False, **views)
 
 
-def default_source(settings: StoreSettings | None = None) -> Source:
+def default_source(settings: StoreSettings | None = None) -> Bucket:
     """The bucket with the catalogue in the store that the environment names."""
-    return open_source(settings or store_settings(os.environ, home(os.environ)), schema.BUCKET)
+    return Bucket(settings or store_settings(os.environ, home(os.environ)), schema.BUCKET)
 
 
 @contextmanager
@@ -185,12 +185,12 @@ def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:
     return dict(zip(found['mission_id'], found['run_id'], strict=True))
 
 
-def _summary(source: Source, robot: str, run_id: str | None) -> dict[str, Any]:
+def _summary(source: Bucket, robot: str, run_id: str | None) -> dict[str, Any]:
     """What a mission's summary says; empty where there is none yet, or none that can be read."""
     if run_id is None:
         return {}
     try:
-        told = from_json(source.read(f'{robot}/missions/{run_id}/summary.json', MOST_SUMMARY_BYTES), MOST_SUMMARY_BYTES)
+        told = from_json(source.get(f'{robot}/missions/{run_id}/summary.json', MOST_SUMMARY_BYTES), MOST_SUMMARY_BYTES)
     except (ObjectRefused, ValueError):
         return {}
     return told if isinstance(told, dict) else {}

@@ -25,9 +25,10 @@ from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRI
 from shadowhound_data_logger.catalogue.schema import COLUMNS, REQUIRED
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.lake.source import Entry, Source
+from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.untrusted import check_size, is_path
 
 THREADS: Final = 16
@@ -65,7 +66,7 @@ UNREADABLE: Final = (pa.ArrowException, OSError, MemoryError, ValueError, Lookup
 """What comes of a file that is no part."""
 
 
-def tables(source: Source, entries: Sequence[Entry], columns: Sequence[str], findings: Findings,
+def tables(source: Bucket, entries: Sequence[ObjectInfo], columns: Sequence[str], findings: Findings,
            wanted: Wanted | None = None) -> Iterator[pa.Table]:  # fmt: skip
     """The rows of these parts, in their order, some megabytes at a time; a column that a part does not have yet is null.
 
@@ -85,7 +86,7 @@ def tables(source: Source, entries: Sequence[Entry], columns: Sequence[str], fin
     yield from rows.taken(columns)
 
 
-def whole(source: Source, entries: Sequence[Entry], findings: Findings) -> Iterator[tuple[Entry, pa.Table]]:
+def whole(source: Bucket, entries: Sequence[ObjectInfo], findings: Findings) -> Iterator[tuple[ObjectInfo, pa.Table]]:
     """All columns of each of these parts of which nothing is left out. Raises StoreError."""
     schema = narrow(arrow_schema().names)
     for entry, body in _bodies(source, entries):
@@ -113,7 +114,7 @@ def narrow(columns: Sequence[str]) -> pa.Schema:
     return pa.schema([schema.field(name) for name in columns])
 
 
-def footer(source: Source, entry: Entry) -> Mapping[bytes, bytes]:
+def footer(source: Bucket, entry: ObjectInfo) -> Mapping[bytes, bytes]:
     """What a part says of itself beside its rows. Raises ValueError and its kind for a file that is no part, StoreError."""
     if not is_path(entry.key):
         raise ValueError('its name is no path')
@@ -129,12 +130,12 @@ def _robot(key: str) -> str:
     return key.partition('/')[0]
 
 
-def _bodies(source: Source, entries: Sequence[Entry]) -> Iterator[tuple[Entry, bytes | ObjectRefused | None]]:
+def _bodies(source: Bucket, entries: Sequence[ObjectInfo]) -> Iterator[tuple[ObjectInfo, bytes | ObjectRefused | None]]:
     """Each with its content where that is small, or why it cannot be had."""
 
-    def body(entry: Entry) -> bytes | ObjectRefused | None:
+    def body(entry: ObjectInfo) -> bytes | ObjectRefused | None:
         try:
-            return source.read(entry.key, SMALL_BYTES) if entry.size <= SMALL_BYTES and is_path(entry.key) else None
+            return source.get(entry.key, SMALL_BYTES) if entry.size <= SMALL_BYTES and is_path(entry.key) else None
         except ObjectRefused as error:
             if error.data.get('reason') == 'missing':
                 raise
@@ -146,7 +147,7 @@ def _bodies(source: Source, entries: Sequence[Entry]) -> Iterator[tuple[Entry, b
             yield from zip(some, pool.map(body, some), strict=True)
 
 
-def _contents(source: Source, entry: Entry, body: bytes | ObjectRefused | None, schema: pa.Schema, findings: Findings,
+def _contents(source: Bucket, entry: ObjectInfo, body: bytes | ObjectRefused | None, schema: pa.Schema, findings: Findings,
               wanted: Wanted | None) -> Iterator[tuple[pa.Table, int]]:  # fmt: skip
     """The rows of one part, as far as it is one, and how many bytes they take."""
     done, part = 0, None
@@ -272,7 +273,7 @@ class _Chunk(NamedTuple):
 class _Part:
     """A file that should be a part. What it does is on the caller's thread; anything of ``UNREADABLE`` says that it is none."""
 
-    def __init__(self, source: Source, entry: Entry, body: bytes | None) -> None:
+    def __init__(self, source: Bucket, entry: ObjectInfo, body: bytes | None) -> None:
         """``body`` is all of it where it is small."""
         check_size(entry.size, MOST_BYTES)
         self._source, self._entry, self._body = source, entry, body
@@ -389,11 +390,11 @@ class _Held(io.RawIOBase):
         return found[:size]
 
 
-def _tail(source: Source, entry: Entry) -> bytes:
+def _tail(source: Bucket, entry: ObjectInfo) -> bytes:
     """The end of a file, its footer in it."""
-    tail = source.tail(entry.key, min(entry.size, FOOTER_BYTES))
+    (tail,) = source.ranges(entry.key, [(max(0, entry.size - FOOTER_BYTES), entry.size)])
     size = _footer_size(tail, entry.size)
-    return tail if size <= len(tail) else source.tail(entry.key, size)
+    return tail if size <= len(tail) else source.ranges(entry.key, [(entry.size - size, entry.size)])[0]
 
 
 def _footer_size(tail: bytes, size: int) -> int:

@@ -14,15 +14,15 @@ from typing import Final
 
 from shadowhound_data_logger.catalogue import parts
 from shadowhound_data_logger.catalogue.schema import BUCKET, Row, is_row, row_of
-from shadowhound_data_logger.errors import StoreUnavailable
 from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.putting import put_part
 from shadowhound_data_logger.lake.reading import THREADS, tables
 from shadowhound_data_logger.lake.scan import KEY, folders
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.lake.source import Entry, Source, open_source
 from shadowhound_data_logger.lake.standing import mended_key
+from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 
 BUCKETS: Final = (BUCKET, 'trajectories')
@@ -43,7 +43,7 @@ class Reindexed:
 
 
 def reindex(
-    source: Source, store: ObjectStore, robot: str, *, buckets: tuple[str, ...] = BUCKETS,
+    source: Bucket, store: ObjectStore, robot: str, *, buckets: tuple[str, ...] = BUCKETS,
     tell: Callable[[Reindexed], None] = lambda _: None, findings: Findings | None = None,
 ) -> Reindexed:  # fmt: skip
     """Add what is missing of one robot, and what stands only in parts that are left out.
@@ -54,7 +54,7 @@ def reindex(
     found = Reindexed()
     known = _known(source, robot, Findings() if findings is None else findings)
     for bucket in buckets:
-        place = open_source(source.settings, bucket)
+        place = Bucket(source.settings, bucket)
         entries = (entry for entry in place.list(f'{robot}/') if is_row(bucket, entry.key))
         while page := list(islice(entries, PAGE)):
             found.listed += len(page)
@@ -72,25 +72,18 @@ def reindex(
     return found
 
 
-def _known(source: Source, robot: str, findings: Findings) -> set[tuple[str, str]]:
+def _known(source: Bucket, robot: str, findings: Findings) -> set[tuple[str, str]]:
     entries = [entry for day in folders(source, Wanted(robot=robot), findings) for entry in day.entries]
     found = tables(source, entries, KEY, findings)
     return {pair for rows in found for pair in zip(*(rows[name].to_pylist() for name in KEY), strict=True)}
 
 
-def _rows(place: Source, entries: list[Entry]) -> Iterator[Row]:
+def _rows(place: Bucket, entries: list[ObjectInfo]) -> Iterator[Row]:
     """An object that is gone meanwhile has none."""
 
-    def row(entry: Entry) -> Row | None:
-        for left in reversed(range(_TRIES)):
-            try:
-                info = place.head(entry.key)
-            except StoreUnavailable:
-                if not left:
-                    raise
-            else:
-                return None if info is None else row_of(place.bucket, entry.key, info.size, info.content_type, info.metadata)
-        return None
+    def row(entry: ObjectInfo) -> Row | None:
+        info = place.head(entry.key)
+        return None if info is None else row_of(place.name, entry.key, info.size, info.content_type, info.metadata)
 
     with ThreadPoolExecutor(THREADS) as pool:
         yield from (found for found in pool.map(row, entries) if found is not None)

@@ -17,11 +17,12 @@ from typing import Final, TypeVar
 import pyarrow as pa
 
 from shadowhound_data_logger.lake import reading
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, THREADS, arrow_schema
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.lake.source import Entry, Source
 from shadowhound_data_logger.lake.standing import Day, days, robots
+from shadowhound_data_logger.model import ObjectInfo
 
 os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # else it tells its makers of each run, over the network
 os.environ.setdefault('DAFT_PROGRESS_BAR', '0')
@@ -40,7 +41,7 @@ _ROW: Final = (*KEY, 't_start_ns')
 class Catalogue(DataSource):
     """The rows of one bucket's catalogue that can be wanted. Stateless but for what it leaves out: each run lists anew."""
 
-    def __init__(self, source: Source, wanted: Wanted, findings: Findings) -> None:
+    def __init__(self, source: Bucket, wanted: Wanted, findings: Findings) -> None:
         self._source = source
         self._wanted = wanted
         self._findings = findings
@@ -69,15 +70,15 @@ class Catalogue(DataSource):
                 if entry.size > SMALL_BYTES:
                     yield self._parts([entry], columns)
 
-    def _parts(self, entries: Sequence[Entry], columns: Sequence[str], *, once: bool = False) -> _Parts:
+    def _parts(self, entries: Sequence[ObjectInfo], columns: Sequence[str], *, once: bool = False) -> _Parts:
         return _Parts(self._source, entries, columns, self._wanted, self._findings, once=once)
 
 
 class _Parts(DataSourceTask):
     """Parts that are read together, from the store to batches of the columns that are needed."""
 
-    def __init__(self, source: Source, entries: Sequence[Entry], columns: Sequence[str], wanted: Wanted, findings: Findings, *,
-                 once: bool) -> None:  # fmt: skip
+    def __init__(self, source: Bucket, entries: Sequence[ObjectInfo], columns: Sequence[str], wanted: Wanted,
+                 findings: Findings, *, once: bool) -> None:  # fmt: skip
         """``once``: of rows with the same key and time one is kept."""
         self._source = source
         self._entries = tuple(entries)
@@ -114,7 +115,7 @@ async def _apart(work: Callable[[], _Answer]) -> _Answer:
         return await asyncio.get_running_loop().run_in_executor(pool, work)
 
 
-def folders(source: Source, wanted: Wanted, findings: Findings) -> list[Day]:
+def folders(source: Bucket, wanted: Wanted, findings: Findings) -> list[Day]:
     """The days whose parts can hold what is wanted. Raises StoreError."""
     named = [wanted.robot] if wanted.robot else robots(source)
     with ThreadPoolExecutor(THREADS) as pool:

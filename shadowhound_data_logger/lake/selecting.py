@@ -11,11 +11,10 @@ from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import query  # first: it turns Daft's telemetry off
 from shadowhound_data_logger.lake.bodies import Place
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES, extension_of
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.folder_source import FolderSource
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
-from shadowhound_data_logger.lake.source import Source
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.untrusted import MOST_MEMBERS
@@ -25,7 +24,7 @@ from daft import col  # isort: skip
 Row = dict[str, Any]
 
 
-def place(source: Source | Path | str | None) -> tuple[Place, Source]:
+def place(source: Bucket | Path | str | None) -> tuple[Place, Bucket]:
     """Where contents come from, and where the catalogue is. Raises LakeError for a folder without one."""
     if isinstance(source, (str, Path)):
         if not any(Path(source).glob(f'*/{SENSOR}')):
@@ -38,13 +37,13 @@ def place(source: Source | Path | str | None) -> tuple[Place, Source]:
     return Place(found.settings), found
 
 
-def fetched(folder: Path) -> Source:
+def fetched(folder: Path) -> Bucket:
     """A folder of fetched objects as a lake: their rows lie in it as well (lake/fetched_rows.py)."""
     whole = folder.absolute()
-    return FolderSource(StoreSettings(directory=whole.parent), whole.name)
+    return Bucket(StoreSettings(directory=whole.parent), whole.name)
 
 
-def select(source: Source, anchor: str, aligned: Mapping[str, Near | Window], size: tuple[int, int] | None,
+def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], size: tuple[int, int] | None,
            flags: Mapping[str, Any], findings: Findings) -> Selection:  # fmt: skip
     """Raises SettingError for what is no question, LakeError where nothing is known of an aligned sensor, StoreError."""
     for name, how in aligned.items():
@@ -57,7 +56,7 @@ def select(source: Source, anchor: str, aligned: Mapping[str, Near | Window], si
     return Selection(tuple(anchors.values()), dict(aligned), sides, size)
 
 
-def _sides(source: Source, anchors: list[Track], aligned: Mapping[str, Near | Window],
+def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Window],
            findings: Findings) -> dict[tuple[str, str], Track]:  # fmt: skip
     if not aligned:
         return {}

@@ -19,8 +19,9 @@ from typing import Final
 from shadowhound_data_logger.catalogue.schema import part_key, prefix
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.source import Entry, Source
+from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.untrusted import from_json
 
 LEAVES: Final = 'shadowhound.leaves'
@@ -39,9 +40,9 @@ class Day:
 
     robot: str
     date: str
-    entries: tuple[Entry, ...]
+    entries: tuple[ObjectInfo, ...]
     """What is to be read: each row stands in one of them."""
-    covered: tuple[Entry, ...]
+    covered: tuple[ObjectInfo, ...]
     """What those stand for and is still there."""
     leaves: Mapping[str, frozenset[str]]
     """Key of a compacted part among ``entries`` -> the names of the robot's parts that it holds; not of one that is alone."""
@@ -84,12 +85,12 @@ def encode_leaves(names: Iterable[str]) -> str:
     return base64.b64encode(zlib.compress(json.dumps(sorted(names)).encode())).decode('ascii')
 
 
-def robots(source: Source) -> list[str]:
+def robots(source: Bucket) -> list[str]:
     """Those that have a folder. Raises StoreError."""
     return [name for name in source.folders('') if is_name(name)]
 
 
-def dates_of(source: Source, robot: str, findings: Findings) -> list[str]:
+def dates_of(source: Bucket, robot: str, findings: Findings) -> list[str]:
     """The dates of which a robot has rows. Raises StoreError."""
     try:
         return [name[5:] for name in source.folders(prefix(robot)) if _FOLDER.fullmatch(name)]
@@ -98,7 +99,7 @@ def dates_of(source: Source, robot: str, findings: Findings) -> list[str]:
         return []
 
 
-def days(source: Source, named: Sequence[str], dates: Sequence[str] | None, pool: Executor, findings: Findings,
+def days(source: Bucket, named: Sequence[str], dates: Sequence[str] | None, pool: Executor, findings: Findings,
          has: Callable[[str], bool] = lambda _: True) -> list[Day]:  # fmt: skip
     """The folders of these robots and dates (None: of all that there are, those it ``has``) that hold something, oldest first.
 
@@ -110,7 +111,7 @@ def days(source: Source, named: Sequence[str], dates: Sequence[str] | None, pool
     return [day for day in found if day.entries]
 
 
-def _day(source: Source, robot: str, date: str, findings: Findings) -> Day:
+def _day(source: Bucket, robot: str, date: str, findings: Findings) -> Day:
     """What a part says that is no good, or contradicts others, is left out: neither read nor stood for."""
     try:
         entries = [entry for entry in source.list(folder_of(robot, date)) if entry.key.endswith('.parquet')]
@@ -132,13 +133,13 @@ def _day(source: Source, robot: str, date: str, findings: Findings) -> Day:
             entries = [entry for entry in entries if entry.key != error.data['key']]
 
 
-def standing(robot: str, date: str, entries: Sequence[Entry], leaves: dict[str, frozenset[str]]) -> Day:
+def standing(robot: str, date: str, entries: Sequence[ObjectInfo], leaves: dict[str, frozenset[str]]) -> Day:
     """Of parts and compacted parts: the fullest first, then others that share nothing with it, then parts that none holds.
 
     Raises LakeError where a part is gone and the compacted part that held it contradicts a fuller one.
     """
     held: set[str] = set()
-    stand: list[Entry] = []
+    stand: list[ObjectInfo] = []
     names = {name_of(entry.key) for entry in entries}
     for entry in sorted(entries, key=lambda entry: (-len(leaves.get(entry.key, ())), entry.key)):
         inside = leaves.get(entry.key, frozenset({name_of(entry.key)}))
@@ -156,7 +157,7 @@ def standing(robot: str, date: str, entries: Sequence[Entry], leaves: dict[str, 
     return Day(robot, date, tuple(sorted(stand, key=lambda entry: entry.key)), covered, made)
 
 
-def leaves_of(source: Source, entry: Entry) -> frozenset[str]:
+def leaves_of(source: Bucket, entry: ObjectInfo) -> frozenset[str]:
     """What a compacted part says that it was made of. Raises LakeError for a file that does not say it."""
     from shadowhound_data_logger.lake import reading  # noqa: PLC0415 - pyarrow, only for days that are between two states
 

@@ -8,9 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from shadowhound_data_logger.clock import utc
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.reading import THREADS
-from shadowhound_data_logger.lake.source import Source
 from shadowhound_data_logger.lake.standing import Day, days, is_compacted, robots
 
 
@@ -34,7 +34,7 @@ class State:
     """Files that others stand for: they only take room."""
 
 
-def state(source: Source, robot: str | None = None, findings: Findings | None = None) -> list[State]:
+def state(source: Bucket, robot: str | None = None, findings: Findings | None = None) -> list[State]:
     """Of all robots that have a catalogue. Raises StoreError."""
     findings = Findings() if findings is None else findings
     today = f'{utc(time.time_ns()):%Y-%m-%d}'

@@ -1,4 +1,4 @@
-"""What a catalogue says that a store holds: every object that has a row, for ``ship/audit.py`` to ask for, and whom it asks.
+"""What a catalogue says that a store holds: every object that has a row, for ``ship/audit.py`` to ask for.
 
 A store that lost a part of its own catalogue does not know what else it lost. So the catalogue of another store, fetched into a
 folder, can be laid beside it.
@@ -6,24 +6,23 @@ folder, can be laid beside it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
 import pyarrow as pa
 
 from shadowhound_data_logger.lake import query
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.source import Source, open_source
 from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.options import StoreSettings
 
 PAGE: Final = 10_000
 _KEY: Final = ('bucket', 'key')
 _SAID: Final = (*_KEY, 'bytes', 'sha256')
 
 
-def rows(source: Source, findings: Findings, **flags: Any) -> Rows:
+def rows(source: Bucket, findings: Findings, **flags: Any) -> Rows:
     """Of one catalogue; ``flags`` are those of ``lake.objects``. Raises SettingError, LakeError, StoreError."""
     with query.answering():
         found: pa.Table = query.objects(source, findings=findings, **flags).select(*_SAID).distinct().to_arrow()
@@ -63,21 +62,6 @@ class Rows:
         """Those that have no row in the other."""
         left = self.table.join(other.table.select(_KEY), keys=list(_KEY), join_type='left anti')
         return _infos(left.sort_by([(name, 'ascending') for name in _KEY]))
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """The store as an audit asks it, by what the lake reads with. Thread-safe."""
-
-    settings: StoreSettings
-    probe: Callable[[], None]
-    """Raises unless it is the store that answers."""
-
-    def head(self, bucket: str, key: str) -> ObjectInfo | None:
-        return open_source(self.settings, bucket).head(key)
-
-    def content(self, bucket: str, key: str) -> Iterator[bytes]:
-        yield from open_source(self.settings, bucket).get(key).pieces
 
 
 def _infos(table: pa.Table) -> list[ObjectInfo]:

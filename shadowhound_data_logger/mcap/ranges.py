@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size
 
 
@@ -23,12 +24,6 @@ class Ranged(Protocol):
 
     def read(self, start: int, length: int) -> bytes:
         """Exactly these bytes. Raises BagDamaged where the file does not have them, StoreError where it cannot be asked."""
-
-
-class RangedStore(Protocol):
-    """What is asked of a store (stores/base.py)."""
-
-    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes: ...
 
 
 class Meter:
@@ -73,7 +68,7 @@ class LocalFile:
 class StoredFile:
     """An object of a store, of a size that is known already."""
 
-    def __init__(self, store: RangedStore, bucket: str, key: str, size: int, meter: Meter | None = None) -> None:
+    def __init__(self, store: ObjectStore, bucket: str, key: str, size: int, meter: Meter | None = None) -> None:
         self.size = size
         self._store = store
         self._bucket = bucket
@@ -87,7 +82,7 @@ class StoredFile:
     def read(self, start: int, length: int) -> bytes:
         if length <= 0:
             return b''
-        found = self._store.get_range(self._bucket, self._key, start, length)
+        (found,) = self._store.ranges(self._bucket, self._key, [(start, start + length)])
         self._meter.add(len(found))
         return whole(found, length, self.name, start)
 

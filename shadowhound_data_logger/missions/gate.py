@@ -6,7 +6,7 @@ import random
 from collections.abc import Callable
 from typing import Final
 
-from shadowhound_data_logger.ship.retry import backoff
+from shadowhound_data_logger.stores.retry import backoff
 
 LONGEST_PAUSE_S: Final = 60.0
 

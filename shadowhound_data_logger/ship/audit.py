@@ -7,22 +7,19 @@ so, and goes on from there the next time.
 from __future__ import annotations
 
 import hashlib
-import random
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Final, Protocol, TypeVar
+from typing import Final, Protocol
 
-from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreError, StoreUnavailable
+from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreError
 from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.ship.retry import backoff
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.retry import steadily
 
 THREADS: Final = 8
-TRIES: Final = 4
-"""For a request that fails in passing; a store that is away for good is told within a minute."""
-CAP_S: Final = 5.0
 KEYS: Final = 20
 """Keys listed of each kind of finding; all are counted."""
 MISSING: Final = 'missing'
@@ -39,25 +36,13 @@ KINDS: Final = {
 }
 """What can be found, in words."""
 
-_Answer = TypeVar('_Answer')
 
-
-class Source(Protocol):
+class Delivered(Protocol):
     """What an audit asks for, and where it notes how far it came."""
 
     def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]: ...
 
     def note(self, ids: Iterable[int]) -> None: ...
-
-
-class Target(Protocol):
-    """What it asks of a store (stores/base.py)."""
-
-    def head(self, bucket: str, key: str) -> ObjectInfo | None: ...
-
-    def content(self, bucket: str, key: str) -> Iterator[bytes]: ...
-
-    def probe(self) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +77,7 @@ class Audit:
             listed.append(finding)
 
 
-def audit(source: Source, store: Target, *, deep: bool = False, threads: int = THREADS, keys: int | None = KEYS,
+def audit(source: Delivered, store: ObjectStore, *, deep: bool = False, threads: int = THREADS, keys: int | None = KEYS,
           tell: Callable[[], None] = lambda: None, pause: Callable[[float], object] = time.sleep) -> Audit:  # fmt: skip
     """Ask for everything that ``source`` has; ``deep`` reads each object back as well. ``tell`` is called after each one.
 
@@ -114,7 +99,7 @@ def audit(source: Source, store: Target, *, deep: bool = False, threads: int = T
 
 
 def _audit_page(page: Sequence[tuple[int, ObjectInfo]], pool: ThreadPoolExecutor, judge: Callable[[ObjectInfo], Finding | None],
-                source: Source, store: Target, found: Audit, tell: Callable[[], None]) -> None:  # fmt: skip
+                source: Delivered, store: ObjectStore, found: Audit, tell: Callable[[], None]) -> None:  # fmt: skip
     sound: list[int] = []
     findings: list[Finding] = []
     answers = pool.map(judge, [expected for _, expected in page])
@@ -136,7 +121,7 @@ def _audit_page(page: Sequence[tuple[int, ObjectInfo]], pool: ThreadPoolExecutor
         found.add(finding)
 
 
-def _confirm_store(store: Target) -> None:
+def _confirm_store(store: ObjectStore) -> None:
     """Raises StoreError unless it is the store that said so: a hotel's network also answers that there is no such thing."""
     try:
         store.probe()
@@ -144,17 +129,17 @@ def _confirm_store(store: Target) -> None:
         return  # whoever may only read is answered all the same
 
 
-def _judge(store: Target, expected: ObjectInfo, *, deep: bool, pause: Callable[[float], object]) -> Finding | None:
+def _judge(store: ObjectStore, expected: ObjectInfo, *, deep: bool, pause: Callable[[float], object]) -> Finding | None:
     """None when the store has it as it was delivered. Raises StoreError when that cannot be found out."""
     make = partial(Finding, bucket=expected.bucket, key=expected.key)
     try:
-        held = _steadily(lambda: store.head(expected.bucket, expected.key), pause)
+        held = steadily(lambda: store.head(expected.bucket, expected.key), pause=pause)
         if held is None:
             return make(MISSING, detail=f'{expected.size} bytes were delivered')
         if held.size != expected.size:
             return make(SIZE, detail=f'{held.size} bytes, {expected.size} were delivered')
         if deep and expected.sha256 is not None:
-            content = _steadily(lambda: _sha256(store, expected), pause)
+            content = steadily(lambda: _sha256(store, expected), pause=pause)
             if content != expected.sha256:
                 return make(CHECKSUM, detail=f'SHA-256 {content}, {expected.sha256} was delivered')
     except (BucketMissing, ObjectRefused) as error:
@@ -168,20 +153,9 @@ def _judge(store: Target, expected: ObjectInfo, *, deep: bool, pause: Callable[[
     return make(CHECKSUM, detail=f'sha256 {held.sha256} in its metadata, {expected.sha256} was delivered')
 
 
-def _sha256(store: Target, expected: ObjectInfo) -> str:
+def _sha256(store: ObjectStore, expected: ObjectInfo) -> str:
     """Of the content, in bounded memory: a slice has hundreds of megabytes."""
     digest = hashlib.sha256()
     for piece in store.content(expected.bucket, expected.key):
         digest.update(piece)
     return digest.hexdigest()
-
-
-def _steadily(ask: Callable[[], _Answer], pause: Callable[[float], object]) -> _Answer:
-    """The answer, after a few tries where the store is away in passing."""
-    rng = random.Random()
-    for attempt in range(1, TRIES):
-        try:
-            return ask()
-        except StoreUnavailable:
-            pause(backoff(attempt, CAP_S, rng))
-    return ask()

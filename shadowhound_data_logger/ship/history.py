@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.ship.retry import Verdict, backoff
+from shadowhound_data_logger.ship.retry import Verdict
+from shadowhound_data_logger.stores.retry import backoff
 
 DENIALS: Final = 8
 """An object denied so often, its bucket having taken others between each two of these times, is to blame itself.

@@ -10,7 +10,8 @@ from typing import Final
 
 from shadowhound_data_logger.errors import StoreError
 from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.ship.retry import Verdict, backoff
+from shadowhound_data_logger.ship.retry import Verdict
+from shadowhound_data_logger.stores.retry import backoff
 
 _AT_ONCE: Final = frozenset({Verdict.PAUSE, Verdict.BUCKET})
 """No single object can cause these; the others are an outage only once a second put has failed as well."""

@@ -1,8 +1,7 @@
-"""What a failed put means for delivery, in one table, and how long to wait before the next try (D8)."""
+"""What a failed put means for delivery, in one table (D8)."""
 
 from __future__ import annotations
 
-import random
 import re
 from enum import Enum
 from typing import Final
@@ -17,8 +16,6 @@ from shadowhound_data_logger.errors import (
     StoreUntrusted,
 )
 
-BASE_S: Final = 0.5
-"""The longest pause before the second try; it doubles with each further one."""
 _REASON: Final = re.compile(r'[A-Za-z0-9][A-Za-z0-9_-]{0,63}')
 
 
@@ -60,11 +57,3 @@ def quarantine_reason(error: StoreError) -> str:
         return 'access_denied'
     reason = error.data.get('reason')
     return reason if isinstance(reason, str) and _REASON.fullmatch(reason) else 'refused'
-
-
-def backoff(attempt: int, cap_s: float, rng: random.Random) -> float:
-    """Seconds before the next try after ``attempt`` failures (1, 2, ...): exponential, with full jitter.
-
-    https://aws.amazon.com/blogs/architecture/exponential-backoff-and-jitter/
-    """
-    return rng.uniform(0.0, min(cap_s, BASE_S * 2.0 ** min(attempt - 1, 32)))

@@ -18,13 +18,13 @@ from typing import Final, Protocol
 
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import StoreError
-from shadowhound_data_logger.model import Outcome, Put, SpooledObject, State
+from shadowhound_data_logger.model import Outcome, SpooledObject, State
 from shadowhound_data_logger.ship.ahead import IMPORTANT, OLDEST
 from shadowhound_data_logger.ship.outage import Notice
 from shadowhound_data_logger.ship.retry import Verdict
 from shadowhound_data_logger.ship.schedule import Schedule
 from shadowhound_data_logger.ship.steps import Look, Rest, Ship, Step
-from shadowhound_data_logger.stores.pace import Pace
+from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ DRAINED_EVERY_S: Final = 0.02
 """How often ``drain`` looks: a wake for each object delivered would cost more."""
 
 
-class Source(Protocol):
+class Backlog(Protocol):
     """What delivery asks of the spool."""
 
     def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
@@ -44,15 +44,6 @@ class Source(Protocol):
     def pending_count(self) -> int: ...
 
     def drain_lock(self) -> AbstractContextManager[bool]: ...
-
-
-class Target(Protocol):
-    """What delivery asks of a store (stores/base.py)."""
-
-    @property
-    def pace(self) -> Pace: ...
-
-    def put(self, item: SpooledObject) -> Put: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +80,7 @@ class Uploader:
     """
 
     def __init__(
-        self, spool: Source, store: Target, settings: UploadSettings, settle: Callable[[Sequence[Outcome]], None], *,
+        self, spool: Backlog, store: ObjectStore, settings: UploadSettings, settle: Callable[[Sequence[Outcome]], None], *,
         monotonic: Callable[[], float] = time.monotonic, rng: random.Random | None = None,
     ) -> None:  # fmt: skip
         self._spool = spool

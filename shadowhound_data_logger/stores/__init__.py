@@ -1,16 +1,19 @@
-"""Where objects are kept: S3, a folder, or memory; one Protocol (``base.py``), one conformance suite."""
+"""Where objects are kept: S3, a folder, or memory; one Protocol (``base.py``), one table of errors (``s3_errors.py``), one retry.
+
+How fast what is sent may leave is kept by ``pace.py``, what is fetched becomes a file by ``download.py``.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.config import StoreSettings, UploadSettings
     from shadowhound_data_logger.stores.base import ObjectStore
 
-__all__ = ['open_store']
+__all__ = ['open_reader', 'open_store']
 
 
 def open_store(settings: StoreSettings, upload: UploadSettings) -> ObjectStore:
@@ -23,5 +26,19 @@ def open_store(settings: StoreSettings, upload: UploadSettings) -> ObjectStore:
         from shadowhound_data_logger.stores.s3 import S3Store  # noqa: PLC0415 - botocore costs 60 MB and half a second
 
         store = S3Store(settings, upload)
+    store.open()
+    return store
+
+
+def open_reader(settings: StoreSettings) -> ObjectStore:
+    """The same for a machine that reads much: by obstore, which the extra ``lake`` brings. Asks nobody yet.
+
+    A process that is forked afterwards must not use it.
+    """
+    if not settings.endpoint_url:
+        return open_store(settings, UploadSettings())
+    from shadowhound_data_logger.stores.s3_obstore import ObstoreStore  # noqa: PLC0415 - a robot has no obstore
+
+    store = ObstoreStore(settings, UploadSettings())
     store.open()
     return store

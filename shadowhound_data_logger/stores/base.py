@@ -1,19 +1,48 @@
-"""What delivery asks of a place to keep objects. Every store passes the same conformance tests (test/stores)."""
+"""What the node, the lake and the doctor ask of a place to keep objects. Every store passes the same tests (test/stores)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Protocol
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol
 
+from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.pace import Pace
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+@dataclass(frozen=True, slots=True)
+class Content:
+    """An object that is being read: iterate over it once, for its bytes in pieces; leave it where not all of them are wanted."""
+
+    info: ObjectInfo
+    """Of the whole object, wherever the pieces begin."""
+    pieces: Iterator[bytes]
+    """Of a few megabytes at most. Raise StoreError."""
+    release: Callable[[], None] = lambda: None
+    """Lets go of the connection."""
+
+    def __iter__(self) -> Iterator[bytes]:
+        return self.pieces
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.release()
 
 
 class ObjectStore(Protocol):
     """A bucketed object store. Thread-safe after ``open``; life: New; open once; use from any thread; close once.
 
-    Errors are those of ``shadowhound_data_logger.errors``: StoreUnavailable (transient), CredentialsRejected,
-    BucketMissing, AccessDenied, ObjectRefused, ForeignObject. No other exception leaves a store.
+    Each request is one try (``retry.steadily`` makes it more). Errors are those of ``shadowhound_data_logger.errors``:
+    StoreUnavailable (transient), CredentialsRejected, BucketMissing, AccessDenied, ObjectRefused, ForeignObject. No other
+    exception leaves a store. Whatever reads raises ObjectRefused with ``data['reason'] == 'missing'`` where there is no such
+    object, and ``'name'`` for a key that can be no path.
     """
 
     @property
@@ -40,20 +69,37 @@ class ObjectStore(Protocol):
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
         """The object's size and metadata, None when there is none."""
 
-    def get(self, bucket: str, key: str) -> bytes:
-        """The whole content. Raises ObjectRefused when there is none."""
+    def get(self, bucket: str, key: str, most: int | None = None) -> bytes:
+        """The whole content. Raises ObjectRefused (reason ``size``) where it has more than ``most`` bytes, which are not read."""
 
-    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes:
-        """So many bytes from ``start`` on: fewer where the object ends before, none at its end or behind it.
+    def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        """These parts of the content, each from begin to before its end; shorter, or empty, where it ends before."""
 
-        Raises ObjectRefused when there is no such object.
-        """
-
-    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
-        """The content from ``start`` on, in pieces of at most a megabyte. Raises as ``get_range``, at any piece."""
+    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        """The content from ``start`` on."""
 
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
-        """The objects under a prefix, in key order (``sha256`` and metadata may be left out)."""
+        """The objects whose keys begin so, in key order, without ``sha256`` and metadata; none where there is no such bucket."""
+
+    def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
+        """The names of the folders right below a prefix that ends with ``/`` or is empty, sorted."""
+
+    def delete(self, bucket: str, key: str) -> None:
+        """For good; one that is gone already is no error. No stage of the robot deletes."""
 
     def probe(self) -> None:
         """One cheap authenticated request; raises what a put would raise for the store as a whole."""
+
+
+def joined(content: Content, most: int | None) -> bytes:
+    """All of it. Raises ObjectRefused (reason ``size``), before it is read, where there are more than ``most`` bytes."""
+    with content:
+        info = content.info
+        if most is not None and info.size > most:
+            raise too_large(info.bucket, info.key, most)
+        return b''.join(content)
+
+
+def too_large(bucket: str, key: str, most: int) -> ObjectRefused:
+    """The error for an object that is larger than whoever asks for it can take."""
+    return ObjectRefused(f'{bucket}/{key} has more than {most:,} bytes', reason='size', bucket=bucket, key=key)

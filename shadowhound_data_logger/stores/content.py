@@ -1,4 +1,7 @@
-"""The two judgements every store shares: is a spooled file still what it was, and is what a key holds the same."""
+"""What every store needs for a put: a spooled file's content, whole or in parts, verified; does a taken key hold the same?
+
+Nothing of a large file is held in memory: each of its parts is read twice, to know it and to send it.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,24 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.errors import ForeignObject, NameRefused, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.keys import check_key, check_name
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.untrusted import path_below
 
 _PASSING: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE, errno.EINTR, errno.EAGAIN})
 """Troubles of this process or machine that say nothing of the file; EIO does: its disk is rotten."""
 CHUNK_BYTES: Final = 1 << 20
 """Most objects are smaller: they are read, hashed and sent as one piece."""
+PART_BYTES: Final = 8 << 20
+"""What a broken connection costs at most: eight seconds of a link of 1 MB/s. S3 allows no smaller one than 5 MiB."""
+MOST_PARTS: Final = 10_000
+"""S3's own limit."""
 
 
 def check_target(bucket: str, key: str) -> None:
@@ -25,6 +35,15 @@ def check_target(bucket: str, key: str) -> None:
     try:
         check_name(bucket, 'the bucket')
         check_key(key)
+    except NameRefused as error:
+        raise ObjectRefused(str(error), reason='name', bucket=bucket, key=key) from error
+
+
+def check_read(bucket: str, key: str) -> None:
+    """The same for reading: what other programs wrote may be read by any key that is a path."""
+    try:
+        check_name(bucket, 'the bucket')
+        path_below(Path(), key)
     except NameRefused as error:
         raise ObjectRefused(str(error), reason='name', bucket=bucket, key=key) from error
 
@@ -103,3 +122,50 @@ def _damaged(item: SpooledObject, detail: str) -> ObjectRefused:
         f'the spooled file of {item.bucket}/{item.key} is not what was spooled: {detail}',
         remedy=f'look at {item.path}', reason='damaged', bucket=item.bucket, key=item.key, path=str(item.path),
     )  # fmt: skip
+
+
+@dataclass(slots=True)
+class Part:
+    """Bytes ``start`` ... ``start + size`` of an open file, as a body to send."""
+
+    file: int
+    """The descriptor; only read at places of its own, so several may share it."""
+    start: int
+    size: int
+    md5: bytes
+    _place: int = field(default=0, init=False)
+
+    def seek(self, place: int, /) -> int:
+        self._place = place
+        return place
+
+    def read(self, size: int, /) -> bytes:
+        found = os.pread(self.file, min(size, self.size - self._place), self.start + self._place)
+        self._place += len(found)
+        return found
+
+
+def parts(file: int, size: int, whole: Any) -> Iterator[Part]:
+    """The parts of a file of that size, in order; ``whole`` is told all of its bytes. Raises OSError.
+
+    A file that is shorter ends them early.
+    """
+    step = part_bytes(size)
+    for start in range(0, size, step):
+        part = _known(file, start, min(step, size - start), whole)
+        if part.size:
+            yield part
+
+
+def part_bytes(size: int) -> int:
+    """Of each part but the last, for a file of that size."""
+    return max(PART_BYTES, -(-size // MOST_PARTS))
+
+
+def _known(file: int, start: int, size: int, whole: Any) -> Part:
+    md5, place = hashlib.md5(usedforsecurity=False), 0
+    while place < size and (chunk := os.pread(file, min(CHUNK_BYTES, size - place), start + place)):
+        md5.update(chunk)
+        whole.update(chunk)
+        place += len(chunk)
+    return Part(file, start, place, md5.digest())

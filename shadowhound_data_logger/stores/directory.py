@@ -11,15 +11,25 @@ import fcntl
 import json
 import os
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from datetime import datetime, timezone
+from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 from shadowhound_data_logger.disk import fingerprint, sync
 from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_target, chunks, identical_or_foreign, object_metadata
+from shadowhound_data_logger.stores.base import Content, too_large
+from shadowhound_data_logger.stores.content import (
+    CHUNK_BYTES,
+    check_read,
+    check_target,
+    chunks,
+    identical_or_foreign,
+    object_metadata,
+)
 from shadowhound_data_logger.stores.pace import Pace
 
 METADATA: Final = '.metadata'
@@ -72,33 +82,42 @@ class DirectoryStore:
             return end
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
-        check_target(bucket, key)
-        with self._touching(bucket, key):
+        with self._reading(bucket, key):
             return self._info(bucket, key) if self._path(bucket, key).is_file() else None
 
-    def get(self, bucket: str, key: str) -> bytes:
-        with self._opened(bucket, key) as file:
-            return file.read()
+    def get(self, bucket: str, key: str, most: int | None = None) -> bytes:
+        with self._reading(bucket, key), self._path(bucket, key).open('rb') as file:
+            body = file.read() if most is None else file.read(most + 1)
+        if most is not None and len(body) > most:
+            raise too_large(bucket, key, most)
+        return body
 
-    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes:
-        with self._opened(bucket, key) as file:
-            return os.pread(file.fileno(), length, start)
+    def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        with self._reading(bucket, key), self._path(bucket, key).open('rb', buffering=0) as file:
+            return [os.pread(file.fileno(), end - start, start) for start, end in spans]
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
-        with self._opened(bucket, key) as file:
-            file.seek(start)
-            while chunk := file.read(CHUNK_BYTES):
-                yield chunk
+    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        with self._reading(bucket, key):
+            return Content(self._info(bucket, key), self._pieces(bucket, key, start))
 
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
-        check_target(bucket, 'any')
-        root = self._directory / bucket
-        with self._touching(bucket, prefix):
-            keys = sorted(key for key in _keys(root) if key.startswith(prefix))
-        for key in keys:
-            with self._touching(bucket, key):
-                size = (root / key).stat().st_size
-            yield ObjectInfo(bucket, key, size, None)
+        folder = prefix.rpartition('/')[0]
+        with self._reading(bucket, folder or 'any'):
+            found = [(key, seen) for key, seen in _files(self._directory / bucket, folder) if key.startswith(prefix)]
+        for key, seen in sorted(found, key=itemgetter(0)):
+            modified = datetime.fromtimestamp(seen.st_mtime, timezone.utc)
+            yield ObjectInfo(bucket, key, seen.st_size, None, etag=str(seen.st_mtime_ns), modified=modified)
+
+    def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
+        below = prefix.rstrip('/')
+        with self._reading(bucket, below or 'any'):
+            folder = self._path(bucket, below)
+            return sorted(path.name for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+
+    def delete(self, bucket: str, key: str) -> None:
+        with self._reading(bucket, key):
+            self._beside(bucket, key).unlink(missing_ok=True)
+            self._path(bucket, key).unlink(missing_ok=True)
 
     def probe(self) -> None:
         """Writes and removes a file: a full disk, a missing mount or a read-only one shows here as it does in a put."""
@@ -117,15 +136,20 @@ class DirectoryStore:
             raise _translated(error, self._directory, bucket, key) from error
 
     @contextmanager
-    def _opened(self, bucket: str, key: str) -> Iterator[IO[bytes]]:
-        check_target(bucket, key)
+    def _reading(self, bucket: str, key: str) -> Iterator[None]:
+        check_read(bucket, key)
         with self._touching(bucket, key):
             try:
-                file = self._path(bucket, key).open('rb', buffering=0)
+                yield
             except FileNotFoundError as error:
-                raise ObjectRefused(f'there is no {bucket}/{key}', reason='missing', bucket=bucket, key=key) from error
-            with file:
-                yield file
+                where = f'{bucket}/{key} in {self._directory}'
+                raise ObjectRefused(f'there is no {where}', reason='missing', bucket=bucket, key=key) from error
+
+    def _pieces(self, bucket: str, key: str, start: int) -> Iterator[bytes]:
+        with self._reading(bucket, key), self._path(bucket, key).open('rb', buffering=0) as file:
+            file.seek(start)
+            while chunk := file.read(CHUNK_BYTES):
+                yield chunk
 
     @contextmanager
     def _part(self) -> Iterator[Path]:
@@ -223,13 +247,15 @@ def _make_folders(folder: Path) -> None:
             sync(path.parent)
 
 
-def _keys(root: Path) -> Iterator[str]:
-    """The keys of a bucket, in no order; none when there is no such bucket."""
-    if not root.exists():
+def _files(root: Path, below: str) -> Iterator[tuple[str, os.stat_result]]:
+    """Key and facts of each file of a bucket under a folder, in no order; none when there is no such bucket."""
+    if not (root / below).exists():
         return
-    for folder, _, names in os.walk(root, onerror=_raise):
+    for folder, _, names in os.walk(root / below, onerror=_raise):
         prefix = Path(folder).relative_to(root)
-        yield from (str(prefix / name) for name in names)
+        for name in names:
+            with suppress(FileNotFoundError):  # deleted meanwhile
+                yield str(prefix / name), Path(folder, name).stat()
 
 
 def _raise(error: OSError) -> None:

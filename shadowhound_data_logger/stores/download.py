@@ -1,68 +1,125 @@
-"""An object of a store as a file: in bounded memory, taken up where it broke off, and under its name only when it is whole."""
+"""Objects of a store as files: in bounded memory, verified, taken up where they broke off, under their names only when whole."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Final, Protocol
+from typing import IO, Any, Final, TypeVar
 
 from shadowhound_data_logger.errors import ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import CHUNK_BYTES
+from shadowhound_data_logger.stores.retry import steadily
 
 UNFINISHED: Final = '.part'
+TRIES: Final = 6
+"""Until a download fails: one of an hour may meet more gaps in a WiFi than one request."""
+
+_Found = TypeVar('_Found')
 
 
-class Source(Protocol):
-    """What a download asks of a store (stores/base.py)."""
+@dataclass(frozen=True, slots=True)
+class Downloaded:
+    """What is there now."""
 
-    def head(self, bucket: str, key: str) -> ObjectInfo | None: ...
+    info: ObjectInfo
+    sha256: str
+    """Of the file."""
+    is_proved: bool
+    """Whether anybody said which it has to be."""
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]: ...
 
+def download(
+    store: ObjectStore, wanted: ObjectInfo, path: Path, *, part: Path | None = None, is_synced: bool = True,
+    tell: Callable[[int], None] = lambda _: None, pause: Callable[[float], object] = time.sleep,
+) -> Downloaded:  # fmt: skip
+    """The object as ``path``, of the wanted size and SHA-256, else of the one that its metadata name.
 
-def download(store: Source, bucket: str, key: str, path: Path, *, tell: Callable[[int], None] = lambda _: None) -> ObjectInfo:
-    """The object as ``path``, verified against its size and the ``sha256`` of its metadata, and synced; returns its description.
-
-    What arrives lies in ``<path>.part``, which the next try continues. ``tell`` is called with the bytes that each piece adds.
-    Raises StoreUnavailable where it broke off, ObjectRefused where there is none or it is not what its metadata say
-    (``data['reason'] == 'damaged'``), OSError of the file.
+    What arrives lies in ``part`` (``<path>.part``), which the next call continues. ``tell`` is called with the bytes that each
+    piece adds, negative where they are thrown away; what it raises ends the download. What is damaged is fetched once more.
+    Raises StoreUnavailable where it broke off after some tries, ObjectRefused where there is none or it is not what it has to
+    be (``data['reason'] == 'damaged'``, ``data['why']`` says how), OSError of the file.
     """
-    info = store.head(bucket, key)
-    if info is None:
-        raise ObjectRefused(f'there is no {bucket}/{key}', reason='missing', bucket=bucket, key=key)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f'{path.name}{UNFINISHED}')
-    with part.open('ab+', buffering=0) as file:
-        sha256 = _complete(store, info, file, tell)
-        os.fsync(file.fileno())
-    if info.sha256 not in {None, sha256}:
-        part.unlink()
-        raise ObjectRefused(f'{bucket}/{key} has not the content that its metadata name', remedy='was it damaged in the store?',
-                            reason='damaged', bucket=bucket, key=key, sha256=sha256)  # fmt: skip
+    part = part or path.with_name(f'{path.name}{UNFINISHED}')
+    try:
+        with part.open('ab+', buffering=0) as file:
+            transfer = _Transfer(store, wanted, file, tell)
+            found = twice(lambda: steadily(transfer.complete, tries=TRIES, pause=pause))
+            if is_synced:
+                os.fsync(file.fileno())
+    except ObjectRefused as error:
+        if error.data.get('reason') == 'damaged':
+            part.unlink()
+        raise
     part.replace(path)
-    return info
+    return found
 
 
-def _complete(store: Source, info: ObjectInfo, file: IO[bytes], tell: Callable[[int], None]) -> str:
-    """Add what is missing; returns the SHA-256 of the whole."""
-    if file.seek(0, os.SEEK_END) > info.size:  # of another object, or of none of ours
-        file.truncate(0)
-    file.seek(0)
-    digest, size = hashlib.sha256(), 0
-    while chunk := file.read(CHUNK_BYTES):
-        digest.update(chunk)
-        size += len(chunk)
-    if size < info.size:
-        for chunk in store.content(info.bucket, info.key, size):
-            file.write(chunk)
-            digest.update(chunk)
-            size += len(chunk)
-            tell(len(chunk))
-    if size != info.size:
-        raise StoreUnavailable(
-            f'{info.bucket}/{info.key} ended after {size} of {info.size} bytes', bucket=info.bucket, key=info.key
-        )
-    return digest.hexdigest()
+def twice(fetch: Callable[[], _Found]) -> _Found:
+    """What was fetched, the second time where it was damaged: on its way, or by a power cut before it was synced."""
+    try:
+        return fetch()
+    except ObjectRefused as error:
+        if error.data.get('reason') != 'damaged':
+            raise
+    return fetch()
+
+
+def damaged(bucket: str, key: str, why: str, **data: Any) -> ObjectRefused:
+    """The error for content that is not what was stored."""
+    return ObjectRefused(f'{bucket}/{key} has not the content that its metadata name', remedy='was it damaged in the store?',
+                         reason='damaged', why=why, bucket=bucket, key=key, **data)  # fmt: skip
+
+
+class _Transfer:
+    """What is there of one object already, and the rest of it on its way. One thread."""
+
+    def __init__(self, store: ObjectStore, wanted: ObjectInfo, file: IO[bytes], tell: Callable[[int], None]) -> None:
+        self._store = store
+        self._wanted = wanted
+        self._file = file
+        self._tell = tell
+        self._digest = hashlib.sha256()
+        self._size = 0
+        file.seek(0)
+        while chunk := file.read(CHUNK_BYTES):
+            self._digest.update(chunk)
+            self._size += len(chunk)
+
+    def complete(self) -> Downloaded:
+        """One try: add what is missing, and judge the whole. What is damaged is thrown away."""
+        wanted = self._wanted
+        with self._store.content(wanted.bucket, wanted.key, self._size) as content:
+            info = content.info
+            if info.size != wanted.size:  # before a byte of it takes room
+                raise self._damaged(f'it has {info.size} bytes instead of {wanted.size}')
+            if self._size < info.size:
+                self._add(content.pieces)
+        if self._size > info.size:  # of another object, or of none of ours
+            raise self._damaged(f'it has {self._size} bytes instead of {info.size}')
+        if self._size < info.size:
+            text = f'{wanted.bucket}/{wanted.key} ended after {self._size} of {info.size} bytes'
+            raise StoreUnavailable(text, bucket=wanted.bucket, key=wanted.key)
+        sha256, expected = self._digest.hexdigest(), wanted.sha256 or info.sha256
+        if expected is not None and sha256 != expected:
+            raise self._damaged(f'its SHA-256 is {sha256[:12]}... instead of {expected[:12]}...', sha256=sha256)
+        return Downloaded(info, sha256, expected is not None)
+
+    def _add(self, pieces: Any) -> None:
+        for piece in pieces:
+            self._file.write(piece)
+            self._digest.update(piece)
+            self._size += len(piece)
+            self._tell(len(piece))
+
+    def _damaged(self, why: str, **data: str) -> ObjectRefused:
+        self._tell(-self._size)
+        self._file.truncate(0)
+        self._digest, self._size = hashlib.sha256(), 0
+        return damaged(self._wanted.bucket, self._wanted.key, why, **data)

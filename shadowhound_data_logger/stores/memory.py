@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime, timezone
 
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_target, chunks, identical_or_foreign, object_metadata
+from shadowhound_data_logger.stores.base import Content, joined
+from shadowhound_data_logger.stores.content import (
+    CHUNK_BYTES,
+    check_read,
+    check_target,
+    chunks,
+    identical_or_foreign,
+    object_metadata,
+)
 from shadowhound_data_logger.stores.pace import Pace
 
 
@@ -18,8 +27,9 @@ class MemoryStore:
     ``fail`` is asked before each put (with the item) and each probe (with None); the exception it returns is raised.
     """
 
-    def __init__(self, fail: Callable[[SpooledObject | None], Exception | None] | None = None) -> None:
+    def __init__(self, fail: Callable[[SpooledObject | None], Exception | None] | None = None, *, name: str = 'memory') -> None:
         self.fail = fail
+        self._name = name
         self.pace = Pace()
         self._lock = threading.Lock()
         self._objects: dict[tuple[str, str], tuple[ObjectInfo, bytes]] = {}
@@ -34,7 +44,7 @@ class MemoryStore:
         """Nothing to release; what it holds stays."""
 
     def describe(self) -> str:
-        return 'memory'
+        return self._name
 
     def put(self, item: SpooledObject) -> Put:
         self._fail(item)
@@ -48,34 +58,47 @@ class MemoryStore:
         return identical_or_foreign(item, held, lambda: hashlib.sha256(body).hexdigest())
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
-        check_target(bucket, key)
+        check_read(bucket, key)
         with self._lock:
             found = self._objects.get((bucket, key))
         return found[0] if found else None
 
-    def get(self, bucket: str, key: str) -> bytes:
-        check_target(bucket, key)
-        with self._lock:
-            found = self._objects.get((bucket, key))
-        if found is None:
-            raise ObjectRefused(f'there is no {bucket}/{key}', reason='missing', bucket=bucket, key=key)
-        return found[1]
+    def get(self, bucket: str, key: str, most: int | None = None) -> bytes:
+        return joined(self.content(bucket, key), most)
 
-    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes:
-        return self.get(bucket, key)[start : start + length]
+    def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        _, body = self._held(bucket, key)
+        return [body[start:end] for start, end in spans]
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
-        body = self.get(bucket, key)
-        yield from (body[place : place + CHUNK_BYTES] for place in range(start, len(body), CHUNK_BYTES))
+    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        info, body = self._held(bucket, key)
+        return Content(info, (body[place : place + CHUNK_BYTES] for place in range(start, len(body), CHUNK_BYTES)))
 
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
         with self._lock:
             held = sorted(where for where in self._objects if where[0] == bucket and where[1].startswith(prefix))
             infos = [self._objects[where][0] for where in held]
-        return iter(infos)
+        return (ObjectInfo(info.bucket, info.key, info.size, None, etag=info.etag, modified=info.modified) for info in infos)
+
+    def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
+        below = (info.key[len(prefix) :].partition('/') for info in self.list(bucket, prefix))
+        return sorted({name for name, slash, _ in below if slash})
+
+    def delete(self, bucket: str, key: str) -> None:
+        check_read(bucket, key)
+        with self._lock:
+            self._objects.pop((bucket, key), None)
 
     def probe(self) -> None:
         self._fail(None)
+
+    def _held(self, bucket: str, key: str) -> tuple[ObjectInfo, bytes]:
+        check_read(bucket, key)
+        with self._lock:
+            found = self._objects.get((bucket, key))
+        if found is None:
+            raise ObjectRefused(f'there is no {bucket}/{key}', reason='missing', bucket=bucket, key=key)
+        return found
 
     def _fail(self, item: SpooledObject | None) -> None:
         error = self.fail(item) if self.fail else None
@@ -84,4 +107,5 @@ class MemoryStore:
 
 
 def _info(item: SpooledObject) -> ObjectInfo:
-    return ObjectInfo(item.bucket, item.key, item.size, item.sha256, object_metadata(item), item.content_type)
+    when = datetime.now(timezone.utc)
+    return ObjectInfo(item.bucket, item.key, item.size, item.sha256, object_metadata(item), item.content_type, item.sha256, when)

@@ -14,10 +14,11 @@ import os
 import threading
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import Enum
-from typing import IO, Final
+from operator import attrgetter
+from typing import IO, Final, TypeVar
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import (
@@ -29,7 +30,8 @@ from shadowhound_data_logger.errors import (
     StoreUnavailable,
 )
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.stores.content import check_target, chunks, identical_or_foreign, opened
+from shadowhound_data_logger.stores.base import Content, joined
+from shadowhound_data_logger.stores.content import check_read, check_target, chunks, identical_or_foreign, opened
 from shadowhound_data_logger.stores.pace import Pace
 from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES, Multipart
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
@@ -40,6 +42,7 @@ BUCKET_PAUSE_S: Final = 10.0
 """A bucket that could not be created is not asked for again sooner: each of its objects would ask."""
 
 _log = logging.getLogger(__name__)
+_Answer = TypeVar('_Answer')
 
 
 class _Condition(Enum):
@@ -81,36 +84,47 @@ class S3Store:
 
     def put(self, item: SpooledObject) -> Put:
         check_target(item.bucket, item.key)
-        generation = self._s3.generation
-        try:
-            return self._put_somehow(item)
-        except CredentialsRejected:
-            if self._s3.generation == generation:
-                raise
-            return self._put_somehow(item)  # somebody changed the keys, and the new ones were read meanwhile
+        return self._asking(lambda: self._put_somehow(item))
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
-        check_target(bucket, key)
-        return self._s3.head(bucket, key)
+        check_read(bucket, key)
+        return self._asking(lambda: self._s3.head(bucket, key))
 
-    def get(self, bucket: str, key: str) -> bytes:
-        check_target(bucket, key)
-        return b''.join(self._s3.content(bucket, key))
+    def get(self, bucket: str, key: str, most: int | None = None) -> bytes:
+        return joined(self.content(bucket, key), most)
 
-    def get_range(self, bucket: str, key: str, start: int, length: int) -> bytes:
-        check_target(bucket, key)
-        return b''.join(self._s3.content(bucket, key, start, length)) if length > 0 else b''
+    def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        check_read(bucket, key)
+        return [self._asking(lambda: self._s3.range(bucket, key, *span)) if span[0] < span[1] else b'' for span in spans]  # noqa: B023 - called at once
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
-        check_target(bucket, key)
-        yield from self._s3.content(bucket, key, start)
+    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        check_read(bucket, key)
+        return self._asking(lambda: self._s3.content(bucket, key, start))
 
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
-        check_target(bucket, 'any')
-        yield from sorted(self._s3.list(bucket, prefix), key=lambda info: info.key)
+        check_read(bucket, 'any')
+        yield from sorted(self._s3.list(bucket, prefix), key=attrgetter('key'))
+
+    def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
+        check_read(bucket, 'any')
+        return sorted(self._s3.folders(bucket, prefix))
+
+    def delete(self, bucket: str, key: str) -> None:
+        check_read(bucket, key)
+        self._s3.delete(bucket, key)
 
     def probe(self) -> None:
         self._s3.probe()
+
+    def _asking(self, ask: Callable[[], _Answer]) -> _Answer:
+        """Once more where the keys were refused that somebody had changed: the new ones were read meanwhile."""
+        generation = self._s3.generation
+        try:
+            return ask()
+        except CredentialsRejected:
+            if self._s3.generation == generation:
+                raise
+            return ask()
 
     def _put_somehow(self, item: SpooledObject) -> Put:
         put = self._put_in_parts if item.size > MULTIPART_BYTES else self._put_whole

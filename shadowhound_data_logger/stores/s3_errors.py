@@ -23,7 +23,7 @@ from shadowhound_data_logger.errors import (
     StoreUnavailable,
     StoreUntrusted,
 )
-from shadowhound_data_logger.tls import causes, distrust
+from shadowhound_data_logger.tls import causes, distrust, distrust_told
 
 REQUEST_ERRORS: Final = (boto.BotoCoreError, boto.ClientError, ResponseParserError, OSError, ValueError)
 """Everything a request through botocore can raise; ValueError comes of a header that broke off."""
@@ -110,6 +110,7 @@ _NO_KEYS: Final = (boto.NoCredentialsError, boto.PartialCredentialsError, boto.C
                    boto.ProfileNotFound, boto.ConfigParseError)  # fmt: skip
 _BROKEN: Final = (boto.ConnectionClosedError, boto.ResponseStreamingError, boto.IncompleteReadError, ConnectionResetError)
 
+_SILENT: Final[_Row] = (StoreUnavailable, 'Tower at {endpoint} gave no answer for {bucket}/{key}', 'is Tower on, and the WiFi?')
 _FAILURES: Final[tuple[tuple[type[BaseException] | tuple[type[BaseException], ...], _Row], ...]] = (
     (_NO_KEYS, (CredentialsRejected, 'there are no credentials for Tower at {endpoint}',
                 'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SHARED_CREDENTIALS_FILE to a file with them')),
@@ -163,7 +164,12 @@ def status_of(error: boto.ClientError) -> int:
 
 
 def _answered(error: boto.ClientError, request: Request) -> StoreError:
-    code, status = code_of(error), status_of(error)
+    detail = str(error.response.get('Error', {}).get('Message', ''))
+    return refused(code_of(error), status_of(error), detail, request, is_head=error.operation_name == 'HeadObject')
+
+
+def refused(code: str, status: int, detail: str, request: Request, *, is_head: bool = False) -> StoreError:
+    """The same for an answer that another client told: S3 error code (else the HTTP status as text), HTTP status, message."""
     row = _CODES.get(code)
     if row is None and (status >= 500 or status in {408, 409, 425, 429, 499}):
         row = (StoreUnavailable, 'Tower at {endpoint} answers with a server error ({status} {code})', 'look at its log')
@@ -171,12 +177,19 @@ def _answered(error: boto.ClientError, request: Request) -> StoreError:
         row = (AccessDenied, 'Tower at {endpoint} denies these credentials {bucket}/{key} ({code})', _POLICY)
     elif row is None and not code.isdigit() and status >= 400:
         row = (ObjectRefused, 'Tower at {endpoint} refuses {bucket}/{key} ({status} {code}: {detail})', '')
-    elif row is None and status == 403 and error.operation_name == 'HeadObject':
+    elif row is None and status == 403 and is_head:
         row = _CODES['AccessDenied']
     elif row is None:  # a captive portal, a proxy, a web server on this port: nobody's object is at fault
         row = (StoreUnavailable, '{endpoint} does not answer like an S3 server ({status} without an S3 error)', _NOT_S3)
-    detail = str(error.response.get('Error', {}).get('Message', ''))[:200]
+    detail = detail[:200]
     return _error(*row, request, code=detail if code.isdigit() else code, status=status, detail=detail)
+
+
+def away(reason: str, request: Request) -> StoreError:
+    """For a request that got no answer, by a client that has only words for why."""
+    untrusted = distrust_told(reason, 'Tower at {endpoint}', bundle='AWS_CA_BUNDLE', address='AWS_ENDPOINT_URL')
+    row = (StoreUntrusted, *untrusted) if untrusted else _SILENT
+    return _error(*row, request, code='no answer')
 
 
 def _unanswered(error: Exception) -> _Row:
@@ -196,5 +209,6 @@ def _error(kind: type[StoreError], message: str, remedy: str, request: Request, 
         'endpoint': request.endpoint, 'bucket': request.bucket, 'key': request.key,
         'connect_timeout_s': request.connect_timeout_s, 'read_timeout_s': request.read_timeout_s, **data,
     }  # fmt: skip
-    facts = {'endpoint': request.endpoint, 'bucket': request.bucket, 'key': request.key, 'reason': data['code'], **data}
+    reason = 'missing' if data['code'] == 'NoSuchKey' else data['code']
+    facts = {'endpoint': request.endpoint, 'bucket': request.bucket, 'key': request.key, 'reason': reason, **data}
     return kind(message.format(**nouns), remedy=remedy.format(**nouns), **facts)

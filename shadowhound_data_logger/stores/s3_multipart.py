@@ -11,16 +11,18 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final
+
+from botocore.exceptions import ClientError
 
 from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.stores.content import check_content, opened
-from shadowhound_data_logger.stores.parts import Part, parts
+from shadowhound_data_logger.stores.content import Part, check_content, object_metadata, opened, parts
+from shadowhound_data_logger.stores.s3_errors import code_of, status_of
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
-from shadowhound_data_logger.stores.s3_uploads import HeldPart, Uploads
 
 MULTIPART_BYTES: Final = 16 << 20
 """Larger objects are sent in parts: what is smaller is sent again as a whole after a broken connection."""
@@ -30,12 +32,21 @@ _LOST: Final = frozenset({'InvalidPart', 'InvalidPartOrder', 'EntityTooSmall'})
 _log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
+class HeldPart:
+    """A part that the server has."""
+
+    size: int
+    etag: str
+    """As it wrote it, in quotes; what is in them is the MD5 in hex, unless the server encrypts."""
+
+
 class Multipart:
     """Thread-safe. Two that send one object at a time take each other's upload up, or abort it: neither does harm."""
 
     def __init__(self, s3: S3Requests) -> None:
         self._s3 = s3
-        self._uploads = Uploads(s3)
+        self._uploads = _Uploads(s3)
 
     def put(self, item: SpooledObject, is_taken: Callable[[], bool]) -> bool:
         """One try; True once the server confirmed the object, False where its key is taken by then.
@@ -116,3 +127,69 @@ def _is_of(held: Mapping[int, HeldPart], file: int, size: int) -> bool:
 
 def _is_same(held: HeldPart, part: Part) -> bool:
     return held.size == part.size and held.etag.strip('"') == part.md5.hex()
+
+
+class _Uploads:
+    """The single requests of an upload but for its parts: begin, list, complete, abort. Thread-safe; raises as S3Requests."""
+
+    def __init__(self, s3: S3Requests) -> None:
+        self._s3 = s3
+
+    def begin(self, item: SpooledObject) -> str:
+        """A new upload, with all that is to be known of the object; returns its id."""
+        with self._s3.asking(item.bucket, item.key) as client:
+            answer = client.create_multipart_upload(
+                Bucket=item.bucket, Key=item.key, ContentType=item.content_type, Metadata=object_metadata(item)
+            )
+        self._s3.confirm({'ETag': answer.get('UploadId')}, item.bucket, item.key)
+        return str(answer['UploadId'])
+
+    def of(self, item: SpooledObject) -> list[str]:
+        """The ids of the uploads of its key that are under way."""
+        with self._s3.asking(item.bucket, item.key) as client:
+            answer = client.list_multipart_uploads(Bucket=item.bucket, Prefix=item.key)
+        return [upload['UploadId'] for upload in answer.get('_Uploads', ()) if upload['Key'] == item.key]
+
+    def parts(self, item: SpooledObject, upload: str) -> dict[int, HeldPart]:
+        """Number -> part."""
+        return {part['PartNumber']: HeldPart(part['Size'], part['ETag']) for part in self._pages(item, upload)}
+
+    def complete(self, item: SpooledObject, upload: str, etags: Mapping[int, str]) -> Sent:
+        """Make it the object, unless there is one by then. Sent.CREATED only when the server confirmed it."""
+        parts = {'Parts': [{'PartNumber': number, 'ETag': etag} for number, etag in sorted(etags.items())]}
+        sent = self._complete(item, upload, parts, {'IfNoneMatch': '*'})
+        return self._complete(item, upload, parts, {}) if sent is Sent.NOT_IMPLEMENTED else sent
+
+    def abort(self, item: SpooledObject, upload: str) -> None:
+        """Returns also when there is no such upload."""
+        with self._s3.asking(item.bucket, item.key) as client:
+            try:
+                client.abort_multipart_upload(Bucket=item.bucket, Key=item.key, UploadId=upload)
+            except ClientError as error:
+                if code_of(error) != 'NoSuchUpload':
+                    raise
+
+    def _pages(self, item: SpooledObject, upload: str) -> Iterator[Mapping[str, Any]]:
+        after = 0
+        while True:
+            with self._s3.asking(item.bucket, item.key) as client:
+                page = client.list_parts(Bucket=item.bucket, Key=item.key, UploadId=upload, PartNumberMarker=after)
+            yield from page.get('Parts', ())
+            if not page.get('IsTruncated'):
+                return
+            after = page['NextPartNumberMarker']
+
+    def _complete(self, item: SpooledObject, upload: str, parts: Mapping[str, object], condition: Mapping[str, str]) -> Sent:
+        with self._s3.asking(item.bucket, item.key) as client:
+            try:
+                answer = client.complete_multipart_upload(
+                    Bucket=item.bucket, Key=item.key, UploadId=upload, MultipartUpload=parts, **condition
+                )
+            except ClientError as error:
+                if status_of(error) == 412:
+                    return Sent.TAKEN
+                if condition and status_of(error) == 501:
+                    return Sent.NOT_IMPLEMENTED
+                raise
+        self._s3.confirm(answer, item.bucket, item.key)
+        return Sent.CREATED

@@ -18,16 +18,18 @@ from botocore.session import Session
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import AccessDenied, CredentialsRejected, SettingError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, SpooledObject
-from shadowhound_data_logger.stores.content import CHUNK_BYTES
+from shadowhound_data_logger.stores.base import Content
+from shadowhound_data_logger.stores.content import CHUNK_BYTES, Part
 from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted
 from shadowhound_data_logger.stores.pace import Body, Pace
-from shadowhound_data_logger.stores.parts import Part
 from shadowhound_data_logger.stores.s3_errors import REQUEST_ERRORS, Request, classify, code_of, public_url, status_of
-from shadowhound_data_logger.stores.s3_put import AGENT, ObjectPut
+from shadowhound_data_logger.stores.s3_http import AGENT, ContentRequests
 
 OLDEST_BOTOCORE: Final = (1, 36)
 """The first with If-None-Match on PUT and the checksum settings; Debian's of Humble and Jazzy are older."""
-
+RANGE_NOT_SATISFIABLE: Final = 416
+"""Nothing is behind the first byte that was asked for."""
+META: Final = 'x-amz-meta-'
 
 _Asked = TypeVar('_Asked')
 
@@ -53,7 +55,7 @@ class S3Requests:
         self.pace = Pace(upload.max_mbps)
         self._keys: Keys | None = None
         self._client: Any = None
-        self._put: ObjectPut | None = None
+        self._http: ContentRequests | None = None
 
     @property
     def generation(self) -> int:
@@ -65,19 +67,19 @@ class S3Requests:
         if self._client is None:
             self._keys = Keys(self._settings)
             self._client, trust = _client(session_with(self._keys), self._settings, self._upload)
-            self._put = ObjectPut(self._keys, trust, self._settings, self._upload, self.pace)
+            self._http = ContentRequests(self._keys, trust, self._settings, self._upload, self.pace)
 
     def close(self) -> None:
         client, self._client = self._client, None
-        put, self._put = self._put, None
+        http, self._http = self._http, None
         self.pace.abandon()
-        for held in (client, put):
+        for held in (client, http):
             if held is not None:
                 held.close()
 
     def put(self, item: SpooledObject, body: bytes | Body, crc32: str, *, conditional: bool) -> Sent:
         """One PUT; ``crc32`` in base64. Returns Sent.CREATED only when the server confirmed it."""
-        with self._asking(item.bucket, item.key, self._put) as sender:
+        with self._asking(item.bucket, item.key, self._http) as sender:
             try:
                 answer = sender.put(item, body, crc32, conditional=conditional)
             except ClientError as error:
@@ -91,7 +93,7 @@ class S3Requests:
 
     def put_part(self, item: SpooledObject, upload: str, number: int, part: Part) -> str:
         """One part of a multipart upload, verified by the server; returns its ETag."""
-        with self._asking(item.bucket, item.key, self._put) as sender:
+        with self._asking(item.bucket, item.key, self._http) as sender:
             answer = sender.put_part(item, upload, number, part)
         self.confirm(answer, item.bucket, item.key)
         return answer['ETag']
@@ -115,42 +117,70 @@ class S3Requests:
         metadata = answer.get('Metadata', {})
         return ObjectInfo(bucket, key, answer['ContentLength'], metadata.get('sha256'), metadata, answer.get('ContentType', ''))
 
-    def content(self, bucket: str, key: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
-        """The object, or a part of it, in pieces. Raises ObjectRefused when there is none."""
-        wanted = {}
-        if start or length is not None:
-            wanted = {'Range': f'bytes={start}-{"" if length is None else start + length - 1}'}
-        with self._asking(bucket, key, self._client) as client:
+    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        """The object, or what of it is behind ``start``, in pieces. Raises ObjectRefused when there is none."""
+        with self._asking(bucket, key, self._http) as http:
             try:
-                answer = client.get_object(Bucket=bucket, Key=key, **wanted)
+                headers, body = http.get(bucket, key, f'bytes={start}-' if start else '')
             except ClientError as error:
-                if wanted and status_of(error) == 416:  # it ends before
-                    return
+                if not start or status_of(error) != RANGE_NOT_SATISFIABLE:
+                    raise
+                info = self.head(bucket, key)  # it ends before
+                if info is None:
+                    raise
+                return Content(info, iter(()))
+            try:
+                size = self._whole_size(headers, bucket, key, start or None)
+            except BaseException:
+                body.close()
                 raise
-            self.confirm(answer, bucket, key)
-            if wanted and not answer.get('ContentRange', '').startswith(f'bytes {start}-'):
-                raise self._not_s3(bucket, key)
-            with closing(answer['Body']) as body:
-                yield from body.iter_chunks(CHUNK_BYTES)
+        metadata = {name.lower()[len(META) :]: value for name, value in headers.items() if name.lower().startswith(META)}
+        kind = headers.get('content-type', '')
+        info = ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, kind)
+        return Content(info, self._pieces(bucket, key, body), body.close)
+
+    def range(self, bucket: str, key: str, begin: int, end: int) -> bytes:
+        """From the first byte to before the last one; fewer where it ends before."""
+        with self._asking(bucket, key, self._http) as http:
+            try:
+                headers, body = http.get(bucket, key, f'bytes={begin}-{end - 1}')
+            except ClientError as error:
+                if status_of(error) == RANGE_NOT_SATISFIABLE:
+                    return b''
+                raise
+            with closing(body):
+                self._whole_size(headers, bucket, key, begin)
+                found: bytes = body.read()
+                return found
 
     def list(self, bucket: str, prefix: str) -> Iterator[ObjectInfo]:
         """The objects under a prefix, page by page; none when there is no such bucket.
 
         In the server's order: AWS and MinIO compare whole keys, SeaweedFS name by name (``a/1`` before ``a-1``).
         """
+        for page in self._pages(bucket, prefix):
+            for entry in page.get('Contents', ()):
+                yield ObjectInfo(bucket, entry['Key'], entry['Size'], None, etag=entry.get('ETag', ''),
+                                 modified=entry.get('LastModified'))  # fmt: skip
+
+    def folders(self, bucket: str, prefix: str) -> Iterator[str]:
+        """The names right below a prefix that have something below them."""
+        for page in self._pages(bucket, prefix, Delimiter='/'):
+            yield from (entry['Prefix'][len(prefix) : -1] for entry in page.get('CommonPrefixes', ()))
+
+    def _pages(self, bucket: str, prefix: str, **how: str) -> Iterator[Mapping[str, Any]]:
         token: dict[str, str] = {}
         while True:
             with self._asking(bucket, prefix, self._client) as client:
                 try:
-                    page = client.list_objects_v2(Bucket=bucket, Prefix=prefix, **token)
+                    page = client.list_objects_v2(Bucket=bucket, Prefix=prefix, **how, **token)
                 except ClientError as error:
                     if code_of(error) == 'NoSuchBucket':
                         return
                     raise
             if 'Name' not in page:
                 raise self._not_s3(bucket, prefix)
-            for entry in page.get('Contents', ()):
-                yield ObjectInfo(bucket, entry['Key'], entry['Size'], None)
+            yield page
             if not page.get('IsTruncated'):
                 return
             token = {'ContinuationToken': page['NextContinuationToken']}
@@ -167,7 +197,7 @@ class S3Requests:
                     raise
 
     def delete(self, bucket: str, key: str) -> None:
-        """Returns also where there is no such object. No stage of ours deletes; the doctor asks whether Tower's own keys may."""
+        """Returns also where there is no such object."""
         with self._asking(bucket, key, self._client) as client:
             client.delete_object(Bucket=bucket, Key=key)
 
@@ -195,6 +225,21 @@ class S3Requests:
         """A captive portal answers 200 to anything, too; only an S3 server sends the ETag of an object."""
         if not answer.get('ETag'):
             raise self._not_s3(bucket, key)
+
+    def _pieces(self, bucket: str, key: str, body: Any) -> Iterator[bytes]:
+        with self._asking(bucket, key, body), closing(body):
+            yield from body.iter_chunks(CHUNK_BYTES)
+
+    def _whole_size(self, headers: Mapping[str, str], bucket: str, key: str, first: int | None) -> int:
+        """Of the object that an answer is about. Raises StoreUnavailable for an answer that no S3 server gave."""
+        self.confirm({'ETag': headers.get('etag')}, bucket, key)
+        told = headers.get('content-range', '')
+        if first is not None and not told.startswith(f'bytes {first}-'):
+            raise self._not_s3(bucket, key)
+        size = told.rpartition('/')[2] if told else headers.get('content-length', '')
+        if not (size.isascii() and size.isdigit()):
+            raise self._not_s3(bucket, key)
+        return int(size)
 
     def _not_s3(self, bucket: str, key: str) -> StoreUnavailable:
         return StoreUnavailable(

@@ -20,6 +20,7 @@ from shadowhound_data_logger.bags.fetch import Told, fetch
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.errors import BagDamaged, BagError, StoreUnavailable
+from shadowhound_data_logger.stores.base import Content
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore
 
@@ -30,8 +31,12 @@ class Counting(MemoryStore):
     limit = 1 << 62
     sent = 0
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Iterator[bytes]:
-        for piece in super().content(bucket, key, start):
+    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        found = super().content(bucket, key, start)
+        return Content(found.info, self._cut_off(found.pieces))
+
+    def _cut_off(self, pieces: Iterator[bytes]) -> Iterator[bytes]:
+        for piece in pieces:
             for at in range(0, len(piece), 4096):
                 if self.sent >= self.limit:
                     raise StoreUnavailable('gone')

@@ -12,10 +12,11 @@ import pytest
 from bags.recording import ROBOT, Desk, desk, manifest, numbers, start, write_out
 
 from shadowhound_data_logger.bags.naming import BUCKET
-from shadowhound_data_logger.bags.overview import NoStore, overview
+from shadowhound_data_logger.bags.overview import overview
 from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.stores.memory import MemoryStore
 
 
 def test_a_disk_without_room_costs_what_comes_meanwhile(tmp_path: Path) -> None:
@@ -146,11 +147,11 @@ def test_slices_that_are_given_up_after_the_end_are_told_on_the_robot(tmp_path: 
         start(it.recorder)
         it.hear(range(20), size=100_000)
         it.recorder.stop()
-        (row,) = overview(NoStore(), ROBOT, it.home)
+        (row,) = overview(MemoryStore(), ROBOT, it.home)
         assert (row.state, row.finding) == ('complete', '')
         more = DataObject(bucket=BUCKET, key='more', body=bytes(3 << 20), content_type='', sensor='imu', topic=None, type='',
                           samples=0, t_start_ns=0, t_end_ns=0, priority=1)  # fmt: skip
         it.spool.commit([more])
-        (row,) = overview(NoStore(), ROBOT, it.home)
+        (row,) = overview(MemoryStore(), ROBOT, it.home)
         assert row.state == 'growing'
         assert row.finding == '1 of 1 slices are not here; 1 were given up by the full spool of this machine'

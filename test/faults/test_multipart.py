@@ -23,7 +23,7 @@ from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import StoreError
 from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.sim.tower import Tower
-from shadowhound_data_logger.stores import parts, s3
+from shadowhound_data_logger.stores import content, s3
 from shadowhound_data_logger.stores.s3 import S3Store
 
 pytestmark = pytest.mark.seaweedfs
@@ -41,7 +41,7 @@ TEST = Path(__file__).parents[1]
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(s3, 'MULTIPART_BYTES', PART)
-    monkeypatch.setattr(parts, 'PART_BYTES', PART)
+    monkeypatch.setattr(content, 'PART_BYTES', PART)
 
 
 @pytest.fixture
@@ -164,8 +164,8 @@ def test_kill_between_parts(store: S3Store, front: Front, seaweed: Tower, item: 
 from pathlib import Path, PosixPath
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.stores import parts, s3
-parts.PART_BYTES = s3.MULTIPART_BYTES = {PART}
+from shadowhound_data_logger.stores import content, s3
+content.PART_BYTES = s3.MULTIPART_BYTES = {PART}
 store = s3.S3Store(StoreSettings(endpoint_url={front.url!r}), UploadSettings())
 store.open()
 store.put({item!r})

@@ -42,17 +42,18 @@ from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.cli.output import shown_time
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.lake import decode, query, reading
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetch import Wish
 from shadowhound_data_logger.lake.fetch import fetch as fetch_objects
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.numbers import table
 from shadowhound_data_logger.lake.samples import Near, Samples, Selection, Window
-from shadowhound_data_logger.lake.source import Entry, open_source
 from shadowhound_data_logger.lake.standing import leaves_of
 from shadowhound_data_logger.lake.track import Track
 from shadowhound_data_logger.mcap.format import CHUNK, RECORD, record, text
 from shadowhound_data_logger.mcap.index import records
 from shadowhound_data_logger.mcap.messages import unpack
+from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore
@@ -245,19 +246,17 @@ def said(ask: Callable[[], object]) -> str:
 class _Bodies:
     """A source of one bucket in memory."""
 
-    bucket, settings = schema.BUCKET, StoreSettings()
+    name, settings = schema.BUCKET, StoreSettings()
 
     def __init__(self, bodies: Mapping[str, bytes]) -> None:
         self.bodies = bodies
 
-    def entries(self) -> list[Entry]:
-        return [Entry(key, len(body), '', datetime.now(timezone.utc)) for key, body in self.bodies.items()]
+    def entries(self) -> list[ObjectInfo]:
+        now = datetime.now(timezone.utc)
+        return [ObjectInfo(schema.BUCKET, key, len(body), None, modified=now) for key, body in self.bodies.items()]
 
-    def read(self, key: str, most: int) -> bytes:
+    def get(self, key: str, most: int) -> bytes:
         return self.bodies[key]
-
-    def tail(self, key: str, count: int) -> bytes:
-        return self.bodies[key][-count:] if count else b''
 
     def ranges(self, key: str, spans: Any) -> list[bytes]:
         return [self.bodies[key][start:end] for start, end in spans]
@@ -348,7 +347,7 @@ def summaries(shop: Shop) -> Round:
         root = shop.input / schema.BUCKET / 'thor' / 'missions' / 'run'
         root.mkdir(parents=True)
         (root / 'summary.json').write_bytes(as_json(fine, rng))
-        source = open_source(StoreSettings(directory=shop.input), schema.BUCKET)
+        source = Bucket(StoreSettings(directory=shop.input), schema.BUCKET)
         run = rng.choice(('run', 'run', 'run', *TEXTS))
         with shop.reading():
             told = query._summary(source, rng.choice(('thor', 'thor', *TEXTS)), run)
@@ -377,7 +376,7 @@ def fetched_objects(shop: Shop) -> Round:
             for _ in range(4)
         ] + [Wish(schema.BUCKET, key, len(body)) for key, body in bodies.items() if rng.random() < 0.5]  # fmt: skip
         with shop.reading():
-            found = fetch_objects(wishes, shop.target, lambda name: open_source(settings, name), threads=2)
+            found = fetch_objects(wishes, shop.target, DirectoryStore(settings.directory), threads=2)
         return f'{found.moved} moved'
 
     return one

@@ -25,9 +25,9 @@ from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bodies import Bodies
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.numbers import table
 from shadowhound_data_logger.lake.query import _summary
-from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.lake.track import Object
 from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, MOST_PIXELS, from_json, from_yaml, unpacked
@@ -229,7 +229,7 @@ def test_a_summary_that_is_none_costs_its_own_figures_alone(tmp_path: Path, told
     path = settings.directory / schema.BUCKET / 'thor/missions/run/summary.json'
     path.parent.mkdir(parents=True)
     path.write_bytes(told)
-    assert _summary(open_source(settings, schema.BUCKET), 'thor', 'run') == {}
+    assert _summary(Bucket(settings, schema.BUCKET), 'thor', 'run') == {}
 
 
 def test_an_object_of_which_a_row_claims_a_million_messages_is_left_out(tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ def test_an_object_of_which_a_row_claims_a_million_messages_is_left_out(tmp_path
         {**row('camera', NOON_NS + 2 * 10**9), 'count': -1},
     ]
     bad_parts.put(folder_store(tmp_path), parts.encode(rows))
-    frames = lake.MissionDataset(open_source(folder_store(tmp_path), schema.BUCKET))
+    frames = lake.MissionDataset(Bucket(folder_store(tmp_path), schema.BUCKET))
     assert len(frames) == 1
     assert len(frames.left_out) == 2
     assert np.array_equal(frames.stamps_ns, [NOON_NS])

@@ -27,8 +27,8 @@ from shadowhound_data_logger.cli.lake import lake as lake_command
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.lake import reading
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.stores import open_store
 
 LIMIT_BYTES = 2 << 30
@@ -84,7 +84,7 @@ def home(sound: Path, tmp_path: Path) -> Path:
 
 def good(home: Path) -> list[str]:
     """The keys of all rows that count."""
-    return sorted(lake.objects(open_source(folder_store(home), schema.BUCKET)).select('key').to_pydict()['key'])
+    return sorted(lake.objects(Bucket(folder_store(home), schema.BUCKET)).select('key').to_pydict()['key'])
 
 
 def run(command: Callable[..., object], home: Path, *arguments: str) -> Result:
@@ -141,7 +141,7 @@ def test_rows_of_others_are_refused_and_counted_and_the_rest_of_the_part_is_answ
     before = good(home)
     key = bad_parts.put(folder_store(home), parts.encode([*mine, *THEIRS]))
     findings = Findings(lambda _: None)
-    source = open_source(folder_store(home), schema.BUCKET)
+    source = Bucket(folder_store(home), schema.BUCKET)
     found = lake.objects(source, findings=findings).select('key').to_pydict()['key']
     assert sorted(found) == sorted([*before, *(str(each['key']) for each in mine)])
     assert [(one.key, one.rows) for one in findings] == [(key, 3)]
@@ -150,7 +150,7 @@ def test_rows_of_others_are_refused_and_counted_and_the_rest_of_the_part_is_answ
 
 def test_a_data_set_says_what_it_leaves_out(home: Path) -> None:
     """And has all the rest."""
-    source = open_source(folder_store(home), schema.BUCKET)
+    source = Bucket(folder_store(home), schema.BUCKET)
     count = len(lake.MissionDataset(source))
     key = bad_parts.put(folder_store(home), b'')
     frames = lake.MissionDataset(source)
@@ -169,7 +169,7 @@ def test_a_compacted_part_that_lies_about_its_leaves_costs_itself_alone(home: Pa
     ]  # fmt: skip
     told = [bad_parts.put(settings, body, name) for name, body in made]
     findings = Findings(lambda _: None)
-    found = sorted(lake.objects(open_source(settings, schema.BUCKET), findings=findings).select('key').to_pydict()['key'])
+    found = sorted(lake.objects(Bucket(settings, schema.BUCKET), findings=findings).select('key').to_pydict()['key'])
     assert {one.key for one in findings} == set(told[:-1]), 'of those that contradict each other the fuller one counts'
     assert found == sorted([*before, *keys(ROWS)])
 
@@ -189,7 +189,7 @@ def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None
     assert good(home) == before
     (root / 'thor/_catalog/date=2026-10-28/\x1b[31m.parquet').write_bytes(parts.encode(ROWS))
     findings = Findings(lambda _: None)
-    lake.objects(open_source(folder_store(home), schema.BUCKET), findings=findings).collect()
+    lake.objects(Bucket(folder_store(home), schema.BUCKET), findings=findings).collect()
     assert [(one.key.rpartition('/')[2], '\x1b' in str(one)) for one in findings] == [('\x1b[31m.parquet', False)]
 
 
@@ -227,4 +227,4 @@ def test_large_parts_are_read_in_pieces_and_ruled_out_by_their_statistics(
     monkeypatch.setattr(lake.reading, 'SMALL_BYTES', 1000)
     source = watched(settings)
     assert sorted(lake.objects(source).select('key').to_pydict()['key']) == keys(rows)
-    assert {verb for verb, _ in source.asked} == {'folders', 'list', 'tail', 'ranges'}
+    assert {verb for verb, _ in source.asked} == {'folders', 'list', 'ranges'}

@@ -20,7 +20,7 @@ from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import BagDamaged, LakeError, NameRefused, ObjectRefused, StoreError
 from shadowhound_data_logger.lake.bodies import Place
-from shadowhound_data_logger.lake.source import open_source
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.memory import MemoryStore
@@ -52,7 +52,7 @@ def test_a_data_set_reads_nothing_outside(tmp_path: Path, key: str, is_fetched: 
     (root / 'secret.jpg').write_bytes(b'secret')
     told = {**row('camera', NOON_NS), 'key': key, 'sha256': None, 'bytes': 6}
     bad_parts.put(folder_store(tmp_path), parts.encode([told]))
-    frames = lake.MissionDataset(root if is_fetched else open_source(folder_store(tmp_path), schema.BUCKET))
+    frames = lake.MissionDataset(root if is_fetched else Bucket(folder_store(tmp_path), schema.BUCKET))
     assert len(frames) == 1
     with pytest.raises((StoreError, LakeError), match='no path'):
         frames[0]
@@ -82,11 +82,11 @@ def test_a_source_reads_nothing_outside_its_bucket(tmp_path: Path) -> None:
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [{**row('camera', NOON_NS), 'mission_id': 'm', 'run_id': run_id}], 'a', tmp_path / 'tmp')
     (settings.directory / schema.BUCKET / 'thor' / 'missions').mkdir()
-    source = open_source(settings, schema.BUCKET)
+    source = Bucket(settings, schema.BUCKET)
     assert lake.missions(source).to_pydict()['result'] == [None]
     key = f'thor/missions/{run_id}/summary.json'
-    for ask in (lambda: source.read(key, 100), lambda: source.tail(key, 5), lambda: source.get(key), lambda: source.head(key),
-                lambda: source.ranges(key, [(0, 5)]), lambda: source.delete([key]), lambda: source.folders('../'),
+    for ask in (lambda: source.get(key, 100), lambda: source.head(key),
+                lambda: source.ranges(key, [(0, 5)]), lambda: source.delete(key), lambda: source.folders('../'),
                 lambda: list(source.list('../../'))):  # fmt: skip
         with pytest.raises(ObjectRefused):
             ask()

@@ -14,8 +14,8 @@ from typing import Any, Final
 from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.lake.source import Entry, Source, open_source
-from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -104,11 +104,11 @@ def folder_store(root: Path) -> StoreSettings:
 
 
 class Watched:
-    """A source that remembers what it was asked for, and may be told to fail."""
+    """A bucket that remembers what it was asked for, and may be told to fail."""
 
-    def __init__(self, inner: Source) -> None:
+    def __init__(self, inner: Bucket) -> None:
         self.inner = inner
-        self.settings, self.bucket = inner.settings, inner.bucket
+        self.settings, self.name = inner.settings, inner.name
         self.asked: list[tuple[str, str]] = []
         self._lock = threading.Lock()
 
@@ -119,42 +119,33 @@ class Watched:
         with self._lock:
             self.asked.append((verb, key))
 
-    def folders(self, prefix: str) -> list[str]:
+    def folders(self, prefix: str) -> Sequence[str]:
         self._ask('folders', prefix)
         return self.inner.folders(prefix)
 
-    def list(self, prefix: str) -> Iterator[Entry]:
+    def list(self, prefix: str) -> Sequence[ObjectInfo]:
         self._ask('list', prefix)
         return self.inner.list(prefix)
 
-    def read(self, key: str, most: int) -> bytes:
-        self._ask('read', key)
-        return self.inner.read(key, most)
+    def get(self, key: str, most: int) -> bytes:
+        self._ask('get', key)
+        return self.inner.get(key, most)
 
     def ranges(self, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
         self._ask('ranges', key)
         return self.inner.ranges(key, spans)
 
-    def tail(self, key: str, count: int) -> bytes:
-        self._ask('tail', key)
-        return self.inner.tail(key, count)
-
-    def get(self, key: str) -> Any:
-        self._ask('get', key)
-        return self.inner.get(key)
-
     def head(self, key: str) -> Any:
         self._ask('head', key)
         return self.inner.head(key)
 
-    def delete(self, keys: Sequence[str]) -> None:
-        for key in keys:
-            self._ask('delete', key)
-        self.inner.delete(keys)
+    def delete(self, key: str) -> None:
+        self._ask('delete', key)
+        self.inner.delete(key)
 
 
 def watched(settings: StoreSettings, bucket: str = schema.BUCKET) -> Watched:
-    return Watched(open_source(settings, bucket))
+    return Watched(Bucket(settings, bucket))
 
 
 def keys(rows: Sequence[schema.Row]) -> list[str]:

@@ -17,8 +17,8 @@ from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import AccessDenied, StoreUnavailable
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import Compacted, compact
-from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.lake.standing import is_compacted
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
@@ -64,15 +64,15 @@ class MortalStore:
 
 def run(settings: StoreSettings, **how: Any) -> list[Compacted]:
     with closing(open_store(settings, UploadSettings())) as store:
-        return list(compact(open_source(settings, schema.BUCKET), store, **{'now': lambda: TODAY, 'before': '2026-10-29', **how}))
+        return list(compact(Bucket(settings, schema.BUCKET), store, **{'now': lambda: TODAY, 'before': '2026-10-29', **how}))
 
 
 def files(settings: StoreSettings, date: str = '2026-10-28') -> list[str]:
-    return sorted(entry.key for entry in open_source(settings, schema.BUCKET).list(f'thor/_catalog/date={date}/'))
+    return sorted(entry.key for entry in Bucket(settings, schema.BUCKET).list(f'thor/_catalog/date={date}/'))
 
 
 def answer(settings: StoreSettings, **flags: Any) -> list[str]:
-    return sorted(lake.objects(open_source(settings, schema.BUCKET), **flags).select('key').to_pydict()['key'])
+    return sorted(lake.objects(Bucket(settings, schema.BUCKET), **flags).select('key').to_pydict()['key'])
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_it_may_die_anywhere(tmp_path: Path) -> None:
                 add_part(store, [row('odom', NOON_NS + minute * 60 * SECOND)], f'part{minute}', tmp_path / 'tmp')
             rows = [row('odom', NOON_NS + minute * 60 * SECOND) for minute in range(3)]
             life = [number]
-            mortal = Mortal(open_source(settings, schema.BUCKET), life)
+            mortal = Mortal(Bucket(settings, schema.BUCKET), life)
             try:
                 for now in (TODAY, LATER):
                     list(compact(mortal, MortalStore(store, life), before='2026-10-29', now=lambda now=now: now))  # type: ignore[arg-type, misc]
@@ -203,7 +203,7 @@ def test_on_a_real_server(seaweed: Tower, tmp_path: Path) -> None:
     with closing(open_store(settings, UploadSettings())) as store:
         for start in range(0, len(rows), 20):
             add_part(store, rows[start : start + 20], f'part{start:04d}', tmp_path)
-        source = open_source(settings, schema.BUCKET)
+        source = Bucket(settings, schema.BUCKET)
         want = {'robot': 'tachi', 'since': '2026-10-28', 'until': '2026-10-29'}
         assert answer(settings, **want) == keys(rows)
         for now in (TODAY, LATER):

@@ -18,10 +18,11 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.lake import MissionDataset, Near, Window, fetched_rows, query, selecting
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.fetch import Wish, fetch
-from shadowhound_data_logger.lake.source import Source, open_source
 from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.directory import DirectoryStore
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.sim.tower import Tower
@@ -30,10 +31,10 @@ ALIGN = {'odom': 0.5, 'imu': Window(0.5, rows=8), 'joints': 0.2, 'lowstate': 5.0
 SECONDS = 6
 
 
-def drive(tmp_path: Path, seconds: int = SECONDS, **how: Any) -> Source:
+def drive(tmp_path: Path, seconds: int = SECONDS, **how: Any) -> Bucket:
     settings = folder_store(tmp_path)
     Drive(settings, tmp_path).record(seconds, **how)
-    return open_source(settings, BUCKET)
+    return Bucket(settings, BUCKET)
 
 
 def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
@@ -102,7 +103,7 @@ def test_repeats_are_samples_of_their_own(tmp_path: Path) -> None:
         {**one.metadata, 't_start_ns': str(at), 't_end_ns': str(at)} for at in (NOON_NS + 2 * SECOND, NOON_NS + 3 * SECOND)
     ]
     still.catalogue([(one, told) for told in repeats])
-    dataset = MissionDataset(open_source(settings, BUCKET))
+    dataset = MissionDataset(Bucket(settings, BUCKET))
     assert [int(dataset[number]['stamp_ns']) for number in range(len(dataset))] == [
         *stamps, *(NOON_NS + second * SECOND for second in (1, 2, 3))
     ]  # fmt: skip
@@ -116,9 +117,7 @@ def test_what_is_too_far_away_is_missing(tmp_path: Path) -> None:
     partly = Drive(settings, tmp_path)
     partly.record(4, without=['imu'])
     partly.record(1, first=9)
-    dataset = MissionDataset(
-        open_source(settings, BUCKET), align={'odom': Near(0.02), 'lowstate': 0.1, 'imu': Window(0.5, rows=3)}
-    )
+    dataset = MissionDataset(Bucket(settings, BUCKET), align={'odom': Near(0.02), 'lowstate': 0.1, 'imu': Window(0.5, rows=3)})
     sample = dataset[3]
     assert np.isnan(sample['odom']).all()
     assert sample['odom'].shape == (13,)
@@ -131,7 +130,7 @@ def test_robots_differ_in_what_they_have(tmp_path: Path) -> None:
     settings = folder_store(tmp_path)
     Drive(settings, tmp_path).record(1)
     Drive(settings, tmp_path, 'tachi').record(1, without=['imu', 'joints', 'lidar'])
-    dataset = MissionDataset(open_source(settings, BUCKET), align={'joints': 0.1, 'imu': Window(0.5, rows=3), 'lidar': 0.1})
+    dataset = MissionDataset(Bucket(settings, BUCKET), align={'joints': 0.1, 'imu': Window(0.5, rows=3), 'lidar': 0.1})
     bare, full = dataset.__getitems__(range(2))
     assert {name: value.dtype for name, value in bare.items()} == {name: value.dtype for name, value in full.items()}
     assert [bare[name].shape for name in ('joints', 'imu', 'lidar')] == [(12,), (3, 10), (0, 4)]
@@ -156,7 +155,7 @@ def test_a_pose_that_is_known_is_not_lost_at_the_side_of_one_that_is_not(tmp_pat
         stamps = [NOON_NS + second * SECOND + number * SECOND // 4 for number in range(4)]
         kind, how = 'sensor_msgs/msg/CompressedImage', {'format': 'tar', 'batch_s': 1.0}
         still.store([still.one(kind, stamps, [still.frame(number) for number in range(4)], **how)], **more)
-    dataset = MissionDataset(open_source(settings, BUCKET))
+    dataset = MissionDataset(Bucket(settings, BUCKET))
     assert [dataset[number]['pose'][0] for number in range(4)] == pytest.approx([0.375] * 4)
     assert all(np.isnan(dataset[number]['pose']).all() for number in range(4, 8))
 
@@ -173,7 +172,7 @@ def test_incomplete_samples_can_be_left_out(tmp_path: Path) -> None:
     partly = Drive(settings, tmp_path)
     partly.record(3, frames='tar')
     partly.record(3, frames='tar', without=['joints'], first=3)
-    source = open_source(settings, BUCKET)
+    source = Bucket(settings, BUCKET)
     whole = MissionDataset(source, align={'joints': 0.05}, drop_incomplete=True)
     assert len(whole) == 3 * FRAMES_HZ
     streamed = list(whole.stream())
@@ -200,7 +199,8 @@ def test_a_fetched_folder_gives_the_same(tmp_path: Path, frames: str) -> None:
     source, to = drive(tmp_path, frames=frames), tmp_path / 'data'
     for flags in ({'sensor': 'camera'}, {'robot': 'thor'}):
         rows = query.objects(source, **flags).to_pylist()
-        fetch([Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows], to, lambda _: source)
+        wishes = [Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows]
+        fetch(wishes, to, DirectoryStore(source.settings.directory))
         fetched_rows.keep(to, rows)
     store, folder = MissionDataset(source, align=ALIGN), MissionDataset(to, align=ALIGN)
     assert len(store) == len(folder) > 0
@@ -231,7 +231,7 @@ def test_repeats_survive_compaction(tmp_path: Path) -> None:
     one = still.one('sensor_msgs/msg/CompressedImage', [NOON_NS], [still.frame(6)])
     still.store([one])
     still.catalogue([(one, {**one.metadata, 't_start_ns': str(NOON_NS + SECOND), 't_end_ns': str(NOON_NS + SECOND)})])
-    source = open_source(settings, BUCKET)
+    source = Bucket(settings, BUCKET)
     with closing(open_store(settings, UploadSettings())) as store:
         assert [each.rows for each in compact(source, store, grace=None)] == [2]
     assert list(MissionDataset(source).stamps_ns) == [NOON_NS, NOON_NS + SECOND]
@@ -252,7 +252,7 @@ def test_questions_are_those_of_the_catalogue(tmp_path: Path) -> None:
     settings = folder_store(tmp_path)
     Drive(settings, tmp_path).record(4)
     Drive(settings, tmp_path, 'tachi').record(4, without=['odom'])
-    source = open_source(settings, BUCKET)
+    source = Bucket(settings, BUCKET)
     near = MissionDataset(source, robot='thor', near=(2.0, -2.0, 0.5), align={'odom': 0.5})
     assert [sample['odom'][0] for sample in near.stream()] == [2]
     both = MissionDataset(source, align={'odom': 0.5})
@@ -287,7 +287,7 @@ def test_from_a_real_server(tmp_path: Path, seaweed: Tower, frames: str) -> None
     there = Drive(folder_store(tmp_path), tmp_path / 'folder', robot)
     for each in (ours, there):
         each.record(SECONDS, frames=frames)
-    one, other = (MissionDataset(open_source(each.settings, BUCKET), robot=robot, align=ALIGN) for each in (ours, there))
+    one, other = (MissionDataset(Bucket(each.settings, BUCKET), robot=robot, align=ALIGN) for each in (ours, there))
     assert len(one) == len(other) > 0
     assert all(map(same, one.stream(), other.stream()))
     assert all(same(one[number], other[number]) for number in range(len(one)))

@@ -17,7 +17,7 @@ from lake.training import FRAMES_HZ, Drive, in_a_child
 
 from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.lake import MissionDataset, dataset, shards
-from shadowhound_data_logger.lake.source import Source, open_source
+from shadowhound_data_logger.lake.bucket import Bucket
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.sim.tower import Tower
@@ -27,11 +27,11 @@ CHILD_S = 60
 
 
 @pytest.fixture(scope='module')
-def source(tmp_path_factory: pytest.TempPathFactory) -> Source:
+def source(tmp_path_factory: pytest.TempPathFactory) -> Bucket:
     """Ten archives of four frames each."""
     tmp = tmp_path_factory.mktemp('drive')
     Drive(folder_store(tmp), tmp).record(SECONDS, frames='tar', without=['imu', 'joints', 'lidar', 'lowstate'])
-    return open_source(folder_store(tmp), BUCKET)
+    return Bucket(folder_store(tmp), BUCKET)
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def stamps(stream: Any) -> list[int]:
     return [int(sample['stamp_ns']) for sample in stream]
 
 
-def test_workers_have_whole_shards_and_all_of_them(source: Source, in_worker: Any) -> None:
+def test_workers_have_whole_shards_and_all_of_them(source: Bucket, in_worker: Any) -> None:
     """Three workers: no archive is read by two, every frame comes once; a DataLoader takes the stream for an IterableDataset."""
     frames = MissionDataset(source)
     got = []
@@ -70,7 +70,7 @@ def test_workers_have_whole_shards_and_all_of_them(source: Source, in_worker: An
     assert sorted(stamp for mine in got for stamp in mine) == stamps(frames.stream())
 
 
-def test_ranks_split_what_their_workers_split(source: Source, in_worker: Any) -> None:
+def test_ranks_split_what_their_workers_split(source: Bucket, in_worker: Any) -> None:
     """Two processes of two workers each: four shares of one whole."""
     frames, got = MissionDataset(source), []
     for rank in range(2):
@@ -81,7 +81,7 @@ def test_ranks_split_what_their_workers_split(source: Source, in_worker: Any) ->
     assert sorted(got) == stamps(frames.stream())
 
 
-def test_epochs_differ_and_can_be_had_again(source: Source) -> None:
+def test_epochs_differ_and_can_be_had_again(source: Bucket) -> None:
     """Each iteration is another epoch's order, ``set_epoch`` names one, and seeds differ."""
     frames = MissionDataset(source)
     stream = frames.stream(shuffle=True, seed=7)
@@ -94,7 +94,7 @@ def test_epochs_differ_and_can_be_had_again(source: Source) -> None:
     assert stamps(pickle.loads(pickle.dumps(frames.stream(shuffle=True, seed=7)))) == first  # noqa: S301 - our own
 
 
-def test_a_shuffled_stream_mixes_archives_and_reads_each_once(source: Source) -> None:
+def test_a_shuffled_stream_mixes_archives_and_reads_each_once(source: Bucket) -> None:
     """Neighbours in the stream are of several archives, and no object is fetched twice."""
     frames = MissionDataset(source)
     asked: list[str] = []
@@ -120,7 +120,7 @@ def test_a_shard_of_single_objects_is_bounded() -> None:
     assert [(each.first, each.last) for each in cut] == [(0, 64), (64, 70), (70, 71), (71, 72), (72, 74)]
 
 
-def test_what_is_read_ahead_is_bounded(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_read_ahead_is_bounded(source: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the first sample no more is asked for than the bound and one object."""
     frames = MissionDataset(source)
     size = int(frames._selection.anchors[0].size[0])
@@ -140,7 +140,7 @@ def test_a_process_that_was_started_after_reading(tmp_path: Path, seaweed: Tower
     """Forked or spawned, it reads from the server what its parent reads, though the parent has connections and threads."""
     robot = f'worker{way}'
     Drive(seaweed.store_settings(), tmp_path, robot).record(4)
-    frames = MissionDataset(open_source(seaweed.store_settings(), BUCKET), robot=robot)
+    frames = MissionDataset(Bucket(seaweed.store_settings(), BUCKET), robot=robot)
     expected = [int(sample['stamp_ns']) for sample in frames.__getitems__(range(4))]
     context: Any = multiprocessing.get_context(way)
     out = context.SimpleQueue()
@@ -156,7 +156,7 @@ def test_a_process_that_was_started_after_reading(tmp_path: Path, seaweed: Tower
         frames.close()
 
 
-def test_a_pickled_data_set_is_a_value(source: Source) -> None:
+def test_a_pickled_data_set_is_a_value(source: Bucket) -> None:
     """No thread, lock or connection goes along, and neither does what was read."""
     frames = MissionDataset(source)
     before = len(pickle.dumps(frames))
@@ -174,7 +174,7 @@ def test_importing_it_loads_no_torch() -> None:
 
 
 @pytest.mark.parametrize('style', ['number', 'stream'])
-def test_with_the_real_data_loader(source: Source, style: str) -> None:
+def test_with_the_real_data_loader(source: Bucket, style: str) -> None:
     """Two forked workers give every frame once, as tensors."""
     data = pytest.importorskip('torch.utils.data', reason='torch is not installed (the extra "train")')
     frames = MissionDataset(source, align={'odom': 0.5})

@@ -10,17 +10,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from lake.making import NOON_NS, Watched, add, folder_store, row, watched
+from lake.making import NOON_NS, add, folder_store, row
 
 from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import CredentialsRejected, LakeError, StoreUnavailable
 from shadowhound_data_logger.lake import fetched_rows
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetch import Result, Wish, fetch, under
 from shadowhound_data_logger.lake.fetched import Fetched
-from shadowhound_data_logger.lake.source import Content, open_source
 from shadowhound_data_logger.options import StoreSettings
-from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores import open_store, retry
+from shadowhound_data_logger.stores.base import Content
+from shadowhound_data_logger.stores.directory import DirectoryStore
+from shadowhound_data_logger.stores.s3_obstore import ObstoreStore
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.sim.tower import Tower
@@ -44,14 +47,36 @@ def fill(settings: StoreSettings, folder: Path) -> None:
         add(store, folder, 'thor/camera/20261029/000000_front.jpg', b'another day')
 
 
-def run(source: Watched, to: Path, **how: Any) -> Result:
-    """Everything under the prefix; the source remembers what that took."""
-    wishes = how.pop('wishes', None) or under(source, PREFIX)
-    return fetch(wishes, to, lambda _: source, **how)
+class Asked(DirectoryStore):
+    """Remembers whose content it was asked for."""
+
+    def __init__(self, settings: StoreSettings) -> None:
+        super().__init__(settings.directory)
+        self.settings = settings
+        self.asked: list[str] = []
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        self.asked.append(key)
+        return super().content(bucket, key, start)
 
 
-def moved(source: Watched) -> list[str]:
-    return [key for verb, key in source.asked if verb == 'get']
+class Real(ObstoreStore):
+    """The same, of a server."""
+
+    def __init__(self, settings: StoreSettings) -> None:
+        super().__init__(settings, UploadSettings())
+        self.settings = settings
+        self.asked: list[str] = []
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        self.asked.append(key)
+        return super().content(bucket, key, start)
+
+
+def run(store: Asked | Real, to: Path, **how: Any) -> Result:
+    """Everything under the prefix."""
+    wishes = how.pop('wishes', None) or under(Bucket(store.settings, BUCKET), PREFIX)
+    return fetch(wishes, to, store, **how)
 
 
 def whole(to: Path) -> bool:
@@ -60,24 +85,24 @@ def whole(to: Path) -> bool:
 
 def test_a_prefix_keeps_its_layout_and_a_second_run_moves_nothing(settings: StoreSettings, tmp_path: Path) -> None:
     """Exactly the objects under it, each at DIR/KEY; then one listing and not one object more."""
-    source, to = watched(settings), tmp_path / 'data'
+    source, to = Asked(settings), tmp_path / 'data'
     assert run(source, to) == Result(moved=COUNT, bytes=sum(map(len, OBJECTS.values())))
     assert whole(to)
     source.asked.clear()
     assert run(source, to) == Result(present=COUNT)
-    assert source.asked == [('list', PREFIX)]
+    assert source.asked == []
 
 
 @pytest.mark.parametrize('prefix', ['thor/camera/2026102', 'thor/camera/20261028', 'thor/cam', 'thor/camera/20261028/00001'])
 def test_a_prefix_need_not_end_at_a_folder(settings: StoreSettings, prefix: str) -> None:
     """As in S3."""
     expected = sorted(key for key in [*OBJECTS, 'thor/camera/20261029/000000_front.jpg'] if key.startswith(prefix))
-    assert [wish.key for wish in under(open_source(settings, BUCKET), prefix)] == expected
+    assert [wish.key for wish in under(Bucket(settings, BUCKET), prefix)] == expected
 
 
 def test_what_was_changed_on_this_side_is_fetched_again(settings: StoreSettings, tmp_path: Path) -> None:
     """A file that is gone, of another size, or written since; only those."""
-    source, to = watched(settings), tmp_path / 'data'
+    source, to = Asked(settings), tmp_path / 'data'
     run(source, to)
     gone, short, touched, *_ = OBJECTS
     (to / gone).unlink()
@@ -85,13 +110,13 @@ def test_what_was_changed_on_this_side_is_fetched_again(settings: StoreSettings,
     (to / touched).write_bytes(bytes(len(OBJECTS[touched])))
     source.asked.clear()
     assert run(source, to).moved == 3
-    assert sorted(moved(source)) == sorted([gone, short, touched])
+    assert sorted(source.asked) == sorted([gone, short, touched])
     assert whole(to)
 
 
 def test_verify_finds_what_has_the_right_size_and_time(settings: StoreSettings, tmp_path: Path) -> None:
     """A bit that rotted on this disk."""
-    source, to = watched(settings), tmp_path / 'data'
+    source, to = Asked(settings), tmp_path / 'data'
     run(source, to)
     rotten = to / next(iter(OBJECTS))
     seen = rotten.stat()
@@ -105,14 +130,14 @@ def test_verify_finds_what_has_the_right_size_and_time(settings: StoreSettings, 
 
 def test_what_another_program_fetched_is_read_and_not_moved(settings: StoreSettings, tmp_path: Path) -> None:
     """A folder that `aws s3 sync` or a lost memory left: the content is compared, nothing is transferred."""
-    source, to = watched(settings), tmp_path / 'data'
+    source, to = Asked(settings), tmp_path / 'data'
     for key, body in OBJECTS.items():
         (to / key).parent.mkdir(parents=True, exist_ok=True)
         (to / key).write_bytes(body)
     (to / '.fetch').mkdir()
     (to / '.fetch' / 'files.db').write_bytes(b'no database at all' * 100)
     assert run(source, to) == Result(present=COUNT)
-    assert moved(source) == []
+    assert source.asked == []
 
 
 def test_damage_on_the_way_is_tried_again_and_never_kept(settings: StoreSettings, tmp_path: Path) -> None:
@@ -120,15 +145,15 @@ def test_damage_on_the_way_is_tried_again_and_never_kept(settings: StoreSettings
     once, always, *_ = OBJECTS
     damaged = {once: 1, always: 99}
 
-    class Damaging(Watched):
-        def get(self, key: str) -> Content:
-            content = super().get(key)
+    class Damaging(Asked):
+        def content(self, bucket: str, key: str, start: int = 0) -> Content:
+            content = super().content(bucket, key, start)
             if damaged.get(key, 0):
                 damaged[key] -= 1
-                return replace(content, pieces=iter([bytes(content.size)]))
+                return replace(content, pieces=iter([bytes(content.info.size)]))
             return content
 
-    source, to = Damaging(open_source(settings, BUCKET)), tmp_path / 'data'
+    source, to = Damaging(settings), tmp_path / 'data'
     found = run(source, to)
     assert (found.moved, list(found.failed)) == (COUNT - 1, [f'{BUCKET}/{always}'])
     assert 'SHA-256' in found.failed[f'{BUCKET}/{always}']
@@ -140,7 +165,7 @@ def test_damage_on_the_way_is_tried_again_and_never_kept(settings: StoreSettings
 def test_the_word_of_the_catalogue_counts(settings: StoreSettings, tmp_path: Path) -> None:
     """An object that is not what its row says is a failure, whatever it says of itself."""
     key = next(iter(OBJECTS))
-    found = run(watched(settings), tmp_path / 'data', wishes=[Wish(BUCKET, key, len(OBJECTS[key]), sha256='0' * 64)])
+    found = run(Asked(settings), tmp_path / 'data', wishes=[Wish(BUCKET, key, len(OBJECTS[key]), sha256='0' * 64)])
     assert list(found.failed) == [f'{BUCKET}/{key}']
 
 
@@ -148,17 +173,17 @@ def test_an_object_without_a_checksum_has_its_size_alone(settings: StoreSettings
     """Said so, and looked at again the next time."""
     key = next(iter(OBJECTS))
     (settings.directory / '.metadata' / BUCKET / f'{key}.json').unlink()
-    source = watched(settings)
+    source = Asked(settings)
     assert run(source, tmp_path / 'data').unverified == 1
     source.asked.clear()
     assert run(source, tmp_path / 'data').moved == 1
-    assert moved(source) == [key]
+    assert source.asked == [key]
 
 
 @pytest.mark.parametrize('key', ['../outside', '/etc/passwd', 'a//b', 'a/./b', 'a/../../b', '.fetch/files.db', ''])
 def test_no_key_leads_out_of_the_folder(settings: StoreSettings, tmp_path: Path, key: str) -> None:
     """Anybody may have written to a bucket."""
-    source = watched(settings)
+    source = Asked(settings)
     found = run(source, tmp_path / 'data', wishes=[Wish(BUCKET, key, 3)])
     assert list(found.failed) == [f'{BUCKET}/{key}']
     assert source.asked == []
@@ -178,24 +203,25 @@ def test_one_that_cannot_be_fetched_stops_no_other(settings: StoreSettings, tmp_
     keys = list(OBJECTS)
     to = tmp_path / 'data'
     (to / keys[0]).mkdir(parents=True)
-    wishes = [*under(open_source(settings, BUCKET), PREFIX), Wish(BUCKET, 'thor/gone', 3), Wish('other', keys[1], 3)]
-    found = run(watched(settings), to, wishes=wishes)
+    wishes = [*under(Bucket(settings, BUCKET), PREFIX), Wish(BUCKET, 'thor/gone', 3), Wish('other', keys[1], 3)]
+    found = run(Asked(settings), to, wishes=wishes)
     assert found.moved == COUNT - 1
     assert set(found.failed) == {f'{BUCKET}/{keys[0]}', f'{BUCKET}/thor/gone', f'other/{keys[1]}'}
     assert all(found.failed.values())
 
 
-def test_a_store_that_is_away_ends_it(settings: StoreSettings, tmp_path: Path) -> None:
+def test_a_store_that_is_away_ends_it(settings: StoreSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not each of a million objects is tried; what concerns all of them is raised."""
+    monkeypatch.setattr(retry, 'BASE_S', 0.001)
     tried = 0
 
-    class Away(Watched):
-        def get(self, key: str) -> Content:
+    class Away(Asked):
+        def content(self, bucket: str, key: str, start: int = 0) -> Content:
             nonlocal tried
             tried += 1
             raise error
 
-    source = Away(open_source(settings, BUCKET))
+    source = Away(settings)
     wishes = [Wish(BUCKET, f'thor/{number}', 3) for number in range(2000)]
     error: Exception = StoreUnavailable('away')
     with pytest.raises(StoreUnavailable):
@@ -209,12 +235,12 @@ def test_a_store_that_is_away_ends_it(settings: StoreSettings, tmp_path: Path) -
 def test_two_do_not_write_to_one_folder(settings: StoreSettings, tmp_path: Path) -> None:
     """The second says so."""
     with Fetched(tmp_path / 'data'), pytest.raises(LakeError, match='another fetch'):
-        run(watched(settings), tmp_path / 'data')
+        run(Asked(settings), tmp_path / 'data')
 
 
 def test_what_was_not_synced_is_read_again_after_a_power_cut(settings: StoreSettings, tmp_path: Path) -> None:
     """Noted by a run that was killed, in another boot: the file is hashed, and moved if it is not whole."""
-    source, to = watched(settings), tmp_path / 'data'
+    source, to = Asked(settings), tmp_path / 'data'
     run(source, to)
     with closing(sqlite3.connect(to / '.fetch' / 'files.db')) as db, db:
         db.execute("UPDATE files SET boot = 'another'")
@@ -224,7 +250,7 @@ def test_what_was_not_synced_is_read_again_after_a_power_cut(settings: StoreSett
     os.utime(zeros, ns=(seen.st_atime_ns, seen.st_mtime_ns))
     source.asked.clear()
     assert run(source, to).moved == 1
-    assert moved(source) == [str(zeros.relative_to(to))]
+    assert source.asked == [str(zeros.relative_to(to))]
     assert whole(to)
 
 
@@ -238,7 +264,7 @@ def test_progress_adds_up(settings: StoreSettings, tmp_path: Path) -> None:
 
     for _ in range(2):
         told[:] = [0, 0]
-        run(watched(settings), tmp_path / 'data', tell=tell, threads=1)
+        run(Asked(settings), tmp_path / 'data', tell=tell, threads=1)
         assert told == [sum(map(len, OBJECTS.values())), COUNT]
 
 
@@ -254,12 +280,12 @@ def test_from_a_real_server(real: Tower, tmp_path: Path) -> None:
     with closing(open_store(real.store_settings(), UploadSettings())) as store:
         add(store, tmp_path / 'tmp', 'thor/rosbags/large/0.mcap', os.urandom(5 << 20))
         add(store, tmp_path / 'tmp', 'thor/rosbags/large/empty', b'')
-    source, to = watched(real.store_settings()), tmp_path / 'data'
+    source, to = Real(real.store_settings()), tmp_path / 'data'
     assert run(source, to).moved == COUNT
     assert whole(to)
-    assert run(source, to, wishes=under(source, 'thor/rosbags/large/')) == Result(moved=2, bytes=5 << 20)
+    assert run(source, to, wishes=under(Bucket(source.settings, BUCKET), 'thor/rosbags/large/')) == Result(moved=2, bytes=5 << 20)
     source.asked.clear()
     assert run(source, to) == Result(present=COUNT)
-    assert moved(source) == []
+    assert source.asked == []
     with pytest.raises(StoreUnavailable):
-        run(watched(replace(real.store_settings(), endpoint_url='http://127.0.0.1:9')), to)
+        run(Real(replace(real.store_settings(), endpoint_url='http://127.0.0.1:9')), to)

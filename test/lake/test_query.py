@@ -17,8 +17,8 @@ from shadowhound_data_logger import lake
 from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import CredentialsRejected, LakeError, SettingError
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.query import answering
-from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
@@ -69,14 +69,14 @@ def test_flags_mean_what_they_say(
     """The answer is what a loop over all rows finds."""
     settings, rows = world
     expected = keys([row for row in rows if holds(row)])
-    assert found(open_source(settings, schema.BUCKET), **flags) == expected
+    assert found(Bucket(settings, schema.BUCKET), **flags) == expected
     assert bool(expected) != (flags == {'robot': 'tachi'}), 'a question that nothing answers proves nothing'
 
 
 def test_every_column_comes_back_as_it_was_written(world: tuple[StoreSettings, list[schema.Row]]) -> None:
     """Names, order and values; times in UTC."""
     settings, rows = world
-    answer = lake.objects(open_source(settings, schema.BUCKET), sensor='camera').sort('t_start_ns').limit(1).to_pylist()
+    answer = lake.objects(Bucket(settings, schema.BUCKET), sensor='camera').sort('t_start_ns').limit(1).to_pylist()
     first = min((row for row in rows if row['sensor'] == 'camera'), key=lambda row: row['t_start_ns'])
     assert list(answer[0]) == list(schema.COLUMNS)
     times = {'t_start', 't_end'}
@@ -93,11 +93,11 @@ def test_only_the_asked_days_are_asked_for(world: tuple[StoreSettings, list[sche
     frame = lake.objects(source, **DAY)
     assert source.asked == []
     frame.collect()
-    assert {verb for verb, _ in source.asked} == {'folders', 'list', 'read'}
+    assert {verb for verb, _ in source.asked} == {'folders', 'list', 'get'}
     assert [key for verb, key in source.asked if verb == 'folders'] == ['']
     assert {key for verb, key in source.asked if verb == 'list'} == {'thor/_catalog/date=2026-10-28/'}
-    assert all(key.startswith('thor/_catalog/date=2026-10-28/') for verb, key in source.asked if verb == 'read')
-    assert len({key for verb, key in source.asked if verb == 'read'}) == 24
+    assert all(key.startswith('thor/_catalog/date=2026-10-28/') for verb, key in source.asked if verb == 'get')
+    assert len({key for verb, key in source.asked if verb == 'get'}) == 24
 
 
 def test_a_robot_that_is_named_is_not_looked_for(world: tuple[StoreSettings, list[schema.Row]]) -> None:
@@ -110,7 +110,7 @@ def test_a_robot_that_is_named_is_not_looked_for(world: tuple[StoreSettings, lis
 
 def test_sql_over_the_views(world: tuple[StoreSettings, list[schema.Row]]) -> None:
     """``objects``, ``topics`` and ``missions`` agree with one another, within the flags."""
-    source = open_source(world[0], schema.BUCKET)
+    source = Bucket(world[0], schema.BUCKET)
     day = [row for row in world[1] if schema.date_of(row) == '2026-10-28']
     counted = lake.sql('SELECT sensor, count(*) AS n FROM objects GROUP BY sensor ORDER BY sensor', source, **DAY).to_pydict()
     assert counted == {'sensor': ['camera', 'odom'], 'n': [len(day) // 2, len(day) // 2]}
@@ -134,7 +134,7 @@ def test_a_senseless_summary_costs_its_own_figures_alone(tmp_path: Path, told: s
     with closing(open_store(settings, UploadSettings())) as store:
         add(store, tmp_path / 'tmp', 'thor/missions/run-odd/summary.json', told.encode())
         add_part(store, [untyped], 'odd', tmp_path / 'tmp')
-    every = {one['mission_id']: one for one in lake.missions(open_source(settings, schema.BUCKET)).to_pylist()}
+    every = {one['mission_id']: one for one in lake.missions(Bucket(settings, schema.BUCKET)).to_pylist()}
     assert (every[FAILED]['success'], every[FINISHED]['success']) == (False, True)
     assert (every['odd']['distance_m'], every['odd']['success'], every['odd']['mission_type']) == (None, None, None)
 
@@ -145,15 +145,15 @@ def test_a_file_that_goes_while_a_folder_is_listed_is_no_error(tmp_path: Path) -
     rows = fill(settings, tmp_path / 'tmp', days=(0,), hours=(12,))
     gone = settings.directory / schema.BUCKET / 'thor/_catalog/date=2026-10-28/gone.parquet'
     gone.symlink_to(tmp_path / 'nowhere')
-    assert lake.objects(open_source(settings, schema.BUCKET)).count_rows() == len(rows)
+    assert lake.objects(Bucket(settings, schema.BUCKET)).count_rows() == len(rows)
 
 
 def test_a_mission_without_a_summary_is_told_without_an_end(tmp_path: Path) -> None:
     """It goes on, or its robot is away: neither failed nor succeeded."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,), hours=(11,))
-    source = open_source(settings, schema.BUCKET)
-    source.delete([f'thor/missions/run-{FAILED}/summary.json'])
+    source = Bucket(settings, schema.BUCKET)
+    source.delete(f'thor/missions/run-{FAILED}/summary.json')
     store = open_store(settings, UploadSettings())
     add(store, tmp_path / 'tmp', 'thor/missions/run-x/summary.json', b'{broken')
     told = lake.missions(source).sort('mission_id').to_pydict()
@@ -171,7 +171,7 @@ def test_what_was_delivered_before_its_mission_had_a_run_belongs_to_it(tmp_path:
     fill(settings, tmp_path / 'tmp', days=(), hours=())
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, early, 'early', tmp_path / 'tmp')
-    source = open_source(settings, schema.BUCKET)
+    source = Bucket(settings, schema.BUCKET)
     frames = sorted(each['key'] for each in rows if each['sensor'] == 'camera' and each['mission_id'] == FAILED)
     assert found(source, sensor='camera', success=False) == frames
     assert found(source, sensor='camera', mission='run-mfail', **DAY) == found(source, sensor='camera', mission=FAILED) == frames
@@ -194,12 +194,12 @@ def test_what_is_no_question_is_one_kind_of_error(
 ) -> None:
     """A LakeError that says what Daft could not make sense of."""
     with pytest.raises(LakeError, match='cannot be answered'), answering():
-        ask(open_source(world[0], schema.BUCKET))
+        ask(Bucket(world[0], schema.BUCKET))
 
 
 def test_a_lake_that_is_not_there_is_empty(tmp_path: Path) -> None:
     """No store yet, no catalogue yet: no rows, no error."""
-    source = open_source(folder_store(tmp_path), schema.BUCKET)
+    source = Bucket(folder_store(tmp_path), schema.BUCKET)
     assert found(source) == []
     assert lake.missions(source).to_pydict()['mission_id'] == []
     assert lake.topics(source, **DAY).to_pydict()['topic'] == []
@@ -228,7 +228,7 @@ def test_a_real_server_is_asked_for_that_day_alone(seaweed: Tower, tmp_path: Pat
     with Recorder(seaweed.endpoint_url) as front:
         front.targets = []
         settings = through(front, seaweed)
-        source = Watched(open_source(settings, schema.BUCKET))
+        source = Watched(Bucket(settings, schema.BUCKET))
         frame = lake.objects(source, **DAY, robot='thor', near=(3.0, 1.5, 2.0), where='battery_pct < 62')
         answer = frame.select('key').to_pydict()['key']
         dated = [target for target in front.targets if 'date' in target]
@@ -251,7 +251,7 @@ def test_wrong_credentials_are_told_without_showing_them(seaweed: Tower) -> None
     plain = seaweed.store_settings()
     wrong = StoreSettings(endpoint_url=plain.endpoint_url, access_key_id=plain.access_key_id, secret_access_key='not the secret')
     with pytest.raises(CredentialsRejected) as caught:
-        lake.objects(open_source(wrong, schema.BUCKET)).collect()
+        lake.objects(Bucket(wrong, schema.BUCKET)).collect()
     assert plain.access_key_id not in str(caught.value)
     assert 'not the secret' not in str(caught.value)
     assert 'AWS_SECRET_ACCESS_KEY' in str(caught.value)
@@ -271,10 +271,10 @@ def test_credentials_that_are_not_there_are_told(
         monkeypatch.delenv(name)
     monkeypatch.setenv('HOME', str(tmp_path))
     with pytest.raises(error, match=says):
-        open_source(StoreSettings(endpoint_url='http://127.0.0.1:9', **keys), schema.BUCKET).folders('')
+        Bucket(StoreSettings(endpoint_url='http://127.0.0.1:9', **keys), schema.BUCKET).folders('')
 
 
 def test_a_source_can_be_sent_to_another_process(world: tuple[StoreSettings, list[schema.Row]]) -> None:
     """As Ray does it."""
-    source = pickle.loads(pickle.dumps(open_source(world[0], schema.BUCKET)))  # noqa: S301 - our own
+    source = pickle.loads(pickle.dumps(Bucket(world[0], schema.BUCKET)))  # noqa: S301 - our own
     assert len(found(source, **DAY)) == len(world[1]) // 2

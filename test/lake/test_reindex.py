@@ -16,8 +16,8 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import StoreUnavailable
 from shadowhound_data_logger.lake import reindex as library
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
-from shadowhound_data_logger.lake.source import open_source
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
@@ -47,11 +47,11 @@ ALL = sorted([*keys(ROWS), 'thor/patrol_20261028_120000.csv'])
 
 def run(settings: StoreSettings, robot: str = 'thor') -> library.Reindexed:
     with closing(open_store(settings, UploadSettings())) as store:
-        return library.reindex(open_source(settings, schema.BUCKET), store, robot)
+        return library.reindex(Bucket(settings, schema.BUCKET), store, robot)
 
 
 def answer(settings: StoreSettings, **flags: Any) -> list[str]:
-    return sorted(lake.objects(open_source(settings, schema.BUCKET), **flags).select('key').to_pydict()['key'])
+    return sorted(lake.objects(Bucket(settings, schema.BUCKET), **flags).select('key').to_pydict()['key'])
 
 
 def test_a_lost_catalogue_is_made_again(settings: StoreSettings) -> None:
@@ -59,7 +59,7 @@ def test_a_lost_catalogue_is_made_again(settings: StoreSettings) -> None:
     found = run(settings)
     assert (found.listed, found.added, found.gone) == (9, 9, 0)
     assert answer(settings) == ALL
-    made = {one['key']: one for one in lake.objects(open_source(settings, schema.BUCKET), robot='thor').to_pylist()}
+    made = {one['key']: one for one in lake.objects(Bucket(settings, schema.BUCKET), robot='thor').to_pylist()}
     for expected in ROWS:
         kept = {name for name in schema.COLUMNS if name not in {'t_start', 't_end', 'mission_id', 'run_id', 'mission_type'}}
         assert {name: made[expected['key']][name] for name in kept} == {name: expected[name] for name in kept}
@@ -82,8 +82,8 @@ def test_a_part_that_comes_after_it_adds_no_row_twice(settings: StoreSettings, t
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [row(sensor, stamp_ns) for sensor in SENSORS for stamp_ns in TIMES[:3]], 'late', tmp_path / 'tmp')
         assert answer(settings) == ALL
-        assert len(lake.objects(open_source(settings, schema.BUCKET), sensor='camera').collect()) == len(TIMES)
-        source = open_source(settings, schema.BUCKET)
+        assert len(lake.objects(Bucket(settings, schema.BUCKET), sensor='camera').collect()) == len(TIMES)
+        source = Bucket(settings, schema.BUCKET)
         for now in (datetime(2026, 10, 30, tzinfo=timezone.utc), LATER):
             list(compact(source, store, before='2026-10-30', now=lambda now=now: now))  # type: ignore[misc]
         assert answer(settings) == ALL
@@ -95,7 +95,7 @@ def test_it_goes_on_where_it_died(settings: StoreSettings, monkeypatch: pytest.M
     """Parts of what was asked so far are there; the next run asks for the rest."""
     monkeypatch.setattr(library, 'PAGE', 4)
     asked: list[str] = []
-    plain = library.open_source
+    plain = library.Bucket
 
     class Flaky(Watched):
         def head(self, key: str) -> Any:
@@ -105,7 +105,7 @@ def test_it_goes_on_where_it_died(settings: StoreSettings, monkeypatch: pytest.M
             return super().head(key)
 
     with monkeypatch.context() as patch:
-        patch.setattr(library, 'open_source', lambda *place: Flaky(plain(*place)))
+        patch.setattr(library, 'Bucket', lambda *place: Flaky(plain(*place)))
         with pytest.raises(StoreUnavailable):
             run(settings)
     assert run(settings).added == 5

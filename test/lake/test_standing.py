@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shadowhound_data_logger.errors import LakeError
-from shadowhound_data_logger.lake.source import Entry
 from shadowhound_data_logger.lake.standing import Day, compacted_key, folder_of, is_compacted, name_of, standing
+from shadowhound_data_logger.model import ObjectInfo
 
 NOW = datetime(2026, 10, 28, tzinfo=timezone.utc)
 ROBOT, DATE = 'thor', '2026-10-27'
@@ -37,8 +37,8 @@ class Folder:
     def standing(self) -> Day:
         return standing(ROBOT, DATE, self.entries(), {key: self.leaves[key] for key in self.files if is_compacted(key)})
 
-    def entries(self) -> list[Entry]:
-        return [Entry(key, 1, '', modified) for key, modified in self.files.items()]
+    def entries(self) -> list[ObjectInfo]:
+        return [ObjectInfo('sensor-data', key, 1, None, modified=modified) for key, modified in self.files.items()]
 
     def part(self) -> None:
         self.files[f'{folder_of(ROBOT, DATE)}thor_{self.written:04d}.parquet'] = self.now
@@ -103,7 +103,7 @@ def test_a_part_that_comes_again_after_its_deletion_is_not_read_again() -> None:
 def test_what_cannot_be_is_said_instead_of_losing_rows() -> None:
     """Two that overlap, and what only one of them has is gone: an error names the file and what to do."""
     keys = [compacted_key(ROBOT, DATE, names, is_mended=False) for names in ('abc', 'bcde')]
-    entries = [Entry(key, 1, '', NOW) for key in keys]
+    entries = [ObjectInfo('sensor-data', key, 1, None, modified=NOW) for key in keys]
     leaves = {keys[0]: frozenset('abc'), keys[1]: frozenset('bcde')}
     with pytest.raises(LakeError, match='contradict') as caught:
         standing(ROBOT, DATE, entries, leaves)

@@ -20,7 +20,7 @@ from shadowhound_data_logger import lake
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.errors import SettingError, StoreUntrusted
 from shadowhound_data_logger.lake import scan
-from shadowhound_data_logger.lake.source import open_source
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.sim.tower import Tower
 
@@ -76,7 +76,7 @@ def test_a_private_authority_is_trusted(
     if compacted:
         monkeypatch.setattr(scan, 'SMALL_BYTES', 0)
     with secured(filled, authorities['authority'], 'good') as front:
-        source = open_source(towards(front.url), 'sensor-data')
+        source = Bucket(towards(front.url), 'sensor-data')
         assert len(lake.objects(source, robot=ROBOT).select('key').to_pydict()['key']) == OBJECTS
         told = run('fetch', '--robot', ROBOT, '--to', str(tmp_path / 'data'), '--json')
         assert json.loads(told.stdout)['moved'] == OBJECTS
@@ -94,8 +94,8 @@ def test_a_certificate_that_is_not_believed(
     """Each kind has the words and the remedy that the robot has for it; no request leaves."""
     signer, how, words, remedy = WRONG[kind]
     with secured(filled, authorities[signer], kind, **how) as front:
-        source = open_source(towards(front.url), 'sensor-data')
-        for ask in (lambda: source.read('x', 9), lambda: lake.objects(source).to_pydict()):
+        source = Bucket(towards(front.url), 'sensor-data')
+        for ask in (lambda: source.get('x', 9), lambda: lake.objects(source).to_pydict()):
             with pytest.raises(StoreUntrusted) as caught:
                 ask()
             assert words in str(caught.value)
@@ -111,7 +111,7 @@ def test_without_a_bundle_the_system_decides(
 ) -> None:
     """It does not know this authority, and the message names the variable."""
     with secured(filled, authorities['authority'], 'plain') as front:
-        source = open_source(towards(front.url), 'sensor-data')
+        source = Bucket(towards(front.url), 'sensor-data')
         monkeypatch.delenv('AWS_CA_BUNDLE')
         with pytest.raises(StoreUntrusted, match='AWS_CA_BUNDLE'):
             source.folders('')
@@ -123,7 +123,7 @@ def test_an_authority_is_no_server(
 ) -> None:
     """Its own certificate is not taken of a server, though it is the one that is trusted."""
     with behind_tls(filled.endpoint_url, authorities['authority'].itself()) as front:
-        source = open_source(towards(front.url), 'sensor-data')
+        source = Bucket(towards(front.url), 'sensor-data')
         with pytest.raises(StoreUntrusted, match='is that of an authority itself'):
             source.folders('')
     assert front.inside.heard == b''
@@ -137,7 +137,7 @@ def test_a_bundle_that_is_none_is_bad_usage(
     (tmp_path / 'ca.pem').write_text('no certificate')
     monkeypatch.setenv('AWS_CA_BUNDLE', str(tmp_path / 'ca.pem'))
     with pytest.raises(SettingError, match='AWS_CA_BUNDLE'):
-        open_source(settings, 'sensor-data').folders('')
+        Bucket(settings, 'sensor-data').folders('')
     found = run('query', '--robot', ROBOT)
     assert isinstance(found.exception, click.UsageError)
     assert 'AWS_CA_BUNDLE' in str(found.exception)

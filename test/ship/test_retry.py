@@ -5,7 +5,8 @@ import random
 import pytest
 
 from shadowhound_data_logger import errors
-from shadowhound_data_logger.ship.retry import BASE_S, Verdict, backoff, decide, quarantine_reason
+from shadowhound_data_logger.ship.retry import Verdict, decide, quarantine_reason
+from shadowhound_data_logger.stores.retry import BASE_S, backoff
 
 TABLE = [
     (errors.StoreUnavailable, Verdict.RETRY),

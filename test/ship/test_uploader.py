@@ -22,8 +22,9 @@ from shadowhound_data_logger.errors import (
     StoreUnavailable,
 )
 from shadowhound_data_logger.model import Put, SpooledObject, State
-from shadowhound_data_logger.ship.uploader import Target, Uploader
+from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.memory import MemoryStore
 
 SETTINGS = UploadSettings(threads=3, backoff_s=0.1)
@@ -62,7 +63,7 @@ def start(spool: FakeSpool) -> Iterator[Start]:
     """Opens an uploader over the fake spool, and closes it."""
     opened: list[Uploader] = []
 
-    def start(store: Target, settings: UploadSettings = SETTINGS) -> Uploader:
+    def start(store: ObjectStore, settings: UploadSettings = SETTINGS) -> Uploader:
         uploader = Uploader(spool, store, settings, spool.settle, rng=random.Random(5))
         spool.uploader = uploader
         opened.append(uploader)

@@ -12,12 +12,13 @@ from stores.spooled import MOTO, QUICK, Spool
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.sim.tower import Tower
-from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores import open_reader, open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.memory import MemoryStore
 from shadowhound_data_logger.stores.s3 import S3Store
 
-STORES = ('memory', 'directory', MOTO, pytest.param('seaweed', marks=pytest.mark.seaweedfs))
+STORES = ('memory', 'directory', MOTO, pytest.param('seaweed', marks=pytest.mark.seaweedfs),
+          pytest.param('obstore', marks=pytest.mark.seaweedfs))  # fmt: skip
 
 
 @pytest.fixture
@@ -55,6 +56,9 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ObjectStor
     elif request.param == 'seaweed':
         tower: Tower = request.getfixturevalue('seaweed')
         opened = open_store(tower.store_settings(), QUICK)
+    elif request.param == 'obstore':
+        tower = request.getfixturevalue('seaweed')
+        opened = open_reader(tower.store_settings())
     yield opened
     opened.close()
 

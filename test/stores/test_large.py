@@ -16,7 +16,7 @@ from shadowhound_data_logger.config import StoreSettings
 from shadowhound_data_logger.errors import ForeignObject, ObjectRefused
 from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.sim.tower import Tower
-from shadowhound_data_logger.stores import parts, s3
+from shadowhound_data_logger.stores import content, s3
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.s3 import S3Store
 
@@ -31,7 +31,7 @@ KEY = "thor/rosbags/patrol's(1)+@=/patrol_0.mcap"
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is large here is a fraction of a slice."""
     monkeypatch.setattr(s3, 'MULTIPART_BYTES', SMALLEST_PART)
-    monkeypatch.setattr(parts, 'PART_BYTES', SMALLEST_PART)
+    monkeypatch.setattr(content, 'PART_BYTES', SMALLEST_PART)
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_parts_that_are_there_are_not_sent_again(server: S3Store, item: SpooledO
     uploads = server._multipart._uploads
     upload = uploads.begin(item)
     with item.path.open('rb') as file:
-        for number, part in enumerate(parts.parts(file.fileno(), 2 * SMALLEST_PART, hashlib.sha256()), 1):
+        for number, part in enumerate(content.parts(file.fileno(), 2 * SMALLEST_PART, hashlib.sha256()), 1):
             server._s3.put_part(item, upload, number, part)
     sent = server.pace.sent_bytes
     assert server.put(item) is Put.CREATED
@@ -131,7 +131,7 @@ def test_an_upload_of_other_content_is_aborted(server: S3Store, item: SpooledObj
     other = spool(KEY, CONTENT[::-1])
     upload = uploads.begin(other)
     with other.path.open('rb') as file:
-        part = next(parts.parts(file.fileno(), other.size, hashlib.sha256()))
+        part = next(content.parts(file.fileno(), other.size, hashlib.sha256()))
         server._s3.put_part(other, upload, 1, part)
     uploads.begin(item)
     uploads.begin(replace(item, key=f'{KEY}2'))
@@ -160,10 +160,10 @@ def test_a_key_that_is_taken_meanwhile(server: S3Store, item: SpooledObject, spo
 
 def test_no_file_has_more_parts_than_s3_allows() -> None:
     """From 80 GB on the parts grow."""
-    for size in (1, 100 * MEBI, parts.MOST_PARTS * parts.PART_BYTES, 1 << 40, (1 << 40) + 1):
-        step = parts.part_bytes(size)
-        assert step >= parts.PART_BYTES
-        assert -(-size // step) <= parts.MOST_PARTS
+    for size in (1, 100 * MEBI, content.MOST_PARTS * content.PART_BYTES, 1 << 40, (1 << 40) + 1):
+        step = content.part_bytes(size)
+        assert step >= content.PART_BYTES
+        assert -(-size // step) <= content.MOST_PARTS
 
 
 def test_a_part_can_be_read_twice(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_a_part_can_be_read_twice(tmp_path: Path) -> None:
     path = tmp_path / 'file'
     path.write_bytes(bytes(range(100)))
     with path.open('rb') as file:
-        part = parts.Part(file.fileno(), 10, 20, b'')
+        part = content.Part(file.fileno(), 10, 20, b'')
         for _ in range(2):
             part.seek(0)
             assert b''.join(iter(lambda: part.read(7), b'')) == bytes(range(10, 30))

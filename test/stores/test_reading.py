@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from stores.spooled import Spool
 
 from shadowhound_data_logger.errors import ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.base import Content, ObjectStore
 from shadowhound_data_logger.stores.content import CHUNK_BYTES
-from shadowhound_data_logger.stores.download import download
+from shadowhound_data_logger.stores.download import TRIES, download
+from shadowhound_data_logger.stores.memory import MemoryStore
 
 CONTENT = os.urandom(2 * CHUNK_BYTES + 17)
 KEY = 'thor/rosbags/patrol/patrol_0.mcap'
@@ -28,25 +28,47 @@ KEY = 'thor/rosbags/patrol/patrol_0.mcap'
 def test_a_range_is_a_slice(store: ObjectStore, spool: Spool, bucket: str, start: int, length: int) -> None:
     """It has the bytes that a slice of the content has: fewer at its end, none behind it."""
     store.put(spool(KEY, CONTENT))
-    assert store.get_range(bucket, KEY, start, length) == CONTENT[start : start + length]
+    assert store.ranges(bucket, KEY, [(start, start + length)])[0] == CONTENT[start : start + length]
+
+
+def test_ranges_come_in_the_order_that_they_were_asked_for_in(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """Several at once, some behind the end, some empty."""
+    store.put(spool(KEY, CONTENT))
+    end = len(CONTENT)
+    spans = [(100, 200), (0, 10), (end - 5, end + 5), (end, end + 5), (7, 7), (CHUNK_BYTES, CHUNK_BYTES + 1)]
+    assert [bytes(each) for each in store.ranges(bucket, KEY, spans)] == [CONTENT[begin:stop] for begin, stop in spans]
+
+
+def test_content_tells_of_the_whole_object(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """Wherever it begins: the size, and what was stored with it; it can be left unread."""
+    item = spool('a', b'0123456789', metadata={'topic': '/x'})
+    store.put(item)
+    for start in (0, 4, 10, 20):
+        with store.content(bucket, 'a', start) as content:
+            told = content.info
+        assert (told.size, told.sha256, told.metadata['topic'], told.content_type) == (10, item.sha256, '/x', item.content_type)
 
 
 def test_a_range_of_nothing_is_refused(store: ObjectStore, spool: Spool, bucket: str) -> None:
     """A missing key is named in the error, also where it is read in pieces."""
     store.put(spool('a', b'x'))
     with pytest.raises(ObjectRefused, match=f'there is no {bucket}/b'):
-        store.get_range(bucket, 'b', 0, 5)
+        store.ranges(bucket, 'b', [(0, 5)])
     with pytest.raises(ObjectRefused, match=f'there is no {bucket}/b'):
-        next(store.content(bucket, 'b'))
+        next(store.content(bucket, 'b').pieces)
 
 
 @pytest.mark.parametrize('start', [0, 1, CHUNK_BYTES, len(CONTENT)])
 def test_content_comes_in_bounded_pieces(store: ObjectStore, spool: Spool, bucket: str, start: int) -> None:
-    """From any byte on, in order, and no piece is larger than a megabyte."""
+    """From any byte on, in order, and no piece is larger than two megabytes."""
     store.put(spool(KEY, CONTENT))
     pieces = list(store.content(bucket, KEY, start))
     assert b''.join(pieces) == CONTENT[start:]
-    assert all(0 < len(piece) <= CHUNK_BYTES for piece in pieces)
+    assert all(0 < len(piece) <= 2 * CHUNK_BYTES for piece in pieces)
+
+
+def wanted(bucket: str, size: int = len(CONTENT), sha256: str | None = None) -> ObjectInfo:
+    return ObjectInfo(bucket, KEY, size, sha256)
 
 
 def test_a_download_is_the_object(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
@@ -54,9 +76,10 @@ def test_a_download_is_the_object(store: ObjectStore, spool: Spool, bucket: str,
     store.put(spool(KEY, CONTENT))
     told: list[int] = []
     path = tmp_path / 'out' / 'a.mcap'
-    info = download(store, bucket, KEY, path, tell=told.append)
+    found = download(store, wanted(bucket), path, tell=told.append)
     assert path.read_bytes() == CONTENT
-    assert (info.size, info.sha256) == (len(CONTENT), hashlib.sha256(CONTENT).hexdigest())
+    assert found.sha256 == found.info.sha256 == hashlib.sha256(CONTENT).hexdigest()
+    assert found.is_proved
     assert sum(told) == len(CONTENT)
     assert list(path.parent.iterdir()) == [path]
 
@@ -66,37 +89,69 @@ def test_a_download_goes_on_where_it_broke_off(store: ObjectStore, spool: Spool,
     store.put(spool(KEY, CONTENT))
     (tmp_path / 'a.mcap.part').write_bytes(CONTENT[: CHUNK_BYTES + 5])
     told: list[int] = []
-    download(store, bucket, KEY, tmp_path / 'a.mcap', tell=told.append)
+    download(store, wanted(bucket), tmp_path / 'a.mcap', tell=told.append)
     assert sum(told) == len(CONTENT) - CHUNK_BYTES - 5
     assert (tmp_path / 'a.mcap').read_bytes() == CONTENT
 
 
-def test_a_download_of_wrong_bytes_is_begun_anew(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
-    """What does not fit is refused and thrown away, so that the next try works; so is a part that is too long."""
+@pytest.mark.parametrize('there', [b'wrong', bytes(len(CONTENT)), CONTENT + b'more'])
+def test_a_download_of_wrong_bytes_is_begun_anew(
+    store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path, there: bytes
+) -> None:
+    """What does not fit is thrown away, as the caller is told, and fetched once more."""
     store.put(spool(KEY, CONTENT))
-    (tmp_path / 'a.mcap.part').write_bytes(b'wrong')
-    with pytest.raises(ObjectRefused, match='has not the content') as caught:
-        download(store, bucket, KEY, tmp_path / 'a.mcap')
-    assert caught.value.data['reason'] == 'damaged'
-    assert not (tmp_path / 'a.mcap').exists()
-    (tmp_path / 'a.mcap.part').write_bytes(CONTENT + b'more')
-    download(store, bucket, KEY, tmp_path / 'a.mcap')
+    (tmp_path / 'a.mcap.part').write_bytes(there)
+    told = [len(there)]
+    download(store, wanted(bucket), tmp_path / 'a.mcap', tell=told.append)
     assert (tmp_path / 'a.mcap').read_bytes() == CONTENT
+    assert sum(told) == len(CONTENT)
 
 
-def test_a_download_that_ends_early_is_no_file(tmp_path: Path) -> None:
-    """The store ends the content before its size: what came is kept for the next try."""
+@pytest.mark.parametrize('how', [{'size': 5}, {'sha256': '0' * 64}])
+def test_what_is_not_what_was_asked_for_is_no_file(
+    store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path, how: dict[str, Any]
+) -> None:
+    """Of another size or content than the caller knows: refused the second time, and nothing stays."""
+    store.put(spool(KEY, CONTENT))
+    told: list[int] = []
+    with pytest.raises(ObjectRefused, match='has not the content') as caught:
+        download(store, wanted(bucket, **how), tmp_path / 'a.mcap', tell=told.append)
+    assert caught.value.data['reason'] == 'damaged'
+    assert list(tmp_path.glob('*.mcap*')) == []
+    assert sum(told) == 0
 
-    class Short:
-        def head(self, bucket: str, key: str) -> ObjectInfo:
-            return ObjectInfo(bucket, key, 10, None)
 
-        def content(self, _bucket: str, _key: str, start: int = 0) -> Iterator[bytes]:
-            yield b'0123456789'[start : start + 4]
+class Short(MemoryStore):
+    """Breaks off after four bytes each time."""
 
-    with pytest.raises(StoreUnavailable, match='ended after 4 of 10 bytes'):
-        download(Short(), 'b', 'k', tmp_path / 'file')
-    with pytest.raises(StoreUnavailable, match='ended after 8 of 10 bytes'):
-        download(Short(), 'b', 'k', tmp_path / 'file')
-    assert replace(download(Short(), 'b', 'k', tmp_path / 'file'), key='k').size == 10
+    asked = 0
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        self.asked += 1
+        return Content(ObjectInfo(bucket, key, 10, None), iter([b'0123456789'[start : start + 4]]))
+
+
+def test_a_download_that_ends_early_goes_on(tmp_path: Path) -> None:
+    """The store ends the content before its size: the next try asks for the rest alone, after a pause."""
+    store, pauses = Short(), list[float]()
+    found = download(store, ObjectInfo('b', 'k', 10, None), tmp_path / 'file', pause=pauses.append)
+    assert (tmp_path / 'file').read_bytes() == b'0123456789'
+    assert (store.asked, len(pauses), found.is_proved) == (3, 2, False)
+
+
+def test_a_store_that_stays_away_keeps_what_came(tmp_path: Path) -> None:
+    """So many tries, then the error; the next call goes on."""
+
+    class Away(Short):
+        def content(self, bucket: str, key: str, start: int = 0) -> Content:
+            if start:
+                raise StoreUnavailable('away')
+            return super().content(bucket, key, start)
+
+    pauses: list[float] = []
+    with pytest.raises(StoreUnavailable, match='away'):
+        download(Away(), ObjectInfo('b', 'k', 10, None), tmp_path / 'file', pause=pauses.append)
+    assert len(pauses) == TRIES - 1
+    assert (tmp_path / 'file.part').read_bytes() == b'0123'
+    download(Short(), ObjectInfo('b', 'k', 10, None), tmp_path / 'file', pause=pauses.append)
     assert (tmp_path / 'file').read_bytes() == b'0123456789'

@@ -23,7 +23,7 @@ from shadowhound_data_logger.model import Put
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import s3
 from shadowhound_data_logger.stores.s3 import S3Store
-from shadowhound_data_logger.stores.s3_put import UNASKED_BYTES
+from shadowhound_data_logger.stores.s3_http import UNASKED_BYTES
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 
 IMPATIENT = UploadSettings(connect_timeout_s=1.0, read_timeout_s=0.3)

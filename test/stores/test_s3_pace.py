@@ -17,7 +17,7 @@ from shadowhound_data_logger.errors import ForeignObject, StoreUnavailable
 from shadowhound_data_logger.model import Put
 from shadowhound_data_logger.stores.pace import BYTES_PER_MEGABIT, LATE_S
 from shadowhound_data_logger.stores.s3 import S3Store
-from shadowhound_data_logger.stores.s3_put import UNASKED_BYTES
+from shadowhound_data_logger.stores.s3_http import UNASKED_BYTES
 
 SLACK_S = 0.25
 """What a busy machine may add to an arrival."""

@@ -12,7 +12,7 @@ from botocore.auth import S3SigV4Auth
 from botocore.awsrequest import AWSRequest
 from botocore.credentials import Credentials
 
-from shadowhound_data_logger.stores.sigv4 import signed
+from shadowhound_data_logger.stores.s3_http import signed
 
 NOW = datetime(2025, 10, 18, 12, 0, 5, tzinfo=timezone.utc)
 BODY = b'{"robot": "thor"}'

@@ -24,7 +24,7 @@ from faults.upstream import Request
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.sim.tower import Tower
-from shadowhound_data_logger.stores import parts, s3
+from shadowhound_data_logger.stores import content, s3
 from shadowhound_data_logger.stores.s3 import S3Store
 
 pytestmark = pytest.mark.seaweedfs
@@ -38,10 +38,10 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.stores import parts, s3
+from shadowhound_data_logger.stores import content, s3
 sys.path.insert(0, sys.argv[1])
 from tower.test_parts import KEY, PART, slice_of
-parts.PART_BYTES = s3.MULTIPART_BYTES = PART
+content.PART_BYTES = s3.MULTIPART_BYTES = PART
 settings = StoreSettings(endpoint_url=sys.argv[3], access_key_id=sys.argv[4], secret_access_key=sys.argv[5])
 store = s3.S3Store(settings, UploadSettings())
 store.open()
@@ -83,7 +83,7 @@ def file(tmp_path: Path) -> Path:
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is large here is a fraction of a slice."""
     monkeypatch.setattr(s3, 'MULTIPART_BYTES', PART)
-    monkeypatch.setattr(parts, 'PART_BYTES', PART)
+    monkeypatch.setattr(content, 'PART_BYTES', PART)
 
 
 @pytest.fixture

@@ -1,0 +1,273 @@
+"""An S3 server as a store for machines that read much: through obstore, at a quarter of botocore's CPU (docs/decisions/0013).
+
+It comes with the extra ``lake``; no robot needs it. In the child of a process that used it and was forked it waits for
+ever: there ``S3Store`` reads (docs/decisions/0016).
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import obstore
+from obstore import exceptions as refused
+from obstore.store import S3Store as Client
+
+from shadowhound_data_logger.errors import BucketMissing, CredentialsRejected, ObjectRefused, StoreError
+from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.stores.base import Content, joined
+from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_read
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.stores.pace import Pace
+    from shadowhound_data_logger.stores.s3 import S3Store
+
+_CONNECT: Final = timedelta(seconds=10)
+_SILENCE: Final = timedelta(seconds=60)
+"""Of a server in the middle of an answer."""
+_WHOLE: Final = timedelta(days=1)
+"""For one answer: a large object over WiFi takes its time."""
+_CODE: Final = re.compile(r'<Code>(\w+)</Code>|\(code: (\w+)\)')
+_MESSAGE: Final = re.compile(r'<Message>([^<]*)</Message>')
+_STATUS: Final = re.compile(r'non-2xx status code: (\d{3})')
+NOTHING_THERE: Final = 416
+"""Behind the first byte that was asked for."""
+_HEADERS: Final = {
+    'Content-Disposition', 'Content-Encoding', 'Content-Language', 'Content-Type', 'Cache-Control', 'Storage-Class',
+}  # fmt: skip
+"""What obstore has among the attributes beside the object's own."""
+
+_Answer = TypeVar('_Answer')
+
+
+class ObstoreStore:
+    """Reads, lists and deletes by obstore; whatever else is asked goes to an S3Store.
+
+    ``_lock`` guards the clients and that store, which is made when it is needed.
+    """
+
+    def __init__(self, settings: StoreSettings, upload: UploadSettings) -> None:
+        self._settings = settings
+        self._upload = upload
+        self._endpoint = settings.endpoint_url or ''
+        self._lock = threading.Lock()
+        self._clients: dict[str, Client] = {}
+        self._other: S3Store | None = None
+
+    def __repr__(self) -> str:
+        return f'ObstoreStore({self.describe()!r})'
+
+    @property
+    def pace(self) -> Pace:
+        return self._plain.pace
+
+    def open(self) -> None:
+        """Nothing to acquire yet."""
+
+    def close(self) -> None:
+        with self._lock:
+            other, self._other = self._other, None
+            self._clients.clear()
+        if other is not None:
+            other.close()
+
+    def describe(self) -> str:
+        return f'the S3 server at {self._endpoint}'
+
+    def put(self, item: SpooledObject) -> Put:
+        return self._plain.put(item)
+
+    def probe(self) -> None:
+        self._plain.probe()
+
+    def head(self, bucket: str, key: str) -> ObjectInfo | None:
+        def head(client: Client) -> ObjectInfo | None:
+            try:
+                return _info(bucket, key, obstore.get(client, key, options={'head': True}))
+            except FileNotFoundError:
+                return None
+            except refused.PermissionDeniedError:  # an answer without a body: ask for the reason
+                return _info(bucket, key, obstore.get(client, key, options={'range': (0, 1)}))
+
+        return self._ask(bucket, key, head)
+
+    def get(self, bucket: str, key: str, most: int | None = None) -> bytes:
+        return joined(self.content(bucket, key), most)
+
+    def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        if not all(begin < end for begin, end in spans):
+            return [self.ranges(bucket, key, [span])[0] if span[0] < span[1] else b'' for span in spans]
+
+        def read(client: Client) -> Sequence[bytes]:
+            begins, ends = [begin for begin, _ in spans], [end for _, end in spans]
+            try:
+                return [bytes(each) for each in obstore.get_ranges(client, key, starts=begins, ends=ends)]
+            except refused.BaseError as error:
+                if _said(error)[0] != NOTHING_THERE:
+                    raise
+            return [self.ranges(bucket, key, [span])[0] for span in spans] if len(spans) > 1 else [b'']
+
+        return self._ask(bucket, key, read)
+
+    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
+        folder, _, begin = prefix.rpartition('/')
+        if not begin:
+            yield from sorted(self._all(bucket, folder), key=attrgetter('key'))
+            return
+        below = self._below(bucket, folder)  # S3 knows any prefix, obstore whole names alone
+        found = [_entry(bucket, each) for each in below['objects'] if each['path'].startswith(prefix)]
+        for each in below['common_prefixes']:
+            if each.startswith(prefix):
+                found += self._all(bucket, each)
+        yield from sorted(found, key=attrgetter('key'))
+
+    def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
+        return sorted(folder.rpartition('/')[2] for folder in self._below(bucket, prefix)['common_prefixes'])
+
+    def delete(self, bucket: str, key: str) -> None:
+        self._ask(bucket, key, lambda client: obstore.delete(client, key))
+
+    @property
+    def _plain(self) -> S3Store:
+        with self._lock:
+            if self._other is None:
+                from shadowhound_data_logger.stores.s3 import S3Store  # noqa: PLC0415 - who only reads needs no botocore
+
+                other = S3Store(self._settings, self._upload)
+                other.open()
+                self._other = other
+            return self._other
+
+    def _below(self, bucket: str, prefix: str) -> Any:
+        try:
+            return self._ask(bucket, prefix, lambda client: obstore.list_with_delimiter(client, prefix or None), is_listing=True)
+        except BucketMissing:
+            return {'common_prefixes': [], 'objects': []}
+
+    def _all(self, bucket: str, folder: str) -> Sequence[ObjectInfo]:
+        def read(client: Client) -> Sequence[ObjectInfo]:
+            return [_entry(bucket, each) for page in obstore.list(client, folder or None) for each in page]
+
+        try:
+            return self._ask(bucket, folder, read, is_listing=True)
+        except BucketMissing:
+            return []
+
+    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        check_read(bucket, key)
+        with self._asking(bucket, key):
+            try:
+                found = obstore.get(self._client(bucket), key, options={'range': {'offset': start}} if start else None)
+            except refused.BaseError as error:
+                if not start or _said(error)[0] != NOTHING_THERE or (info := self.head(bucket, key)) is None:
+                    raise
+                return Content(info, iter(()))  # it ends before
+            return Content(_info(bucket, key, found), self._pieces(bucket, key, found))
+
+    def _pieces(self, bucket: str, key: str, found: Any) -> Iterator[bytes]:
+        with self._asking(bucket, key):
+            if found.meta['size'] <= CHUNK_BYTES:
+                yield bytes(found.bytes())
+            else:
+                yield from found.stream(min_chunk_size=CHUNK_BYTES)
+
+    def _client(self, bucket: str) -> Client:
+        """It holds the connections."""
+        with self._lock:
+            if bucket not in self._clients:
+                self._clients[bucket] = _client(self._settings, bucket)
+            return self._clients[bucket]
+
+    def _ask(self, bucket: str, key: str, ask: Callable[[Client], _Answer], *, is_listing: bool = False) -> _Answer:
+        check_read(bucket, 'any' if is_listing else key)
+        client = self._client(bucket)
+        with self._asking(bucket, key):
+            return ask(client)
+
+    @contextmanager
+    def _asking(self, bucket: str, key: str) -> Iterator[None]:
+        try:
+            yield
+        except (refused.BaseError, FileNotFoundError, ValueError) as error:  # ValueError: a key with an unsafe part
+            raise _translated(error, self._endpoint, bucket, key) from None  # its text has the key id
+
+
+def _client(settings: StoreSettings, bucket: str) -> Client:
+    """Without keys in hand it asks what boto3 would ask. Raises SettingError for certificates that are none."""
+    given: dict[str, Any] = {'access_key_id': settings.access_key_id, 'secret_access_key': settings.secret_access_key}
+    if settings.session_token:
+        given['session_token'] = settings.session_token
+    if not (settings.access_key_id and settings.secret_access_key):
+        given = {'credential_provider': _provider(settings)}
+    options: Any = {'allow_http': True, 'connect_timeout': _CONNECT, 'read_timeout': _SILENCE, 'timeout': _WHOLE}
+    if (authorities := _authorities(settings)) is not None:
+        options['root_certificate'] = authorities
+    return Client(
+        bucket, endpoint=settings.endpoint_url, region=settings.region, virtual_hosted_style_request=False, **given,
+        client_options=options, retry_config={'max_retries': 0},
+    )  # fmt: skip
+
+
+def _provider(settings: StoreSettings) -> Any:
+    """What finds the keys of this machine. Raises SettingError for half a pair of keys, CredentialsRejected without any."""
+    from obstore.auth.boto3 import Boto3CredentialProvider  # noqa: PLC0415 - half a second that few need
+
+    from shadowhound_data_logger.stores.credentials import has_keys  # noqa: PLC0415
+
+    if not has_keys(settings):
+        text = f'there are no credentials for Tower at {settings.endpoint_url}'
+        remedy = 'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SHARED_CREDENTIALS_FILE to a file with them'
+        raise CredentialsRejected(text, remedy=remedy, endpoint=settings.endpoint_url or '')
+    return Boto3CredentialProvider()
+
+
+def _authorities(settings: StoreSettings) -> bytes | None:
+    """Certificates (PEM) of those that delivery trusts (``AWS_CA_BUNDLE``), for rustls; None where the system's count."""
+    endpoint = settings.endpoint_url or ''
+    if not endpoint.lower().startswith('https:'):
+        return None
+    from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted  # noqa: PLC0415 - botocore takes a while
+
+    path = trusted(session_with(Keys(settings)), endpoint)
+    return Path(path).read_bytes() if isinstance(path, str) else None
+
+
+def _info(bucket: str, key: str, found: Any) -> ObjectInfo:
+    """Metadata have lower-case names, as S3 has them."""
+    attributes: Mapping[str, str] = found.attributes
+    metadata = {name.lower(): value for name, value in attributes.items() if name not in _HEADERS}
+    return ObjectInfo(bucket, key, found.meta['size'], metadata.get('sha256'), metadata, attributes.get('Content-Type', ''))
+
+
+def _entry(bucket: str, found: Any) -> ObjectInfo:
+    return ObjectInfo(bucket, found['path'], found['size'], None, etag=found['e_tag'] or '', modified=found['last_modified'])
+
+
+def _said(error: BaseException) -> tuple[int, str, str]:
+    """HTTP status (0: no answer), S3 error code and message of an answer that obstore tells in words."""
+    text = str(error)
+    status, code, message = _STATUS.search(text), _CODE.search(text), _MESSAGE.search(text)
+    denied = 403 if code and not status else 0
+    return int(status[1]) if status else denied, (code[1] or code[2]) if code else '', message[1] if message else ''
+
+
+def _translated(error: BaseException, endpoint: str, bucket: str, key: str) -> StoreError:
+    """What went wrong, by the table of all stores (s3_errors.py): obstore's own words repeat the request."""
+    from shadowhound_data_logger.stores import s3_errors  # noqa: PLC0415 - botocore takes a while
+
+    status, code, message = _said(error)
+    request = s3_errors.Request(s3_errors.public_url(endpoint), bucket, key)
+    if status:
+        return s3_errors.refused(code or str(status), status, message, request)
+    if isinstance(error, refused.UnauthenticatedError):
+        return s3_errors.refused('InvalidAccessKeyId', 401, message, request)
+    if isinstance(error, (refused.InvalidPathError, ValueError)):
+        return ObjectRefused(f'the key {bucket}/{key:.80} cannot be asked for', reason='name', bucket=bucket, key=key)
+    return s3_errors.away(str(error), request)
