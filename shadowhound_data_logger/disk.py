@@ -1,11 +1,15 @@
-"""What files are asked beyond ``pathlib``: that they are on the disk, and what they hold. Everything raises OSError."""
+"""What files are asked beyond ``pathlib``: to be on the disk, replaced as a whole, locked. Everything raises OSError."""
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import hashlib
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 READ_BYTES: Final = 1 << 20
 
@@ -30,3 +34,40 @@ def fingerprint(path: Path) -> tuple[int, str]:
             digest.update(chunk)
             size += len(chunk)
     return size, digest.hexdigest()
+
+
+@contextmanager
+def replacing(path: Path, *, is_synced: bool = False, mode: int = 0o666, part: Path | None = None) -> Iterator[IO[bytes]]:
+    """A file to write that takes the place of ``path`` afterwards: a reader sees the old one or the new one, each whole.
+
+    It lies beside it as ``<path>.part`` (or as ``part``) until then, and stays there where writing fails.
+    """
+    part = part or path.with_name(f'{path.name}.part')
+    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, mode), 'wb') as file:
+        yield file
+        if is_synced:
+            file.flush()
+            os.fsync(file.fileno())
+    os.replace(part, path)
+
+
+def lock(file: int | IO[bytes], *, wait: bool = True, shared: bool = False) -> bool:
+    """An advisory lock on an open file, until it is closed or its process dies; whether it was had."""
+    how = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    try:
+        fcntl.flock(file, how if wait else how | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in {errno.EAGAIN, errno.EACCES}:
+            raise
+        return False
+    return True
+
+
+@contextmanager
+def flock(path: Path, *, wait: bool = True) -> Iterator[bool]:
+    """The same on a file that is made for it; yields whether it was had."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        yield lock(descriptor, wait=wait)
+    finally:
+        os.close(descriptor)

@@ -5,7 +5,6 @@ What is there already and right is not asked for again; a file that a kill cut o
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +17,7 @@ from shadowhound_data_logger.bags.description import slice_info
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, missing_of
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.disk import fingerprint, lock, replacing
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, check_document, read_whole
@@ -143,10 +142,8 @@ def _recorded(store: ObjectStore, file: RemoteFile) -> str:
 def _alone(path: Path) -> Iterator[int]:
     """The bytes that are there already, of which no other process writes more meanwhile. Raises BagError when one does."""
     with path.with_name(path.name + UNFINISHED).open('ab') as part:
-        try:
-            fcntl.flock(part, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise BagError(f'another process fetches {path} already', path=str(path)) from error
+        if not lock(part, wait=False):
+            raise BagError(f'another process fetches {path} already', path=str(path))
         yield os.fstat(part.fileno()).st_size
 
 
@@ -155,7 +152,5 @@ def _describe(folder: Path, bag: RemoteBag) -> None:
     slices = [file for file in bag.slices if file.name.endswith('.mcap')]
     infos = [slice_info(read_index(LocalFile(folder / file.name)), folder / file.name, file.size) for file in slices]
     if infos:
-        path = folder / METADATA
-        part = path.with_name(METADATA + UNFINISHED)
-        part.write_bytes(metadata_yaml(infos, ros_distro=''))
-        os.replace(part, path)
+        with replacing(folder / METADATA) as file:
+            file.write(metadata_yaml(infos, ros_distro=''))

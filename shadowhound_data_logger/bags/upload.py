@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import sqlite3
@@ -21,6 +20,7 @@ from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.parcel import Outgoing, Parcel, archive_of, finished, parcel_of
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import BagError, ForeignObject
 from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
 from shadowhound_data_logger.ship.delivering import delivering
@@ -69,8 +69,7 @@ def parcel(folder: Path, robot: str, bag: str, home: Path, *, is_archive: bool) 
         (home / SENDING).mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f'{bag[:64]}-', dir=home / SENDING))
         try:
-            with (work / 'lock').open('wb') as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
+            with flock(work / 'lock'):
                 _sweep(home / SENDING)
                 yield (archive_of if is_archive else parcel_of)(folder, robot, bag, work)
         finally:
@@ -216,10 +215,7 @@ def _taken(bag: str, key: str) -> BagError:
 
 def _sweep(sending: Path) -> None:
     """Remove what a process left that was killed: nobody holds its lock."""
-    for lock in sending.glob('*/lock'):
-        with lock.open('rb') as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            shutil.rmtree(lock.parent, ignore_errors=True)
+    for path in sending.glob('*/lock'):
+        with flock(path, wait=False) as is_mine:
+            if is_mine:
+                shutil.rmtree(path.parent, ignore_errors=True)

@@ -7,10 +7,8 @@ and after the store itself said that it holds every file of it.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -27,6 +25,7 @@ from shadowhound_data_logger.bags.remote import SLICES
 from shadowhound_data_logger.bags.upload import deliver, is_confirmed, opened_spool, parcel, spool_parcel
 from shadowhound_data_logger.clock import SECOND, Clock, iso
 from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.disk import flock, replacing
 from shadowhound_data_logger.errors import BagError, DataLoggerError
 from shadowhound_data_logger.stores import open_store
 
@@ -75,11 +74,9 @@ class Watch:
     @contextmanager
     def alone(self) -> Iterator[None]:
         """For its whole life. Raises BagError when another process watches this folder."""
-        with on_disk(self._folder), (self._folder / f'{MARKS}.lock').open('wb') as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise BagError(f'another process watches {self._folder} already', path=str(self._folder)) from error
+        with on_disk(self._folder), flock(self._folder / f'{MARKS}.lock', wait=False) as is_mine:
+            if not is_mine:
+                raise BagError(f'another process watches {self._folder} already', path=str(self._folder))
             yield
 
     def round(self) -> list[Step]:
@@ -181,13 +178,8 @@ class Watch:
         return dict(found['bags'])
 
     def _write(self, marks: Mapping[str, Any]) -> None:
-        path = self._folder / MARKS
-        part = path.with_name(f'{MARKS}.part')
-        with part.open('w', encoding='utf-8') as file:
-            json.dump({'version': 1, 'bags': marks}, file, indent=1)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
+        with replacing(self._folder / MARKS, is_synced=True) as file:
+            file.write(json.dumps({'version': 1, 'bags': marks}, indent=1).encode())
 
 
 def _look(folder: Path) -> Look:

@@ -9,7 +9,6 @@ Recorded is as the node does it, slice by slice into the spool, with subscriptio
 from __future__ import annotations
 
 import argparse
-import fcntl
 import json
 import logging
 import os
@@ -36,6 +35,7 @@ from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.node import StopSignals
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import BagError, DataLoggerError
 from shadowhound_data_logger.keys import check_name
@@ -207,11 +207,9 @@ def _alone(settings: Settings) -> Iterator[None]:
     """One at a time: another one's open slice would look like that of a dead process."""
     folder = settings.home / RECORDS
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / f'{settings.robot}.lock').open('wb') as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise BagError(f'another `bag record` records {settings.robot} already', remedy='wait for its end') from error
+    with flock(folder / f'{settings.robot}.lock', wait=False) as is_mine:
+        if not is_mine:
+            raise BagError(f'another `bag record` records {settings.robot} already', remedy='wait for its end')
         yield
 
 

@@ -31,6 +31,7 @@ from shadowhound_data_logger.capture.watchdog import Watchdog
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.disk import replacing
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
 from shadowhound_data_logger.spool.account_rows import Totals
 from shadowhound_data_logger.spool.accounts import BAG, EVENT
@@ -128,11 +129,9 @@ class Status:
 
     def write(self, status: Mapping[str, Any]) -> None:
         """For whoever reads the file meanwhile, it is the old status or the new one. A disk that refuses it is said once."""
-        part = self._path.with_name(self._path.name + '.part')
         try:
-            part.touch(mode=0o600)
-            part.write_text(json.dumps(status), encoding='utf-8')
-            part.replace(self._path)
+            with replacing(self._path, mode=0o600) as file:
+                file.write(json.dumps(status).encode())
         except OSError as error:
             self._complain(f'the status cannot be written: {error}')
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import sqlite3
@@ -16,6 +15,7 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Final
 
 from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.disk import lock
 from shadowhound_data_logger.errors import LakeError
 
 if TYPE_CHECKING:
@@ -66,13 +66,13 @@ class Fetched:
         try:
             home.mkdir(parents=True, exist_ok=True)
             self._lock = (home / 'lock').open('ab')
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._claim(self._lock)
             shutil.rmtree(self.parts, ignore_errors=True)
             self.parts.mkdir()
             self._db = self._opened(home / 'files.db')
-        except BlockingIOError as error:
+        except LakeError:
             self._release()
-            raise LakeError(f'another fetch is writing to {self.folder}', remedy='wait for it, or name another folder') from error
+            raise
         except (OSError, sqlite3.Error) as error:
             self._release()
             raise LakeError(f'{self.folder} cannot be written: {error}', folder=str(self.folder)) from error
@@ -85,6 +85,10 @@ class Fetched:
                 self._db.execute("UPDATE files SET boot = '' WHERE boot != ''")
             self._db.close()
         self._release()
+
+    def _claim(self, file: IO[bytes]) -> None:
+        if not lock(file, wait=False):
+            raise LakeError(f'another fetch is writing to {self.folder}', remedy='wait for it, or name another folder')
 
     def _release(self) -> None:
         if self._lock is not None:

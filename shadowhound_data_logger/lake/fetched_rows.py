@@ -12,6 +12,7 @@ from typing import Any
 
 from shadowhound_data_logger.catalogue import parts
 from shadowhound_data_logger.catalogue.schema import COLUMNS
+from shadowhound_data_logger.disk import replacing
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake.fetched import PARTS
@@ -37,8 +38,8 @@ def keep(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             part = folder / PARTS / f'rows-{os.getpid()}'  # where the next fetch clears away what a kill left
             for place in (part.parent, path.parent):
                 place.mkdir(parents=True, exist_ok=True)
-            part.write_bytes(parts.encode(ours))
-            part.replace(path)
+            with replacing(path, part=part) as file:
+                file.write(parts.encode(ours))
         except OSError as error:
             raise LakeError(f'{path} cannot be written: {error.strerror}', folder=str(folder)) from error
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from shadowhound_data_logger.disk import replacing
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -42,10 +44,8 @@ class Floor:
     def save(self, path: Path) -> None:
         """Where anything was seen. Raises OSError."""
         if self._count:
-            part = path.with_name('floor.npy.part')
-            with part.open('wb') as file:
+            with replacing(path) as file:
                 np.save(file, np.concatenate(self._parts))
-            part.replace(path)
 
     def _keep(self, xy: NDArray[np.float32]) -> None:
         self._parts.append(xy)

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import utc
+from shadowhound_data_logger.disk import replacing
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import MAX_NAME_BYTES, check_name
 from shadowhound_data_logger.missions.journal import Line, dated, read
@@ -198,10 +199,5 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def write_json(path: Path, content: Mapping[str, Any], *, durable: bool = False) -> None:
     """Replace a file as a whole: a reader sees the old or the new one. Raises OSError."""
-    part = path.with_name(f'{path.name}.part')
-    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), 'w', encoding='utf-8') as file:
-        json.dump(content, file, indent=1)
-        if durable:
-            file.flush()
-            os.fsync(file.fileno())
-    os.replace(part, path)
+    with replacing(path, is_synced=durable, mode=0o600) as file:
+        file.write(json.dumps(content, indent=1).encode())

@@ -6,7 +6,7 @@ JSON, so that a torn or rotten line costs itself alone. The file is locked (floc
 
 from __future__ import annotations
 
-import fcntl
+import errno
 import json
 import os
 import threading
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.disk import lock
 
 CHUNK: Final = 1 << 20
 TAIL_BYTES: Final = 64 << 10
@@ -50,14 +51,15 @@ class Journal:
     def create(self) -> None:
         """Raises FileExistsError where there is one, OSError where there is no room or right for it."""
         self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600)
-        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        lock(self._descriptor)
         _open.add(self)
 
     def reopen(self) -> None:
         """Go on with what a writer that is gone wrote, or begin. Raises BlockingIOError while there is another, or OSError."""
         descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not lock(descriptor, wait=False):
+                raise BlockingIOError(errno.EAGAIN, 'another process writes it', str(self.path))
         except OSError:
             os.close(descriptor)
             raise
@@ -165,12 +167,9 @@ def is_locked(path: Path) -> bool:
     """Whether its writer lives. Raises OSError (there is no such file)."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
+        return not lock(descriptor, wait=False, shared=True)
     finally:
         os.close(descriptor)
-    return False
 
 
 def first(path: Path) -> Mapping[str, Any]:
@@ -192,12 +191,7 @@ def abandoned(path: Path) -> Iterator[int | None]:
     """The journal of a writer that is dead, opened to be finished and locked meanwhile; None while the writer lives."""
     descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CLOEXEC)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield None
-        else:
-            yield descriptor
+        yield descriptor if lock(descriptor, wait=False) else None
     finally:
         os.close(descriptor)
 

@@ -7,6 +7,7 @@ of the node have numbers of their own (node_log.FIRST_FRAME).
 from __future__ import annotations
 
 import csv
+import io
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -14,6 +15,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.disk import replacing
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of
 from shadowhound_data_logger.missions.folder import MissionFolder, Run
@@ -114,14 +116,12 @@ class NodeDelivery:
         """Once: trajectory.csv of all poses, in seconds since 1970, metres and radians. Raises OSError."""
         if not self.story.counts['poses'] or self._mission.trajectory.exists():
             return
-        part = self._mission.trajectory.with_name('trajectory.csv.part')
-        with part.open('w', encoding='ascii', newline='') as file:
+        with replacing(self._mission.trajectory) as binary, io.TextIOWrapper(binary, 'ascii', newline='') as file:
             rows = csv.writer(file, lineterminator='\n')
             rows.writerow(('timestamp', 'x', 'y', 'yaw', 'z'))
             for line in self._lines(0):
                 if line.record and line.record.get('k') == 'poses':
                     rows.writerows((f'{ns // SECOND}.{ns % SECOND:09d}', *pose) for ns, *pose in line.record['p'])
-        part.replace(self._mission.trajectory)
 
     # -- within ----------------------------------------------------------------------------------------------------
 

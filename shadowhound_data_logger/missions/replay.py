@@ -23,6 +23,7 @@ from typing import Final
 
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import DataLoggerError, TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.dating import Dating
 from shadowhound_data_logger.missions.delivery import Delivery
@@ -33,7 +34,6 @@ from shadowhound_data_logger.missions.objects import Shelf
 from shadowhound_data_logger.missions.report import LOCK, STATE
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
 from shadowhound_data_logger.spool import clock_record
-from shadowhound_data_logger.spool.files import flock
 
 log = logging.getLogger(__name__)
 

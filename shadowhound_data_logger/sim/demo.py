@@ -7,7 +7,6 @@ the node, 2 bad usage.
 from __future__ import annotations
 
 import argparse
-import fcntl
 import importlib.util
 import json
 import os
@@ -24,6 +23,7 @@ from typing import Final
 from rich.console import Console
 
 from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.sim import demo_audit, demo_mission, demo_processes, demo_report, demo_run
 from shadowhound_data_logger.sim.mlflow_access import READER
@@ -128,11 +128,9 @@ def fresh_folder(folder: Path) -> Iterator[Path]:
     if folder.exists() and not marker.is_file() and (not folder.is_dir() or any(folder.iterdir())):
         raise FolderRefused(f'{folder} is there and no demo made it', remedy='name another one with --folder')
     folder.mkdir(parents=True, exist_ok=True)
-    with marker.open('w', encoding='ascii') as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise FolderRefused(f'another demo is running in {folder}', remedy='name another one with --folder') from None
+    with flock(marker, wait=False) as is_mine:
+        if not is_mine:
+            raise FolderRefused(f'another demo is running in {folder}', remedy='name another one with --folder')
         for path in folder.iterdir():
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)

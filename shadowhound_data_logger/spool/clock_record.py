@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.clock_watch import ClockWatch
+from shadowhound_data_logger.disk import replacing
 
 log = logging.getLogger(__name__)
 
@@ -74,10 +75,8 @@ class ClockRecord:
         if state.steps != self._said['steps']:
             self._said |= {'last_step_s': state.last_step_s, 'last_step_time': iso(watch.wall_ns())}
         self._said |= {'is_set': state.is_set, 'steps': state.steps, 'offsets': self._offsets}
-        part = self._path.with_name(self._path.name + '.part')
         try:
-            part.touch(mode=0o600)
-            part.write_text(json.dumps(self._said), encoding='utf-8')
-            part.replace(self._path)
+            with replacing(self._path, mode=0o600) as file:
+                file.write(json.dumps(self._said).encode())
         except OSError as error:
             log.warning('what is known of the clock cannot be kept: %s', error)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool.files import Tree, flock
+from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import MISSING, Index
 
 HERE: Final = (State.PENDING, State.HELD, State.QUARANTINED)

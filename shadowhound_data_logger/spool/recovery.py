@@ -12,7 +12,6 @@ other way round. A log that is there but damaged does not show; with it, what wa
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import os
@@ -21,6 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.disk import lock
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import plausible
 from shadowhound_data_logger.spool.account_rows import Snapshot, TopicRow
@@ -181,12 +181,9 @@ def _is_dead(tree: Tree, session: int) -> bool:
     except FileNotFoundError:
         return True
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
+        return lock(descriptor, wait=False)
     finally:
         os.close(descriptor)
-    return True
 
 
 def _settle_session(index: Index, session: int, now_ns: int, report: Recovery) -> None:

@@ -6,12 +6,12 @@ is spooled, or known to be lost. The two rows change in one transaction, so that
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from dataclasses import replace
 
 from shadowhound_data_logger.clock import Clock
+from shadowhound_data_logger.disk import lock
 from shadowhound_data_logger.spool.account_rows import Snapshot, TopicRow
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
@@ -24,7 +24,7 @@ class Session:
         self.number = number
         self._tree = tree
         self._lock = os.open(tree.session(number), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        lock(self._lock)
 
     @classmethod
     def begin(cls, index: Index, tree: Tree, robot: str, clock: Clock) -> Session:

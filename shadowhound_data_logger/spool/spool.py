@@ -17,6 +17,7 @@ from typing import Final
 
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
 from shadowhound_data_logger.config import SpoolSettings
+from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.spool import binding
@@ -25,7 +26,7 @@ from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.adding import Adding, remove_sources, staged
 from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.ballast import Ballast
-from shadowhound_data_logger.spool.files import Tree, flock
+from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index, spooled
 from shadowhound_data_logger.spool.piles import Piles, look
 from shadowhound_data_logger.spool.recovery import open_recovered

@@ -7,7 +7,6 @@ survives ``cp``, ``tar`` and any file system, and unlike a file next to the obje
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import uuid
@@ -18,7 +17,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.disk import fingerprint, sync
+from shadowhound_data_logger.disk import fingerprint, flock, sync
 from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.base import Content, too_large
@@ -224,8 +223,7 @@ def _appear(part: Path, target: Path) -> bool:
 
 def _rename_alone(part: Path, target: Path) -> bool:
     """``link`` for exFAT and its kind, which have none: one process at a time looks, then renames."""
-    with part.with_name('rename.lock').open('wb') as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with flock(part.with_name('rename.lock')):
         if target.exists():
             return False
         part.rename(target)

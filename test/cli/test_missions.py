@@ -14,6 +14,7 @@ from click.testing import CliRunner, Result
 from missions.fakes import FakeShelf, FakeTracking, journalling
 
 from shadowhound_data_logger.cli.missions import missions
+from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.delivery import Delivery
@@ -21,7 +22,6 @@ from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, write
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.missions.overview import BRIEF, overview, overviews
 from shadowhound_data_logger.missions.report import LOCK
-from shadowhound_data_logger.spool.files import flock
 
 
 def run(home: Path, *arguments: str) -> Result:

@@ -12,11 +12,11 @@ from spool.making import make, new_spool, put, rows
 
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.objects import Shelf, objects_of
 from shadowhound_data_logger.model import DataObject
-from shadowhound_data_logger.spool.files import flock
 from shadowhound_data_logger.spool.status import file
 
 RUN = Run('abc', '1', 'x')
