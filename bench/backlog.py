@@ -28,8 +28,7 @@ from shadowhound_data_logger.config import DEFAULT_SENSORS, SensorSettings, Spoo
 from shadowhound_data_logger.errors import BucketMissing
 from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.ship.ahead import IMPORTANT, OLDEST
-from shadowhound_data_logger.ship.schedule import Schedule
-from shadowhound_data_logger.ship.steps import Look, Ship
+from shadowhound_data_logger.ship.schedule import Look, Schedule, Ship
 from shadowhound_data_logger.spool.spool import Spool
 
 NOON_NS: Final = 1_760_788_800 * SECOND

@@ -1,1 +1,4 @@
-"""Delivery of what is spooled: schedule, retry, upload."""
+"""Delivery of what is spooled: what goes next, what a failure means, when it is tried again.
+
+How fast bytes may leave (``upload.max_mbps``) is kept by ``stores/pace.py``, how long a pause lasts by ``stores/retry.py``.
+"""

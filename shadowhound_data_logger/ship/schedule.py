@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from shadowhound_data_logger.errors import StoreError
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.ship.ahead import LOOK_EVERY_S, Ahead
-from shadowhound_data_logger.ship.history import History
-from shadowhound_data_logger.ship.outage import Breakers, Notice
-from shadowhound_data_logger.ship.retry import Verdict, decide, quarantine_reason
-from shadowhound_data_logger.ship.steps import Look, Rest, Ruling, Ship, Snapshot, Step
+from shadowhound_data_logger.ship.failures import Breakers, History, Notice, Verdict, decide, quarantine_reason
 
 MANY_DEFERRED: Final = 64
 """From here on most probes are objects that failed before: a long outage does not touch ever more objects."""
@@ -28,6 +26,57 @@ ENOUGH_S: Final = 0.5
 SHORTEST_REST_S: Final = 0.01
 LARGE_BYTES: Final = 4 << 20
 """From here on an object keeps a thread for seconds or, over a slow link, minutes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ship:
+    """Put this object, then call ``delivered``, ``failed`` or ``crashed``."""
+
+    item: SpooledObject
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Ask the spool for what is pending, then call ``found`` or ``look_failed``."""
+
+    exclude: frozenset[int]
+    without: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """There is nothing to do for so long, or until something changes: call ``rest`` with it."""
+
+    seconds: float
+    version: int
+
+
+Step = Ship | Look | Rest
+
+
+@dataclass(frozen=True, slots=True)
+class Ruling:
+    """What follows from a failure: the reason to quarantine the object, if so, and what is to be logged."""
+
+    quarantine: str | None = None
+    notices: Sequence[Notice] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The schedule at one instant."""
+
+    active: bool | None
+    """Whether this process drains; None while it is not known yet."""
+    outage: Verdict | None
+    blocked: Mapping[str, str]
+    """Bucket -> why its objects wait."""
+    in_flight: int
+    ready: int
+    deferred: int
+    delivered: int
+    retries: int
+    last_error: str
 
 
 class Schedule:

@@ -20,10 +20,8 @@ from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import StoreError
 from shadowhound_data_logger.model import Outcome, SpooledObject, State
 from shadowhound_data_logger.ship.ahead import IMPORTANT, OLDEST
-from shadowhound_data_logger.ship.outage import Notice
-from shadowhound_data_logger.ship.retry import Verdict
-from shadowhound_data_logger.ship.schedule import Schedule
-from shadowhound_data_logger.ship.steps import Look, Rest, Ship, Step
+from shadowhound_data_logger.ship.failures import Notice, Verdict
+from shadowhound_data_logger.ship.schedule import Look, Rest, Schedule, Ship, Step
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.worker import Worker
 

@@ -9,8 +9,7 @@ from collections.abc import Callable
 from typing import Final
 
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.ship.schedule import Schedule
-from shadowhound_data_logger.ship.steps import Rest
+from shadowhound_data_logger.ship.schedule import Rest, Schedule
 
 STUCK_S: Final = 30.0
 """Real seconds without a word from the one thread that may run: it waits for something that is not of this time."""

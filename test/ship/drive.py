@@ -9,10 +9,8 @@ from ship.fakes import FakeSpool, Time
 from shadowhound_data_logger.errors import StoreError
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.ship.ahead import IMPORTANT, OLDEST
-from shadowhound_data_logger.ship.outage import Notice
-from shadowhound_data_logger.ship.retry import Verdict
-from shadowhound_data_logger.ship.schedule import Schedule
-from shadowhound_data_logger.ship.steps import Look, Rest, Ship
+from shadowhound_data_logger.ship.failures import Notice, Verdict
+from shadowhound_data_logger.ship.schedule import Look, Rest, Schedule, Ship
 
 CAP_S = 60.0
 

@@ -13,8 +13,7 @@ from stores.fake_s3 import FakeS3, served
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.ship.schedule import Schedule
-from shadowhound_data_logger.ship.steps import Rest, Ship
+from shadowhound_data_logger.ship.schedule import Rest, Schedule, Ship
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.stores.s3 import S3Store
 

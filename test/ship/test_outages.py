@@ -6,7 +6,7 @@ from ship.drive import CAP_S, Drive
 from ship.fakes import FakeSpool, Time
 
 from shadowhound_data_logger.errors import StoreUnavailable
-from shadowhound_data_logger.ship.retry import Verdict
+from shadowhound_data_logger.ship.failures import Verdict
 
 AWAY = StoreUnavailable('Tower is away')
 

@@ -18,9 +18,8 @@ from shadowhound_data_logger.errors import (
     StoreError,
     StoreUnavailable,
 )
-from shadowhound_data_logger.ship.history import DENIALS
-from shadowhound_data_logger.ship.retry import Verdict
-from shadowhound_data_logger.ship.steps import Rest
+from shadowhound_data_logger.ship.failures import DENIALS, Verdict
+from shadowhound_data_logger.ship.schedule import Rest
 
 AWAY = StoreUnavailable('Tower is away')
 

@@ -5,7 +5,7 @@ import random
 import pytest
 
 from shadowhound_data_logger import errors
-from shadowhound_data_logger.ship.retry import Verdict, decide, quarantine_reason
+from shadowhound_data_logger.ship.failures import Verdict, decide, quarantine_reason
 from shadowhound_data_logger.stores.retry import BASE_S, backoff
 
 TABLE = [

@@ -6,7 +6,7 @@ from ship.drive import Drive
 
 from shadowhound_data_logger.errors import BucketMissing, StoreUnavailable
 from shadowhound_data_logger.ship.ahead import LOOK_EVERY_S
-from shadowhound_data_logger.ship.steps import Look, Rest
+from shadowhound_data_logger.ship.schedule import Look, Rest
 
 AWAY = StoreUnavailable('Tower is away')
 

@@ -17,7 +17,7 @@ from stores.tls_front import Secured, behind_tls
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import SettingError, StoreUnavailable, StoreUntrusted
 from shadowhound_data_logger.model import Put, SpooledObject
-from shadowhound_data_logger.ship.retry import Verdict, decide
+from shadowhound_data_logger.ship.failures import Verdict, decide
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.s3 import S3Store
