@@ -141,7 +141,9 @@ def _expected(manifest: Manifest | None, described: Description | None, there: M
     return [*found.values(), *(_Expected(file.name, None, None, None) for file in slices if file.name not in found)]
 
 
-def _check_remote(store: ObjectStore, file: RemoteFile, expected: _Expected, meter: Meter, deep: bool, told: Telling) -> FileCheck:
+def _check_remote(
+    store: ObjectStore, file: RemoteFile, expected: _Expected, meter: Meter, deep: bool, told: Telling
+) -> FileCheck:
     if expected.size is not None and file.size != expected.size:
         return FileCheck(file.name, f'has {file.size} bytes, {expected.size} were recorded', 'size')
     held = store.head(BUCKET, file.key)

@@ -11,14 +11,13 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.errors import ForeignObject, NameRefused, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.keys import check_key, check_name
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.untrusted import path_below
+from shadowhound_data_logger.untrusted import is_path
 
 _PASSING: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE, errno.EINTR, errno.EAGAIN})
 """Troubles of this process or machine that say nothing of the file; EIO does: its disk is rotten."""
@@ -43,9 +42,10 @@ def check_read(bucket: str, key: str) -> None:
     """The same for reading: what other programs wrote may be read by any key that is a path."""
     try:
         check_name(bucket, 'the bucket')
-        path_below(Path(), key)
     except NameRefused as error:
         raise ObjectRefused(str(error), reason='name', bucket=bucket, key=key) from error
+    if not is_path(key):
+        raise ObjectRefused(f'the key {key[:200]!r} is no path below a folder', reason='name', bucket=bucket, key=key)
 
 
 def chunks(item: SpooledObject) -> Iterator[bytes]:

@@ -45,10 +45,9 @@ def download(
     Raises StoreUnavailable where it broke off after some tries, ObjectRefused where there is none or it is not what it has to
     be (``data['reason'] == 'damaged'``, ``data['why']`` says how), OSError of the file.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     part = part or path.with_name(f'{path.name}{UNFINISHED}')
     try:
-        with part.open('ab+', buffering=0) as file:
+        with _opened(part) as file:
             transfer = _Transfer(store, wanted, file, tell)
             found = twice(lambda: steadily(transfer.complete, tries=TRIES, pause=pause))
             if is_synced:
@@ -57,8 +56,20 @@ def download(
         if error.data.get('reason') == 'damaged':
             part.unlink()
         raise
-    part.replace(path)
+    try:
+        part.replace(path)
+    except FileNotFoundError:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.replace(path)
     return found
+
+
+def _opened(part: Path) -> IO[bytes]:
+    try:
+        return part.open('ab+', buffering=0)
+    except FileNotFoundError:
+        part.parent.mkdir(parents=True, exist_ok=True)
+        return part.open('ab+', buffering=0)
 
 
 def twice(fetch: Callable[[], _Found]) -> _Found:
@@ -87,10 +98,11 @@ class _Transfer:
         self._tell = tell
         self._digest = hashlib.sha256()
         self._size = 0
-        file.seek(0)
-        while chunk := file.read(CHUNK_BYTES):
-            self._digest.update(chunk)
-            self._size += len(chunk)
+        if file.tell():  # which was opened at its end
+            file.seek(0)
+            while chunk := file.read(CHUNK_BYTES):
+                self._digest.update(chunk)
+                self._size += len(chunk)
 
     def complete(self) -> Downloaded:
         """One try: add what is missing, and judge the whole. What is damaged is thrown away."""

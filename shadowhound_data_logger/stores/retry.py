@@ -16,6 +16,7 @@ TRIES: Final = 4
 CAP_S: Final = 5.0
 
 _Answer = TypeVar('_Answer')
+_rng: Final = random.Random()
 
 
 def backoff(attempt: int, cap_s: float, rng: random.Random) -> float:
@@ -32,7 +33,7 @@ def steadily(ask: Callable[[], _Answer], *, tries: float | None = None, until_s:
 
     No try begins after ``until_s`` of the monotonic clock.
     """
-    rng, failures, most = random.Random(), 0, TRIES if tries is None else tries
+    failures, most = 0, TRIES if tries is None else tries
     while True:
         try:
             return ask()
@@ -40,7 +41,7 @@ def steadily(ask: Callable[[], _Answer], *, tries: float | None = None, until_s:
             raise
         except StoreUnavailable:
             failures += 1
-            pause_s = backoff(failures, cap_s, rng)
+            pause_s = backoff(failures, cap_s, _rng)
             if failures >= most or time.monotonic() + pause_s >= until_s:
                 raise
             pause(pause_s)

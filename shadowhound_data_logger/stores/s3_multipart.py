@@ -148,7 +148,7 @@ class _Uploads:
         """The ids of the uploads of its key that are under way."""
         with self._s3.asking(item.bucket, item.key) as client:
             answer = client.list_multipart_uploads(Bucket=item.bucket, Prefix=item.key)
-        return [upload['UploadId'] for upload in answer.get('_Uploads', ()) if upload['Key'] == item.key]
+        return [upload['UploadId'] for upload in answer.get('Uploads', ()) if upload['Key'] == item.key]
 
     def parts(self, item: SpooledObject, upload: str) -> dict[int, HeldPart]:
         """Number -> part."""

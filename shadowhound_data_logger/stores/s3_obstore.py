@@ -174,7 +174,7 @@ class ObstoreStore:
     def _pieces(self, bucket: str, key: str, found: Any) -> Iterator[bytes]:
         with self._asking(bucket, key):
             if found.meta['size'] <= CHUNK_BYTES:
-                yield bytes(found.bytes())
+                yield found.bytes()
             else:
                 yield from found.stream(min_chunk_size=CHUNK_BYTES)
 
