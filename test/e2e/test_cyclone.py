@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import time
 from importlib.util import find_spec
 
 import pytest
-from e2e.processes import Processes
+from e2e.processes import Processes, until
 from e2e.reading import STRING, cdr, texts
 
 from shadowhound_data_logger.capture.middleware import possible_buffer
@@ -58,3 +60,26 @@ def test_large_messages_come_as_they_do_to_cyclone_dds(processes: Processes, kin
     row = node.stop()['topics']['/large']
     assert row['accounting'] == 'exact'
     assert row['published'] == row['received'] + row['missed']
+
+
+@pytest.mark.long('a node that is stopped until Fast DDS loses its place')
+def test_a_publisher_that_outruns_the_node(processes: Processes) -> None:
+    """It has no more of the parts that the node lacks, and Fast DDS loses its place: nothing is invented, the topic goes on."""
+    node, driver = processes.node(None, SENSORS, environ=CYCLONE), processes.publisher(cyclone=True)
+    driver.create('/plain', STRING, depth=1)
+    driver.heard('/plain', node, texts(['warm-up'])[0])
+    driver.begin_numbered('/plain', 'large', 300_000, 0.01)
+
+    def is_lost() -> bool:
+        node.signal(signal.SIGSTOP)
+        time.sleep(0.3)
+        node.signal(signal.SIGCONT)
+        time.sleep(0.2)
+        return 'listening anew' in node.log
+
+    until(is_lost, 'Fast DDS loses its place', 150.0)
+    node.received('/plain', node.topic('/plain')['received'] + 50)
+    driver.halt_numbered('/plain')
+    row = node.stop()['topics']['/plain']
+    assert (row['accounting'], row['rejected']) == ('exact', {})
+    assert row['missed'] > 0
