@@ -38,7 +38,7 @@ from shadowhound_data_logger.worker import Worker
 
 COMPARE_S: Final = 2.0
 """How often it looks at the publishers of what is logged, or more seldom: it takes at most so much of the time."""
-COMPARE_SHARE: Final = 0.05
+COMPARE_SHARE, LONGEST_COMPARE_S = 0.05, 20.0
 MOST_REPORTED, MOST_LETTERS = 64, 150
 """Publishers in a report, and letters of a name: together they fit into a request."""
 LOOK_S: Final = 1.0
@@ -161,7 +161,7 @@ class PublicNode:
         answer = self._ask({'do': 'compare', 'found': found})
         if answer['ok']:
             self._topics, self._gids = answer['topics'], frozenset(answer['gids'])
-        self._compare_s = began_s + max(COMPARE_S, (time.monotonic() - began_s) / COMPARE_SHARE)
+        self._compare_s = began_s + min(LONGEST_COMPARE_S, max(COMPARE_S, (time.monotonic() - began_s) / COMPARE_SHARE))
 
     def _ask(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         """As ``Commands.answer``; that nobody answers is an answer as well."""

@@ -18,8 +18,9 @@ log = logging.getLogger(__name__)
 SETTLED_S: Final = 30.0
 """For how long the front must report a publisher before it is called unheard. One that was killed stays known for its lease (10 s
 by default with Cyclone DDS, 20 s with Fast DDS as ROS has it), and the two sides forget it at different moments."""
-SILENT_S: Final = 10.0
-"""After a longer silence of the front nothing is known, and what is reported then begins anew; it reports every other second."""
+SILENT_S: Final = 30.0
+"""After a longer silence of the front nothing is known, and what is reported then begins anew; it reports every other second, or
+every 20 s in a crowd of publishers."""
 MOST_PUBLISHERS: Final = 8
 """Of a topic, in a report: a crowd of them costs no more."""
 MOST_NODES: Final = 3
