@@ -10,7 +10,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
+from shadowhound_data_logger.doctor.model import Context, Result, error, info, measured, ok, warning
 
 NAME: Final = 'disk'
 SMALL_BYTES, LARGE_BYTES = 1 << 20, 8 << 20
@@ -101,24 +101,22 @@ def _speed(probe: Path) -> Iterator[Result]:
         if took_s * LARGE_BYTES / SMALL_BYTES < WITHIN_S:
             size, took_s = LARGE_BYTES, _write(file, LARGE_BYTES)
         mbytes = size / 1e6 / took_s
-    seen = f'a sync takes {1000 * middle_s:.1f} ms'
-    if middle_s > SLOW_SYNC_S:
-        yield warning(
-            'disk.sync',
-            seen,
-            'an SD card, a dying or a busy disk: commits come late, and more is lost in a power cut',
-            'iostat -x 1 5 ; an NVMe disk: export SHADOWHOUND_HOME=/data/shadowhound',
-            sync_s=round(middle_s, 4),
-        )
-    else:
-        yield ok('disk.sync', seen, sync_s=round(middle_s, 4))
-    written = f'{mbytes:.0f} MB/s can be written'
-    if mbytes < SLOW_MBYTES:
-        yield warning(
-            'disk.speed', written, 'an SD card, or a disk that others keep busy', 'iostat -x 1 5', write_mbytes=round(mbytes, 1)
-        )
-    else:
-        yield ok('disk.speed', written, write_mbytes=round(mbytes, 1))
+    yield measured(
+        'disk.sync',
+        f'a sync takes {1000 * middle_s:.1f} ms',
+        'an SD card, a dying or a busy disk: commits come late, and more is lost in a power cut',
+        'iostat -x 1 5 ; an NVMe disk: export SHADOWHOUND_HOME=/data/shadowhound',
+        is_fine=middle_s <= SLOW_SYNC_S,
+        sync_s=round(middle_s, 4),
+    )
+    yield measured(
+        'disk.speed',
+        f'{mbytes:.0f} MB/s can be written',
+        'an SD card, or a disk that others keep busy',
+        'iostat -x 1 5',
+        is_fine=mbytes >= SLOW_MBYTES,
+        write_mbytes=round(mbytes, 1),
+    )
 
 
 def _write(file: FileIO, size: int) -> float:

@@ -130,6 +130,11 @@ def warning(check: str, seen: str, cause: str, remedy: str, *, fix: tuple[str, .
     return Result(check, Severity.WARNING, seen, cause, remedy, fix=fix, data=data)
 
 
+def measured(check: str, seen: str, cause: str, remedy: str, *, is_fine: bool, **data: Any) -> Result:
+    """A figure: as it should be, or a finding though it works all the same."""
+    return ok(check, seen, **data) if is_fine else warning(check, seen, cause, remedy, **data)
+
+
 def error(check: str, seen: str, cause: str, remedy: str, *, fix: tuple[str, ...] = (), **data: Any) -> Result:
     """A finding; something does not work."""
     return Result(check, Severity.ERROR, seen, cause, remedy, fix=fix, data=data)

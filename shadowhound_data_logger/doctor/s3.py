@@ -20,7 +20,19 @@ from urllib.request import Request, urlopen
 
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.doctor import network, s3_put, services
-from shadowhound_data_logger.doctor.model import Context, Result, Role, Severity, error, info, of_error, ok, skipped, warning
+from shadowhound_data_logger.doctor.model import (
+    Context,
+    Result,
+    Role,
+    Severity,
+    error,
+    info,
+    measured,
+    of_error,
+    ok,
+    skipped,
+    warning,
+)
 from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S, TowerService
 from shadowhound_data_logger.errors import (
     AccessDenied,
@@ -189,16 +201,14 @@ def _latency(requests: S3Requests, bucket: str, robot: str) -> Result:
         requests.head(bucket, s3_put.key(robot))
         took.append(time.perf_counter() - began_s)
     middle_s = sorted(took)[LATENCY_TRIES // 2]
-    seen = f'a small request takes {1000 * middle_s:.1f} ms'
-    if middle_s > SLOW_S:
-        return warning(
-            's3.latency',
-            seen,
-            'a weak WiFi, or a server that is busy',
-            'ping -c 10 TOWER_IP ; iw dev wlan0 link',
-            latency_s=round(middle_s, 4),
-        )
-    return ok('s3.latency', seen, latency_s=round(middle_s, 4))
+    return measured(
+        's3.latency',
+        f'a small request takes {1000 * middle_s:.1f} ms',
+        'a weak WiFi, or a server that is busy',
+        'ping -c 10 TOWER_IP ; iw dev wlan0 link',
+        is_fine=middle_s <= SLOW_S,
+        latency_s=round(middle_s, 4),
+    )
 
 
 def _delete(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.doctor.model import Result, error, of_error, ok, warning
+from shadowhound_data_logger.doctor.model import Result, error, measured, of_error, ok, warning
 from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.model import SpooledObject
 
@@ -115,17 +115,14 @@ def promises(requests: S3Requests, bucket: str, robot: str, latency_s: float) ->
             'update the S3 server on Tower',
         )
     mbps = 8e-6 * size / max(took_s - latency_s, took_s / 2)
-    seen = f'{mbps:,.1f} Mbit/s to Tower ({size >> 10} KiB in {took_s:.2f} s)'
-    if mbps < SLOW_MBPS:
-        yield warning(
-            's3.throughput',
-            seen,
-            'below what the default settings make: the backlog grows',
-            'iw dev wlan0 link ; log less: camera.rate_hz, lidar.rate_hz, camera.quality in the parameter file',
-            upload_mbps=round(mbps, 2),
-        )
-    else:
-        yield ok('s3.throughput', seen, upload_mbps=round(mbps, 2))
+    yield measured(
+        's3.throughput',
+        f'{mbps:,.1f} Mbit/s to Tower ({size >> 10} KiB in {took_s:.2f} s)',
+        'below what the default settings make: the backlog grows',
+        'iw dev wlan0 link ; log less: camera.rate_hz, lidar.rate_hz, camera.quality in the parameter file',
+        is_fine=mbps >= SLOW_MBPS,
+        upload_mbps=round(mbps, 2),
+    )
 
 
 def _damaged(requests: S3Requests, bucket: str, name: str, size: int) -> tuple[float, bool]:

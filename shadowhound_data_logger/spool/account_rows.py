@@ -99,7 +99,7 @@ class RhythmRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class AccountSnapshot:
     """The accounts at one instant, as a group commit writes them."""
 
     topics: tuple[TopicRow, ...]

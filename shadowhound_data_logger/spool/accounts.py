@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from shadowhound_data_logger.spool.account_rows import OtherTypeRow, PublisherRow, RhythmRow, Snapshot, TopicRow, Totals
+from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
 from shadowhound_data_logger.spool.span import Span
 
@@ -377,7 +377,7 @@ class Accounts:
                 if (topic.startswith(sink) if sink else not topic.startswith(SINKS))
             }
 
-    def snapshot(self, stored: Mapping[str, tuple[int, int]]) -> Snapshot | None:
+    def snapshot(self, stored: Mapping[str, tuple[int, int]]) -> AccountSnapshot | None:
         """The state as it will be once ``stored`` is durable; None when nothing changed since the last one."""
         with self._lock:
             if not self._dirty and not stored:
@@ -400,7 +400,7 @@ class Accounts:
                 spans += [(topic, name, span) for name, span in removed.items()
                           if span is not None and name not in self._topics[topic].publishers]  # fmt: skip
             rhythms = (account.estimate.row(topic) for topic, account in self._topics.items())
-            return Snapshot(
+            return AccountSnapshot(
                 tuple(self._row(topic, account, *stored.get(topic, (0, 0))) for topic, account in self._topics.items()),
                 tuple(
                     PublisherRow(topic, publisher, span.first, span.last, span.published, span.received, dict(+span.missed))

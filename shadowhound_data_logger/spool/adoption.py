@@ -19,7 +19,7 @@ from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_key, check_name
 from shadowhound_data_logger.model import DataObject, FileBody, State
-from shadowhound_data_logger.spool.account_rows import Snapshot, TopicRow
+from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.files import Tree, description_of
 from shadowhound_data_logger.spool.index import MISSING, Index
@@ -139,7 +139,7 @@ class Adoption:
                 for account, count in {item.topic: item.samples}.items() if item.topic is not None else item.counts.items():
                     self._topics[account] = _more(self._topics.get(account), account, count, item)
                 self._report.counts['files adopted'] += 1
-            self._index.write(self._session, Snapshot(tuple(self._topics.values()), ()))
+            self._index.write(self._session, AccountSnapshot(tuple(self._topics.values()), ()))
             self._index.end_session(self._session, self._now_ns)
         self._group.clear()
 

@@ -20,7 +20,7 @@ from typing import Any, Final
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
-from shadowhound_data_logger.spool.account_rows import OtherTypeRow, PublisherRow, RhythmRow, Snapshot, TopicRow
+from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.schema import definitions, expected, prepare
 
 FORGET_STEP: Final = 10_000
@@ -217,7 +217,7 @@ class Index:
     def end_session(self, session: int, now_ns: int) -> None:
         self.db.execute('UPDATE sessions SET ended_ns = ? WHERE id = ?', (now_ns, session))
 
-    def write(self, session: int, snapshot: Snapshot) -> None:
+    def write(self, session: int, snapshot: AccountSnapshot) -> None:
         """Replace the session's accounts by a newer snapshot."""
         self.db.executemany(
             'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?)',

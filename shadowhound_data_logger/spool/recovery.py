@@ -23,7 +23,7 @@ from typing import Final
 from shadowhound_data_logger.disk import lock
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import plausible
-from shadowhound_data_logger.spool.account_rows import Snapshot, TopicRow
+from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import SINKS
 from shadowhound_data_logger.spool.adoption import Adoption, Recovery, place_said
 from shadowhound_data_logger.spool.ballast import says_full
@@ -196,5 +196,5 @@ def _settle_session(index: Index, session: int, now_ns: int, report: Recovery) -
         rows.append(replace(row, dropped=dropped) if row.open else row)
         report.counts['messages lost with an open batch'] += row.open
     with index.transaction():
-        index.write(session, Snapshot(tuple(rows), ()))
+        index.write(session, AccountSnapshot(tuple(rows), ()))
         index.end_session(session, now_ns)

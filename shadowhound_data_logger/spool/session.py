@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.disk import lock
-from shadowhound_data_logger.spool.account_rows import Snapshot, TopicRow
+from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 
@@ -33,7 +33,7 @@ class Session:
             number = index.begin_session(robot, clock.boot_id, os.getpid(), clock.wall_ns())
         return cls(number, tree)
 
-    def end(self, index: Index, snapshot: Snapshot | None, now_ns: int) -> None:
+    def end(self, index: Index, snapshot: AccountSnapshot | None, now_ns: int) -> None:
         """Write the last accounts and close them, in one transaction."""
         with index.transaction():
             if snapshot:
@@ -66,7 +66,7 @@ def carry(index: Index, session: int, robot: str, sink: str) -> list[TopicRow]:
                     'UPDATE estimates SET estimated = estimated - ?, unknown = unknown - ? WHERE session = ? AND topic = ?',
                     (estimated, unknown, *place),
                 )
-    index.write(session, Snapshot(tuple(moved.values()), ()))
+    index.write(session, AccountSnapshot(tuple(moved.values()), ()))
     return list(moved.values())
 
 
