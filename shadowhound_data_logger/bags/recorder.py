@@ -184,9 +184,7 @@ class Recorder:
         try:
             current = self._current
             if current is not None and self._place.is_due(current.recording.notes):
-                self._end_after(current.recording, STOP_S)
-                self._current = None
-                self._start(current.by, current.recording.notes.mission, listening=True)
+                self._start(current.by, current.recording.notes.mission, after=current)
         finally:
             self._control.release()
 
@@ -201,16 +199,14 @@ class Recorder:
             return
         if current is None and self._settings.record == ALWAYS:
             return  # somebody stopped it
-        if current is not None:
-            self._end_after(current.recording, STOP_S)
-            self._current = None
-        self._start(ALWAYS if mission is None else MISSION, mission, listening=current is not None)
+        self._start(ALWAYS if mission is None else MISSION, mission, after=current)
 
     def _begin_by(self, by: str) -> None:
         with self._control:
             self._start(by, self._mission)
 
-    def _start(self, by: str, mission: MissionOf | None, *, listening: bool = False) -> Answer:
+    def _start(self, by: str, mission: MissionOf | None, *, after: _Current | None = None) -> Answer:
+        """``after``: the recording that this one follows."""
         place = self._place
         unset = place.unset()
         name = place.name(mission.type if mission is not None else '', unset)
@@ -218,21 +214,24 @@ class Recorder:
             notes = Notes.begin(place.root / name, place.robot, mission, clock=unset)
         except OSError as error:
             log.error('no bag is recorded: %s', error)  # noqa: TRY400 - an operator's matter
-            if listening:
-                self._listen(False, STOP_S)
+            if after is not None:
+                self._stop(STOP_S)
             return False, f'no bag can be made in {place.root}: {error.strerror}'
-        goes_on = by == ALWAYS or listening or (mission is not None and mission.mission_id in self._salvage.missions)
+        goes_on = by == ALWAYS or after is not None or (mission is not None and mission.mission_id in self._salvage.missions)
         if not goes_on:
             self._place.spool.accounts.rebase_all(BAG)
         recording = Recording(notes, self._settings, place, self._salvage)
         self._current = _Current(recording, by, time.monotonic(), self._queue.dropped)
-        self._queue.paused = self._queue.paused and listening
-        if not listening:
+        self._queue.paused = self._queue.paused and after is not None
+        if after is None:
             self._queue.take_lost()
         if not self._started:
             self._started = True
             self._worker.start()
-        self._queue.mark(lambda: self._write_to(recording))
+        if after is None:
+            self._queue.mark(lambda: self._write_to(recording))
+        else:
+            self._end_after(after.recording, STOP_S, then=recording)
         if not self._listen(True, STOP_S):
             log.warning('the intake did not begin to record within %.0f s; it does as soon as it can', STOP_S)
         log.info('bag %s is recorded', name)
@@ -254,8 +253,8 @@ class Recorder:
         log.info('%s', text)
         return True, text
 
-    def _end_after(self, recording: Recording, deadline_s: float) -> threading.Event:
-        """Have the thread end a bag after all that waits for it."""
+    def _end_after(self, recording: Recording, deadline_s: float, then: Recording | None = None) -> threading.Event:
+        """Have the thread end a bag after all that waits for it, and write to the next one without a message between them."""
         done = threading.Event()
 
         def end() -> None:
@@ -263,6 +262,8 @@ class Recorder:
             recording.leave_out(self._queue.take_lost())
             if recording.close(deadline_s):
                 done.set()
+            if then is not None:
+                self._write_to(then)
 
         self._queue.mark(end)
         return done

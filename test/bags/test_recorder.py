@@ -5,11 +5,15 @@ from __future__ import annotations
 import shutil
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
+from bags.eventing import until
 from bags.recording import ROBOT, STRING, desk, lot, manifest, mission, numbers, start, write_out
 from clocks import Clocks
 from mcap.reader import make_reader
+
+from shadowhound_data_logger.bags.notes import Notes
 
 
 def test_a_bag_from_start_to_stop(tmp_path: Path) -> None:
@@ -146,6 +150,28 @@ def test_one_bag_follows_the_other_without_a_gap(tmp_path: Path) -> None:
             list(range(10 * number, 10 * number + 10)) for number in range(4)
         ]
         assert it.listening == [True] * 4 + [False]
+
+
+def test_what_comes_while_the_next_bag_is_made_is_in_one_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its folder is synced to a disk that may be slow, and the intake goes on meanwhile."""
+    begin = Notes.begin
+    with desk(tmp_path, record='always') as it:
+
+        def slowly(*given: Any, **named: Any) -> Notes:
+            it.hear(range(10, 20))
+            until(lambda: not it.queue.bytes, 'the thread has taken it')
+            return begin(*given, **named)
+
+        monkeypatch.setattr(Notes, 'begin', slowly)
+        names = [it.recorder.status().bag]
+        it.hear(range(10))
+        it.recorder.on_mission(mission())
+        names.append(it.recorder.status().bag)
+        it.hear(range(20, 30))
+        it.recorder.stop()
+        found = it.objects()
+        assert [n for bag in names for n in numbers(found[f'{bag}/{bag}_0.mcap'])] == list(range(30))
+        assert it.row()['dropped'] == {}
 
 
 def test_what_somebody_started_outlives_missions(tmp_path: Path) -> None:
