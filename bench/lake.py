@@ -200,7 +200,7 @@ def fetches(tower: Tower, settings: StoreSettings, folder: Path, objects: int) -
     progress(f'{objects:,} objects to fetch')
     source, to = Bucket(settings, schema.BUCKET), _memory(folder) / 'fetched'
 
-    def ours() -> fetching.Result:
+    def ours() -> fetching.FetchResult:
         with closing(open_reader(settings)) as store:
             return fetching.fetch(fetching.under(source, PREFIX), to, store)
 

@@ -16,7 +16,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Final, Protocol
 
-from shadowhound_data_logger.bags.description import Description, Part, of_metadata
+from shadowhound_data_logger.bags.description import BagPart, Description, of_metadata
 from shadowhound_data_logger.bags.fetch import fetch, on_disk
 from shadowhound_data_logger.bags.naming import BUCKET, METADATA
 from shadowhound_data_logger.bags.packed import Packed
@@ -121,7 +121,7 @@ def _packed(folder: Path, told: Description | None) -> Packed:
 
 
 def _cut(source: CutSource, folder: Path, out: Path, choice: Choice, meter: Meter, bag_bytes: int,
-         others: Sequence[Part] = ()) -> Cut:  # fmt: skip
+         others: Sequence[BagPart] = ()) -> Cut:  # fmt: skip
     """``others`` are slices that are not there."""
     first_ns, last_ns = source.span()
     start_ns = moment_in_bag('--start', choice.start, first_ns, last_ns) if choice.start else first_ns
@@ -147,12 +147,12 @@ def _cut(source: CutSource, folder: Path, out: Path, choice: Choice, meter: Mete
                meter.bytes, meter.requests, bag_bytes, _absent(source, choice), missing)  # fmt: skip
 
 
-def _others(told: Description | None, there: Sequence[str]) -> list[Part]:
+def _others(told: Description | None, there: Sequence[str]) -> list[BagPart]:
     """Slices that the metadata names beside those that are there."""
     return [part for part in told.parts if part.name not in there] if told is not None else []
 
 
-def _overlaps(part: Part, start_ns: int, end_ns: int) -> bool:
+def _overlaps(part: BagPart, start_ns: int, end_ns: int) -> bool:
     if part.t_start_ns is None or part.t_end_ns is None:
         return part.messages != 0
     return part.t_start_ns < end_ns and part.t_end_ns >= start_ns

@@ -30,7 +30,7 @@ class DescribedTopic:
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class BagPart:
     """One file of a bag. Times are log times, Unix nanoseconds, both inclusive; None where they are not known."""
 
     name: str
@@ -49,7 +49,7 @@ class Description:
     """Of files or messages, as rosbag2 does it outside the storage: ``zstd file``; empty without."""
     distro: str
     topics: tuple[DescribedTopic, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[BagPart, ...]
     messages: int
     t_start_ns: int
     t_end_ns: int
@@ -81,7 +81,7 @@ def of_slices(slices: Sequence[SliceInfo]) -> Description:
     return Description(
         storage='mcap', compression='', distro='',
         topics=tuple(replace(topic, messages=counts[key]) for key, topic in found.items()),
-        parts=tuple(Part(one.path.name, one.messages, one.t_start_ns, one.t_end_ns) for one in slices),
+        parts=tuple(BagPart(one.path.name, one.messages, one.t_start_ns, one.t_end_ns) for one in slices),
         messages=sum(one.messages for one in slices),
         t_start_ns=min((one.t_start_ns for one in filled), default=0), t_end_ns=max((one.t_end_ns for one in filled), default=0),
     )  # fmt: skip
@@ -130,11 +130,11 @@ def _topics(found: Iterable[Mapping[str, Any]]) -> Iterable[DescribedTopic]:
         )  # fmt: skip
 
 
-def _part(path: str, told: Mapping[str, Any] | None) -> Part:
+def _part(path: str, told: Mapping[str, Any] | None) -> BagPart:
     if told is None:
-        return Part(path, None, None, None)
+        return BagPart(path, None, None, None)
     start, messages = _whole(told['starting_time'], 'nanoseconds_since_epoch'), _whole(told, 'message_count')
-    return Part(
+    return BagPart(
         path, messages, start if messages else None, start + _whole(told['duration'], 'nanoseconds') if messages else None
     )
 

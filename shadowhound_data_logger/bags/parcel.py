@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, Final, cast
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.bags.description import Description, Part, of_metadata, slice_info
+from shadowhound_data_logger.bags.description import BagPart, Description, of_metadata, slice_info
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, RecordedTopic, SliceEntry
 from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, prefix_of
 from shadowhound_data_logger.bags.remote import ARCHIVE, natural
@@ -131,7 +131,7 @@ def _outgoing(path: Path, name: str, robot: str, bag: str) -> Outgoing:
     return Outgoing(name, key, path, *fingerprint(path), {words.ROBOT: robot, words.BAG: bag})
 
 
-def _marked(file: Outgoing, part: Part | None, robot: str, bag: str) -> Outgoing:
+def _marked(file: Outgoing, part: BagPart | None, robot: str, bag: str) -> Outgoing:
     """With what can be told of a slice without opening it."""
     if part is None or part.messages is None:
         return file

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Final
 
-from shadowhound_data_logger.bags.description import Description, Part
+from shadowhound_data_logger.bags.description import BagPart, Description
 from shadowhound_data_logger.mcap.index import McapIndex, read_index
 from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage, read_messages
 from shadowhound_data_logger.mcap.ranges import Ranged
@@ -63,6 +63,6 @@ class Plain:
         return part.t_start_ns < wanted.end_ns and part.t_end_ns >= wanted.start_ns
 
 
-def _times(told: Description | None, sources: Sequence[Ranged]) -> list[Part | None]:
+def _times(told: Description | None, sources: Sequence[Ranged]) -> list[BagPart | None]:
     parts = {part.name: part for part in told.parts} if told else {}
     return [parts.get(source.name.rpartition('/')[2]) for source in sources]

@@ -50,7 +50,7 @@ class Wish:
 
 
 @dataclass(slots=True)
-class Result:
+class FetchResult:
     """What became of the wishes, as it goes on: each is in one of the first three."""
 
     moved: int = 0
@@ -79,7 +79,7 @@ def under(source: Bucket, prefix: str) -> list[Wish]:
 def fetch(
     wishes: Sequence[Wish], folder: Path, store: ObjectStore, *, verify: bool = False, threads: int = THREADS,
     tell: Callable[[int, int], None] = lambda _bytes, _objects: None,
-) -> Result:  # fmt: skip
+) -> FetchResult:  # fmt: skip
     """Put them there; ``verify`` reads what is there already once more. ``tell`` hears of bytes and objects, from any thread.
 
     Raises StoreError where the store as a whole refuses or is away, LakeError where the folder cannot be written.
@@ -102,9 +102,9 @@ class _Fetch:
         self._fresh: list[Verified] = []
         self._noted_s = time.monotonic()
         self._silent = 0
-        self.result = Result()
+        self.result = FetchResult()
 
-    def run(self, wishes: Sequence[Wish], pool: ThreadPoolExecutor, ahead: int) -> Result:
+    def run(self, wishes: Sequence[Wish], pool: ThreadPoolExecutor, ahead: int) -> FetchResult:
         done: SimpleQueue[tuple[Wish, Future[_Done]]] = SimpleQueue()
         under_way = 0
         try:

@@ -15,7 +15,7 @@ from shadowhound_data_logger.lake.standing import Day, days, is_compacted, robot
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class CatalogueState:
     """Of one robot's catalogue."""
 
     robot: str
@@ -34,7 +34,7 @@ class State:
     """Files that others stand for: they only take room."""
 
 
-def state(source: Bucket, robot: str | None = None, findings: Findings | None = None) -> list[State]:
+def state(source: Bucket, robot: str | None = None, findings: Findings | None = None) -> list[CatalogueState]:
     """Of all robots that have a catalogue. Raises StoreError."""
     findings = Findings() if findings is None else findings
     today = f'{utc(time.time_ns()):%Y-%m-%d}'
@@ -43,10 +43,10 @@ def state(source: Bucket, robot: str | None = None, findings: Findings | None = 
     return [_state(name, each, today) for name, each in found.items() if each]
 
 
-def _state(robot: str, found: Iterable[Day], today: str) -> State:
+def _state(robot: str, found: Iterable[Day], today: str) -> CatalogueState:
     each = list(found)
     entries = [entry for day in each for entry in (*day.entries, *day.covered)]
-    return State(
+    return CatalogueState(
         robot=robot, days=len(each), first=each[0].date, last=each[-1].date, files=len(entries),
         size=sum(entry.size for entry in entries), covered=sum(len(day.covered) for day in each),
         compacted=sum(len(day.entries) == 1 and is_compacted(day.entries[0].key) for day in each),

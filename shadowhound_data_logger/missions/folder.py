@@ -48,7 +48,7 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Sent:
+class MissionSent:
     """How far a mission is sent: offsets in its journal, up to which each receiver has everything."""
 
     metrics: int = 0
@@ -137,19 +137,19 @@ class MissionFolder:
     def set_run(self, run: Run) -> None:
         write_json(self.path / 'run.json', {**asdict(run), 'mission_id': self.mission_id}, durable=True)
 
-    def sent(self) -> Sent:
+    def sent(self) -> MissionSent:
         """From the beginning where nothing readable says otherwise: what is sent again changes nothing."""
         found = read_json(self.path / 'sent.json')
         try:
-            return Sent(**found)
+            return MissionSent(**found)
         except TypeError:
-            return Sent()
+            return MissionSent()
 
     def age_s(self) -> float:
         """Since something of it was sent last. Raises OSError where nothing was."""
         return time.time() - (self.path / 'sent.json').stat().st_mtime
 
-    def set_sent(self, sent: Sent, *, durable: bool = False) -> None:
+    def set_sent(self, sent: MissionSent, *, durable: bool = False) -> None:
         write_json(self.path / 'sent.json', asdict(sent), durable=durable)
 
 

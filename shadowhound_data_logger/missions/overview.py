@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.missions import journal
-from shadowhound_data_logger.missions.folder import MissionFolder, Sent, missions, read_json
+from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, missions, read_json
 from shadowhound_data_logger.missions.report import report
 from shadowhound_data_logger.missions.story import Point, Story
 
@@ -112,7 +112,7 @@ def _counts(story: Story) -> dict[str, int]:
     }  # fmt: skip
 
 
-def _unsent(folder: MissionFolder, sent: Sent) -> dict[str, int]:
+def _unsent(folder: MissionFolder, sent: MissionSent) -> dict[str, int]:
     """Records that the run has not, and files that are not among its artifacts, or not in the spool."""
     count = {'records': 0, 'artifacts': 0, 'objects': 0}
     if sent.complete:

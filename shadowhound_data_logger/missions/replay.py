@@ -29,11 +29,41 @@ from shadowhound_data_logger.missions.dating import Dating
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.drawing import Drawing
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missions, write_json
-from shadowhound_data_logger.missions.gate import Gate
 from shadowhound_data_logger.missions.objects import Shelf
 from shadowhound_data_logger.missions.report import LOCK, STATE
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
 from shadowhound_data_logger.spool import clock_record
+from shadowhound_data_logger.stores.retry import backoff
+
+LONGEST_PAUSE_S: Final = 60.0
+
+
+class Gate:
+    """Open while the receiver is to be tried; each failure closes it for longer (exponential, full jitter, up to a minute)."""
+
+    def __init__(self, monotonic: Callable[[], float], rng: random.Random) -> None:
+        self._monotonic = monotonic
+        self._rng = rng
+        self._failures = 0
+        self._next_s = float('-inf')
+        self.error: Exception | None = None
+
+    @property
+    def is_open(self) -> bool:
+        return self._monotonic() >= self._next_s
+
+    def failed(self, error: Exception) -> None:
+        self._failures += 1
+        self.error = error
+        self._next_s = self._monotonic() + backoff(self._failures, LONGEST_PAUSE_S, self._rng)
+
+    def worked(self) -> None:
+        self._failures, self.error, self._next_s = 0, None, float('-inf')
+
+    def hurry(self) -> None:
+        """Try at once: somebody waits for it."""
+        self._next_s = float('-inf')
+
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.dating import REMEDY, WAITS, waits
-from shadowhound_data_logger.missions.folder import MissionFolder, Sent, read_json
+from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, read_json
 
 STATE: Final = 'replay.json'
 """Beside the missions: what the replayer says of itself."""
@@ -47,7 +47,7 @@ def report(folder: MissionFolder) -> Report:
     return Report(folder.mission_id, run_id, count - unsent, unsent, sent.complete, sent.missing, error, remedy)
 
 
-def _count(path: Path, sent: Sent) -> tuple[int, int]:
+def _count(path: Path, sent: MissionSent) -> tuple[int, int]:
     """Records of a journal, and those that the run has not."""
     try:
         ends = [line.end for line in journal.read(path)]

@@ -7,11 +7,11 @@ from datetime import timedelta
 from typing import Any
 
 from shadowhound_data_logger.clock import iso, utc
-from shadowhound_data_logger.missions.folder import Run, Sent, stamped
+from shadowhound_data_logger.missions.folder import MissionSent, Run, stamped
 from shadowhound_data_logger.missions.story import BUCKET, DISTANCE, TRAJECTORIES, Story
 
 
-def summary_of(story: Story, mission_id: str, run: Run, sent: Sent, pictures: Mapping[str, str]) -> dict[str, Any]:
+def summary_of(story: Story, mission_id: str, run: Run, sent: MissionSent, pictures: Mapping[str, str]) -> dict[str, Any]:
     """Of a mission that is over and whose points and files are handed on."""
     start, end = story.start, story.end
     node = story.node or Story()
@@ -36,7 +36,7 @@ def summary_of(story: Story, mission_id: str, run: Run, sent: Sent, pictures: Ma
     }  # fmt: skip
 
 
-def _ledger(story: Story, sent: Sent) -> dict[str, Any]:
+def _ledger(story: Story, sent: MissionSent) -> dict[str, Any]:
     """What became of all that the agent logged: each ``logged`` is the sum of what follows it.
 
     ``not_logged`` is what could not be taken, by reason; ``disk_full`` is not known (null) of an agent that died.

@@ -16,7 +16,7 @@ from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.spool.index import Index
 
 
-class Delivered(NamedTuple):
+class UncataloguedObject(NamedTuple):
     """An object as the store holds it; of a repeat its own times, and the key that holds its content."""
 
     id: int
@@ -27,7 +27,7 @@ class Delivered(NamedTuple):
     metadata: Mapping[str, str]
 
 
-def waiting(spool: Path, limit: int) -> list[Delivered]:
+def waiting(spool: Path, limit: int) -> list[UncataloguedObject]:
     """The oldest of the list; waits for no commit. Raises SpoolError or sqlite3.Error."""
     with closing(Index(spool / 'index.db', read_only=True)) as index:
         index.open()
@@ -36,7 +36,7 @@ def waiting(spool: Path, limit: int) -> list[Delivered]:
             ' ORDER BY id LIMIT ?', (limit,),
         ).fetchall()  # fmt: skip
     said = [json.loads(metadata) for *_, metadata in rows]
-    return [Delivered(number, bucket, metadata.get(words.CONTENT_KEY, key), size, content_type, metadata)
+    return [UncataloguedObject(number, bucket, metadata.get(words.CONTENT_KEY, key), size, content_type, metadata)
             for (number, bucket, key, size, content_type, _), metadata in zip(rows, said, strict=True)]  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import CredentialsRejected, LakeError, StoreUnavailable
 from shadowhound_data_logger.lake import fetched_rows
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.fetch import Result, Wish, fetch, under
+from shadowhound_data_logger.lake.fetch import FetchResult, Wish, fetch, under
 from shadowhound_data_logger.lake.fetched import Fetched
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store, retry
@@ -73,7 +73,7 @@ class Real(ObstoreStore):
         return super().content(bucket, key, start)
 
 
-def run(store: Asked | Real, to: Path, **how: Any) -> Result:
+def run(store: Asked | Real, to: Path, **how: Any) -> FetchResult:
     """Everything under the prefix."""
     wishes = how.pop('wishes', None) or under(Bucket(store.settings, BUCKET), PREFIX)
     return fetch(wishes, to, store, **how)
@@ -86,10 +86,10 @@ def whole(to: Path) -> bool:
 def test_a_prefix_keeps_its_layout_and_a_second_run_moves_nothing(settings: StoreSettings, tmp_path: Path) -> None:
     """Exactly the objects under it, each at DIR/KEY; then one listing and not one object more."""
     source, to = Asked(settings), tmp_path / 'data'
-    assert run(source, to) == Result(moved=COUNT, bytes=sum(map(len, OBJECTS.values())))
+    assert run(source, to) == FetchResult(moved=COUNT, bytes=sum(map(len, OBJECTS.values())))
     assert whole(to)
     source.asked.clear()
-    assert run(source, to) == Result(present=COUNT)
+    assert run(source, to) == FetchResult(present=COUNT)
     assert source.asked == []
 
 
@@ -122,7 +122,7 @@ def test_verify_finds_what_has_the_right_size_and_time(settings: StoreSettings, 
     seen = rotten.stat()
     rotten.write_bytes(bytes(seen.st_size))
     os.utime(rotten, ns=(seen.st_atime_ns, seen.st_mtime_ns))
-    assert run(source, to) == Result(present=COUNT)
+    assert run(source, to) == FetchResult(present=COUNT)
     assert not whole(to)
     assert run(source, to, verify=True).moved == 1
     assert whole(to)
@@ -136,7 +136,7 @@ def test_what_another_program_fetched_is_read_and_not_moved(settings: StoreSetti
         (to / key).write_bytes(body)
     (to / '.fetch').mkdir()
     (to / '.fetch' / 'files.db').write_bytes(b'no database at all' * 100)
-    assert run(source, to) == Result(present=COUNT)
+    assert run(source, to) == FetchResult(present=COUNT)
     assert source.asked == []
 
 
@@ -283,9 +283,11 @@ def test_from_a_real_server(real: Tower, tmp_path: Path) -> None:
     source, to = Real(real.store_settings()), tmp_path / 'data'
     assert run(source, to).moved == COUNT
     assert whole(to)
-    assert run(source, to, wishes=under(Bucket(source.settings, BUCKET), 'thor/rosbags/large/')) == Result(moved=2, bytes=5 << 20)
+    assert run(source, to, wishes=under(Bucket(source.settings, BUCKET), 'thor/rosbags/large/')) == FetchResult(
+        moved=2, bytes=5 << 20
+    )
     source.asked.clear()
-    assert run(source, to) == Result(present=COUNT)
+    assert run(source, to) == FetchResult(present=COUNT)
     assert source.asked == []
     with pytest.raises(StoreUnavailable):
         run(Real(replace(real.store_settings(), endpoint_url='http://127.0.0.1:9')), to)

@@ -13,7 +13,7 @@ from typing import Any
 from missions.fakes import FakeShelf, journalling
 
 from shadowhound_data_logger.missions.delivery import Delivery
-from shadowhound_data_logger.missions.folder import Sent, missions
+from shadowhound_data_logger.missions.folder import MissionSent, missions
 from shadowhound_data_logger.missions.replay import open_tracking
 
 POINTS = 1200
@@ -38,7 +38,7 @@ def send(home: Path) -> Delivery:
         delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
         while any([delivery.track(), delivery.attach(), delivery.shelve()]):
             pass
-        folder.set_sent(Sent())
+        folder.set_sent(MissionSent())
     return delivery
 
 
