@@ -6,6 +6,7 @@ import ast
 import json
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -92,6 +93,15 @@ def test_who_imports_what(package: str) -> None:
     """ROS, S3, MLflow and Arrow are known to their own folders alone."""
     importers = {folder(path) for path in MODULES if any(name.partition('.')[0] == package for name in imports(path))}
     assert importers <= ALLOWED[package]
+
+
+def test_a_public_class_name_stands_for_one_thing() -> None:
+    """No two modules have a class of the same public name."""
+    uses = Counter(
+        node.name for path in MODULES for node in ast.parse(path.read_text(encoding='utf-8')).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith('_')
+    )  # fmt: skip
+    assert [name for name, count in uses.items() if count > 1] == []
 
 
 def test_one_file_knows_mlflow() -> None:
