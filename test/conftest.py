@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.sim.tower import Tower
 
 
-ENDING_S = 20.0
+ENDING_S = 60.0
 """More than enough for threads that were told to end and are not waited for."""
 SERVERS = ('process_request_thread', '_server_entry')
 """Threads of the stand-in servers (http.server, moto), which end with their clients or the session."""

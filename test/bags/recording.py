@@ -28,7 +28,7 @@ from shadowhound_data_logger.spool.writer import SpoolWriter
 NOON_NS = 1_760_788_800 * 10**9
 STRING = 'std_msgs/msg/String'
 ROBOT = 'thor'
-WAIT_S = 20.0
+WAIT_S = 60.0
 HOLD_S = 600.0
 
 

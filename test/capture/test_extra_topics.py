@@ -26,7 +26,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.accounts import Accounts
 
 pytestmark = pytest.mark.ros
-WAIT_S: Final = 30.0
+WAIT_S: Final = 60.0
 GRAPH: Final = ('/imu', '/odom', '/camera/image_raw', '/_hidden', '/a/_hidden/b', '/rosout')
 SENSORS: Final = ('/imu', '/camera/compressed')
 

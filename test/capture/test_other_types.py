@@ -33,7 +33,7 @@ from shadowhound_data_logger.spool.account_rows import Totals
 from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts
 
 pytestmark = pytest.mark.ros
-WAIT_S: Final = 30.0
+WAIT_S: Final = 60.0
 INT, STRING, FLOAT = (f'std_msgs/msg/{name}' for name in ('Int32', 'String', 'Float64'))
 ABSENT: Final = 'no_such_msgs/msg/Thing'
 SMALL: Final = IntakeSettings(max_rate_hz=1.0)

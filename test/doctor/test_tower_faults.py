@@ -126,7 +126,7 @@ def test_ports_of_something_else_are_no_finding(robot: Scene) -> None:
         for url in (mute, other.url, nothing):
             port = int(url.rpartition(':')[2])
             assert not seaweedfs.answers_anybody('127.0.0.1', port, seaweedfs.S3.method)
-    assert time.monotonic() - began < 3 * seaweedfs.ANSWER_S
+    assert time.monotonic() - began < 10 * seaweedfs.ANSWER_S
 
 
 def keys(**changes: str) -> Inject:

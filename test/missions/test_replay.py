@@ -234,7 +234,7 @@ def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     logger = MissionDataLogger(home=tmp_path, start_timeout_s=0.0)
     try:
         first = logger._replayer._process  # type: ignore[union-attr]
-        until(lambda: logger._replayer._process is not first, 'another is started', 20.0)  # type: ignore[union-attr]
+        until(lambda: logger._replayer._process is not first, 'another is started')  # type: ignore[union-attr]
         assert first is not None
         assert first.returncode == 1
     finally:

@@ -77,7 +77,7 @@ class Time:
         return self.now
 
 
-def until(condition: Callable[[], object], seconds: float = 30.0) -> None:
+def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
     """Wait for something that another thread does; a deadline that is missed is a failure."""
     end = time.monotonic() + seconds
     while not condition():
