@@ -33,7 +33,7 @@ FRONT = 'shadowhound_data_logger.capture.front'
 OFFERED = 'services and parameters are offered in'
 DIRECT, BESIDE = '/direct', '/beside'
 COUNT = 20
-ENDS_S = 10.0
+ENDS_S = 60.0
 """It takes a second and a half at most on a machine that is idle."""
 SENSORS: dict[str, Any] = {
     'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 3600.0,
