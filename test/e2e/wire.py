@@ -78,15 +78,20 @@ class Wire:
         elif isinstance(self._mode, tuple):
             await self._answer(reader, writer, *self._mode)
         else:
-            there, back = await asyncio.open_connection(*self._target)
+            opening = asyncio.ensure_future(asyncio.open_connection(*self._target))
+            try:
+                there, back = await asyncio.shield(opening)
+            except asyncio.CancelledError:
+                (await opening)[1].close()
+                raise
             pumps = [asyncio.create_task(_pump(reader, back)), asyncio.create_task(_pump(there, writer))]
             try:
                 await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
             finally:
+                back.close()
                 for pump in pumps:
                     pump.cancel()
                 await asyncio.gather(*pumps, return_exceptions=True)
-                back.close()
 
     @staticmethod
     async def _answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, status: int, code: str) -> None:
