@@ -103,7 +103,7 @@ def test_rows_that_were_being_written(tmp_path: Path, monkeypatch: pytest.Monkey
         raise SystemExit
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, 'replace', die)
+        patch.setattr(os, 'replace', die)
         with pytest.raises(SystemExit):
             fetched_rows.keep(tmp_path, [said])
     assert left_over(tmp_path)
