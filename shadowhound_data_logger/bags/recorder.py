@@ -260,10 +260,12 @@ class Recorder:
         def end() -> None:
             self._writing = None
             recording.leave_out(self._queue.take_lost())
-            if recording.close(deadline_s):
-                done.set()
-            if then is not None:
-                self._write_to(then)
+            try:
+                if recording.close(deadline_s):
+                    done.set()
+            finally:
+                if then is not None:
+                    self._write_to(then)
 
         self._queue.mark(end)
         return done

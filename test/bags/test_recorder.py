@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from bags.eventing import until
@@ -14,6 +16,7 @@ from clocks import Clocks
 from mcap.reader import make_reader
 
 from shadowhound_data_logger.bags.notes import Notes
+from shadowhound_data_logger.bags.recording import Recording
 
 
 def test_a_bag_from_start_to_stop(tmp_path: Path) -> None:
@@ -171,6 +174,24 @@ def test_what_comes_while_the_next_bag_is_made_is_in_one_of_them(tmp_path: Path,
         it.recorder.stop()
         found = it.objects()
         assert [n for bag in names for n in numbers(found[f'{bag}/{bag}_0.mcap'])] == list(range(30))
+        assert it.row()['dropped'] == {}
+
+
+def test_a_bag_that_cannot_be_ended_does_not_keep_the_next_one_from_beginning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever its end raises costs no message of the one that follows."""
+    with desk(tmp_path, record='always') as it:
+        it.hear(range(10))
+        with monkeypatch.context() as patch:
+            broken = Mock(side_effect=sqlite3.OperationalError('disk I/O error'))
+            patch.setattr(Recording, 'close', broken)
+            it.recorder.on_mission(mission())
+            until(lambda: broken.called, 'the first one was to end')
+        bag = it.recorder.status().bag
+        it.hear(range(10, 20))
+        it.recorder.stop()
+        assert numbers(it.objects()[f'{bag}/{bag}_0.mcap']) == list(range(10, 20))
         assert it.row()['dropped'] == {}
 
 
