@@ -212,12 +212,10 @@ class LossEstimator:
 
     def _is_ahead(self, stamp: int, now_s: float) -> bool:
         """Whether the message is younger than one can be: not by what the node took late, but by a clock that stepped."""
-        age_s, youngest_s = now_s - stamp / SECOND, self._youngest_s
-        if youngest_s is not None:
-            youngest_s += DRIFT * (now_s - self._taken_s)
+        age_s, youngest_s, drift_s = now_s - stamp / SECOND, self._youngest_s, DRIFT * (now_s - self._taken_s)
         self._taken_s = now_s
-        self._youngest_s = age_s if youngest_s is None else min(age_s, youngest_s)
-        return youngest_s is not None and age_s < youngest_s - STEP_S
+        self._youngest_s = age_s if youngest_s is None else min(age_s, youngest_s + drift_s)
+        return youngest_s is not None and age_s < youngest_s - drift_s - STEP_S
 
     def _gap(self, stamp: int, last: int) -> int:
         wrap = self.expected.wrap

@@ -156,7 +156,7 @@ def test_what_the_network_held_for_a_node_that_stood_still() -> None:
     assert ear.missed == {TRANSPORT: 100}
 
 
-@pytest.mark.parametrize('pause_s', [3, 60])
+@pytest.mark.parametrize('pause_s', [3, 60, 2000])
 def test_a_pause_is_marked(pause_s: int) -> None:
     """Whether the publisher paused or the network was away, nobody knows: the cause says so."""
     sent = even(500)
