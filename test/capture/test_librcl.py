@@ -164,6 +164,23 @@ def test_what_came_before_an_empty_message_is_taken(node: Any, monkeypatch: pyte
     found.close()
 
 
+@needs_fast_dds
+@pytest.mark.parametrize('version', [(), (99,)])
+def test_what_is_behind_an_empty_message_is_taken(node: Any, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...]) -> None:
+    """Anybody in the network may send some: they cost neither the messages behind them nor the subscription."""
+    monkeypatch.setattr(reader, 'TELLS_PUBLISHERS', version)
+    found = read(node, '/hollow')
+    before = found._subscription
+    publisher = node.create_publisher(String, '/hollow', 10)
+    until(lambda: found.matched() == 1, 'it is matched')
+    sent = [b'', serialize_message(String(data='1')), b'', b'', serialize_message(String(data='2'))]
+    for cdr in sent:
+        publisher.publish(cdr)
+    assert [taken.cdr for taken in drained(found, 2)] == list(filter(None, sent))
+    assert found._subscription is before
+    found.close()
+
+
 class EmptyHandle:
     """Of a subscription that is stuck."""
 
