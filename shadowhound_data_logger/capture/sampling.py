@@ -6,7 +6,7 @@ object, the ``Sampler`` does both for each sensor and hands the batches to the e
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final, Protocol
 from zlib import crc32
 
@@ -17,7 +17,7 @@ from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.model import Batch, Sample
 from shadowhound_data_logger.options import ARCHIVES
-from shadowhound_data_logger.spool.accounts import PAUSED, Accounts
+from shadowhound_data_logger.spool.accounts import PAUSED, Accounts, TopicAccount
 
 QUEUE_FULL: Final = 'queue_full'
 """Why samples are dropped that the encoders' queue has no room for."""
@@ -163,9 +163,13 @@ class Sampler(Consumer):
         """Before the intake is open, or by its thread."""
         self.idle = idle
 
-    def take(self, drained: Drained) -> None:
+    def enter(self, topic: str, type_name: str, sensor: str) -> None:
+        kept_ns = self._kept_ns.get(topic) or self._accounts.last_kept_ns(topic)
+        self._sampled[topic] = _Sampled(self._sensors[sensor], topic, type_name, self._types.has_header(type_name), kept_ns)
+
+    def choose(self, drained: Drained, account: TopicAccount) -> None:
         messages = drained.messages
-        sampled = self._sampled.get(drained.topic) or self._begin(drained)
+        sampled = self._sampled[drained.topic]
         sampled.follow(self._sensors[drained.sensor])
         kept: list[Sample] = []
         if not (drained.paused or self.idle):
@@ -174,18 +178,21 @@ class Sampler(Consumer):
                 stamp_ns = stamp_of(header_stamp_ns(cdr) if has_header else 0, source_ns, clock)
                 if keep(stamp_ns, cdr):
                     kept.append(Sample(stamp_ns, cdr))
-        if len(kept) < len(messages):
-            with self._accounts.entry(drained.topic) as account:
-                if drained.paused:
-                    account.dropped[PAUSED] += len(messages)
-                else:
-                    account.skipped += len(messages) - len(kept)
+        sampled.chosen = kept
         if kept:
             sampled.kept_ns = kept[-1].stamp_ns
-            add, now_s = sampled.batcher.add, drained.now_s
-            for sample in kept:
-                for batch in add(sample, now_s):
-                    self._offer(batch)
+        if drained.paused:
+            account.dropped[PAUSED] += len(messages)
+        else:
+            account.skipped += len(messages) - len(kept)
+
+    def take(self, drained: Drained) -> None:
+        sampled = self._sampled[drained.topic]
+        add, now_s = sampled.batcher.add, drained.now_s
+        chosen, sampled.chosen = sampled.chosen, ()
+        for sample in chosen:
+            for batch in add(sample, now_s):
+                self._offer(batch)
 
     def leave(self, topic: str) -> None:
         sampled = self._sampled.pop(topic, None)
@@ -203,13 +210,6 @@ class Sampler(Consumer):
         """Close the open batches."""
         for sampled in self._sampled.values():
             self._close(sampled)
-
-    def _begin(self, drained: Drained) -> _Sampled:
-        topic = drained.topic
-        kept_ns = self._kept_ns.get(topic) or self._accounts.last_kept_ns(topic)
-        sampled = _Sampled(self._sensors[drained.sensor], topic, drained.type, self._types.has_header(drained.type), kept_ns)
-        self._sampled[topic] = sampled
-        return sampled
 
     def _close(self, sampled: _Sampled) -> None:
         if len(sampled.batcher):
@@ -229,6 +229,8 @@ class _Sampled:
         """Stamp of the newest message that was kept: no period is stored twice."""
         self.has_header = has_header
         self.rule = rule_for(sensor, has_header=has_header, last_kept_ns=kept_ns)
+        self.chosen: Sequence[Sample] = ()
+        """Of the drain under way, what is kept."""
         self.batcher = Batcher(sensor, topic, type_name)
         self._sensor = sensor
 

@@ -17,7 +17,7 @@ from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import CounterField, MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Taken
-from shadowhound_data_logger.spool.accounts import EXACT, Accounts, Losses
+from shadowhound_data_logger.spool.accounts import EXACT, Accounts, Losses, TopicAccount
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
 
 if TYPE_CHECKING:
@@ -65,6 +65,18 @@ class Consumer(Protocol):
     """With a choice: whether it listens as soon as the intake is open, or once ``Intake.listen`` says so."""
     wants_latched: bool = False
     """With a choice: whether it begins with what latched publishers sent before, with subscriptions of its own for that."""
+
+    def enter(self, topic: str, type_name: str, sensor: str) -> None:  # noqa: ARG002
+        """Without a choice: messages of a sensor's topic begin here, of this type."""
+        return
+
+    def choose(self, drained: Drained, account: TopicAccount) -> None:  # noqa: ARG002
+        """Without a choice, before ``take``: count in the topic's account what is not stored.
+
+        The lock of the accounts has been held since the messages were received, so that no commit sees the one without the
+        other: nothing but that is done here.
+        """
+        return
 
     def take(self, drained: Drained) -> None:
         """Messages of one topic, and the gap before them."""
@@ -226,6 +238,7 @@ class SensorStream:
         self._type = type_name
         self._accounts = accounts
         self._consumers = consumers
+        self._choosing = [consumer for consumer in consumers if consumer.choice is None]
         self._recent = RecentMessages()
         self._arrivals = Arrivals()
         self._counter: CounterField | None = None
@@ -233,6 +246,8 @@ class SensorStream:
         with accounts.entry(topic) as account:
             account.type = type_name
             account.expect(self._expected(sensor, types))
+        for consumer in self._choosing:
+            consumer.enter(topic, type_name, sensor.name)
 
     def _expected(self, sensor: SensorSettings, types: MessageTypes) -> Expectation:
         """What is declared of the sensor's messages: a counter in them, else how often they come."""
@@ -262,12 +277,15 @@ class SensorStream:
                     sent.setdefault(gid or '', []).append(source_ns if counter is None else counter.read(cdr))
             lost = account.observe(sent, self._arrivals.hear(senders, now_s)) if sent else None
             is_refuted = bool(sent) and account.estimate.refuted
+            if fresh:
+                drained = Drained(self._topic, self._type, self._sensor, fresh, lost, now_s, paused)
+                for consumer in self._choosing:
+                    consumer.choose(drained, account)
         if is_refuted and not self._is_refuted:
             self._is_refuted = True
             text = '%s: messages come more often than %s says: how often they are published is learned instead'
             log.warning(text, self._topic, 'counter_step' if counter else 'expected_hz')
         if fresh:
-            drained = Drained(self._topic, self._type, self._sensor, fresh, lost, now_s, paused)
             for consumer in self._consumers:
                 if consumer.choice is None or self._topic in consumer.topics:
                     consumer.take(drained)

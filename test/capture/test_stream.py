@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from shadowhound_data_logger.capture.sampling import Sampler
-from shadowhound_data_logger.capture.stream import Senders, SensorStream
+from shadowhound_data_logger.capture.stream import Consumer, Drained, Senders, SensorStream
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -43,7 +43,11 @@ class Talk:
         self.sensors, types, clock = {'talk': self.sensor}, MessageTypes(), SystemClock.of_this_machine()
         queue: Any = self.batches
         self.sampler = Sampler(self.sensors, IntakeSettings(), self.accounts, types, clock, queue)
-        self.stream = SensorStream(self.sensor, TOPIC, TYPE, self.accounts, types, [self.sampler])
+        self.listen(self.sampler)
+
+    def listen(self, *consumers: Consumer) -> None:
+        """Begin a stream."""
+        self.stream = SensorStream(self.sensor, TOPIC, TYPE, self.accounts, MessageTypes(), consumers)
 
     def messages(self, how_many: int, **fields: object) -> list[Taken]:
         """The next ones, of a publisher that is known unless ``fields`` say otherwise."""
@@ -77,6 +81,29 @@ def test_a_pause_counts_and_drops() -> None:
         talk.add(talk.messages(3), paused=paused)
     assert talk.kept() == [1, 2, 3, 7, 8, 9]
     assert (talk.account.received, talk.account.dropped, talk.account.missed) == (9, {'paused': 3}, 0)
+
+
+class Commits(Consumer):
+    """Between the count of a drain's messages and what the others do with them: what a commit shows then as open."""
+
+    def __init__(self, accounts: Accounts) -> None:
+        self.accounts = accounts
+        self.open: list[int] = []
+
+    def take(self, drained: Drained) -> None:
+        self.open.append(self.accounts.totals()[drained.topic].open)
+
+
+@pytest.mark.parametrize(('given', 'settings', 'still_open'), [
+    ({'idle': True}, {}, 0), ({'paused': True}, {}, 0), ({}, {'rate_hz': 1.0}, 4), ({}, {}, 30),
+])  # fmt: skip
+def test_what_is_skipped_is_at_no_time_open(given: dict[str, bool], settings: dict[str, float], still_open: int) -> None:
+    """A commit at any moment and a kill right then: the next start counts nothing as lost that was to be left out."""
+    talk = Talk(**settings)
+    commits = Commits(talk.accounts)
+    talk.listen(commits, talk.sampler)
+    talk.add(talk.messages(30), **given)
+    assert commits.open == [still_open]
 
 
 def test_what_nobody_asked_for_is_skipped() -> None:
@@ -123,7 +150,8 @@ def test_what_was_kept_before_the_stream_began_is_not_kept_again() -> None:
     talk = Talk(rate_hz=1.0, last_kept_ns=NOON_NS + 1)
     talk.add(talk.messages(12))
     assert talk.kept() == [10]
-    talk.sampler.leave(TOPIC)
+    talk.stream.close()
+    talk.listen(talk.sampler)
     talk.add(talk.messages(8))
     assert talk.kept() == [10, 20]
 
