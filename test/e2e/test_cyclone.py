@@ -42,6 +42,7 @@ LARGE_COUNT = 40
 
 
 @pytest.mark.skipif(possible_buffer() < 1 << 20, reason='net.core.rmem_max is below 1 MB: a matter of luck for either')
+@pytest.mark.long('fourteen seconds of images and clouds')
 @pytest.mark.parametrize('kind', LARGE)
 def test_large_messages_come_as_they_do_to_cyclone_dds(processes: Processes, kind: str) -> None:
     """Raw images and clouds, BEST_EFFORT and depth 1 as a Go2's driver has them: never fewer than its own RMW gets."""

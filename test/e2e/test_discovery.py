@@ -126,6 +126,7 @@ def as_humble(folder: Path) -> Mapping[str, str]:
     return {'AMENT_PREFIX_PATH': f'{folder}:{os.environ["AMENT_PREFIX_PATH"]}'}
 
 
+@pytest.mark.long('machines of their own, one after the other')
 @pytest.mark.parametrize('case', CASES)
 def test_whom_cyclone_dds_finds_we_find(found: dict[str, tuple[list[str], list[str]]], case: str) -> None:
     """Nothing that the robot's own RMW hears is lost, and nobody else is heard."""

@@ -27,6 +27,7 @@ def switched(node: Node, topic: str, times: int) -> None:
     until(lambda: node.log.count(words) >= times, f'{words}, {times} times')
 
 
+@pytest.mark.long('twelve seconds of raw images')
 def test_raw_images_are_not_missed(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
     """30 raw images a second arrive, BEST_EFFORT and 921 KB each; compressed ones are taken as long as there are any."""
     node = processes.node(seaweed.environment(), {'sensors': ['camera']})

@@ -27,6 +27,7 @@ def findings(node: Node) -> list[str]:
     return found
 
 
+@pytest.mark.long('twelve seconds of two machines')
 def test_a_publisher_where_our_profile_does_not_look_is_an_error(processes: Processes) -> None:
     """In log and status, by its topic; it is logged and no error any more once the networks are one."""
     domain = processes.environ['ROS_DOMAIN_ID']

@@ -37,6 +37,7 @@ def started(processes: Processes, folder: Path, sensors: list[str], expected_hz:
     return processes.node(None, parameters, environ={'PYTHONPATH': path})
 
 
+@pytest.mark.long('seven seconds of a topic without a rhythm')
 def test_without_a_rhythm_nothing_is_claimed(processes: Processes, tmp_path: Path) -> None:
     """Each message is counted once, also where a history is delivered that two subscriptions hear; what was missed is null."""
     node, publisher = started(processes, tmp_path, ['plain', 'latched'], 0.0), processes.publisher()
@@ -83,6 +84,7 @@ def test_what_is_lost_is_estimated(processes: Processes, tmp_path: Path) -> None
     assert row['missed_by']['transport'] > 0
 
 
+@pytest.mark.long('nine seconds of a topic')
 def test_what_a_dead_publisher_did_not_publish_is_not_lost(processes: Processes, tmp_path: Path) -> None:
     """One that is killed, and another one in its place two seconds later: the gap between them is nobody's loss."""
     node = started(processes, tmp_path, ['calm'])

@@ -193,6 +193,7 @@ def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None
     assert [(one.key.rpartition('/')[2], '\x1b' in str(one)) for one in findings] == [('\x1b[31m.parquet', False)]
 
 
+@pytest.mark.long('commands in little memory')
 def test_a_bomb_is_left_out_in_2_gb(home: Path) -> None:
     """With no more memory than that, ``query`` and ``lake compact`` end by themselves and say of each bomb that it is one."""
     bombs = {'thor_bad': bad_parts.dictionary_bomb(ROWS[0]), 'thor_zeros': bad_parts.zeros_bomb(ROWS),
