@@ -8,6 +8,7 @@ import signal
 import time
 from pathlib import Path
 
+import pytest
 from e2e.processes import Node, Processes, until
 from e2e.reading import STRING, texts
 

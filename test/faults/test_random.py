@@ -25,7 +25,6 @@ def check(summary: Summary, first: int, days: int) -> None:
 
 
 @pytest.mark.timeout(1800)
-@pytest.mark.long('some days')
 def test_simulated_days() -> None:
     """With the clock, the pauses and the network simulated, and all else real."""
     first = given_seed()
