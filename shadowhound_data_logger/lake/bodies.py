@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from shadowhound_data_logger.errors import LakeError, NameRefused, ObjectRefused
 from shadowhound_data_logger.lake.track import Object
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
+_PATIENT: Final = UploadSettings(threads=32, connect_timeout_s=10.0, read_timeout_s=60.0)
+"""As patient as whatever else reads (stores/s3_obstore.py), and connections for several data sets in one process."""
+_locks: Final[dict[int, threading.Lock]] = {}
+"""By process."""
 Read = Callable[[str, str, int], bytes]
 """From bucket, key and size to content."""
 
@@ -42,7 +46,7 @@ class Place:
     def read(self, bucket: str, key: str, most: int) -> bytes:
         """Raises StoreError; ObjectRefused where it is larger than it should be, of which nothing is read then."""
         if self.folder is None:
-            store = _of_this_process(self.settings, os.getpid())
+            store = _of_this_process(self.settings)
             return steadily(lambda: store.get(bucket, key, most))
         where: dict[str, Any] = {'bucket': bucket, 'key': key}
         try:
@@ -149,7 +153,13 @@ class Bodies:
             raise LakeError(text, bucket=wanted.bucket, key=wanted.key) from error
 
 
+def _of_this_process(settings: StoreSettings) -> ObjectStore:
+    """A forked process makes one of its own: no thread, no connection and no lock is taken over from the parent."""
+    process = os.getpid()
+    with _locks.setdefault(process, threading.Lock()):  # else each thread would open one, of half a second and megabytes
+        return _opened(settings, process)
+
+
 @lru_cache(maxsize=4)
-def _of_this_process(settings: StoreSettings, _process: int) -> ObjectStore:
-    """A forked process makes one of its own: no thread and no connection is taken over from the parent."""
-    return open_store(settings, UploadSettings())
+def _opened(settings: StoreSettings, _process: int) -> ObjectStore:
+    return open_store(settings, _PATIENT)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TypeVar
 
@@ -23,7 +23,7 @@ class Bucket:
     Nothing but a StoreError leaves, or SettingError for settings that no request can be sent with.
     """
 
-    settings: StoreSettings
+    settings: StoreSettings = field(repr=False)
     name: str
 
     def describe(self) -> str:

@@ -92,12 +92,20 @@ class ObjectStore(Protocol):
 
 
 def joined(content: Content, most: int | None) -> bytes:
-    """All of it. Raises ObjectRefused (reason ``size``), before it is read, where there are more than ``most`` bytes."""
+    """All of it. Raises ObjectRefused (reason ``size``), before it is read, where there are more than ``most`` bytes.
+
+    A server that sends more than it said is refused as well: what it sends takes no more memory than that.
+    """
     with content:
-        info = content.info
+        info, pieces, size = content.info, list[bytes](), 0
         if most is not None and info.size > most:
             raise too_large(info.bucket, info.key, most)
-        return b''.join(content)
+        for piece in content:
+            size += len(piece)
+            if size > info.size:
+                raise too_large(info.bucket, info.key, info.size)
+            pieces.append(piece)
+        return pieces[0] if len(pieces) == 1 else b''.join(pieces)
 
 
 def too_large(bucket: str, key: str, most: int) -> ObjectRefused:

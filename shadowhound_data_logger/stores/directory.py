@@ -223,7 +223,7 @@ def _appear(part: Path, target: Path) -> bool:
 
 def _rename_alone(part: Path, target: Path) -> bool:
     """``link`` for exFAT and its kind, which have none: one process at a time looks, then renames."""
-    with flock(part.with_name('rename.lock')):
+    with flock(part.with_name('rename.lock'), mode=0o666):
         if target.exists():
             return False
         part.rename(target)
@@ -247,7 +247,7 @@ def _make_folders(folder: Path) -> None:
 
 def _files(root: Path, below: str) -> Iterator[tuple[str, os.stat_result]]:
     """Key and facts of each file of a bucket under a folder, in no order; none when there is no such bucket."""
-    if not (root / below).exists():
+    if not (root / below).is_dir():
         return
     for folder, _, names in os.walk(root / below, onerror=_raise):
         prefix = Path(folder).relative_to(root)

@@ -124,7 +124,10 @@ class _Transfer:
         return Downloaded(info, sha256, expected is not None)
 
     def _add(self, pieces: Any) -> None:
+        most = self._wanted.size
         for piece in pieces:
+            if self._size + len(piece) > most:
+                raise self._damaged(f'it has more than {most} bytes')
             self._file.write(piece)
             self._digest.update(piece)
             self._size += len(piece)

@@ -19,11 +19,19 @@ import obstore
 from obstore import exceptions as refused
 from obstore.store import S3Store as Client
 
-from shadowhound_data_logger.errors import BucketMissing, CredentialsRejected, ObjectRefused, StoreError
+from shadowhound_data_logger.errors import (
+    BucketMissing,
+    CredentialsRejected,
+    ObjectRefused,
+    SettingError,
+    StoreError,
+    StoreUnavailable,
+)
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores.base import Content, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_read
+from shadowhound_data_logger.stores.retry import steadily
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.stores.pace import Pace
@@ -34,6 +42,10 @@ _SILENCE: Final = timedelta(seconds=60)
 """Of a server in the middle of an answer."""
 _WHOLE: Final = timedelta(days=1)
 """For one answer: a large object over WiFi takes its time."""
+_CLIENTS: Final = 16
+"""Buckets whose connections are kept: rows of a catalogue can name any number."""
+_URL: Final = re.compile(r'https?://([^\s/@]*@)?([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?(/[!-~]*)?', re.IGNORECASE)
+"""What obstore can send a request to; at anything else it panics."""
 _CODE: Final = re.compile(r'<Code>(\w+)</Code>|\(code: (\w+)\)')
 _MESSAGE: Final = re.compile(r'<Message>([^<]*)</Message>')
 _STATUS: Final = re.compile(r'non-2xx status code: (\d{3})')
@@ -69,7 +81,9 @@ class ObstoreStore:
         return self._plain.pace
 
     def open(self) -> None:
-        """Nothing to acquire yet."""
+        """Raises SettingError for an endpoint that no request can be sent to."""
+        if not _URL.fullmatch(self._endpoint):
+            raise SettingError('AWS_ENDPOINT_URL', _shown(self._endpoint), 'a URL such as http://TOWER_IP:9000')
 
     def close(self) -> None:
         with self._lock:
@@ -79,7 +93,7 @@ class ObstoreStore:
             other.close()
 
     def describe(self) -> str:
-        return f'the S3 server at {self._endpoint}'
+        return f'the S3 server at {_shown(self._endpoint)}'
 
     def put(self, item: SpooledObject) -> Put:
         return self._plain.put(item)
@@ -152,13 +166,27 @@ class ObstoreStore:
             return {'common_prefixes': [], 'objects': []}
 
     def _all(self, bucket: str, folder: str) -> Sequence[ObjectInfo]:
-        def read(client: Client) -> Sequence[ObjectInfo]:
-            return [_entry(bucket, each) for page in obstore.list(client, folder or None) for each in page]
+        """A page that fails is no reason to ask for those before it once more: after them it goes on."""
+        found: list[ObjectInfo] = []
 
-        try:
-            return self._ask(bucket, folder, read, is_listing=True)
-        except BucketMissing:
-            return []
+        def read(client: Client) -> None:
+            for page in obstore.list(client, folder or None, offset=found[-1].key if found else None):
+                found.extend(_entry(bucket, each) for each in page)
+
+        while True:
+            known = len(found)
+            try:
+                if found:
+                    steadily(lambda: self._ask(bucket, folder, read, is_listing=True))
+                else:
+                    self._ask(bucket, folder, read, is_listing=True)
+            except BucketMissing:
+                return found
+            except StoreUnavailable:
+                if len(found) == known:
+                    raise
+            else:
+                return found
 
     def content(self, bucket: str, key: str, start: int = 0) -> Content:
         check_read(bucket, key)
@@ -169,11 +197,11 @@ class ObstoreStore:
                 if not start or _said(error)[0] != NOTHING_THERE or (info := self.head(bucket, key)) is None:
                     raise
                 return Content(info, iter(()))  # it ends before
-            return Content(_info(bucket, key, found), self._pieces(bucket, key, found))
+            return Content(_info(bucket, key, found), self._pieces(bucket, key, found, is_small=not start))
 
-    def _pieces(self, bucket: str, key: str, found: Any) -> Iterator[bytes]:
+    def _pieces(self, bucket: str, key: str, found: Any, *, is_small: bool) -> Iterator[bytes]:
         with self._asking(bucket, key):
-            if found.meta['size'] <= CHUNK_BYTES:
+            if is_small and found.meta['size'] <= CHUNK_BYTES:  # of a range it would take whatever is sent
                 yield found.bytes()
             else:
                 yield from found.stream(min_chunk_size=CHUNK_BYTES)
@@ -181,15 +209,16 @@ class ObstoreStore:
     def _client(self, bucket: str) -> Client:
         """It holds the connections."""
         with self._lock:
-            if bucket not in self._clients:
-                self._clients[bucket] = _client(self._settings, bucket)
-            return self._clients[bucket]
+            client = self._clients.pop(bucket, None) or _client(self._settings, bucket)
+            self._clients[bucket] = client  # the last that was asked
+            if len(self._clients) > _CLIENTS:
+                self._clients.pop(next(iter(self._clients)))
+            return client
 
     def _ask(self, bucket: str, key: str, ask: Callable[[Client], _Answer], *, is_listing: bool = False) -> _Answer:
         check_read(bucket, 'any' if is_listing else key)
-        client = self._client(bucket)
         with self._asking(bucket, key):
-            return ask(client)
+            return ask(self._client(bucket))
 
     @contextmanager
     def _asking(self, bucket: str, key: str) -> Iterator[None]:
@@ -222,9 +251,10 @@ def _provider(settings: StoreSettings) -> Any:
     from shadowhound_data_logger.stores.credentials import has_keys  # noqa: PLC0415
 
     if not has_keys(settings):
-        text = f'there are no credentials for Tower at {settings.endpoint_url}'
+        endpoint = _shown(settings.endpoint_url or '')
+        text = f'there are no credentials for Tower at {endpoint}'
         remedy = 'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SHARED_CREDENTIALS_FILE to a file with them'
-        raise CredentialsRejected(text, remedy=remedy, endpoint=settings.endpoint_url or '')
+        raise CredentialsRejected(text, remedy=remedy, endpoint=endpoint)
     return Boto3CredentialProvider()
 
 
@@ -237,6 +267,12 @@ def _authorities(settings: StoreSettings) -> bytes | None:
 
     path = trusted(session_with(Keys(settings)), endpoint)
     return Path(path).read_bytes() if isinstance(path, str) else None
+
+
+def _shown(endpoint: str) -> str:
+    """Without a password."""
+    scheme, _, rest = endpoint.rpartition('://')
+    return f'{scheme}://{rest.rpartition("@")[2]}' if '@' in rest else endpoint
 
 
 def _info(bucket: str, key: str, found: Any) -> ObjectInfo:

@@ -18,7 +18,7 @@ from botocore.session import Session
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import AccessDenied, CredentialsRejected, SettingError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, SpooledObject
-from shadowhound_data_logger.stores.base import Content
+from shadowhound_data_logger.stores.base import Content, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, Part
 from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted
 from shadowhound_data_logger.stores.pace import Body, Pace
@@ -150,8 +150,7 @@ class S3Requests:
                 raise
             with closing(body):
                 self._whole_size(headers, bucket, key, begin)
-                found: bytes = body.read()
-                return found
+                return joined(Content(ObjectInfo(bucket, key, end - begin, None), self._pieces(bucket, key, body)), None)
 
     def list(self, bucket: str, prefix: str) -> Iterator[ObjectInfo]:
         """The objects under a prefix, page by page; none when there is no such bucket.

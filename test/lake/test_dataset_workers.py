@@ -6,7 +6,10 @@ import multiprocessing
 import pickle
 import subprocess
 import sys
+import threading
+import time
 import types
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +19,9 @@ from lake.making import folder_store
 from lake.training import FRAMES_HZ, Drive, in_a_child
 
 from shadowhound_data_logger.catalogue.schema import BUCKET
-from shadowhound_data_logger.lake import MissionDataset, dataset, shards
+from shadowhound_data_logger.lake import MissionDataset, bodies, dataset, shards
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.options import StoreSettings
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.sim.tower import Tower
@@ -184,3 +188,23 @@ def test_with_the_real_data_loader(source: Bucket, style: str) -> None:
     assert sorted(int(stamp) for batch in batches for stamp in batch['stamp_ns']) == sorted(stamps(frames.stream()))
     assert tuple(batches[0]['image'].shape[1:]) == (24, 32, 3)
     assert tuple(batches[0]['odom'].shape[1:]) == (13,)
+
+
+def test_the_threads_of_a_process_open_one_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each opens none of its own when they all begin at once: a client of S3 takes half a second and megabytes."""
+    opened: list[object] = []
+    begin = threading.Barrier(8)
+
+    def open_slowly(*_: object) -> object:
+        opened.append(object())
+        time.sleep(0.05)  # a client takes longer
+        return opened[-1]
+
+    def ask(_: int) -> object:
+        begin.wait()
+        return bodies._of_this_process(StoreSettings(directory=tmp_path))
+
+    monkeypatch.setattr(bodies, 'open_store', open_slowly)
+    with ThreadPoolExecutor(8) as pool:
+        found = set(pool.map(ask, range(8)))
+    assert [*found] == opened

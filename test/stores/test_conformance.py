@@ -73,6 +73,12 @@ def test_list_is_in_key_order_and_under_the_prefix(store: ObjectStore, spool: Sp
     assert [info.key for info in store.list(bucket)] == ['tachi/a', 'thor/a-1', 'thor/a/1', 'thor/a/2', 'thor/b']
 
 
+def test_list_below_an_object_is_empty(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """It is no folder."""
+    store.put(spool('thor/a', b'x'))
+    assert list(store.list(bucket, 'thor/a/')) == []
+
+
 def test_list_of_nothing_is_empty(store: ObjectStore, bucket: str) -> None:
     """A bucket that nobody has written to yet holds nothing."""
     assert list(store.list(bucket)) == []

@@ -148,3 +148,17 @@ def test_a_file_system_without_links(store: DirectoryStore, spool: Spool, bucket
         store.put(spool('a', b'other'))
     assert store.get(bucket, 'a') == b'first'
     assert store.put(spool('a', b'first')) is Put.IDENTICAL
+
+
+def test_users_share_a_folder_without_links(
+    store: DirectoryStore, spool: Spool, bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lock may be used by whoever may write to the folder, as the umask of its first user says."""
+    monkeypatch.setattr(os, 'link', _failing(errno.EPERM))
+    before = os.umask(0o002)
+    try:
+        store.put(spool('a', b'first'))
+    finally:
+        os.umask(before)
+    (lock,) = tmp_path.rglob('rename.lock')
+    assert lock.stat().st_mode & 0o777 == 0o664
