@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
+from shadowhound_data_logger.bandwidth import Pace
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import SpoolSettings, UploadSettings, store_settings
 from shadowhound_data_logger.model import Outcome, Put, SpooledObject
@@ -24,7 +25,6 @@ from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.pace import Pace
 from torture._profile import LIVE, arrivals, make, receive
 
 TELL_EVERY_S = 0.5

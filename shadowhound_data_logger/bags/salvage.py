@@ -3,6 +3,8 @@
 Whatever reached the disk is recovered and spooled, the manifest says what is missing, and the accounts are settled: what was
 received and is in no slice is lost by the restart. Every step can be cut short and done again. What is no slice, whoever put it
 there, is set aside unopened.
+
+This decides about a bag; ``mcap/recovery.py`` repairs the bytes of a slice, ``spool/recovery.py`` mends a spool.
 """
 
 from __future__ import annotations

@@ -23,13 +23,13 @@ from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import BagError, ForeignObject
 from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
+from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.ship.delivering import delivering
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import limits
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.retry import steadily
 
 SENDING: Final = 'sending'
 """The folder of bags on their way into the spool, in SHADOWHOUND_HOME."""

@@ -16,7 +16,7 @@ from typing import Any, Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.capture.encode_pool import BatchQueue
 from shadowhound_data_logger.capture.intake import Intake
-from shadowhound_data_logger.capture.mission_tap import MissionTap
+from shadowhound_data_logger.capture.mission_observer import MissionObserver
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.config import Settings
@@ -44,14 +44,14 @@ class MissionWatch:
     ``mark`` and ``observe`` are called by the encoders; they see the mission as a whole, as it is replaced.
     """
 
-    def __init__(self, settings: Settings, intake: Intake, sampler: Sampler, queue: BatchQueue, tap: MissionTap,
+    def __init__(self, settings: Settings, intake: Intake, sampler: Sampler, queue: BatchQueue, observer: MissionObserver,
                  tell: Callable[[Mapping[str, Any]], None]) -> None:  # fmt: skip
         """``tell`` is given what is active whenever that changes; empty when nothing is."""
         self._settings = settings.mission
         self._intake = intake
         self._sampler = sampler
         self._queue = queue
-        self._tap = tap
+        self._observer = observer
         self._tell = tell
         self._lookout = Lookout(settings.home, settings.robot)
         self._mission: Active | None = None
@@ -103,7 +103,7 @@ class MissionWatch:
         """Take from a batch what is logged; ``item`` is what it was encoded as."""
         node_log = self._log
         if node_log is not None:
-            for fact in self._tap.facts(batch, item):
+            for fact in self._observer.facts(batch, item):
                 node_log.add(fact)
 
     # -- the thread ------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.interface import Interface
 from shadowhound_data_logger.capture.middleware import Middleware
 from shadowhound_data_logger.capture.mission import MissionWatch
-from shadowhound_data_logger.capture.mission_tap import MissionTap
+from shadowhound_data_logger.capture.mission_observer import MissionObserver
 from shadowhound_data_logger.capture.parameters import Parameters, live
 from shadowhound_data_logger.capture.pose_track import RobotTrack
 from shadowhound_data_logger.capture.reader import endpoints
@@ -134,8 +134,8 @@ class Pipeline:
         consumers = (track, sampler, *self.event_buffer.consumers, bags)
         self.intake = Intake(node, sensors, settings.intake, accounts, types, consumers, first=[track.odometry])
         self.recorder = Recorder(settings.bag, place, bag_queue, salvage, partial(self.intake.listen, bags))
-        tap = MissionTap(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
-        self.mission = MissionWatch(settings, self.intake, sampler, queue, tap, self._tell_mission)
+        observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
+        self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)
         marks = self.mission.mark, track.mark, self._redating.date
         self.pool = EncodePool(settings, queue, sensors, types, self.writer, marks, self.mission.observe)
         self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)

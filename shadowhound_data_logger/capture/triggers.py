@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.bags.recorder import Answer
-from shadowhound_data_logger.capture.mission_tap import number_at
+from shadowhound_data_logger.capture.mission_observer import number_at
 from shadowhound_data_logger.clock import SECOND, Clock
 from shadowhound_data_logger.conditions import Condition
 from shadowhound_data_logger.encode.types import MessageTypes

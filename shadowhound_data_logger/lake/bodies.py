@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, Final
 from shadowhound_data_logger.errors import LakeError, NameRefused, ObjectRefused
 from shadowhound_data_logger.lake.track import Object
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import damaged, twice
-from shadowhound_data_logger.stores.retry import steadily
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, path_below
 
 if TYPE_CHECKING:

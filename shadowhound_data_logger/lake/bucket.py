@@ -9,9 +9,9 @@ from typing import TypeVar
 
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.retry import steadily
 
 _Answer = TypeVar('_Answer')
 

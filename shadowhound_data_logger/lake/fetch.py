@@ -21,9 +21,9 @@ from shadowhound_data_logger.errors import AccessDenied, BucketMissing, LakeErro
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetched import FOLDER, Fetched, Verified
 from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import download
-from shadowhound_data_logger.stores.retry import steadily
 from shadowhound_data_logger.untrusted import is_path
 
 THREADS: Final = 16

@@ -5,6 +5,8 @@ chunk, zeros, anything. What is kept is every chunk whose CRC-32 holds, up to th
 lies, so a large slice takes neither memory nor a second copy. Every step can be cut short and done again. Whatever the file
 claims, it takes the memory of a chunk packed and unpacked, each at most ``MOST_CHUNK_BYTES``, and of what goes into the
 summary, at most ``MOST_SUMMARY_BYTES`` before Python's overhead.
+
+This repairs the bytes of a slice; ``bags/salvage.py`` decides about a bag, ``spool/recovery.py`` mends a spool.
 """
 
 from __future__ import annotations

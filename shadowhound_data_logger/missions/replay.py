@@ -32,8 +32,8 @@ from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missi
 from shadowhound_data_logger.missions.objects import Shelf
 from shadowhound_data_logger.missions.report import LOCK, STATE
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
+from shadowhound_data_logger.retry import backoff
 from shadowhound_data_logger.spool import clock_record
-from shadowhound_data_logger.stores.retry import backoff
 
 LONGEST_PAUSE_S: Final = 60.0
 

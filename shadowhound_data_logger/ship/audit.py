@@ -16,8 +16,8 @@ from typing import Final, Protocol
 
 from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreError
 from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.retry import steadily
 
 THREADS: Final = 8
 KEYS: Final = 20

@@ -25,7 +25,7 @@ from shadowhound_data_logger.errors import (
     StoreUntrusted,
 )
 from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.stores.retry import backoff
+from shadowhound_data_logger.retry import backoff
 
 _REASON: Final = re.compile(r'[A-Za-z0-9][A-Za-z0-9_-]{0,63}')
 

@@ -8,6 +8,8 @@ in time: it is new, or it does not know a session whose file is there, or a sess
 removes that at a clean stop only). Then a part that is whole by its own description is adopted, as are files that have their
 names. Where it had not been committed after all its samples are stored as well as lost at the restart: rather that than the
 other way round. A log that is there but damaged does not show; with it, what was being renamed in that instant is lost.
+
+This mends a spool; ``bags/salvage.py`` decides about a bag, ``mcap/recovery.py`` repairs the bytes of a slice.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Where objects are kept: S3, a folder, or memory; one Protocol (``base.py``), one table of errors (``s3_errors.py``), one retry.
+"""Where objects are kept: S3, a folder, or memory; one Protocol (``base.py``), one table of errors (``s3_errors.py``).
 
-How fast what is sent may leave is kept by ``pace.py``, what is fetched becomes a file by ``download.py``.
+How fast bytes may leave is kept by ``bandwidth.py``, how long a retry waits by ``retry.py``, both beside the folders;
+``download.py`` makes a file of what is fetched.
 """
 
 from __future__ import annotations

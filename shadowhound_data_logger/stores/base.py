@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
+from shadowhound_data_logger.bandwidth import Pace
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.stores.pace import Pace
 
 if TYPE_CHECKING:
     from typing_extensions import Self

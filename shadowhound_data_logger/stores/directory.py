@@ -17,6 +17,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.bandwidth import Pace
 from shadowhound_data_logger.disk import fingerprint, flock, sync
 from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
@@ -29,7 +30,6 @@ from shadowhound_data_logger.stores.content import (
     identical_or_foreign,
     object_metadata,
 )
-from shadowhound_data_logger.stores.pace import Pace
 
 METADATA: Final = '.metadata'
 PARTS: Final = '.part'

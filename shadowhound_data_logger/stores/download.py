@@ -12,9 +12,9 @@ from typing import IO, Any, Final, TypeVar
 
 from shadowhound_data_logger.errors import ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import CHUNK_BYTES
-from shadowhound_data_logger.stores.retry import steadily
 
 UNFINISHED: Final = '.part'
 TRIES: Final = 6

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime, timezone
 
+from shadowhound_data_logger.bandwidth import Pace
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.base import Content, joined
@@ -18,7 +19,6 @@ from shadowhound_data_logger.stores.content import (
     identical_or_foreign,
     object_metadata,
 )
-from shadowhound_data_logger.stores.pace import Pace
 
 
 class MemoryStore:

@@ -20,6 +20,7 @@ from enum import Enum
 from operator import attrgetter
 from typing import IO, Final, TypeVar
 
+from shadowhound_data_logger.bandwidth import Pace
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import (
     AccessDenied,
@@ -32,7 +33,6 @@ from shadowhound_data_logger.errors import (
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.base import Content, joined
 from shadowhound_data_logger.stores.content import check_read, check_target, chunks, identical_or_foreign, opened
-from shadowhound_data_logger.stores.pace import Pace
 from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES, Multipart
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 

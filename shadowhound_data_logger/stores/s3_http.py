@@ -30,11 +30,11 @@ from botocore.parsers import create_parser
 from botocore.response import StreamingBody
 from botocore.utils import get_environ_proxies
 
+from shadowhound_data_logger.bandwidth import Body, Pace
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.stores.content import Part, object_metadata
 from shadowhound_data_logger.stores.credentials import Keys
-from shadowhound_data_logger.stores.pace import Body, Pace
 
 ALGORITHM: Final = 'AWS4-HMAC-SHA256'
 AGENT: Final = 'shadowhound-data-logger'

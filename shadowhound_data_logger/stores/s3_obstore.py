@@ -29,12 +29,12 @@ from shadowhound_data_logger.errors import (
 )
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import Content, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_read
-from shadowhound_data_logger.stores.retry import steadily
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.stores.pace import Pace
+    from shadowhound_data_logger.bandwidth import Pace
     from shadowhound_data_logger.stores.s3 import S3Store
 
 _CONNECT: Final = timedelta(seconds=10)

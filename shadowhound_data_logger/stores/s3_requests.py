@@ -15,13 +15,13 @@ from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 from botocore.session import Session
 
+from shadowhound_data_logger.bandwidth import Body, Pace
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import AccessDenied, CredentialsRejected, SettingError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.stores.base import Content, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, Part
 from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted
-from shadowhound_data_logger.stores.pace import Body, Pace
 from shadowhound_data_logger.stores.s3_errors import REQUEST_ERRORS, Request, classify, code_of, public_url, status_of
 from shadowhound_data_logger.stores.s3_http import AGENT, ContentRequests
 

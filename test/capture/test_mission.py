@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.capture.encode_pool import BatchQueue
 from shadowhound_data_logger.capture.mission import MissionWatch
-from shadowhound_data_logger.capture.mission_tap import MissionTap
+from shadowhound_data_logger.capture.mission_observer import MissionObserver
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.registry import encode
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -65,7 +65,7 @@ class Setting:
         self.told: list[dict[str, Any]] = []
         queue = BatchQueue(settings.queue)
         self.watch = MissionWatch(
-            settings, self.intake, self.intake, queue, new_tap(**parameters), lambda said: self.told.append(dict(said))
+            settings, self.intake, self.intake, queue, new_observer(**parameters), lambda said: self.told.append(dict(said))
         )
         self.watch.open()
 
@@ -88,10 +88,10 @@ def watching(opened: ExitStack, home: Path, **parameters: object) -> tuple[Setti
     return setting, logger
 
 
-def new_tap(**parameters: object) -> MissionTap:
+def new_observer(**parameters: object) -> MissionObserver:
     settings = given(parameters, Path('nowhere'))
     sensors = {sensor.name: sensor for sensor in settings.sensors}
-    return MissionTap(settings.mission, sensors, 'thor', MessageTypes(), lambda topic: f'/{topic}')
+    return MissionObserver(settings.mission, sensors, 'thor', MessageTypes(), lambda topic: f'/{topic}')
 
 
 def batch(sensor: str, topic: str, kind: str, *messages: Any, start_ns: int = NOON_NS, step_ns: int = SECOND // 10) -> Batch:
@@ -201,7 +201,7 @@ def test_it_joins_only_when_it_is_asked_to(tmp_path: Path, opened: ExitStack) ->
 
 def test_poses_are_read_from_odometry() -> None:
     """All that is kept of it, with the heading in radians."""
-    found = list(new_tap().facts(batch('odom', '/odom', 'nav_msgs/msg/Odometry', odometry(1, 0.5), odometry(1.5, -3.0))))
+    found = list(new_observer().facts(batch('odom', '/odom', 'nav_msgs/msg/Odometry', odometry(1, 0.5), odometry(1.5, -3.0))))
     assert [pose for pose in found if isinstance(pose, Pose)] == [
         Pose(NOON_NS, 1.0, 2.0, pytest.approx(0.5), 0.3, 'odom'),
         Pose(NOON_NS + SECOND // 10, 1.5, 2.0, pytest.approx(-3.0), 0.3, 'odom'),
@@ -210,19 +210,19 @@ def test_poses_are_read_from_odometry() -> None:
 
 def test_a_field_is_read_once_a_period() -> None:
     """Any number of any type, an array's element as well."""
-    tap = new_tap(battery='joint_states:position.1', temperature='')
+    observer = new_observer(battery='joint_states:position.1', temperature='')
     joints = STORE.types['sensor_msgs/msg/JointState']
     empty = np.zeros(0)
     messages = [joints(a_header(), [], np.array([0.0, float(number)]), empty, empty) for number in range(25)]
-    found = list(tap.facts(batch('joints', '/joint_states', 'sensor_msgs/msg/JointState', *messages)))
+    found = list(observer.facts(batch('joints', '/joint_states', 'sensor_msgs/msg/JointState', *messages)))
     assert found == [Reading(NOON_NS + number * SECOND // 10, 'battery_pct', float(number)) for number in (0, 10, 20)]
 
 
 def test_a_field_that_is_not_there_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
     """The mission goes on without it."""
-    tap = new_tap(battery='talk:no.such', temperature='')
+    observer = new_observer(battery='talk:no.such', temperature='')
     messages = [STORE.types['std_msgs/msg/String']('hi')] * 20
-    assert list(tap.facts(batch('talk', '/talk', 'std_msgs/msg/String', *messages))) == []
+    assert list(observer.facts(batch('talk', '/talk', 'std_msgs/msg/String', *messages))) == []
     assert [record.getMessage() for record in caplog.records] == [
         'battery_pct is not logged to the mission: std_msgs/msg/String has no number no.such'
     ]
@@ -230,12 +230,12 @@ def test_a_field_that_is_not_there_is_said_once(caplog: pytest.LogCaptureFixture
 
 def test_a_picture_is_taken_every_few_seconds() -> None:
     """As the camera published it; other sensors' pictures are none of the mission's."""
-    tap, kind = new_tap(frame_every_s=5.0), 'sensor_msgs/msg/CompressedImage'
+    observer, kind = new_observer(frame_every_s=5.0), 'sensor_msgs/msg/CompressedImage'
     image = STORE.types[kind](a_header(), 'jpeg', np.frombuffer(JPEG, np.uint8))
     batches = [batch('camera', '/c', kind, image, start_ns=NOON_NS + second * SECOND) for second in range(11)]
-    found = [fact for one in batches for fact in tap.facts(one)]
+    found = [fact for one in batches for fact in observer.facts(one)]
     assert found == [Frame(NOON_NS + second * SECOND, JPEG) for second in (0, 5, 10)]
-    assert list(tap.facts(batch('other', '/c', kind, image))) == []
+    assert list(observer.facts(batch('other', '/c', kind, image))) == []
 
 
 @pytest.mark.parametrize(
@@ -259,8 +259,8 @@ def test_a_raw_picture_is_encoded_once(monkeypatch: pytest.MonkeyPatch, paramete
     item = encode(taken, camera, 'thor', MessageTypes()).object
     assert item is not None
     of_sensor = len(made)
-    tap = MissionTap(settings.mission, {'camera': camera}, 'thor', MessageTypes(), lambda topic: f'/{topic}')
-    (frame,) = tap.facts(taken, item)
+    observer = MissionObserver(settings.mission, {'camera': camera}, 'thor', MessageTypes(), lambda topic: f'/{topic}')
+    (frame,) = observer.facts(taken, item)
     assert isinstance(frame, Frame)
     assert simplejpeg.is_jpeg(frame.body)
     assert (frame.body == item.body, len(made) - of_sensor) == (not again, again)

@@ -112,7 +112,7 @@ def test_a_store_that_is_away(home: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'http://127.0.0.1:9')
     monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'KEYID')
     monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', SECRET)
-    monkeypatch.setattr('shadowhound_data_logger.stores.retry.TRIES', 1)
+    monkeypatch.setattr('shadowhound_data_logger.retry.TRIES', 1)
     answer = run('--verify')
     assert answer.return_value == 1
     text = ' '.join(answer.output.split())

@@ -12,10 +12,10 @@ from ship.fakes import until
 from stores.fake_s3 import error, etag
 from stores.spooled import Spool
 
+from shadowhound_data_logger.bandwidth import BYTES_PER_MEGABIT, LATE_S
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import ForeignObject, StoreUnavailable
 from shadowhound_data_logger.model import Put
-from shadowhound_data_logger.stores.pace import BYTES_PER_MEGABIT, LATE_S
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_http import UNASKED_BYTES
 

@@ -1,12 +1,9 @@
 from __future__ import annotations
 
-import random
-
 import pytest
 
 from shadowhound_data_logger import errors
 from shadowhound_data_logger.ship.failures import Verdict, decide, quarantine_reason
-from shadowhound_data_logger.stores.retry import BASE_S, backoff
 
 TABLE = [
     (errors.StoreUnavailable, Verdict.RETRY),
@@ -46,12 +43,3 @@ def test_the_table_names_every_store_error() -> None:
 def test_a_reason_can_name_a_folder(error: errors.StoreError, reason: str) -> None:
     """A word from a server becomes part of a path only where it is harmless there."""
     assert quarantine_reason(error) == reason
-
-
-def test_backoff_doubles_up_to_its_cap_with_full_jitter() -> None:
-    """The pause is anywhere from 0 to twice the last bound, never above the cap, and no attempt number overflows."""
-    rng = random.Random(1)
-    for attempt, bound in ((1, BASE_S), (2, 2 * BASE_S), (5, 16 * BASE_S), (9, 60.0), (10_000, 60.0)):
-        pauses = [backoff(attempt, 60.0, rng) for _ in range(2000)]
-        assert 0.0 <= min(pauses) < 0.01 * bound
-        assert 0.99 * bound < max(pauses) <= bound

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 from ship.fakes import until
 
-from shadowhound_data_logger.stores.pace import BYTES_PER_MEGABIT, LARGEST_PIECE, LATE_S, Pace
+from shadowhound_data_logger.bandwidth import BYTES_PER_MEGABIT, LARGEST_PIECE, LATE_S, Pace
 
 QUICK_S = 5.0
 """What happens at once takes much less, what does not takes more."""

@@ -1,5 +1,6 @@
 """What the node sees of the robot while a mission is active: read from batches that were just encoded, by the encoders' threads.
 
+It is no listener: those get each message from the intake (``stream.Consumer``).
 Only what is logged is deserialized: one message a period of the battery's and the thermometer's topic, every pose that is kept.
 """
 
@@ -32,7 +33,7 @@ FLOAT32: Final = 7
 """sensor_msgs/msg/PointField."""
 
 
-class MissionTap:
+class MissionObserver:
     """New; ``facts`` of each batch, on any thread. What cannot be read is said once a topic.
 
     Two threads that have batches of one topic may both take a value of one period: there is one more then.
