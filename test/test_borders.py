@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -139,6 +140,15 @@ def test_the_words_of_metadata_are_told() -> None:
     page = (ROOT.parent / 'docs' / 'formats.md').read_text(encoding='utf-8')
     assert len(set(words.values())) == len(words)
     assert [word for word in words.values() if f'`{word}`' not in page] == []
+
+
+def test_the_page_on_architecture_names_files_that_are_there() -> None:
+    """Who looks for the place of a change there finds it."""
+    page = (ROOT.parent / 'docs' / 'architecture.md').read_text(encoding='utf-8')
+    named = set(re.findall(r'`([\w/]+\.py)\b', page)) - {'bench/code.py', 'test/test_borders.py'}
+    there = {path.relative_to(ROOT).as_posix() for path in MODULES} | {path.name for path in MODULES}
+    assert len(named) > 50
+    assert sorted(named - there) == []
 
 
 PROGRAM = f"""
