@@ -30,6 +30,7 @@ from shadowhound_data_logger.stores.content import (
     identical_or_foreign,
     object_metadata,
 )
+from shadowhound_data_logger.untrusted import from_json
 
 METADATA: Final = '.metadata'
 PARTS: Final = '.part'
@@ -172,11 +173,11 @@ class DirectoryStore:
     def _info(self, bucket: str, key: str) -> ObjectInfo:
         size = self._path(bucket, key).stat().st_size
         try:
-            record = json.loads(self._beside(bucket, key).read_bytes())
-        except (FileNotFoundError, ValueError):
+            record = from_json(self._beside(bucket, key).read_bytes())
+            metadata, content_type = dict(record['metadata']), str(record['content_type'])
+        except (FileNotFoundError, ValueError, TypeError, LookupError):  # cut short, or written by anybody
             return ObjectInfo(bucket, key, size, None)
-        metadata = record['metadata']
-        return ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, record['content_type'])
+        return ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, content_type)
 
     def _beside(self, bucket: str, key: str) -> Path:
         return self._directory / METADATA / bucket / f'{key}.json'

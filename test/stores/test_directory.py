@@ -150,6 +150,22 @@ def test_a_file_system_without_links(store: DirectoryStore, spool: Spool, bucket
     assert store.put(spool('a', b'first')) is Put.IDENTICAL
 
 
+@pytest.mark.parametrize('record', ['[]', '{}', '7', '{"metadata": 7, "content_type": ""}', '{"metadata": {}}', '[' * 100_000])
+def test_a_record_that_is_none_tells_nothing(
+    store: DirectoryStore, spool: Spool, bucket: str, tmp_path: Path, record: str
+) -> None:
+    """Whoever wrote it: the object is there, known by its content alone, and can be listed, read and put again."""
+    item = spool('a', b'first')
+    store.put(item)
+    (beside,) = tmp_path.rglob('a.json')
+    beside.write_text(record)
+    held = store.head(bucket, 'a')
+    assert held is not None
+    assert (held.size, held.sha256, dict(held.metadata)) == (5, None, {})
+    assert b''.join(store.content(bucket, 'a')) == b'first'
+    assert store.put(item) is Put.IDENTICAL
+
+
 def test_users_share_a_folder_without_links(
     store: DirectoryStore, spool: Spool, bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
