@@ -205,7 +205,7 @@ class TopicStream:
             publisher = gid or senders.name(number, source_ns)
             if (gid is None or number is None) and self._recent.has(message):
                 continue
-            fresh.append(message if gid else message._replace(publisher=publisher))
+            fresh.append(message if publisher is gid else message._replace(publisher=publisher))
             if publisher is None or number is None:
                 sent.setdefault(gid or '', []).append(source_ns)
         lost = self._estimate.observe(sent, self._arrivals.hear(senders, now_s)).lost if sent else None
@@ -272,7 +272,7 @@ class SensorStream:
                     continue
                 if not account.receive(publisher, number):
                     continue
-                fresh.append(message if gid else message._replace(publisher=publisher))
+                fresh.append(message if publisher is gid else message._replace(publisher=publisher))
                 if publisher is None or number is None:
                     sent.setdefault(gid or '', []).append(source_ns if counter is None else counter.read(cdr))
             lost = account.observe(sent, self._arrivals.hear(senders, now_s)) if sent else None
