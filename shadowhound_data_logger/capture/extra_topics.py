@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Final
 
-from shadowhound_data_logger.capture.stream import Consumer
+from shadowhound_data_logger.capture.consumers import Consumer
 from shadowhound_data_logger.capture.subscriber import Subscriber, Surroundings
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.keys import printable

@@ -1,6 +1,6 @@
 """The intake thread: it alone creates, drains and destroys subscriptions, on its own clock (D1, D2).
 
-What it takes of a topic goes to the consumers of that topic (``stream.Consumer``), in order; it knows none of them. Nothing here
+What it takes of a topic goes to its consumers (``consumers.Consumer``), in order; it knows none of them. Nothing here
 touches disk or network or parses a message.
 """
 
@@ -16,9 +16,9 @@ from typing import Final
 
 from rclpy.node import Node
 
+from shadowhound_data_logger.capture.consumers import Consumer
 from shadowhound_data_logger.capture.extra_topics import ExtraTopics
 from shadowhound_data_logger.capture.reader import PolledGroup
-from shadowhound_data_logger.capture.stream import Consumer
 from shadowhound_data_logger.capture.subscriber import OtherTypes, Subscriber, SubscriberStatus, Surroundings
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes

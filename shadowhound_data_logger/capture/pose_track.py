@@ -14,8 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
+from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.capture.mission_observer import number_at, yaw_of
-from shadowhound_data_logger.capture.stream import Consumer, Drained
 from shadowhound_data_logger.clock import SECOND, Clock, stamp_of
 from shadowhound_data_logger.config import MissionSettings
 from shadowhound_data_logger.encode.records import ODOMETRY

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Final, Protocol
 from zlib import crc32
 
+from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.capture.encode_pool import BatchQueue
-from shadowhound_data_logger.capture.stream import Consumer, Drained
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock, stamp_of
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns

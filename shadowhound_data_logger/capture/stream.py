@@ -1,7 +1,7 @@
-"""The messages of one topic and type on their way from the take to whoever listens. Plain Python, owned by the intake thread.
+"""The messages of one topic and type on their way from the take to its consumers. Plain Python, owned by the intake thread.
 
 A stream names who sent each message, leaves out what came twice, and estimates what was lost between messages without numbers.
-What is left goes to the consumers of the topic: ``Consumer`` is all that the intake knows of them.
+What is left goes to the consumers of the topic (``consumers.py``).
 """
 
 from __future__ import annotations
@@ -9,19 +9,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from math import inf
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import Final
 from zlib import crc32
 
+from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import CounterField, MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Taken
-from shadowhound_data_logger.spool.accounts import EXACT, Accounts, Losses, TopicAccount
+from shadowhound_data_logger.spool.accounts import EXACT, Accounts
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
-
-if TYPE_CHECKING:
-    from shadowhound_data_logger.capture.extra_topics import TopicChoice
 
 log = logging.getLogger(__name__)
 
@@ -31,71 +29,6 @@ DEAD_S: Final = 15.0
 """A publisher that was killed stays in the graph for less: Cyclone DDS gives it up after ten seconds."""
 NEW_S: Final = 2.0
 """The graph may know a publisher so long before its first message is taken, and its predecessor's last one."""
-
-
-class Drained(NamedTuple):
-    """What one drain took of a topic."""
-
-    topic: str
-    type: str
-    sensor: str
-    """The name of the sensor that has the topic; empty where none has."""
-    messages: Sequence[Taken]
-    """The oldest first, each with its sender where that is known; none came before. Where ``sensor`` is empty, numbered messages
-    may be repeats: whoever counts them leaves those out."""
-    lost: Losses
-    """What is estimated to have been lost before these messages, where they have no numbers; None where nobody knows."""
-    now_s: float
-    """When they were drained, by the monotonic clock."""
-    paused: bool
-    """Whether messages are only counted now."""
-
-
-class Consumer(Protocol):
-    """Whoever listens to what the robot publishes: derive from it, and name it where the node is put together (``pipeline``).
-
-    The intake thread calls all of it, in the order in which messages came, and nothing in it may wait.
-    """
-
-    choice: TopicChoice | None = None
-    """Which topics it wants; None for those that the sensors have."""
-    topics: frozenset[str] = frozenset()
-    """With a choice: those that it gets now, by their full names. The intake sets them."""
-    from_start: bool = True
-    """With a choice: whether it listens as soon as the intake is open, or once ``Intake.listen`` says so."""
-    wants_latched: bool = False
-    """With a choice: whether it begins with what latched publishers sent before, with subscriptions of its own for that."""
-
-    def enter(self, topic: str, type_name: str, sensor: str) -> None:  # noqa: ARG002
-        """Without a choice: messages of a sensor's topic begin here, of this type."""
-        return
-
-    def choose(self, drained: Drained, account: TopicAccount) -> None:  # noqa: ARG002
-        """Without a choice, before ``take``: count in the topic's account what is not stored.
-
-        The lock of the accounts has been held since the messages were received, so that no commit sees the one without the
-        other: nothing but that is done here.
-        """
-        return
-
-    def take(self, drained: Drained) -> None:
-        """Messages of one topic, and the gap before them."""
-
-    def begin(self) -> None:
-        """It listens from now on; again without an ``end`` where something new begins for it here."""
-        return
-
-    def leave(self, topic: str) -> None:  # noqa: ARG002 - for those who have something to do then
-        """The messages of the topic end here; should more come, they are of another type, or another beginning."""
-        return
-
-    def tick(self, now_s: float) -> None:  # noqa: ARG002
-        """Each round, after the messages: do what is due without one."""
-        return
-
-    def flush(self) -> None:
-        """Hand on what was gathered, as if no further message came."""
-        return
 
 
 class Senders:

@@ -13,9 +13,10 @@ from capture.test_stream import NOON_NS, TOPIC, TYPE, Batches
 
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
 from shadowhound_data_logger.capture.bags import BagConsumer
+from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.capture.extra_topics import ExtraTopics, TopicChoice
 from shadowhound_data_logger.capture.sampling import Sampler
-from shadowhound_data_logger.capture.stream import Consumer, Drained, Senders, SensorStream, TopicStream
+from shadowhound_data_logger.capture.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.capture.subscriber import Surroundings
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings

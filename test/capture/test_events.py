@@ -16,8 +16,8 @@ from clocks import Clocks
 from e2e.reading import STRING
 
 from shadowhound_data_logger.bags.ring import Held, Ring
+from shadowhound_data_logger.capture.consumers import Drained
 from shadowhound_data_logger.capture.events import EventConsumer
-from shadowhound_data_logger.capture.stream import Drained
 from shadowhound_data_logger.capture.triggers import LARGE_BYTES, SEEN, EventWatch, Inbox
 from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.encode.types import MessageTypes

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from shadowhound_data_logger.capture.consumers import Drained
 from shadowhound_data_logger.capture.pose_track import RobotTrack
-from shadowhound_data_logger.capture.stream import Drained
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import MissionSettings
 from shadowhound_data_logger.encode.records import ODOMETRY

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
+from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.capture.sampling import Sampler
-from shadowhound_data_logger.capture.stream import Consumer, Drained, Senders, SensorStream
+from shadowhound_data_logger.capture.stream import Senders, SensorStream
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
