@@ -27,6 +27,7 @@ from shadowhound_data_logger.stores.s3_http import AGENT, ContentRequests
 
 OLDEST_BOTOCORE: Final = (1, 36)
 """The first with If-None-Match on PUT and the checksum settings; Debian's of Humble and Jazzy are older."""
+FORBIDDEN: Final = 403
 RANGE_NOT_SATISFIABLE: Final = 416
 """Nothing is behind the first byte that was asked for."""
 META: Final = 'x-amz-meta-'
@@ -108,9 +109,15 @@ class S3Requests:
                 try:  # its answer has a body: the reason
                     client.get_object(Bucket=bucket, Key=key, Range='bytes=0-0')['Body'].close()
                 except ClientError as reason:
-                    if status_of(reason) == status_of(error):  # else it is another trouble, or over: there is no such key, say
+                    if status_of(reason) == status_of(error):
                         raise
-                raise
+                if status_of(error) != FORBIDDEN:
+                    raise
+                # Another trouble, or over: no word on rights, which would let a put go on without this look.
+                raise StoreUnavailable(
+                    f'{self.endpoint} refused to describe {bucket}/{key} and gave another answer when it was asked why',
+                    endpoint=self.endpoint, bucket=bucket, key=key,
+                ) from error  # fmt: skip
         self.confirm(answer, bucket, key)
         if 'ContentLength' not in answer:
             raise self._not_s3(bucket, key)

@@ -195,3 +195,21 @@ def test_an_answer_that_breaks_off_condemns_nobody(proved: S3Store, front: Front
             ends.add(None)
         place += random.Random(place).randint(1, 7)
     assert ends == {Put.IDENTICAL, None}
+
+
+def test_a_look_that_fails_for_an_unknown_reason_is_none(
+    opened: S3Store, direct: S3Store, front: Front, spool: Spool, key: str
+) -> None:
+    """A clock that is wrong, and a login page where the reason is asked for: this does not say that looking is forbidden.
+
+    A server that overwrites would then lose what somebody else has stored.
+    """
+    again(direct, spool(key, b'of another writer'))
+    front.condition = Condition.OVERWRITES
+    faults = iter([Fault.SKEWED, Fault.PORTAL])
+    front.script = lambda: next(faults, Fault.NONE)
+    with pytest.raises(StoreUnavailable, match='another answer'):
+        opened.put(spool(key, CONTENT))
+    with pytest.raises(ForeignObject):
+        opened.put(spool(key, CONTENT))
+    assert direct.get(BUCKET, key) == b'of another writer'
