@@ -195,7 +195,7 @@ def test_a_type_that_is_not_installed(make: Callable[[str], Any], monkeypatch: p
     squatter.create(String, '/odom')
     robot.create(Int32, '/odom')
     logger.listen('/odom', INT)
-    logger.until(lambda: logger.source.status().matched, 'its own is matched')
+    logger.until(lambda: logger.source.status().matched and robot.matched(), 'its own is matched')
     logger.until(lambda: logger.totals('/odom').other_types.get(STRING, {}).get('publishers'), 'the other one is seen')
     squatter.publish(String())
     robot.publish(*ints(3))

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from ship.fakes import until
 from spool.conftest import Open
 from spool.making import FakeClock, assert_whole, files, make, new_spool, put, receive, rows
 
@@ -156,6 +157,7 @@ def test_a_disk_that_takes_nothing(
         connection.execute('PRAGMA query_only = 0')
     assert writer.flush(10)
     assert assert_whole(root)['topics']['/camera']['stored'] == 3
+    until(lambda: not writer.worker.failing)  # it says so after the commit
     told = [record.getMessage() for record in caplog.records if record.name.endswith('worker')]
     assert len(told) == 2, told
     assert 'cannot be written' in told[0]
