@@ -45,7 +45,7 @@ class Wire:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.set(REFUSE)
+        asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(30)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
@@ -61,6 +61,13 @@ class Wire:
         if mode != REFUSE:
             self._server = await asyncio.start_server(self._accept, '127.0.0.1', self._port, reuse_address=True)
 
+    async def _end(self) -> None:
+        """A connection that was accepted in this instant has a task that has not begun: it finds out here."""
+        await self._set(REFUSE)
+        while others := asyncio.all_tasks() - {asyncio.current_task()}:
+            await asyncio.wait(others)
+        await asyncio.sleep(0)  # transports close a turn after they are told to
+
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task is not None
@@ -73,6 +80,8 @@ class Wire:
             writer.transport.abort() if self._mode == HANG else writer.close()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._mode == REFUSE:
+            return
         if self._mode == HANG:
             await asyncio.Event().wait()
         elif isinstance(self._mode, tuple):
