@@ -37,7 +37,7 @@ from torture.kills import running
 
 KILLS: Final = 50
 SHORT_KILLS: Final = 6
-ROBOT: Final = 'torture'
+ROBOT: Final = 'thor'
 COMMAND: Final = 'joined'
 NODE, AGENT, SENDER = 'node', 'agent', 'sender'
 UP_S: Final = (0.3, 8.0)
