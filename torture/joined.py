@@ -33,11 +33,10 @@ from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
-from torture.kills import running
+from torture.kills import ROBOT, running
 
 KILLS: Final = 50
 SHORT_KILLS: Final = 6
-ROBOT: Final = 'thor'
 COMMAND: Final = 'joined'
 NODE, AGENT, SENDER = 'node', 'agent', 'sender'
 UP_S: Final = (0.3, 8.0)

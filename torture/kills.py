@@ -32,7 +32,7 @@ from torture._kill_audit import CALIBRATION, CLOUDS, Audit, Heard, Kill, audit
 
 KILLS: Final = 100
 SHORT_KILLS: Final = 5
-ROBOT: Final = 'torture'
+ROBOT: Final = 'thor'
 AT_THE_START: Final = 0.2
 """Share of the nodes that are killed before they listen or soon after: in their imports, recovery, discovery."""
 START_S: Final = (0.1, 2.5)
