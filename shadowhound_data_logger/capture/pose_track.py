@@ -36,7 +36,7 @@ GAP_NS: Final = 3 * SECOND // 2
 AHEAD_NS: Final = SECOND // 4
 """For so long the robot is taken to go on as it did: objects are encoded before the next odometry has come."""
 AT_ONCE_NS: Final = SECOND // 20
-"""For so long it is taken to stand: where there is one pose alone."""
+"""For so long one pose alone holds, and the robot is taken to have gone as it does before the first of several."""
 _NO_WORD: Final = re.compile(r'[^!-~]')
 
 
@@ -172,7 +172,7 @@ class RobotTrack(Consumer):
 def _between(found: list[tuple[int, _Pose]], stamp_ns: int) -> _Pose | None:
     """The pose at a time between or near two others, straight on; yaw turns the shorter way."""
     (start_ns, a), (end_ns, b) = found[0], found[-1]
-    if not (0 < end_ns - start_ns <= GAP_NS and start_ns - AHEAD_NS <= stamp_ns <= end_ns + AHEAD_NS and a.frame == b.frame):
+    if not (0 < end_ns - start_ns <= GAP_NS and start_ns - AT_ONCE_NS <= stamp_ns <= end_ns + AHEAD_NS and a.frame == b.frame):
         near_ns, near = min(found, key=lambda pose: abs(pose[0] - stamp_ns))
         return near if abs(near_ns - stamp_ns) <= AT_ONCE_NS else None
     part = (stamp_ns - start_ns) / (end_ns - start_ns)
