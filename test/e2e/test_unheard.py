@@ -31,7 +31,7 @@ def findings(node: Node) -> list[str]:
 def test_a_publisher_where_our_profile_does_not_look_is_an_error(processes: Processes) -> None:
     """In log and status, by its topic; it is logged and no error any more once the networks are one."""
     domain = processes.environ['ROS_DOMAIN_ID']
-    everywhere = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
+    everywhere = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', 'ROS_LOCALHOST_ONLY': '0'}
     with ExitStack() as stack:
         machines = Machines(stack)
         machines.start('publish', '/there', json.dumps([{'ROS_DOMAIN_ID': domain}]), other=True)
