@@ -25,14 +25,14 @@ Figures = Mapping[str, Any]
 
 
 def write(results: Figures, template: Path, output: Path) -> None:
-    """The page and its pictures; a block whose benchmark was not run says so."""
-
-    def block(match: re.Match[str]) -> str:
-        return f'{match[1]}{_block(match[2], results)}\n{match[3]}'
-
-    text = _BLOCK.sub(block, template.read_text(encoding='utf-8'))
-    (output / 'performance.md').write_text(text, encoding='utf-8')
+    """The page and its pictures."""
+    (output / 'performance.md').write_text(filled(template.read_text(encoding='utf-8'), results), encoding='utf-8')
     _pictures.draw({name: found['figures'] for name, found in results['benches'].items()}, output / 'images')
+
+
+def filled(page: str, results: Figures) -> str:
+    """The page with these figures; a block whose benchmark was not run says so."""
+    return _BLOCK.sub(lambda match: f'{match[1]}{_block(match[2], results)}\n{match[3]}', page)
 
 
 def dump(results: Figures) -> str:
@@ -69,9 +69,15 @@ def _machine(results: Figures) -> str:
 
 
 def _commands(results: Figures) -> str:
+    """A benchmark that was measured alone, later, has a commit of its own, and maybe another machine."""
+    machine = results['machine']
+    rows = []
+    for found in results['benches'].values():
+        processor = found.get('processor', machine['processor'])
+        where = f', on {processor}' if processor != machine['processor'] else ''
+        rows.append((f'`{found["command"]}`', f'{found["took_s"]:.0f} s', f'{found.get("commit", machine["commit"])}{where}'))
     total = f'All of it took {results["took_s"] / 60:.1f} minutes.'
-    return _table(('command', 'took'), [(f'`{found["command"]}`', f'{found["took_s"]:.0f} s')
-                                        for found in results['benches'].values()]) + '\n\n' + total  # fmt: skip
+    return _table(('command', 'took', 'commit'), rows) + '\n\n' + total
 
 
 def _node_cpu(figures: Figures) -> str:
@@ -99,6 +105,18 @@ def _intake(figures: Figures) -> str:
         row('the node', figures['node_us'], figures['node_lost']),
         row('(the publisher)', figures['publisher_us'], ''),
     ])  # fmt: skip
+
+
+def _vendors(figures: Figures) -> str:
+    words = {'fast': 'Fast DDS', 'cyclone': 'Cyclone DDS', 'robot': "Cyclone DDS, in the robot's own RMW"}
+    kinds = sorted(figures['bytes'], key=figures['bytes'].__getitem__)
+    rows = []
+    for name, us in figures['us'].items():
+        used = [(f'{sum(us[kind]) / len(us[kind]):.0f} us', f'{min(us[kind]):.0f} to {max(us[kind]):.0f} us') for kind in kinds]
+        rows.append((words[name], *(cell for pair in used for cell in pair), f'{sum(figures["memory"][name].values()):.0f} MB',
+                     figures['lost'].get(name, 'not known')))  # fmt: skip
+    head = [cell for kind in kinds for cell in (f'CPU a message of {figures["bytes"][kind]:,} bytes', 'spread')]
+    return _table(('the node hears', *head, 'resident memory', 'messages lost'), rows)
 
 
 def _small(figures: Figures) -> str:
@@ -190,10 +208,10 @@ def _missions(figures: Figures) -> str:
 
 _WHOLE: Final[Mapping[str, Callable[[Figures], str]]] = {'bars': _bars, 'machine': _machine, 'commands': _commands}
 _PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
-    'node_cpu': ('node_cpu', _node_cpu), 'intake': ('intake', _intake), 'small_messages': ('small_messages', _small),
-    'full_rate': ('full_rate', _full_rate), 'memory': ('full_rate', _memory), 'latency': ('latency', _latency),
-    'encode_formats': ('encode_formats', _encode), 'spool_commits': ('spool_commits', _spool), 'drain': ('drain', _drain),
-    'mission_calls': ('mission_calls', _mission_calls), 'missions': ('missions', _missions),
+    'node_cpu': ('node_cpu', _node_cpu), 'intake': ('intake', _intake), 'vendors': ('vendors', _vendors),
+    'small_messages': ('small_messages', _small), 'full_rate': ('full_rate', _full_rate), 'memory': ('full_rate', _memory),
+    'latency': ('latency', _latency), 'encode_formats': ('encode_formats', _encode), 'spool_commits': ('spool_commits', _spool),
+    'drain': ('drain', _drain), 'mission_calls': ('mission_calls', _mission_calls), 'missions': ('missions', _missions),
 }  # fmt: skip
 
 if __name__ == '__main__':

@@ -148,7 +148,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     results: dict[str, Any] = {'machine': machine(), 'quick': options.quick}
     steps = [step for step in STEPS if (step.name in options.only if options.only else step.quick is not None or whole)]
     found = {step.name: run(step, options.folder, quick=options.quick) for step in steps}
-    results['benches'] = benches = {name: answer for name, answer in found.items() if answer is not None}
+    where = {name: results['machine'][name] for name in ('commit', 'processor')}
+    results['benches'] = benches = {name: {**answer, **where} for name, answer in found.items() if answer is not None}
     results['took_s'] = round(time.monotonic() - start)
     whole = whole and len(benches) == len(steps)
     output = options.output or (DOCS if whole else options.folder / 'page')

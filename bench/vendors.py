@@ -89,7 +89,12 @@ def measure(options: argparse.Namespace) -> Report:
         memory = {name: _proc.memory(each.node.popen.pid)._asdict() for name, each in sides.items()}
         ledgers = {name: each.node.stop() for name, each in sides.items()}
     gone = {name: lost(ledger['topics'].values()) for name, ledger in ledgers.items() if name != 'robot'}
-    figures = {'us': {name: each.used_us for name, each in sides.items()}, 'memory': memory, 'lost': gone}
+    figures = {
+        'bytes': {kind: size for kind, (size, _) in KINDS.items()},
+        'us': {name: each.used_us for name, each in sides.items()},
+        'memory': memory,
+        'lost': gone,
+    }
     return Report(tuple(_bars(sides, memory)), figures)
 
 

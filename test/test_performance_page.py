@@ -1,0 +1,47 @@
+"""docs/performance.md is what bench/_page.py makes of docs/performance.json."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGE, FIGURES = ROOT / 'docs/performance.md', ROOT / 'docs/performance.json'
+
+
+@pytest.fixture
+def page(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(ROOT / 'bench')
+    return importlib.import_module('_page')
+
+
+def test_the_page_has_the_measured_figures(page: Any) -> None:
+    """``python bench/_page.py`` would change no figure of it."""
+    text = PAGE.read_text(encoding='utf-8')
+    assert page.filled(text, json.loads(FIGURES.read_text(encoding='utf-8'))) == text
+
+
+def test_what_another_vendors_messages_cost_is_on_the_page(page: Any) -> None:
+    """A line for each pair that was measured; the third, in the robot's own RMW, is not always there."""
+    figures = {
+        'bytes': {'large': 300_000, 'small': 324},
+        'us': {'fast': {'small': [100.0, 140.0], 'large': [500.0]}, 'cyclone': {'small': [110.0], 'large': [480.0]}},
+        'memory': {'fast': {'anon': 50.0, 'file': 40.0, 'shmem': 10.0}, 'cyclone': {'anon': 50.0, 'file': 20.4, 'shmem': 0.0}},
+        'lost': {'fast': 0, 'cyclone': 2},
+    }
+    results = {'benches': {'vendors': {'figures': figures}}}
+    lines = page.filled('<!-- bench vendors -->\n<!-- end vendors -->\n', results).splitlines()
+    assert lines[1].startswith('| the node hears | CPU a message of 324 bytes | spread | CPU a message of 300,000 bytes |')
+    assert lines[3:5] == [
+        '| Fast DDS | 120 us | 100 to 140 us | 500 us | 500 to 500 us | 100 MB | 0 |',
+        '| Cyclone DDS | 110 us | 110 to 110 us | 480 us | 480 to 480 us | 70 MB | 2 |',
+    ]
+    assert '<!-- bench vendors -->' in PAGE.read_text(encoding='utf-8')
+
+
+def test_what_was_not_measured_says_so(page: Any) -> None:
+    assert '*not measured*' in page.filled('<!-- bench vendors -->\n<!-- end vendors -->\n', {'benches': {}})
