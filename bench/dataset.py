@@ -77,7 +77,9 @@ def fill(store: S3Store, frames: int) -> int:
         ]
         for start in range(0, len(rows), 60):
             name = f'{utc(rows[start]["t_start_ns"]):%Y%m%dT%H%M%S}_b'
-            obstore.put(store, schema.part_key(robot, schema.date_of(rows[start]), name), parts.encode(rows[start : start + 60]))
+            obstore.put(
+                store, schema.OBJECTS.part_key(robot, schema.date_of(rows[start]), name), parts.encode(rows[start : start + 60])
+            )
     return sum(len(bodies[number % 16]) for number in range(frames))
 
 

@@ -96,7 +96,7 @@ def fill(settings: StoreSettings, days: int) -> tuple[int, int]:
         made = list(rows(minute))
         body = parts.encode(made)
         stamp = utc(made[0]['t_start_ns'])
-        obstore.put(bare, schema.part_key('thor', f'{stamp:%Y-%m-%d}', f'{stamp:%Y%m%dT%H%M}00_b007'), body)
+        obstore.put(bare, schema.OBJECTS.part_key('thor', f'{stamp:%Y-%m-%d}', f'{stamp:%Y%m%dT%H%M}00_b007'), body)
         done[0] += len(made)
         done[1] += len(body)
 

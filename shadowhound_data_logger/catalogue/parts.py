@@ -1,4 +1,4 @@
-"""Parts of the catalogue: rows to Parquet files that are never changed, one for each robot and date among them."""
+"""Parts of the tables in the store: rows to Parquet files that are never changed, one for each robot and date among them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 from shadowhound_data_logger.catalogue.parquet import Column, table
-from shadowhound_data_logger.catalogue.schema import COLUMNS, FORMAT_VERSION, REQUIRED, Row, date_of
+from shadowhound_data_logger.catalogue.schema import OBJECTS, Row, TableSchema, date_of
 
 CONTENT_TYPE: Final = 'application/vnd.apache.parquet'
-ABOUT: Final = {'shadowhound.catalog': str(FORMAT_VERSION)}
-_COLUMNS: Final = {name: Column(name, kind, optional=name not in REQUIRED) for name, kind in COLUMNS.items()}
 
 
-def encode(rows: Sequence[Row]) -> bytes:
+def encode(rows: Sequence[Row], of: TableSchema = OBJECTS) -> bytes:
     """The Parquet file of rows, at least one, in their order. It takes some 20 us of CPU a row."""
-    return table({column: [row[name] for row in rows] for name, column in _COLUMNS.items()}, ABOUT)
+    columns = (Column(name, kind, optional=name not in of.required) for name, kind in of.columns.items())
+    return table({column: [row[column.name] for row in rows] for column in columns}, of.about)
 
 
 def by_folder(rows: Iterable[tuple[int, Row]]) -> Iterator[tuple[str | None, str, list[tuple[int, Row]]]]:

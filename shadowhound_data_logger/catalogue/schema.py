@@ -3,12 +3,14 @@
 A row holds nothing that is not in the object's S3 metadata and in a listing: a catalogue that is lost is made again from those.
 Every object of a robot is a row but the files of the catalogue itself. Parts lie at
 ``<robot>/_catalog/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.parquet``; the date is that of ``t_start``, UTC.
+Beside them lie the parts of the gap journal (catalogue/gaps.py), in ``<robot>/_gaps/``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
@@ -57,25 +59,41 @@ message, the middle of a batch. ``clock`` is how well the times are known (spool
 REQUIRED: Final = ('bucket', 'key', 'bytes', 'format_version')
 UNDATED: Final = '1970-01-01'
 SENSOR: Final = '_catalog'
-"""Of the catalogue's own objects, and their folder."""
+"""Of the catalogue's own objects and of the gap journal's, which have no rows in it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TableSchema:
+    """A table whose parts lie in the store: their folder below the robot's name, and their columns."""
+
+    folder: str
+    columns: Mapping[str, str]
+    """Name -> kind."""
+    required: tuple[str, ...]
+    """Columns without nulls."""
+    about: Mapping[str, str]
+    """The key-value metadata of each part."""
+
+    def prefix(self, robot: str) -> str:
+        """What the keys of a robot's parts begin with."""
+        return f'{robot}/{self.folder}/'
+
+    def part_key(self, robot: str, date: str, name: str) -> str:
+        """The key of a part with rows of one date (``YYYY-MM-DD``); ``name`` makes it unique."""
+        return f'{self.prefix(robot)}date={date}/{robot}_{name}.parquet'
+
+
+OBJECTS: Final = TableSchema(SENSOR, COLUMNS, REQUIRED, {'shadowhound.catalog': str(FORMAT_VERSION)})
+GAPS_FOLDER: Final = '_gaps'
+"""Of the gap journal's parts."""
 
 Row = dict[str, Any]
 """Column -> value; a time as an int of microseconds."""
 
 
-def prefix(robot: str) -> str:
-    """What the keys of a robot's catalogue begin with."""
-    return f'{robot}/{SENSOR}/'
-
-
-def part_key(robot: str, date: str, name: str) -> str:
-    """The key of a part with rows of one date (``YYYY-MM-DD``); ``name`` makes it unique."""
-    return f'{prefix(robot)}date={date}/{robot}_{name}.parquet'
-
-
 def is_row(bucket: str, key: str) -> bool:
-    """Whether an object belongs into the catalogue: all do but its own files."""
-    return bucket != BUCKET or key.split('/')[1:2] != [SENSOR]
+    """Whether an object belongs into the catalogue: all do but its own files and those of the gap journal."""
+    return bucket != BUCKET or key.split('/')[1:2] not in ([SENSOR], [GAPS_FOLDER])
 
 
 def date_of(row: Row) -> str:

@@ -13,7 +13,7 @@ from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue import parts
-from shadowhound_data_logger.catalogue.schema import BUCKET, SENSOR, Row, part_key, row_of
+from shadowhound_data_logger.catalogue.schema import BUCKET, OBJECTS, SENSOR, Row, row_of
 from shadowhound_data_logger.clock import Clock, utc
 from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.errors import NameRefused
@@ -75,7 +75,7 @@ class CatalogueWriter:
         name = f'{utc(now_ns):%Y%m%dT%H%M%S}_{self._clock.boot_id[:8]}'
         times = [row['t_start_ns'] for row in rows if row['t_start'] is not None] or [now_ns]
         return DataObject(
-            bucket=BUCKET, key=part_key(robot, date, name), body=parts.encode(rows), content_type=parts.CONTENT_TYPE,
+            bucket=BUCKET, key=OBJECTS.part_key(robot, date, name), body=parts.encode(rows), content_type=parts.CONTENT_TYPE,
             sensor=SENSOR, topic=None, type='', samples=0, t_start_ns=min(times), t_end_ns=max(times), priority=PRIORITY,
             protected=True, metadata={words.ROBOT: robot, words.COUNT: str(len(rows))},
             catalogues=tuple(number for number, _ in found),

@@ -1,6 +1,7 @@
 """The lake: what is stored, as a catalogue of Parquet files beside the objects themselves, and how to ask it.
 
-``lake.objects(sensor='camera', since='yesterday')`` is a Daft DataFrame (docs/lake.md), ``lake.MissionDataset`` what to train on.
+``lake.objects(sensor='camera', since='yesterday')`` is a Daft DataFrame (docs/lake.md), ``lake.MissionDataset`` what to train on,
+``lake.known('thor', '/imu', '2h')`` what is there of a time, what is not and why, and what nobody knows.
 The names below load Daft when they are used: a robot, which writes the catalogue, needs none of it.
 """
 
@@ -11,11 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.dataset import MissionDataset
+    from shadowhound_data_logger.lake.gaps import Known, StatedGap, Stretch, known
     from shadowhound_data_logger.lake.query import missions, objects, sql, topics
     from shadowhound_data_logger.lake.samples import Near, Window
 
-__all__ = ['MissionDataset', 'Near', 'Window', 'missions', 'objects', 'sql', 'topics']
+__all__ = [
+    'Known', 'MissionDataset', 'Near', 'StatedGap', 'Stretch', 'Window', 'known', 'missions', 'objects', 'sql', 'topics',
+]  # fmt: skip
 _MODULES = {'MissionDataset': 'dataset', 'Near': 'samples', 'Window': 'samples'}
+_MODULES |= dict.fromkeys(('Known', 'StatedGap', 'Stretch', 'known'), 'gaps')
 
 
 def __getattr__(name: str) -> Any:

@@ -1,5 +1,7 @@
 """``lake compact``: the many parts of a day that is over become one, in the order in which a question looks for rows.
 
+Of the gap journal, only the newest statement about each gap is left; withdrawals stay, since a part with the gap may come later.
+
 It only ever adds an object, under a name made of what it is made of. What that covers is deleted later, when nobody reads a list
 from before it any more; so it may die, or run twice at a time, at any moment (docs/decisions/0014).
 """
@@ -11,6 +13,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -19,10 +22,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from shadowhound_data_logger.catalogue.parts import ABOUT
+from shadowhound_data_logger.catalogue.gaps import GAPS
+from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
 from shadowhound_data_logger.errors import AccessDenied
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.gaps import folded
 from shadowhound_data_logger.lake.putting import put_part
 from shadowhound_data_logger.lake.reading import THREADS, arrow_schema, whole
 from shadowhound_data_logger.lake.scan import unrepeated
@@ -51,6 +56,7 @@ GROUP_ROWS: Final = 4096
 CELL_M: Final = 4.0
 """Rows are ordered by sensor, by squares of this side along a Z-order curve, then by time: what lies together is read at once."""
 _CELLS: Final = 1 << 15
+_BY_TOPIC: Final = [(name, 'ascending') for name in ('sink', 'topic', 'what', 'from_ns', 'id')]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,29 +89,31 @@ def compact(  # noqa: PLR0913 - what is handed in
     findings = Findings() if findings is None else findings
     end = before or f'{now():%Y-%m-%d}'
     with ThreadPoolExecutor(THREADS) as pool:
-        for name in [robot] if robot else robots(source):
-            for date in (date for date in dates_of(source, name, findings) if date < end):
+        for name, of in product([robot] if robot else robots(source), (OBJECTS, GAPS)):
+            for date in (date for date in dates_of(source, name, findings, of) if date < end):
                 deadline_s = monotonic() + MOST_S
-                for day in days(source, [name], [date], pool, findings):
-                    done = _merge(source, store, day, findings, lambda end_s=deadline_s: monotonic() < end_s)  # type: ignore[misc]
+                for day in days(source, [name], [date], pool, findings, of=of):
+                    done = _merge(source, store, day, of, findings, lambda end_s=deadline_s: monotonic() < end_s)  # type: ignore[misc]
                     done = _tidy(source, day, done, grace, now())
                     if done.merged or done.deleted or done.kept:
                         yield done
 
 
-def _merge(source: Bucket, store: ObjectStore, day: Day, findings: Findings, is_in_time: Callable[[], bool]) -> Compacted:
+def _merge(source: Bucket, store: ObjectStore, day: Day, of: TableSchema, findings: Findings,
+           is_in_time: Callable[[], bool]) -> Compacted:  # fmt: skip
     nothing = Compacted(day.robot, day.date)
     if len(day.entries) < 2:
         return nothing
     try:
-        merged, rows = _rows(source, day, findings)
+        merged, rows = _rows(source, day, of, findings)
         if len(merged) < 2:
             return nothing
         leaves = frozenset().union(*(day.leaves.get(entry.key, {name_of(entry.key)}) for entry in merged))
-        key = compacted_key(day.robot, day.date, leaves, is_mended=day.is_mended)
-        body = _encoded(in_order(unrepeated(rows)), leaves)
+        key = compacted_key(day.robot, day.date, leaves, is_mended=day.is_mended, of=of)
+        rows = in_order(unrepeated(rows)) if of is OBJECTS else folded(rows).sort_by(_BY_TOPIC)
+        body = _encoded(rows, of, leaves)
     except MemoryError:
-        findings.add(folder_of(day.robot, day.date), 'there is not enough memory to compact it')
+        findings.add(folder_of(day.robot, day.date, of), 'there is not enough memory to compact it')
         return nothing
     if not is_in_time():
         return nothing
@@ -113,12 +121,12 @@ def _merge(source: Bucket, store: ObjectStore, day: Day, findings: Findings, is_
     return replace(nothing, merged=len(merged), rows=len(rows), size=len(body))
 
 
-def _rows(source: Bucket, day: Day, findings: Findings) -> tuple[list[ObjectInfo], pa.Table]:
+def _rows(source: Bucket, day: Day, of: TableSchema, findings: Findings) -> tuple[list[ObjectInfo], pa.Table]:
     """The parts that can be merged, and what is in them. Raises MemoryError for more than ``MOST_DAY_BYTES``."""
     merged: list[ObjectInfo] = []
-    found: list[pa.Table] = [arrow_schema().empty_table()]
+    found: list[pa.Table] = [arrow_schema(of).empty_table()]
     size = 0
-    for entry, table in whole(source, day.entries, findings):
+    for entry, table in whole(source, day.entries, findings, of):
         size += table.nbytes
         if size > MOST_DAY_BYTES:
             raise MemoryError
@@ -127,11 +135,11 @@ def _rows(source: Bucket, day: Day, findings: Findings) -> tuple[list[ObjectInfo
     return merged, pa.concat_tables(found).combine_chunks()
 
 
-def _encoded(rows: pa.Table, leaves: frozenset[str]) -> bytes:
+def _encoded(rows: pa.Table, of: TableSchema, leaves: frozenset[str]) -> bytes:
     body = pa.BufferOutputStream()
-    with pq.ParquetWriter(body, arrow_schema(), compression='zstd', store_schema=False) as file:
-        file.write_table(rows.cast(arrow_schema()), row_group_size=GROUP_ROWS)
-        file.add_key_value_metadata({**ABOUT, LEAVES: encode_leaves(leaves)})
+    with pq.ParquetWriter(body, arrow_schema(of), compression='zstd', store_schema=False) as file:
+        file.write_table(rows.cast(arrow_schema(of)), row_group_size=GROUP_ROWS)
+        file.add_key_value_metadata({**of.about, LEAVES: encode_leaves(leaves)})
     return bytes(body.getvalue().to_pybytes())
 
 

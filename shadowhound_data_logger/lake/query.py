@@ -1,4 +1,4 @@
-"""The catalogue as Daft DataFrames and as SQL over ``objects``, ``missions`` and ``topics``.
+"""Catalogue and gap journal as Daft DataFrames, and as SQL over ``objects missions topics gaps watermarks``.
 
 A frame is lazy: it looks which parts there are when it is computed, and of other days than the asked ones not even for the names.
 """
@@ -18,13 +18,16 @@ from operator import and_
 from typing import Any, Final
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from shadowhound_data_logger.catalogue import schema
+from shadowhound_data_logger.catalogue.gaps import GAP, GAPS
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.gaps import newest, watermarks
 from shadowhound_data_logger.lake.reading import THREADS
 from shadowhound_data_logger.lake.scan import Catalogue
 from shadowhound_data_logger.lake.select import Wanted, wanted
@@ -35,6 +38,25 @@ import daft  # isort: skip - after scan, which turns its telemetry off
 from daft import DataFrame, Expression, col, lit  # isort: skip
 
 _MISSIONS: Final = re.compile(r'\bmissions\b', re.IGNORECASE)
+_GAPS: Final = re.compile(r'\b(gaps|watermarks)\b', re.IGNORECASE)
+_OF_OBJECTS: Final = ('near', 'mission_type', 'success', 'where')
+"""Flags that gaps know nothing of."""
+_UNSEEN: Final = {'what', 'id', 'revision', 'received', 'skipped', 'format_version'}
+_GAP_COLUMNS: Final = [name for name in GAPS.columns if name not in _UNSEEN]
+_OF_WATERMARKS: Final = {
+    'robot',
+    'sink',
+    'topic',
+    'session',
+    't_from',
+    't_to',
+    'from_ns',
+    'to_ns',
+    'grade',
+    'received',
+    'skipped',
+}
+_WATERMARK_COLUMNS: Final = [name for name in GAPS.columns if name in _OF_WATERMARKS]
 LONGEST_NS: Final = 24 * 3600 * SECOND
 """For so long after a time that is asked for a mission may go on before one of its objects knows its run."""
 _SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
@@ -83,12 +105,14 @@ def topics(source: Bucket | None = None, *, findings: Findings | None = None, **
 
 
 def sql(query: str, source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
-    """SQL over the three views, each restricted by the flags. Raises LakeError for what is no SQL or names no column."""
+    """SQL over the views, each restricted by the flags. Raises LakeError for what is no SQL or names no column."""
     chosen, asked = _Asked.of(source, findings), wanted(time.time_ns(), **flags)
     rows = _objects(chosen, asked)
     views = {'objects': rows, 'topics': _topics(rows)}
     if _MISSIONS.search(query):  # it has to look first
         views['missions'] = _missions(chosen, asked)
+    if _GAPS.search(query):
+        views.update(_gaps(chosen, asked))
     with answering():
         return daft.sql(query, register_globals=False, **views)
 
@@ -173,6 +197,27 @@ def _missions(lake: _Asked, asked: Wanted) -> DataFrame:
     for column, (name, kind) in _SUMMARY.items():
         found = found.append_column(column, pa.array([_value(one.get(name), kind) for one in told], kind))
     return daft.from_arrow(found)
+
+
+def _gaps(lake: _Asked, asked: Wanted) -> dict[str, DataFrame]:
+    """The newest statements about gaps that reach into the time, and how far they are complete. Reads the journal at once."""
+    if refused := [name for name in _OF_OBJECTS if getattr(asked, name) is not None]:
+        raise LakeError(f'gaps and watermarks cannot be asked for by {" ".join(refused)}',
+                        remedy='ask by robot, sensor, topic, since, until or mission, or join them with objects')  # fmt: skip
+    rows = newest(lake.source, robot=asked.robot, topic=asked.topic, since_ns=asked.since_ns, findings=lake.findings)
+    if asked.sensor is not None:
+        with answering():
+            topics = _objects(lake, asked).select('topic').distinct().to_pydict()['topic']
+        rows = rows.filter(pc.is_in(rows['topic'], value_set=pa.array(topics, pa.string())))
+    if asked.since_ns is not None:
+        rows = rows.filter(pc.greater_equal(rows['to_ns'], asked.since_ns))
+    if asked.until_ns is not None:
+        rows = rows.filter(pc.less(rows['from_ns'], asked.until_ns))
+    marks = pa.Table.from_pylist(watermarks(rows.to_pylist()), schema=rows.schema)
+    gaps = rows.filter(pc.equal(rows['what'], GAP))
+    if asked.mission is not None:
+        gaps = gaps.filter(pc.starts_with(gaps['mission_id'], asked.mission))
+    return {'gaps': daft.from_arrow(gaps.select(_GAP_COLUMNS)), 'watermarks': daft.from_arrow(marks.select(_WATERMARK_COLUMNS))}
 
 
 def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Parts of the catalogue as tables, whoever wrote them: nothing is unpacked before it is known how much that is.
+"""Parts of the catalogue and of the gap journal as tables. Nothing is unpacked before it is known how much it is.
 
 A part of ours is flat: columns of known types, in pages that are plain or by a dictionary, gzip or zstd. Its footer says where
 the pages are, each page's header how large it is; both are read first, and what is something else, or far larger than its file,
@@ -21,8 +21,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from shadowhound_data_logger.catalogue.gaps import GAPS, KINDS
 from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
-from shadowhound_data_logger.catalogue.schema import COLUMNS, REQUIRED
+from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -60,6 +61,10 @@ _PAGE: Final = re.compile(
     rb'\x2c\x15[\x80-\xff]{0,4}[\x00-\x7f]\x15\x00\x15\x06\x15\x06\x00\x00'
 )  # fmt: skip
 """The header of a plain data page as ``parquet.py`` writes it, its sizes in groups."""
+_OWNER: Final = {OBJECTS.folder: 'key', GAPS.folder: 'robot'}
+"""The column that says whose a row is, by the table's folder."""
+_COUNTS: Final = ('bytes', 'revision', 'merged', 'received', 'skipped')
+_TIMES: Final = ('t_start', 't_end', 't_from', 't_to')
 _YEARS_US: Final = (-62_135_596_800_000_000, 253_402_300_799_999_999)
 """1 to 9999, those of a date."""
 UNREADABLE: Final = (pa.ArrowException, OSError, MemoryError, ValueError, LookupError, TypeError, OverflowError)
@@ -67,32 +72,33 @@ UNREADABLE: Final = (pa.ArrowException, OSError, MemoryError, ValueError, Lookup
 
 
 def tables(source: Bucket, entries: Sequence[ObjectInfo], columns: Sequence[str], findings: Findings,
-           wanted: Wanted | None = None) -> Iterator[pa.Table]:  # fmt: skip
+           wanted: Wanted | None = None, of: TableSchema = OBJECTS) -> Iterator[pa.Table]:  # fmt: skip
     """The rows of these parts, in their order, some megabytes at a time; a column that a part does not have yet is null.
 
     Row groups that cannot hold what is ``wanted`` are left out. Raises StoreError.
     """
-    schema = narrow(_needed(columns))
-    rows = _Rows(schema, findings)
+    schema = narrow(_needed(columns, of), of)
+    rows = _Rows(schema, findings, of=of)
     for entry, body in _bodies(source, entries):
         if rows.robot != _robot(entry.key) or rows.nbytes > BATCH_BYTES:
             yield from rows.taken(columns)
-            rows = _Rows(schema, findings, _robot(entry.key))
-        for table, size in _contents(source, entry, body, schema, findings, wanted):
+            rows = _Rows(schema, findings, _robot(entry.key), of)
+        for table, size in _contents(source, entry, body, schema, findings, wanted, of):
             rows.add(entry.key, table, size)
             if rows.nbytes > BATCH_BYTES:
                 yield from rows.taken(columns)
-                rows = _Rows(schema, findings, rows.robot)
+                rows = _Rows(schema, findings, rows.robot, of)
     yield from rows.taken(columns)
 
 
-def whole(source: Bucket, entries: Sequence[ObjectInfo], findings: Findings) -> Iterator[tuple[ObjectInfo, pa.Table]]:
+def whole(source: Bucket, entries: Sequence[ObjectInfo], findings: Findings,
+          of: TableSchema = OBJECTS) -> Iterator[tuple[ObjectInfo, pa.Table]]:  # fmt: skip
     """All columns of each of these parts of which nothing is left out. Raises StoreError."""
-    schema = narrow(arrow_schema().names)
+    schema = narrow(arrow_schema(of).names, of)
     for entry, body in _bodies(source, entries):
         found = Findings(lambda _: None)
-        rows = _Rows(schema, found, _robot(entry.key))
-        for table, size in _contents(source, entry, body, schema, found, None):
+        rows = _Rows(schema, found, _robot(entry.key), of)
+        for table, size in _contents(source, entry, body, schema, found, None, of):
             rows.add(entry.key, table, size)
         made = list(rows.taken(schema.names))
         if not len(found):
@@ -101,16 +107,16 @@ def whole(source: Bucket, entries: Sequence[ObjectInfo], findings: Findings) -> 
             findings.add(one.key, one.why, one.rows)
 
 
-@lru_cache(maxsize=1)
-def arrow_schema() -> pa.Schema:
-    """The columns of the catalogue as pyarrow has them."""
+@lru_cache(maxsize=2)
+def arrow_schema(of: TableSchema = OBJECTS) -> pa.Schema:
+    """The columns of a table as pyarrow has them."""
     kinds = {STRING: pa.string(), INT32: pa.int32(), INT64: pa.int64(), DOUBLE: pa.float64(), TIME: pa.timestamp('us', tz='UTC')}
-    return pa.schema([pa.field(name, kinds[kind], nullable=name not in REQUIRED) for name, kind in COLUMNS.items()])
+    return pa.schema([pa.field(name, kinds[kind], nullable=name not in of.required) for name, kind in of.columns.items()])
 
 
-def narrow(columns: Sequence[str]) -> pa.Schema:
+def narrow(columns: Sequence[str], of: TableSchema = OBJECTS) -> pa.Schema:
     """These columns."""
-    schema = arrow_schema()
+    schema = arrow_schema(of)
     return pa.schema([schema.field(name) for name in columns])
 
 
@@ -121,9 +127,9 @@ def footer(source: Bucket, entry: ObjectInfo) -> Mapping[bytes, bytes]:
     return _opened(_tail(source, entry)).metadata.metadata or {}
 
 
-def _needed(columns: Sequence[str]) -> list[str]:
-    """In the order of the schema; a row's key is always looked at."""
-    return [name for name in arrow_schema().names if name in columns or name == 'key']
+def _needed(columns: Sequence[str], of: TableSchema) -> list[str]:
+    """In the order of the schema; what tells whose a row is, is always looked at."""
+    return [name for name in arrow_schema(of).names if name in columns or name == _OWNER[of.folder]]
 
 
 def _robot(key: str) -> str:
@@ -148,13 +154,13 @@ def _bodies(source: Bucket, entries: Sequence[ObjectInfo]) -> Iterator[tuple[Obj
 
 
 def _contents(source: Bucket, entry: ObjectInfo, body: bytes | ObjectRefused | None, schema: pa.Schema, findings: Findings,
-              wanted: Wanted | None) -> Iterator[tuple[pa.Table, int]]:  # fmt: skip
+              wanted: Wanted | None, of: TableSchema) -> Iterator[tuple[pa.Table, int]]:  # fmt: skip
     """The rows of one part, as far as it is one, and how many bytes they take."""
     done, part = 0, None
     try:
         if isinstance(body, ObjectRefused) or not is_path(entry.key):
             raise ValueError('its name is no path, or it is larger than its listing says')
-        part = _Part(source, entry, body)
+        part = _Part(source, entry, body, of)
         for table, size in part.tables(schema, wanted):
             yield table, size
             done += len(table)
@@ -171,8 +177,9 @@ def _why(error: BaseException) -> str:
 class _Rows:
     """Rows of parts of one robot, until there are enough of them to be looked at and handed on."""
 
-    def __init__(self, schema: pa.Schema, findings: Findings, robot: str = '') -> None:
+    def __init__(self, schema: pa.Schema, findings: Findings, robot: str = '', of: TableSchema = OBJECTS) -> None:
         self.robot = robot
+        self._of = of
         self.nbytes = 0
         self._schema = schema
         self._findings = findings
@@ -189,8 +196,8 @@ class _Rows:
         if not self._parts:
             return
         table = self._readable(pa.concat_tables(self._tables).combine_chunks())
-        table = self._only(table, _is_own(table, self.robot), 'are not of its robot')
-        yield self._only(table, _is_sane(table), 'make no sense').select(columns)
+        table = self._only(table, _is_own(table, self.robot, self._of), 'are not of its robot')
+        yield self._only(table, _is_sane(table, self._of), 'make no sense').select(columns)
 
     def _readable(self, table: pa.Table) -> pa.Table:
         """Without parts whose texts are none: what is no UTF-8 would be an error wherever it is read."""
@@ -233,25 +240,31 @@ def _fit(table: pa.Table, schema: pa.Schema) -> pa.Table:
     )
 
 
-def _is_own(table: pa.Table, robot: str) -> pa.ChunkedArray:
+def _is_own(table: pa.Table, robot: str, of: TableSchema) -> pa.ChunkedArray:
     """Whether a row is one of the robot whose folder it lies in."""
+    if of is GAPS:
+        return pc.fill_null(pc.equal(table['robot'], robot), fill_value=False)
     own = pc.fill_null(pc.starts_with(table['key'], f'{robot}/'), fill_value=False)
     if 'robot' in table.column_names:
         own = pc.and_(own, pc.fill_null(pc.equal(table['robot'], robot), fill_value=True))
     return own
 
 
-def _is_sane(table: pa.Table) -> pa.ChunkedArray:
+def _is_sane(table: pa.Table, of: TableSchema) -> pa.ChunkedArray:
     """Whether what must be there is, and dates are dates; of the columns that were read."""
-    sane = pc.is_valid(table['key'])
-    for name in (name for name in REQUIRED if name in table.column_names):
+    sane = pc.is_valid(table[_OWNER[of.folder]])
+    for name in (name for name in of.required if name in table.column_names):
         sane = pc.and_(sane, pc.is_valid(table[name]))
     if 'bucket' in table.column_names:
         named = [each for each in pc.unique(table['bucket']).to_pylist() if each is not None and is_name(each)]
         sane = pc.and_(sane, pc.is_in(table['bucket'], value_set=pa.array(named, pa.string())))
-    if 'bytes' in table.column_names:
-        sane = pc.and_(sane, pc.fill_null(pc.greater_equal(table['bytes'], 0), fill_value=False))
-    for name in (name for name in ('t_start', 't_end') if name in table.column_names):
+    if 'what' in table.column_names:
+        sane = pc.and_(sane, pc.is_in(table['what'], value_set=pa.array(KINDS)))
+    for name in (name for name in _COUNTS if name in table.column_names):
+        sane = pc.and_(sane, pc.fill_null(pc.greater_equal(table[name], 0), fill_value=name not in of.required))
+    if {'from_ns', 'to_ns'}.issubset(table.column_names):
+        sane = pc.and_(sane, pc.fill_null(pc.less_equal(table['from_ns'], table['to_ns']), fill_value=True))
+    for name in (name for name in _TIMES if name in table.column_names):
         micros = table[name].cast(pa.int64())
         inside = pc.and_(pc.greater_equal(micros, _YEARS_US[0]), pc.less_equal(micros, _YEARS_US[1]))
         sane = pc.and_(sane, pc.fill_null(inside, fill_value=True))
@@ -273,10 +286,10 @@ class _Chunk(NamedTuple):
 class _Part:
     """A file that should be a part. What it does is on the caller's thread; anything of ``UNREADABLE`` says that it is none."""
 
-    def __init__(self, source: Bucket, entry: ObjectInfo, body: bytes | None) -> None:
+    def __init__(self, source: Bucket, entry: ObjectInfo, body: bytes | None, of: TableSchema) -> None:
         """``body`` is all of it where it is small."""
         check_size(entry.size, MOST_BYTES)
-        self._source, self._entry, self._body = source, entry, body
+        self._source, self._entry, self._body, self._of = source, entry, body, of
         self._size = entry.size if body is None else len(body)
         self._file = _opened(_tail(source, entry) if body is None else body)
         self._about = self._file.metadata
@@ -286,7 +299,7 @@ class _Part:
 
     def tables(self, schema: pa.Schema, wanted: Wanted | None) -> Iterator[tuple[pa.Table, int]]:
         """The columns of the schema that it has, and how many bytes they take."""
-        places = _places(self._file, schema)
+        places = _places(self._file, schema, self._of)
         groups = range(self._about.num_row_groups)
         if wanted is not None and len(groups) > 1:
             bounds = _bounds(wanted)
@@ -412,13 +425,13 @@ def _opened(tail: bytes) -> pq.ParquetFile:
     return pq.ParquetFile(pa.BufferReader(tail), pre_buffer=False, **limits)
 
 
-def _places(file: pq.ParquetFile, schema: pa.Schema) -> dict[str, int]:
+def _places(file: pq.ParquetFile, schema: pa.Schema, of: TableSchema) -> dict[str, int]:
     """The columns of a schema that a file has, and their numbers. Raises ValueError where one is not as ours are."""
-    found, ours = file.schema_arrow, arrow_schema()
+    found, ours = file.schema_arrow, arrow_schema(of)
     if found.equals(ours):
         return {name: ours.get_field_index(name) for name in schema.names}
     names = found.names
-    for field in (ours.field(name) for name in schema.names if name in names or name in REQUIRED):
+    for field in (ours.field(name) for name in schema.names if name in names or name in of.required):
         place = names.index(field.name) if names.count(field.name) == 1 else -1
         if place < 0 or found.field(place).type != field.type or file.schema.column(place).path != field.name:
             raise ValueError(f'it has no column {field.name} of type {field.type}')

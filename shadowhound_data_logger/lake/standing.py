@@ -16,7 +16,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Final
 
-from shadowhound_data_logger.catalogue.schema import part_key, prefix
+from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -36,7 +36,7 @@ _MENDED: Final = re.compile(r'_mended(_[0-9a-f]{16})?\.parquet$')
 
 @dataclass(frozen=True, slots=True)
 class Day:
-    """One folder of the catalogue, as it was listed."""
+    """One folder of the catalogue or the gap journal, as it was listed."""
 
     robot: str
     date: str
@@ -53,9 +53,9 @@ class Day:
         return any(_MENDED.search(entry.key) for entry in self.entries)
 
 
-def folder_of(robot: str, date: str) -> str:
+def folder_of(robot: str, date: str, of: TableSchema = OBJECTS) -> str:
     """What the keys of a robot's parts of a date begin with."""
-    return f'{prefix(robot)}date={date}/'
+    return f'{of.prefix(robot)}date={date}/'
 
 
 def name_of(key: str) -> str:
@@ -63,16 +63,16 @@ def name_of(key: str) -> str:
     return key.rpartition('/')[2]
 
 
-def compacted_key(robot: str, date: str, leaves: Iterable[str], *, is_mended: bool) -> str:
+def compacted_key(robot: str, date: str, leaves: Iterable[str], *, is_mended: bool, of: TableSchema = OBJECTS) -> str:
     """The key of the part that is made of these: the same for all who compact the same."""
     digest = hashlib.sha256('\n'.join(sorted(leaves)).encode()).hexdigest()[:16]
-    return part_key(robot, date, f'{date.replace("-", "")}_compacted_{digest}{"_mended" * is_mended}')
+    return of.part_key(robot, date, f'{date.replace("-", "")}_compacted_{digest}{"_mended" * is_mended}')
 
 
 def mended_key(robot: str, date: str, keys: Iterable[str]) -> str:
     """The key of a part with rows that ``reindex`` found missing."""
     digest = hashlib.sha256('\n'.join(sorted(keys)).encode()).hexdigest()[:16]
-    return part_key(robot, date, f'{date.replace("-", "")}_mended_{digest}')
+    return OBJECTS.part_key(robot, date, f'{date.replace("-", "")}_mended_{digest}')
 
 
 def is_compacted(key: str) -> bool:
@@ -90,33 +90,33 @@ def robots(source: Bucket) -> list[str]:
     return [name for name in source.folders('') if is_name(name)]
 
 
-def dates_of(source: Bucket, robot: str, findings: Findings) -> list[str]:
+def dates_of(source: Bucket, robot: str, findings: Findings, of: TableSchema = OBJECTS) -> list[str]:
     """The dates of which a robot has rows. Raises StoreError."""
     try:
-        return [name[5:] for name in source.folders(prefix(robot)) if _FOLDER.fullmatch(name)]
+        return [name[5:] for name in source.folders(of.prefix(robot)) if _FOLDER.fullmatch(name)]
     except ObjectRefused as error:
-        findings.add(prefix(robot), f'{UNLISTED}: {error}')
+        findings.add(of.prefix(robot), f'{UNLISTED}: {error}')
         return []
 
 
 def days(source: Bucket, named: Sequence[str], dates: Sequence[str] | None, pool: Executor, findings: Findings,
-         has: Callable[[str], bool] = lambda _: True) -> list[Day]:  # fmt: skip
+         has: Callable[[str], bool] = lambda _: True, of: TableSchema = OBJECTS) -> list[Day]:  # fmt: skip
     """The folders of these robots and dates (None: of all that there are, those it ``has``) that hold something, oldest first.
 
     No other folder is listed, and a footer is read only of compacted parts that do not stand alone. Raises StoreError.
     """
     pairs = [(robot, date) for robot in named
-             for date in (filter(has, dates_of(source, robot, findings)) if dates is None else dates)]  # fmt: skip
-    found = pool.map(lambda pair: _day(source, pair[0], pair[1], findings), sorted(pairs, key=lambda pair: pair[::-1]))
+             for date in (filter(has, dates_of(source, robot, findings, of)) if dates is None else dates)]  # fmt: skip
+    found = pool.map(lambda pair: _day(source, pair[0], pair[1], findings, of), sorted(pairs, key=lambda pair: pair[::-1]))
     return [day for day in found if day.entries]
 
 
-def _day(source: Bucket, robot: str, date: str, findings: Findings) -> Day:
+def _day(source: Bucket, robot: str, date: str, findings: Findings, of: TableSchema) -> Day:
     """What a part says that is no good, or contradicts others, is left out: neither read nor stood for."""
     try:
-        entries = [entry for entry in source.list(folder_of(robot, date)) if entry.key.endswith('.parquet')]
+        entries = [entry for entry in source.list(folder_of(robot, date, of)) if entry.key.endswith('.parquet')]
     except ObjectRefused as error:
-        findings.add(folder_of(robot, date), f'{UNLISTED}: {error}')
+        findings.add(folder_of(robot, date, of), f'{UNLISTED}: {error}')
         entries = []
     leaves: dict[str, frozenset[str]] = {}
     for entry in [entry for entry in entries if is_compacted(entry.key)] if len(entries) > 1 else []:

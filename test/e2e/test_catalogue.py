@@ -50,7 +50,7 @@ def listed(store: S3Store, robot: str) -> dict[tuple[str, str], ObjectInfo]:
 def catalogued(store: S3Store, robot: str) -> list[dict[str, Any]]:
     """All rows of all parts; each has the schema and the date of its folder."""
     rows = []
-    for info in store.list(schema.BUCKET, schema.prefix(robot)):
+    for info in store.list(schema.BUCKET, schema.OBJECTS.prefix(robot)):
         table = pyarrow.parquet.read_table(io.BytesIO(store.get(schema.BUCKET, info.key)))
         assert table.schema.equals(reading.arrow_schema())
         for row in table.to_pylist():
@@ -84,7 +84,10 @@ def patrol(processes: Processes, seaweed: Tower, store: S3Store) -> int:
     try:
         until(lambda: node.topic('/odom').get('stored', 0) >= 2, 'the robot walks')
         logger.start_mission('patrol', 'go round')
-        until(lambda: any(store.list(schema.BUCKET, schema.prefix(processes.robot))), 'a part is there while the robot walks')
+        until(
+            lambda: any(store.list(schema.BUCKET, schema.OBJECTS.prefix(processes.robot))),
+            'a part is there while the robot walks',
+        )
         node.kill()
         killed_ns = time.time_ns()
         node = processes.node(seaweed.environment(), FAST)

@@ -27,7 +27,7 @@ ROWS: Final = 1_000_000
 
 def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str = 'thor') -> str:
     """As a robot that may write below its own prefix puts it; its key."""
-    key = f'{schema.prefix(robot)}date={DATE}/{name}.parquet'
+    key = f'{schema.OBJECTS.prefix(robot)}date={DATE}/{name}.parquet'
     path = settings.directory / schema.BUCKET / key
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(body)

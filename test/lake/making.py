@@ -69,7 +69,7 @@ def minutes(days: Sequence[int] = (0, 1), hours: Sequence[int] = (11, 12), robot
 def add_part(store: ObjectStore, rows: Sequence[schema.Row], name: str, folder: Path) -> str:
     """A part of the catalogue, as the robot delivers it."""
     robot = str(rows[0]['robot'])
-    key = schema.part_key(robot, schema.date_of(rows[0]), name)
+    key = schema.OBJECTS.part_key(robot, schema.date_of(rows[0]), name)
     add(store, folder, key, parts.encode(rows), {'robot': robot})
     return key
 

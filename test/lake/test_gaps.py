@@ -1,0 +1,287 @@
+"""The gap journal in the store: the newest statement counts, in whatever order it comes; and what is known of a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lake.making import DAY_NS, MINUTE_NS, NOON_NS, add, folder_store
+
+from shadowhound_data_logger import lake
+from shadowhound_data_logger.catalogue import parts
+from shadowhound_data_logger.catalogue.gaps import GAP, GAPS, WITHDRAWN, Statement, complete, date_of, statement
+from shadowhound_data_logger.catalogue.schema import BUCKET
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.compact import compact
+from shadowhound_data_logger.lake.gaps import Stretch, coverage, folded, known, of_rows
+from shadowhound_data_logger.lake.reading import arrow_schema
+from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.stores import open_store
+
+IMU = {'sink': 'objects', 'topic': '/imu', 'session': 1, 'grade': 'exact'}
+
+
+def lost(name: str, first_s: float, last_s: float, revision: int = 1, what: str = GAP, **columns: Any) -> Statement:
+    """A gap so many seconds after noon."""
+    columns = {'kind': 'missed', 'cause': 'transport', 'count': 5, 'merged': 1, 'publisher': 'imu', **IMU, **columns}
+    times = {'from_ns': NOON_NS + int(first_s * SECOND), 'to_ns': NOON_NS + int(last_s * SECOND)}
+    return statement('thor', what, f'j/{name}', revision, **columns, **times)
+
+
+def mark(last_s: float, revision: int = 1, first_s: float = 0.0, **columns: Any) -> Statement:
+    """A watermark that reaches from one second after noon to another."""
+    columns = {**IMU, 'received': int(last_s * 50), 'skipped': 0, **columns}
+    return complete(
+        'thor', 'j', revision, from_ns=NOON_NS + int(first_s * SECOND), to_ns=NOON_NS + int(last_s * SECOND), **columns
+    )
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> StoreSettings:
+    return folder_store(tmp_path)
+
+
+def tell(store: StoreSettings, folder: Path, *rows: Statement, name: str = 'a') -> None:
+    """Parts with these statements, as a robot delivers them."""
+    with closing(open_store(store, UploadSettings())) as target:
+        for date in sorted({date_of(row) for row in rows}):
+            found = [row for row in rows if date_of(row) == date]
+            add(target, folder / 'tmp', GAPS.part_key('thor', date, name), parts.encode(found, GAPS), {'robot': 'thor'})
+
+
+def ask(store: StoreSettings, first_s: float, last_s: float, topic: str = '/imu') -> lake.Known:
+    first_ns, last_ns = (NOON_NS + int(at_s * SECOND) for at_s in (first_s, last_s))
+    return known('thor', topic, first_ns, last_ns, source=Bucket(store, BUCKET))
+
+
+def seconds(found: lake.Known) -> list[tuple[float, float, tuple[str, ...], str]]:
+    return [((each.begin_ns - NOON_NS) / SECOND, (each.end_ns - NOON_NS) / SECOND, each.causes, each.grade)
+            for each in found.stretches]  # fmt: skip
+
+
+def test_without_a_statement_nobody_knows(store: StoreSettings) -> None:
+    """No gap is known to be none where nothing was told: of a robot that never told, and of a topic."""
+    found = ask(store, 0, 10)
+    assert seconds(found) == [(0, 10, (), '')]
+    assert (found.is_whole, found.stretches[0].is_open, found.complete_ns) == (False, True, NOON_NS)
+
+
+def test_below_the_watermark_no_row_is_no_gap_and_above_it_nobody_knows(store: StoreSettings, tmp_path: Path) -> None:
+    """Whole, a gap, whole, and then what is not told yet."""
+    tell(store, tmp_path, mark(60), lost('1', 20, 23))
+    found = ask(store, 10, 90)
+    assert seconds(found) == [
+        (10, 20, (), 'exact'), (20, 23, ('transport',), 'exact'), (23, 60, (), 'exact'), (60, 90, (), ''),
+    ]  # fmt: skip
+    assert found.complete_ns == NOON_NS + 60 * SECOND
+    assert [(gap.cause, gap.count) for gap in found.gaps] == [('transport', 5)]
+    assert ask(store, 25, 60).is_whole
+    assert not ask(store, 25, 61).is_whole
+
+
+def test_a_gap_that_is_told_is_known_above_the_watermark_too(store: StoreSettings, tmp_path: Path) -> None:
+    """As one that nobody can place is: it is listed, and in no time."""
+    untimed = statement('thor', GAP, 'j/9', 1, **IMU, kind='dropped', cause='queue_full', count=7)
+    tell(store, tmp_path, mark(10), lost('1', 8, 14), untimed)
+    found = ask(store, 5, 20)
+    assert seconds(found) == [
+        (5, 8, (), 'exact'),
+        (8, 10, ('transport',), 'exact'),
+        (10, 14, ('transport',), ''),
+        (14, 20, (), ''),
+    ]
+    assert [gap.count for gap in found.untimed] == [7]
+
+
+def test_what_is_only_received_is_not_known(store: StoreSettings, tmp_path: Path) -> None:
+    """Without numbers or a rhythm a watermark tells what became of what came, and nothing of what did not."""
+    tell(store, tmp_path, mark(60, grade='received-only'), mark(60, grade='estimated', topic='/odom'))
+    assert seconds(ask(store, 0, 60)) == [(0, 60, (), '')]
+    assert seconds(ask(store, 0, 60, '/odom')) == [(0, 60, (), 'estimated')]
+
+
+def test_messages_of_another_type_are_nothing_of_the_topic(store: StoreSettings, tmp_path: Path) -> None:
+    """They are listed, and the time is whole."""
+    tell(store, tmp_path, mark(60), lost('1', 0, 60, kind='rejected', cause='wrong_type'))
+    found = ask(store, 0, 60)
+    assert (found.is_whole, len(found.gaps)) == (True, 1)
+
+
+def test_the_time_between_two_sessions_is_not_known_unless_told(store: StoreSettings, tmp_path: Path) -> None:
+    """A node that was off: numbers that went on tell what was lost, as soon as they come."""
+    tell(store, tmp_path, mark(60), mark(300, 2, 200, session=2))
+    assert seconds(ask(store, 0, 300)) == [(0, 60, (), 'exact'), (60, 200, (), ''), (200, 300, (), 'exact')]
+    tell(store, tmp_path, lost('2', 60, 200, 3, cause='restart', session=2), name='b')
+    assert seconds(ask(store, 0, 300)) == [(0, 60, (), 'exact'), (60, 200, ('restart',), ''), (200, 300, (), 'exact')]
+
+
+def test_a_watermark_goes_back_when_an_object_waits_again(store: StoreSettings, tmp_path: Path) -> None:
+    """The newest counts, not the furthest: a quarantined object that is retried is in no row, and not in the store yet."""
+    tell(store, tmp_path, mark(3000), lost('1', 30, 31, kind='quarantined', cause='AccessDenied'))
+    tell(store, tmp_path, mark(30, 2), lost('1', 30, 31, 2, WITHDRAWN), name='b')
+    assert seconds(ask(store, 0, 60)) == [(0, 30, (), 'exact'), (30, 60, (), '')]
+    tell(store, tmp_path, mark(3100, 3), name='c')
+    assert ask(store, 0, 60).is_whole
+
+
+def test_a_gap_over_midnight_is_found_from_either_day(store: StoreSettings, tmp_path: Path) -> None:
+    """It lies under the date of its end, and is asked for by any time that it reaches into."""
+    day_s = DAY_NS // SECOND
+    tell(store, tmp_path, lost('1', 100, 2 * day_s), mark(2 * day_s + 50))
+    for first_s in (100, day_s, 2 * day_s - 5):
+        assert seconds(ask(store, first_s, first_s + 1))[0][2] == ('transport',)
+    assert ask(store, 0, 100).is_whole
+
+
+def test_a_gap_that_moves_to_another_day_is_told_once(store: StoreSettings, tmp_path: Path) -> None:
+    """Its withdrawal stays under the old date; who reads both days sees it once, who reads either sees what holds."""
+    day_s = DAY_NS // SECOND
+    tell(store, tmp_path, lost('1', 100, day_s + 100), mark(day_s + 200))
+    tell(store, tmp_path, lost('1', 100, day_s + 100, 2, WITHDRAWN), lost('1', 100, 200, 2), name='b')
+    assert [gap.to_ns for gap in ask(store, 0, day_s + 200).gaps] == [NOON_NS + 200 * SECOND]
+    assert ask(store, day_s, day_s + 200).is_whole
+
+
+def test_a_part_of_a_time_needs_no_second_look(store: StoreSettings, tmp_path: Path) -> None:
+    """``between`` answers as ``known`` would; what is outside is an error."""
+    tell(store, tmp_path, mark(60), *(lost(str(at), at, at + 0.5) for at in range(0, 60, 3)))
+    found = ask(store, 0, 90)
+    for first_s, last_s in ((0, 90), (3.2, 3.4), (3.5, 6), (59, 61), (70, 80), (5, 5)):
+        first_ns, last_ns = NOON_NS + int(first_s * SECOND), NOON_NS + int(last_s * SECOND)
+        assert found.between(first_ns, last_ns) == ask(store, first_s, last_s)
+    with pytest.raises(ValueError, match='is not within'):
+        found.between(NOON_NS, NOON_NS + 91 * SECOND)
+
+
+def test_a_question_that_is_none(store: StoreSettings) -> None:
+    """It says what is wrong, and what is allowed."""
+    with pytest.raises(SettingError, match='sink'):
+        known('thor', '/imu', 0, 1, sink='tape', source=Bucket(store, BUCKET))
+    with pytest.raises(SettingError, match='until'):
+        known('thor', '/imu', 5, 1, source=Bucket(store, BUCKET))
+
+
+STATEMENTS = st.builds(
+    lambda name, revision, what, first, count: lost(str(name), first, first + 1, revision, what, count=count),
+    st.integers(0, 4), st.integers(0, 4), st.sampled_from([GAP, WITHDRAWN]), st.integers(0, 90), st.integers(0, 3),
+) | st.builds(
+    lambda last, revision, session: mark(last, revision, session=session),
+    st.integers(1, 5000), st.integers(0, 4), st.integers(1, 2),
+)  # fmt: skip
+
+
+def arrow(rows: Sequence[Statement]) -> pa.Table:
+    return pa.Table.from_pylist(list(rows), schema=arrow_schema(GAPS))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(STATEMENTS, max_size=14), st.randoms(use_true_random=False), st.data())
+def test_merging_is_the_same_in_any_order(rows: list[Statement], random: Any, data: st.DataObject) -> None:
+    """Shuffled, repeated, merged piece by piece or at once: what counts is the same."""
+    at_once = folded(arrow(rows))
+    shuffled = [*rows, *rows[:3]]
+    random.shuffle(shuffled)
+    cut = data.draw(st.integers(0, len(shuffled)))
+    pieces = [folded(arrow(shuffled[:cut])), folded(arrow(shuffled[cut:]))]
+    assert folded(pa.concat_tables(pieces)) == at_once
+    of = 'thor', 'objects', '/imu', NOON_NS, NOON_NS + 100 * SECOND
+    assert of_rows(*of, at_once.to_pylist()) == of_rows(*of, folded(arrow(shuffled)).to_pylist())
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 50), st.integers(0, 9), st.sampled_from('ab')), max_size=12),
+       st.lists(st.tuples(st.integers(0, 50), st.integers(1, 30)), max_size=4))  # fmt: skip
+def test_every_instant_is_in_one_stretch_and_says_what_the_rows_say(gaps: list[tuple[int, int, str]],
+                                                                     marks: list[tuple[int, int]]) -> None:  # fmt: skip
+    """Against asking each second by itself."""
+    rows = [lost(str(number), first, first + size, cause=cause) for number, (first, size, cause) in enumerate(gaps)]
+    rows += [mark(first + size, first_s=first, session=number) for number, (first, size) in enumerate(marks)]
+    found = of_rows('thor', 'objects', '/imu', NOON_NS, NOON_NS + 60 * SECOND, rows)
+    for second in range(60):
+        (each,) = [each for each in seconds(found) if each[0] <= second < each[1]]
+        assert set(each[2]) == {cause for first, size, cause in gaps if first <= second < first + size}
+        assert each[3] == ('exact' if any(first <= second < first + size for first, size in marks) else '')
+    ends = [NOON_NS, *(each.end_ns for each in found.stretches)]
+    assert [each.begin_ns for each in found.stretches] == ends[:-1]
+    assert ends[-1] == NOON_NS + 60 * SECOND
+
+
+def test_a_compacted_day_gives_the_same_answers_and_keeps_withdrawals(store: StoreSettings, tmp_path: Path) -> None:
+    """Superseded statements are gone from it; a part that comes late with an older one changes nothing."""
+    for number in range(20):
+        rows = [lost('1', 5, 6, number), lost('2', 7, 8, number, GAP if number < 19 else WITHDRAWN), mark(number + 1, number)]
+        tell(store, tmp_path, *rows, lost(f'x{number}', number, number + 0.5), name=f'p{number:02}')
+    before = ask(store, 0, 30)
+    with closing(open_store(store, UploadSettings())) as target:
+        source = Bucket(store, BUCKET)
+        (done,) = compact(source, target, before=f'{utc(NOON_NS + DAY_NS):%Y-%m-%d}')
+        assert (done.merged, len(source.list('thor/_gaps/'))) == (20, 21)
+        assert ask(store, 0, 30) == before
+        assert [each.deleted for each in compact(source, target, before='2030', grace=timedelta(0))] == [20]
+        (entry,) = source.list('thor/_gaps/')
+    rows = pa.parquet.read_table(store.directory / BUCKET / entry.key).to_pylist()
+    assert sorted(row['what'] for row in rows) == ['complete', *21 * ['gap'], 'withdrawn']
+    tell(store, tmp_path, lost('2', 7, 8, 3), name='late')
+    assert ask(store, 0, 30) == before
+
+
+def test_sql_sees_gaps_and_watermarks(store: StoreSettings, tmp_path: Path) -> None:
+    """Restricted by the flags; withdrawn gaps are not there; flags of objects are refused."""
+    tell(store, tmp_path, mark(60), lost('1', 5, 6), lost('2', 7, 8, 2, WITHDRAWN), lost('3', 9, 12, cause='restart', count=None))
+    tell(store, tmp_path, lost('4', 7, 8, topic='/odom'), mark(90, topic='/odom'), name='b')
+    source = Bucket(store, BUCKET)
+    found = lake.sql('SELECT topic, cause, count FROM gaps ORDER BY topic, from_ns', source).to_pylist()
+    assert [tuple(row.values()) for row in found] == [
+        ('/imu', 'transport', 5), ('/imu', 'restart', None), ('/odom', 'transport', 5),
+    ]  # fmt: skip
+    since = utc(NOON_NS + 10 * SECOND)
+    (row,) = lake.sql('SELECT kind, t_to FROM gaps', source, topic='/imu', since=since).to_pylist()
+    assert (row['kind'], row['t_to']) == ('missed', utc(NOON_NS + 12 * SECOND))
+    marks = lake.sql('SELECT topic, to_ns FROM watermarks ORDER BY topic', source).to_pydict()
+    assert marks == {'topic': ['/imu', '/odom'], 'to_ns': [NOON_NS + 60 * SECOND, NOON_NS + 90 * SECOND]}
+    with pytest.raises(LakeError, match='where'):
+        lake.sql('SELECT * FROM gaps', source, where='x > 1')
+
+
+def test_the_catalogue_does_not_see_the_journal(store: StoreSettings, tmp_path: Path) -> None:
+    """Its parts are no part of the catalogue, and no object that lacks a row."""
+    tell(store, tmp_path, mark(60))
+    source = Bucket(store, BUCKET)
+    assert lake.objects(source).count_rows() == 0
+    with closing(open_store(store, UploadSettings())) as target:
+        from shadowhound_data_logger.lake.reindex import reindex
+
+        assert (reindex(source, target, 'thor').listed, len(source.list('thor/'))) == (0, 1)
+
+
+def test_coverage_by_the_hour(store: StoreSettings, tmp_path: Path) -> None:
+    """Each second of an hour is stored, downsampled, lost by a cause, or not known yet."""
+    hour = 3600
+    marks = [mark(60 * minute, minute, skipped=0 if minute <= 30 else minute) for minute in range(1, 91)]
+    tell(store, tmp_path, *marks, lost('1', 600, 630), lost('2', 620, 640, cause='restart'))
+    tell(store, tmp_path, mark(hour, topic='/odom', skipped=0), name='b')
+    imu, odom = coverage(NOON_NS, NOON_NS + 2 * hour * SECOND, robot='thor', source=Bucket(store, BUCKET))
+    assert dict(imu.hours) == {
+        NOON_NS: {'restart': 20.0, 'stored': 1700.0, 'transport': 20.0, 'downsampled': 1860.0},  # a watermark in ten minutes
+        NOON_NS + hour * SECOND: {'downsampled': 1800.0, 'not known yet': 1800.0},
+    }  # fmt: skip
+    assert dict(odom.hours) == {NOON_NS: {'stored': 3600.0}, NOON_NS + hour * SECOND: {'not known yet': 3600.0}}
+    half = NOON_NS + 30 * MINUTE_NS
+    (part,) = coverage(half, half + MINUTE_NS, robot='thor', topic='/imu', source=Bucket(store, BUCKET))
+    assert dict(part.hours) == {NOON_NS: {'downsampled': 60.0}}
+
+
+def test_a_stretch_says_what_it_is() -> None:
+    """Whole, open, or neither."""
+    kinds = [Stretch(0, 1, (), 'exact'), Stretch(0, 1, (), ''), Stretch(0, 1, ('restart',), ''), Stretch(0, 1, ('a',), 'exact')]
+    assert [(each.is_whole, each.is_open) for each in kinds] == [(True, False), (False, True), (False, False), (False, False)]
