@@ -1,7 +1,7 @@
 """The front camera: draws what it sees of the building from the robot's pose, 640 by 480 pixels, a few ms a frame.
 
 An ideal pinhole. Each column of the picture is one ray in the plane; floor and ceiling are looked up by perspective, walls
-and furniture are vertical spans of a column. Every pixel becomes one index into the atlas (see ``textures``).
+and furniture are vertical spans of a column. Every pixel becomes one index into the atlas (see ``surfaces``).
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowhound_data_logger.sim import glyphs
-from shadowhound_data_logger.sim.floor_plan import CEILING, ROOMS
-from shadowhound_data_logger.sim.raycast import Crossings, cross
-from shadowhound_data_logger.sim.textures import (
+from shadowhound_data_logger.sim.floor_plan import CEILING, ROOMS, Crossings, cross
+from shadowhound_data_logger.sim.surfaces import (
     FACE,
     LEVELS,
     MAP_COLUMNS,

@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowhound_data_logger.sim.floor_plan import CEILING, REFLECTIVITY
-from shadowhound_data_logger.sim.raycast import Crossings, cross
+from shadowhound_data_logger.sim.floor_plan import CEILING, REFLECTIVITY, Crossings, cross
 from shadowhound_data_logger.sim.world import BodyPose, World
 
 AZIMUTHS: Final = 800

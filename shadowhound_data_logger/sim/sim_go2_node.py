@@ -7,11 +7,13 @@ one line of JSON with what it published: ``{"published": {"/imu": 3000, ...}}``.
 
 from __future__ import annotations
 
+import heapq
 import json
+import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from types import FrameType
 from typing import Any, Final
@@ -27,7 +29,6 @@ from rclpy.utilities import remove_ros_args
 from shadowhound_data_logger.config import FOREIGN
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.sim.messages import SimulatedSensor, SimulatedTopic, sources
-from shadowhound_data_logger.sim.schedule import schedule
 from shadowhound_data_logger.sim.world import World
 
 LINGER_S: Final = 0.5
@@ -72,6 +73,28 @@ def _checked(name: str, value: Any, default: Any, metadata: Mapping[str, Any]) -
     if metadata and not metadata['low'] <= value <= metadata['high']:
         raise SettingError(name, value, f'a number, {metadata["low"]:g} to {metadata["high"]:g}')
     return value
+
+
+def count(rate_hz: float, duration_s: float) -> int:
+    """How many samples at 0, 1/rate, 2/rate, ... s lie before ``duration_s``; a product within 1e-6 of a whole is that whole."""
+    return math.ceil(rate_hz * duration_s - 1e-6)
+
+
+def schedule(rates_hz: Mapping[str, float], duration_s: float) -> Iterator[tuple[float, str]]:
+    """(seconds since the start, name) of every sample in the order of time, for ever where ``duration_s`` is 0."""
+    order = list(rates_hz)
+    last = {name: count(rates_hz[name], duration_s) if duration_s else math.inf for name in order}
+    heap = [(0.0, place, 0) for place, name in enumerate(order) if last[name] > 0]
+    heapq.heapify(heap)
+    while heap:
+        due, place, number = heap[0]
+        name = order[place]
+        yield due, name
+        following = number + 1
+        if following < last[name]:
+            heapq.heapreplace(heap, (following / rates_hz[name], place, following))
+        else:
+            heapq.heappop(heap)
 
 
 class SimulatedGo2:

@@ -14,10 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowhound_data_logger.sim import gait
-from shadowhound_data_logger.sim.floor_plan import FloorPlan
-from shadowhound_data_logger.sim.noise import Noise
+from shadowhound_data_logger.sim.floor_plan import FloorPlan, cross
 from shadowhound_data_logger.sim.patrol import SPEED, Motion, Patrol
-from shadowhound_data_logger.sim.raycast import cross
 
 GRAVITY: Final = 9.81
 DISCHARGE_S: Final = 5.0
@@ -26,6 +24,28 @@ EMPTY: Final = 8
 """State of charge (percent) below which it does not fall."""
 RANGE_LIMIT: Final = 6.0
 _IMU, _FOOT, _POWER = range(3)
+_NORMALS: Final = 1 << 16
+
+
+class Noise:
+    """Noise that depends on seed, stream and time alone: the same run can be made again, sample by sample.
+
+    It is a table of standard normal numbers, read from a place that each (stream, time) owns.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.table: NDArray[np.float32] = np.random.default_rng(seed).standard_normal(_NORMALS).astype(np.float32)
+
+    def at(self, stream: int, t: float, count: int) -> list[float]:
+        """``count`` normal numbers for one sample of ``stream``, as Python floats."""
+        return self.array(stream, t, count).tolist()  # type: ignore[no-any-return]
+
+    def array(self, stream: int, t: float, count: int) -> NDArray[np.float32]:
+        """``count`` (at most 65,536) normal numbers for one sample of ``stream``."""
+        start = (round(t * 1000) * 7919 + stream * 104_729) % _NORMALS
+        if start + count <= _NORMALS:
+            return self.table[start : start + count]
+        return np.concatenate((self.table[start:], self.table[: start + count - _NORMALS]))
 
 
 class BodyPose(NamedTuple):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowhound_data_logger.sim.schedule import count, schedule
+from shadowhound_data_logger.sim.sim_go2_node import count, schedule
 
 
 @pytest.mark.parametrize(
