@@ -40,8 +40,8 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
         raise click.UsageError('name either a prefix or what to ask the catalogue for')
     with asking():
         from shadowhound_data_logger.lake import fetch as lake  # noqa: PLC0415
-        from shadowhound_data_logger.lake import fetched_rows  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
+        from shadowhound_data_logger.lake.fetched import keep_rows  # noqa: PLC0415
 
         store = the_store_settings()
         begun_s = time.monotonic()
@@ -61,7 +61,7 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
             bar.say(f'{number(here)} of {number(len(wishes))} objects')
 
         found = lake.fetch(wishes, to, source, verify=verify, threads=threads, tell=tell)
-        fetched_rows.keep(to, [row for row in rows if f'{row["bucket"]}/{row["key"]}' not in found.failed])
+        keep_rows(to, [row for row in rows if f'{row["bucket"]}/{row["key"]}' not in found.failed])
     took_s = time.monotonic() - begun_s
     if as_json:
         told = {'to': str(to), 'asked': len(wishes), 'moved': found.moved, 'present': found.present, 'bytes': found.bytes,

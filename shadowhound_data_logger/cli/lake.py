@@ -43,7 +43,7 @@ def lake_status(*, robot: str | None, as_json: bool) -> int:
     """How many files the catalogue has, of which days, and what compacting would do."""
     with asking():
         from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
-        from shadowhound_data_logger.lake.state import state  # noqa: PLC0415
+        from shadowhound_data_logger.lake.standing import state  # noqa: PLC0415
 
     source = default_source(the_store_settings())
     left_out = quietly()

@@ -1,18 +1,29 @@
-"""Where the lake reads: one bucket of a store, as a value that another process may be given."""
+"""The bucket of the lake: what is asked of it, as a value that another process may be given, and how a part is put into it."""
 
 from __future__ import annotations
 
+import hashlib
+import tempfile
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TypeVar
+from pathlib import Path
+from typing import Final, TypeVar
 
-from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.catalogue.parts import CONTENT_TYPE
+from shadowhound_data_logger.catalogue.schema import BUCKET, SENSOR
+from shadowhound_data_logger.errors import ForeignObject
+from shadowhound_data_logger.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.stores.base import ObjectStore
 
+THREADS: Final = 16
+"""Requests on their way at a time; each waits, most of its time, for the server."""
 _Answer = TypeVar('_Answer')
 
 
@@ -50,6 +61,23 @@ class Bucket:
 
     def _ask(self, ask: Callable[[ObjectStore], _Answer]) -> _Answer:
         return steadily(lambda: ask(_reader(self.settings)))
+
+
+def put_part(store: ObjectStore, key: str, robot: str, body: bytes, rows: int) -> None:
+    """A part of the catalogue into the store; returns when it is there. Raises StoreError.
+
+    Its key says which rows are in it: who was there first wrote the same, and is not overwritten.
+    """
+    with tempfile.TemporaryDirectory(prefix='shadowhound-lake-') as folder:
+        path = Path(folder, 'part.parquet')
+        path.write_bytes(body)
+        metadata = {words.ROBOT: robot, words.SENSOR: SENSOR, words.COUNT: str(rows)}
+        item = SpooledObject(
+            id=0, bucket=BUCKET, key=key, path=path, size=len(body), sha256=hashlib.sha256(body).hexdigest(),
+            content_type=CONTENT_TYPE, metadata=metadata, priority=5, created_ns=time.time_ns(),
+        )  # fmt: skip
+        with suppress(ForeignObject):  # written by another version of the library, or in another order
+            store.put(item)
 
 
 @lru_cache(maxsize=16)

@@ -25,11 +25,10 @@ from numpy.typing import NDArray
 from shadowhound_data_logger.catalogue.gaps import GAPS
 from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
 from shadowhound_data_logger.errors import AccessDenied
-from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import folded
-from shadowhound_data_logger.lake.putting import put_part
-from shadowhound_data_logger.lake.reading import THREADS, arrow_schema, whole
+from shadowhound_data_logger.lake.reading import arrow_schema, whole
 from shadowhound_data_logger.lake.scan import unrepeated
 from shadowhound_data_logger.lake.standing import (
     LEAVES,

@@ -1,6 +1,7 @@
-"""What lies in a folder of fetched objects: which files were verified, so that a second run moves and reads nothing.
+"""What lies in a folder of fetched objects: files that were verified, which a second run leaves alone, and their rows.
 
-``DIR/.fetch/`` holds a SQLite file, the lock of the one fetch at a time, and what is not whole yet.
+``DIR/.fetch/`` holds a SQLite file, the lock of the one fetch at a time, and what is not whole yet. The rows lie in the folder as
+in the bucket, so it is a lake of its own: ``MissionDataset('DIR')`` needs no store.
 """
 
 from __future__ import annotations
@@ -20,6 +21,15 @@ from shadowhound_data_logger.errors import LakeError
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from shadowhound_data_logger.catalogue import parts
+from shadowhound_data_logger.catalogue.schema import COLUMNS
+from shadowhound_data_logger.disk import replacing
+from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.lake.standing import mended_key
 
 FOLDER: Final = '.fetch'
 PARTS: Final = f'{FOLDER}/parts'
@@ -133,3 +143,35 @@ class Fetched:
                     raise
                 path.unlink(missing_ok=True)
         raise AssertionError('unreachable')
+
+
+def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """One part for each robot and date among rows as Daft gives them. Raises LakeError where it cannot be written.
+
+    Rows that two fetches brought are shown once, since they count as mended parts.
+
+    A row whose robot is no name is left out: anybody may have written it, and the name becomes a folder's.
+    """
+    plain = [
+        {**{name: row[name] for name in COLUMNS}, **{name: _micros(row, name) for name in ('t_start', 't_end')}} for row in rows
+    ]
+    for robot, date, found in parts.by_folder(enumerate(plain)):
+        if robot is None or not is_name(robot):
+            continue
+        ours = [row for _, row in found]
+        path = folder / mended_key(robot, date, [f'{row["bucket"]}/{row["key"]} {row["t_start_ns"]}' for row in ours])
+        if path.is_file():
+            continue
+        try:
+            part = folder / PARTS / f'rows-{os.getpid()}'  # where the next fetch clears away what a kill left
+            for place in (part.parent, path.parent):
+                place.mkdir(parents=True, exist_ok=True)
+            with replacing(path, part=part) as file:
+                file.write(parts.encode(ours))
+        except OSError as error:
+            raise LakeError(f'{path} cannot be written: {error.strerror}', folder=str(folder)) from error
+
+
+def _micros(row: Mapping[str, Any], name: str) -> int | None:
+    """As a robot writes them: of what has no date there is none."""
+    return None if row[name] is None else int(row[f'{name}_ns']) // 1000

@@ -26,9 +26,9 @@ from shadowhound_data_logger.catalogue.schema import BUCKET, UNDATED
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.reading import THREADS, arrow_schema, tables
+from shadowhound_data_logger.lake.reading import arrow_schema, tables
 from shadowhound_data_logger.lake.standing import days, robots
 from shadowhound_data_logger.times import moment
 

@@ -25,10 +25,9 @@ from shadowhound_data_logger.catalogue.gaps import GAP, GAPS
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
-from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import newest, watermarks
-from shadowhound_data_logger.lake.reading import THREADS
 from shadowhound_data_logger.lake.scan import Catalogue
 from shadowhound_data_logger.lake.select import Wanted, wanted
 from shadowhound_data_logger.options import StoreSettings

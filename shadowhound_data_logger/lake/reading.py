@@ -26,14 +26,12 @@ from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRI
 from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.keys import is_name
-from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.untrusted import check_size, is_path
 
-THREADS: Final = 16
-"""Requests on their way at a time; each waits, most of its time, for the server."""
 SMALL_BYTES: Final = 256 << 10
 """Up to here a file is read whole: of one-minute parts there are thousands, and a compacted day of a robot is larger."""
 PARTS_AT_A_TIME: Final = 180

@@ -15,10 +15,9 @@ from typing import Final
 from shadowhound_data_logger.catalogue import parts
 from shadowhound_data_logger.catalogue.schema import BUCKET, Row, is_row, row_of
 from shadowhound_data_logger.keys import check_name
-from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.putting import put_part
-from shadowhound_data_logger.lake.reading import THREADS, tables
+from shadowhound_data_logger.lake.reading import tables
 from shadowhound_data_logger.lake.scan import KEY, folders
 from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.lake.standing import mended_key

@@ -14,8 +14,7 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bodies import Bodies
-from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, ArchiveMember
-from shadowhound_data_logger.lake.numbers import Table, table
+from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, ArchiveMember, Table, table
 from shadowhound_data_logger.lake.track import Object, Track
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ class Near:
     tolerance_s: float
     """At most so far away."""
     fields: tuple[str, ...] = ()
-    """Paths of numbers such as ``bms_state.soc``; none: those of ``numbers.FIELDS``."""
+    """Paths of numbers such as ``bms_state.soc``; none: those of ``decode.FIELDS``."""
 
     @property
     def reach_ns(self) -> tuple[int, int]:

@@ -17,9 +17,9 @@ from typing import Final, TypeVar
 import pyarrow as pa
 
 from shadowhound_data_logger.lake import reading
-from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, THREADS, arrow_schema
+from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, arrow_schema
 from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.lake.standing import Day, days, robots
 from shadowhound_data_logger.model import ObjectInfo

@@ -38,7 +38,7 @@ def place(source: Bucket | Path | str | None) -> tuple[Place, Bucket]:
 
 
 def fetched(folder: Path) -> Bucket:
-    """A folder of fetched objects as a lake: their rows lie in it as well (lake/fetched_rows.py)."""
+    """A folder of fetched objects as a lake: their rows lie in it as well (``fetched.keep_rows``)."""
     whole = folder.absolute()
     return Bucket(StoreSettings(directory=whole.parent), whole.name)
 

@@ -10,16 +10,18 @@ import base64
 import hashlib
 import json
 import re
+import time
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
 from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
+from shadowhound_data_logger.clock import utc
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.keys import is_name
-from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.untrusted import from_json
@@ -170,3 +172,43 @@ def leaves_of(source: Bucket, entry: ObjectInfo) -> frozenset[str]:
         text = f'it does not say what it was made of: {error or type(error).__name__}'
         raise LakeError(text, remedy='is it one of ours?', key=entry.key) from error
     return frozenset(names)
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueState:
+    """Of one robot's catalogue."""
+
+    robot: str
+    days: int
+    first: str
+    """Date, as all dates UTC."""
+    last: str
+    files: int
+    size: int
+    """Bytes of all of them."""
+    compacted: int
+    """Days that are one file."""
+    open_days: int
+    """Days that are over and have several."""
+    covered: int
+    """Files that others stand for: they only take room."""
+
+
+def state(source: Bucket, robot: str | None = None, findings: Findings | None = None) -> list[CatalogueState]:
+    """Of all robots that have a catalogue. Raises StoreError."""
+    findings = Findings() if findings is None else findings
+    today = f'{utc(time.time_ns()):%Y-%m-%d}'
+    with ThreadPoolExecutor(THREADS) as pool:
+        found = {name: days(source, [name], None, pool, findings) for name in ([robot] if robot else robots(source))}
+    return [_state(name, each, today) for name, each in found.items() if each]
+
+
+def _state(robot: str, found: Iterable[Day], today: str) -> CatalogueState:
+    each = list(found)
+    entries = [entry for day in each for entry in (*day.entries, *day.covered)]
+    return CatalogueState(
+        robot=robot, days=len(each), first=each[0].date, last=each[-1].date, files=len(entries),
+        size=sum(entry.size for entry in entries), covered=sum(len(day.covered) for day in each),
+        compacted=sum(len(day.entries) == 1 and is_compacted(day.entries[0].key) for day in each),
+        open_days=sum(len(day.entries) > 1 and day.date < today for day in each),
+    )  # fmt: skip

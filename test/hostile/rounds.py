@@ -43,10 +43,10 @@ from shadowhound_data_logger.cli.output import shown_time
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.lake import decode, query, reading
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.decode import table
 from shadowhound_data_logger.lake.fetch import Wish
 from shadowhound_data_logger.lake.fetch import fetch as fetch_objects
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.numbers import table
 from shadowhound_data_logger.lake.samples import Near, Samples, Selection, Window
 from shadowhound_data_logger.lake.standing import leaves_of
 from shadowhound_data_logger.lake.track import Track

@@ -26,7 +26,7 @@ from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bodies import Bodies
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.numbers import table
+from shadowhound_data_logger.lake.decode import table
 from shadowhound_data_logger.lake.query import _summary
 from shadowhound_data_logger.lake.track import Object
 from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet

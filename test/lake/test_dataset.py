@@ -17,10 +17,11 @@ from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import LakeError, ObjectRefused, SettingError
-from shadowhound_data_logger.lake import MissionDataset, Near, Window, fetched_rows, query, selecting
+from shadowhound_data_logger.lake import MissionDataset, Near, Window, query, selecting
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.fetch import Wish, fetch
+from shadowhound_data_logger.lake.fetched import keep_rows
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
@@ -201,7 +202,7 @@ def test_a_fetched_folder_gives_the_same(tmp_path: Path, frames: str) -> None:
         rows = query.objects(source, **flags).to_pylist()
         wishes = [Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows]
         fetch(wishes, to, DirectoryStore(source.settings.directory))
-        fetched_rows.keep(to, rows)
+        keep_rows(to, rows)
     store, folder = MissionDataset(source, align=ALIGN), MissionDataset(to, align=ALIGN)
     assert len(store) == len(folder) > 0
     assert all(map(same, store.stream(), folder.stream()))

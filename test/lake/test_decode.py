@@ -23,7 +23,7 @@ from pypcd4 import Encoding, PointCloud
 
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
-from shadowhound_data_logger.lake.numbers import table
+from shadowhound_data_logger.lake.decode import table
 
 
 def packed(image: Any, kind: str) -> bytes:

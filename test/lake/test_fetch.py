@@ -16,10 +16,9 @@ from shadowhound_data_logger import retry
 from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import CredentialsRejected, LakeError, StoreUnavailable
-from shadowhound_data_logger.lake import fetched_rows
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetch import FetchResult, Wish, fetch, under
-from shadowhound_data_logger.lake.fetched import Fetched
+from shadowhound_data_logger.lake.fetched import Fetched, keep_rows
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import Content
@@ -194,7 +193,7 @@ def test_no_key_leads_out_of_the_folder(settings: StoreSettings, tmp_path: Path,
 def test_no_row_leads_out_of_the_folder(tmp_path: Path, robot: str) -> None:
     """Nor does what a row calls its robot: such a row is not kept, the others are."""
     to, named = tmp_path / 'a' / 'data', robot.format(tmp=tmp_path)
-    fetched_rows.keep(to, [row('camera', NOON_NS), {**row('camera', NOON_NS), 'robot': named}])
+    keep_rows(to, [row('camera', NOON_NS), {**row('camera', NOON_NS), 'robot': named}])
     kept = [path for path in tmp_path.rglob('*') if path.is_file()]
     assert [path.parents[2] for path in kept] == [to / 'thor']
 

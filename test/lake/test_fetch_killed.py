@@ -23,8 +23,7 @@ from lake.making import NOON_NS, add, add_part
 from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.lake import fetched_rows
-from shadowhound_data_logger.lake.fetched import Fetched
+from shadowhound_data_logger.lake.fetched import Fetched, keep_rows
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
@@ -105,7 +104,7 @@ def test_rows_that_were_being_written(tmp_path: Path, monkeypatch: pytest.Monkey
     with monkeypatch.context() as patch:
         patch.setattr(os, 'replace', die)
         with pytest.raises(SystemExit):
-            fetched_rows.keep(tmp_path, [said])
+            keep_rows(tmp_path, [said])
     assert left_over(tmp_path)
     with Fetched(tmp_path):
         pass
