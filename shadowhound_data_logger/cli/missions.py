@@ -29,8 +29,7 @@ from shadowhound_data_logger.cli.output import (
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder
-from shadowhound_data_logger.missions.overview import ACTIVE, export, find, overview, overviews
-from shadowhound_data_logger.missions.report import is_sending
+from shadowhound_data_logger.missions.overview import ACTIVE, export, find, is_sending, overview, overviews
 from shadowhound_data_logger.untrusted import csv_cell
 
 POLL_S: Final = 0.5

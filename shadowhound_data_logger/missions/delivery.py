@@ -20,8 +20,7 @@ from shadowhound_data_logger.missions.drawing import Pictures, nothing
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped, write_json
 from shadowhound_data_logger.missions.node_delivery import NodeDelivery
 from shadowhound_data_logger.missions.objects import Item, Shelf, objects_of
-from shadowhound_data_logger.missions.story import KILLED, Point, Story
-from shadowhound_data_logger.missions.summary import summary_of
+from shadowhound_data_logger.missions.story import KILLED, Point, Story, summary_of
 from shadowhound_data_logger.missions.tracking import Tracking
 
 log = logging.getLogger(__name__)

@@ -22,8 +22,8 @@ from shadowhound_data_logger.errors import NameRefused, SettingError
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import MissionFolder
+from shadowhound_data_logger.missions.overview import Report, has_arrived, report, sizes
 from shadowhound_data_logger.missions.recorder import Beginning, Mission
-from shadowhound_data_logger.missions.report import Report, has_arrived, report, sizes
 from shadowhound_data_logger.missions.story import FAILED, KILLED
 from shadowhound_data_logger.missions.values import text
 from shadowhound_data_logger.worker import Worker

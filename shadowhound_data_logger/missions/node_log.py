@@ -9,18 +9,20 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+import numpy as np
+
 from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.disk import replacing
 from shadowhound_data_logger.missions import copies, journal
 from shadowhound_data_logger.missions.active import Active
-from shadowhound_data_logger.missions.floor import Floor
 from shadowhound_data_logger.missions.odometer import Odometer, Pose
 from shadowhound_data_logger.missions.recorder import MOST_FRAME_ARTIFACTS
 from shadowhound_data_logger.missions.story import DISTANCE, Story
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
 log = logging.getLogger(__name__)
@@ -31,6 +33,11 @@ PATIENCE_NS: Final = 2 * SECOND
 """How long a pose waits for earlier ones that another encoder still has."""
 MOST_WAITING: Final = 100_000
 """Readings and poses that wait for a disk that hangs; what comes then is left out."""
+LOW_M, HIGH_M = 0.15, 1.5
+"""Of the floor plan, above the origin of odometry: neither ground nor ceiling."""
+MOST_CLOUD_POINTS: Final = 2000
+MOST_FLOOR_POINTS: Final = 400_000
+"""3 MB."""
 
 
 class Reading(NamedTuple):
@@ -59,6 +66,45 @@ class Cloud(NamedTuple):
 
 
 Fact = Reading | Pose | Frame | Cloud
+
+
+class Floor:
+    """The floor plan under a mission's path: where the lidar saw walls and furniture, from above.
+
+    It keeps points, evenly thinned out when there are too many. New; ``add`` and ``save`` on one thread.
+    """
+
+    def __init__(self) -> None:
+        self._parts: list[NDArray[np.float32]] = []
+        self._count = 0
+        self._step = 1
+
+    def load(self, path: Path) -> None:
+        """Go on with what an earlier node saw; none is fine, and so is one that cannot be read."""
+        try:
+            found = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError):
+            return
+        if found.ndim == 2 and found.shape[1] == 2:
+            self._keep(found.astype(np.float32))
+
+    def add(self, xyz: NDArray[np.float32]) -> None:
+        """A cloud in the frame of odometry, metres, a row a point."""
+        seen = xyz[(xyz[:, 2] > LOW_M) & (xyz[:, 2] < HIGH_M) & np.isfinite(xyz).all(axis=1), :2]
+        self._keep(seen[:: self._step * max(1, -(-len(seen) // MOST_CLOUD_POINTS))].copy())
+
+    def save(self, path: Path) -> None:
+        """Where anything was seen. Raises OSError."""
+        if self._count:
+            with replacing(path) as file:
+                np.save(file, np.concatenate(self._parts))
+
+    def _keep(self, xy: NDArray[np.float32]) -> None:
+        self._parts.append(xy)
+        self._count += len(xy)
+        if self._count > MOST_FLOOR_POINTS:
+            thinned = np.concatenate(self._parts)[::2]
+            self._parts, self._count, self._step = [thinned], len(thinned), 2 * self._step
 
 
 class NodeLog:

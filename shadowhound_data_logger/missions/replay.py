@@ -30,7 +30,7 @@ from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.drawing import Drawing
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missions, write_json
 from shadowhound_data_logger.missions.objects import Shelf
-from shadowhound_data_logger.missions.report import LOCK, STATE
+from shadowhound_data_logger.missions.overview import LOCK, STATE
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
 from shadowhound_data_logger.retry import backoff
 from shadowhound_data_logger.spool import clock_record

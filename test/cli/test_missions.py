@@ -20,8 +20,7 @@ from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, write_json
 from shadowhound_data_logger.missions.journal import Journal
-from shadowhound_data_logger.missions.overview import BRIEF, overview, overviews
-from shadowhound_data_logger.missions.report import LOCK
+from shadowhound_data_logger.missions.overview import BRIEF, LOCK, overview, overviews
 
 
 def run(home: Path, *arguments: str) -> Result:

@@ -15,9 +15,8 @@ from shadowhound_data_logger.missions.dating import WAITS, Dating
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
 from shadowhound_data_logger.missions.node_log import NodeLog
 from shadowhound_data_logger.missions.odometer import Pose
-from shadowhound_data_logger.missions.overview import overview
+from shadowhound_data_logger.missions.overview import overview, report
 from shadowhound_data_logger.missions.replay import Replay
-from shadowhound_data_logger.missions.report import report
 
 MS = 1_000_000
 NAME = 'patrol_20251018_115950'

@@ -13,8 +13,7 @@ from missions.fakes import journalling
 
 from shadowhound_data_logger.missions import copies, journal
 from shadowhound_data_logger.missions.active import Active, Lookout
-from shadowhound_data_logger.missions.floor import MOST, Floor
-from shadowhound_data_logger.missions.node_log import FIRST_FRAME, Cloud, Frame, NodeLog, Reading
+from shadowhound_data_logger.missions.node_log import FIRST_FRAME, MOST_FLOOR_POINTS, Cloud, Floor, Frame, NodeLog, Reading
 from shadowhound_data_logger.missions.odometer import Pose
 
 SECOND = 10**9
@@ -119,7 +118,7 @@ def test_the_floor_stays_small() -> None:
     for second in range(500):
         floor.add(np.column_stack([np.full(20_000, second), rng.random(20_000), np.ones(20_000)]).astype(np.float32))
     kept = np.concatenate(floor._parts)
-    assert len(kept) <= MOST
+    assert len(kept) <= MOST_FLOOR_POINTS
     assert set(kept[:, 0].tolist()) == set(map(float, range(500)))
 
 

@@ -19,8 +19,8 @@ from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, Run, missions, read_json
+from shadowhound_data_logger.missions.overview import report
 from shadowhound_data_logger.missions.replay import KEEP_S, LINGER_S, Gate, Parent, Replay, open_tracking, run
-from shadowhound_data_logger.missions.report import report
 
 
 class Now:
