@@ -29,7 +29,7 @@ from botocore.config import Config
 
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import SpoolSettings, StoreSettings, UploadSettings
-from shadowhound_data_logger.model import DataObject, Outcome
+from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool.spool import Spool
@@ -78,12 +78,9 @@ def drain(folder: Path, settings: StoreSettings, threads: int, objects: Sequence
     for start in range(0, len(objects), GROUP):
         spool.commit(objects[start : start + GROUP])
     with closing(open_store(settings, upload)) as store:
-
-        def settle(outcomes: Sequence[Outcome]) -> None:
-            writer.settle(outcomes)
-
-        uploader = Uploader(spool, store, upload, settle)
-        writer = SpoolWriter(spool, SpoolSettings().commit_s, settled=uploader.settled)
+        writer = SpoolWriter(spool, SpoolSettings().commit_s)
+        uploader = Uploader(spool, store, upload, writer.settle)
+        writer.on_commit(settled=uploader.settled)
         writer.prompt = True
 
         def send() -> None:

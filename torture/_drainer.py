@@ -12,14 +12,13 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
 from shadowhound_data_logger.bandwidth import Pace
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import SpoolSettings, UploadSettings, store_settings
-from shadowhound_data_logger.model import Outcome, Put, SpooledObject
+from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -74,12 +73,9 @@ def main(home: str, log_path: str) -> None:
     backlog = spool.pending_count()
     stop = threading.Event()
     with Path(log_path).open('w', encoding='utf-8') as log:
-
-        def settle(outcomes: Sequence[Outcome]) -> None:
-            writer.settle(outcomes)
-
-        uploader = Uploader(spool, Noting(store, log), upload, settle)
-        writer = SpoolWriter(spool, SpoolSettings().commit_s, spooled=uploader.wake, settled=uploader.settled)
+        writer = SpoolWriter(spool, SpoolSettings().commit_s)
+        uploader = Uploader(spool, Noting(store, log), upload, writer.settle)
+        writer.on_commit(spooled=uploader.wake, settled=uploader.settled)
         live = threading.Thread(target=go_on, args=(spool, writer, stop))
         began = time.monotonic()
         writer.open()

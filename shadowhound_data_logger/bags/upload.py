@@ -24,8 +24,7 @@ from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import BagError, ForeignObject
 from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
 from shadowhound_data_logger.retry import steadily
-from shadowhound_data_logger.ship.delivering import delivering
-from shadowhound_data_logger.ship.uploader import Uploader
+from shadowhound_data_logger.ship.uploader import Uploader, delivering
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import limits

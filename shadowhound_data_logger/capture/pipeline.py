@@ -7,7 +7,7 @@ import logging
 import os
 import sqlite3
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -45,7 +45,7 @@ from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import dated
-from shadowhound_data_logger.model import DataObject, Outcome
+from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import SINKS
@@ -117,9 +117,9 @@ class Pipeline:
     def _make_stages(self) -> None:
         """Each with what it hands its work to; none runs yet."""
         settings = self._settings
-        self.uploader = Uploader(self.spool, self._store, settings.upload, self._settle)
-        self.writer = SpoolWriter(self.spool, settings.spool.commit_s, spooled=self.uploader.wake,
-                                  settled=self.uploader.settled)  # fmt: skip
+        self.writer = SpoolWriter(self.spool, settings.spool.commit_s)
+        self.uploader = Uploader(self.spool, self._store, settings.upload, self.writer.settle)
+        self.writer.on_commit(spooled=self.uploader.wake, settled=self.uploader.settled)
         accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         place = BagPlace(settings.home / FOLDER / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
                       self._record.offsets)  # fmt: skip
@@ -297,9 +297,6 @@ class Pipeline:
                 self.uploader.wake(named)
         except (OSError, sqlite3.Error) as error:
             log.warning('objects that wait for the clock are not named yet: %s', error)
-
-    def _settle(self, outcomes: Sequence[Outcome]) -> None:
-        self.writer.settle(outcomes)
 
     def _ledger(self) -> DataObject:
         """The ledger as an object of its own, for the store."""

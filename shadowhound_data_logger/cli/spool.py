@@ -33,8 +33,7 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock, Syste
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.ship.delivering import delivering
-from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
+from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus, delivering
 from shadowhound_data_logger.spool.index import MISSING, Index
 from shadowhound_data_logger.spool.listing import HERE, Heap, heaps, objects
 from shadowhound_data_logger.spool.listing import retry as retry_objects

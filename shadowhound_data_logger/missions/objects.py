@@ -22,7 +22,7 @@ from shadowhound_data_logger.errors import StoreUnavailable
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, safe_type, stamped
 from shadowhound_data_logger.missions.story import BUCKET, TRAJECTORIES
 from shadowhound_data_logger.model import Binding, DataObject
-from shadowhound_data_logger.ship.delivering import delivering
+from shadowhound_data_logger.ship.uploader import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import LAST, Spool

@@ -11,17 +11,20 @@ import random
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.config import Settings, UploadSettings
 from shadowhound_data_logger.errors import StoreError
 from shadowhound_data_logger.model import Outcome, SpooledObject, State
 from shadowhound_data_logger.ship.ahead import IMPORTANT, OLDEST
 from shadowhound_data_logger.ship.failures import Notice, Verdict
 from shadowhound_data_logger.ship.schedule import Look, Rest, Schedule, Ship, Step
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.worker import Worker
 
@@ -74,7 +77,8 @@ class Uploader:
     """Life: New; open once; wake, settled, status, drain from any thread; close any number of times.
 
     It owns the threads ``upload-0`` ... and ``upload-lock``, which holds the drain lock while they run. ``settle`` is
-    called from its threads; whoever makes the outcomes durable calls ``settled`` afterwards.
+    called from its threads (``SpoolWriter.settle``); whoever makes the outcomes durable calls ``settled`` afterwards
+    (``SpoolWriter.on_commit``).
     """
 
     def __init__(
@@ -240,3 +244,24 @@ class Uploader:
             count = self._quarantined[item.bucket, reason]
         if str(count).strip('0') == '1':
             log.error('quarantined (%s, number %d in bucket %s): %s', reason, count, item.bucket, error)
+
+
+@contextmanager
+def delivering(spool: Spool, settings: Settings, close_s: float) -> Iterator[tuple[Uploader, SpoolWriter]]:
+    """Delivery for a while by a process that is no node: store, writer and uploader, opened and closed together.
+
+    What waits in an open spool goes to the store of the settings, unless another process has the drain lock.
+
+    On leaving, puts under way and their outcomes have ``close_s`` seconds each. Raises SettingError.
+    """
+    with ExitStack() as opened:
+        store = open_store(settings.store, settings.upload)
+        opened.callback(store.close)
+        writer = SpoolWriter(spool, settings.spool.commit_s)
+        uploader = Uploader(spool, store, settings.upload, writer.settle)
+        writer.on_commit(settled=uploader.settled)
+        writer.open()
+        opened.callback(writer.close, close_s)
+        uploader.open()
+        opened.callback(uploader.close, close_s)
+        yield uploader, writer

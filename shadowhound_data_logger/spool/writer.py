@@ -29,14 +29,13 @@ HANGING_S: Final = 10.0
 
 
 class SpoolWriter:
-    """New; open once; put, settle, flush from any thread; close once. ``_changed`` guards the lists."""
+    """New; ``on_commit``; open once; put, settle, flush from any thread; close once. ``_changed`` guards the lists."""
 
-    def __init__(self, spool: Spool, commit_s: float, *, spooled: Callable[[Sequence[SpooledObject]], None] = lambda _: None,
-                 settled: Callable[[Collection[int]], None] = lambda _: None) -> None:  # fmt: skip
+    def __init__(self, spool: Spool, commit_s: float) -> None:
         self.spool = spool
         self._commit_s = commit_s
-        self._spooled = spooled
-        self._settled = settled
+        self._spooled: Callable[[Sequence[SpooledObject]], None] = lambda _: None
+        self._settled: Callable[[Collection[int]], None] = lambda _: None
         self._changed = threading.Condition()
         self._objects: deque[DataObject] = deque()
         self._outcomes: deque[Outcome] = deque()
@@ -50,6 +49,12 @@ class SpoolWriter:
         self.damaged = False
         """Whether the index was found damaged: only the recovery of a new start can mend that."""
         self.worker = Worker('spool-writer', self._step, patience_s=HEARTBEAT_S + commit_s + HANGING_S)
+
+    def on_commit(self, *, spooled: Callable[[Sequence[SpooledObject]], None] | None = None,
+                  settled: Callable[[Collection[int]], None] | None = None) -> None:  # fmt: skip
+        """After each commit, its thread calls ``spooled`` with the new objects, and ``settled`` with the ids of the outcomes."""
+        self._spooled = spooled or self._spooled
+        self._settled = settled or self._settled
 
     def open(self) -> None:
         self.worker.start()

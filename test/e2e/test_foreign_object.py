@@ -32,8 +32,9 @@ def deliver(folder: Path, store: S3Store, *objects: DataObject) -> dict[str, int
     """A spool's whole way: from the encoder's object to the server's answer; where the objects ended."""
     spool = Spool(folder, SpoolSettings(min_free_bytes=0), SystemClock.of_this_machine(), 'thor')
     spool.open()
-    uploader = Uploader(spool, store, UploadSettings(threads=2), lambda outcomes: writer.settle(outcomes))  # noqa: PLW0108 - there is no writer yet
-    writer = SpoolWriter(spool, 0.01, spooled=lambda _: uploader.wake(), settled=uploader.settled)
+    writer = SpoolWriter(spool, 0.01)
+    uploader = Uploader(spool, store, UploadSettings(threads=2), writer.settle)
+    writer.on_commit(spooled=uploader.wake, settled=uploader.settled)
     writer.open()
     uploader.open()
     try:

@@ -23,7 +23,7 @@ from stores.spooled import Spool as Spooled
 
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import SpoolSettings, StoreSettings, UploadSettings
-from shadowhound_data_logger.model import DataObject, Outcome, Put
+from shadowhound_data_logger.model import DataObject, Put
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -46,8 +46,9 @@ class Process:
         self.spool.open()
         self.store = S3Store(settings, UPLOAD)
         self.store.open()
-        self.uploader = Uploader(self.spool, self.store, UPLOAD, self._settle, rng=random.Random(seed))
-        self.writer = SpoolWriter(self.spool, COMMIT_S, spooled=self.uploader.wake, settled=self.uploader.settled)
+        self.writer = SpoolWriter(self.spool, COMMIT_S)
+        self.uploader = Uploader(self.spool, self.store, UPLOAD, self.writer.settle, rng=random.Random(seed))
+        self.writer.on_commit(spooled=self.uploader.wake, settled=self.uploader.settled)
         self.writer.open()
         self.uploader.open()
 
@@ -63,9 +64,6 @@ class Process:
         self.store.close()
         self.spool.close()
         assert self.uploader.status().worker_failures == 0, self.uploader.status().last_error
-
-    def _settle(self, outcomes: Sequence[Outcome]) -> None:
-        self.writer.settle(outcomes)
 
 
 class Day:

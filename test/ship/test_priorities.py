@@ -41,8 +41,9 @@ def spool(tmp_path: Path) -> Iterator[Spool]:
 def drained(spool: Spool) -> list[tuple[int, int]]:
     """Everything delivered by one thread, in order."""
     store = Ordered()
-    writer = SpoolWriter(spool, 0.05, settled=lambda ids: uploader.settled(ids))  # noqa: PLW0108 - there is no uploader yet
+    writer = SpoolWriter(spool, 0.05)
     uploader = Uploader(spool, store, UploadSettings(threads=1), writer.settle)
+    writer.on_commit(settled=uploader.settled)
     writer.open()
     uploader.open()
     try:

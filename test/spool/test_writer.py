@@ -39,7 +39,8 @@ def opened(spool: Spool) -> Iterator[Callable[..., SpoolWriter]]:
     made: list[SpoolWriter] = []
 
     def make_writer(commit_s: float = 0.01, **callbacks: Callable[..., None]) -> SpoolWriter:
-        made.append(SpoolWriter(spool, commit_s, **callbacks))
+        made.append(SpoolWriter(spool, commit_s))
+        made[-1].on_commit(**callbacks)
         made[-1].open()
         return made[-1]
 
