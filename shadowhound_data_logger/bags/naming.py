@@ -32,7 +32,12 @@ def unsynced_name(what: str, boot_id: str, boot_ns: int, is_taken: Callable[[str
 
     The same is told of an object without a date (``keys.unsynced``); no other boot has the id.
     """
-    return _free(f'{_safe(what)}{UNSYNCED}{boot_id}_{boot_ns // SECOND:08d}', is_taken)
+    return _free(f'{_safe(what)}{unsynced_mark(boot_id, boot_ns)}', is_taken)
+
+
+def unsynced_mark(boot_id: str, boot_ns: int) -> str:
+    """What such a name has in place of a date."""
+    return f'{UNSYNCED}{boot_id}_{boot_ns // SECOND:08d}'
 
 
 def _safe(what: str) -> str:

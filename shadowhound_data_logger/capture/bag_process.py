@@ -25,7 +25,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from shadowhound_data_logger.bags.local import RECORDS, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.naming import MANIFEST
+from shadowhound_data_logger.bags.naming import MANIFEST, unsynced_mark
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
@@ -56,14 +56,24 @@ CLOSE_S: Final = 5.0
 
 
 class ManifestWriter(SpoolWriter):
-    """The spool's writer; ``manifest`` is that of the bag, once it has ended."""
+    """The spool's writer, which remembers the manifests of the bags that ended: not only ours, older ones are made whole too."""
 
-    manifest: Manifest | None = None
+    def __init__(self, spool: Spool, commit_s: float) -> None:
+        super().__init__(spool, commit_s)
+        self._manifests: list[Manifest] = []
 
     def put(self, item: DataObject, *, wait: bool = True) -> None:
         if item.key.endswith(f'/{MANIFEST}') and isinstance(item.body, bytes):
-            self.manifest = Manifest.from_json(item.body)
+            self._manifests.append(Manifest.from_json(item.body))
         super().put(item, wait=wait)
+
+    def manifest_of(self, began_as: str) -> Manifest | None:
+        """That of the bag which began under this name; it has another one where the clock was set meanwhile."""
+        for manifest in self._manifests:
+            clock = manifest.clock
+            if manifest.bag == began_as or (clock is not None and unsynced_mark(clock.boot_id, clock.boot_ns) in began_as):
+                return manifest
+        return None
 
 
 def main() -> int:
@@ -109,19 +119,20 @@ def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[st
         spool = Spool(settings.spool_path, settings.spool, SystemClock.of_this_machine(), owner)
         spool.open()
         opened.callback(spool.close)
-        writer = ManifestWriter(spool, settings.spool.commit_s, spooled=lambda new: uploader.wake(new),  # noqa: PLW0108
-                                settled=lambda ids: uploader.settled(ids))  # fmt: skip  # noqa: PLW0108 - made below
+        writer = ManifestWriter(spool, settings.spool.commit_s)
         uploader = Uploader(spool, store, settings.upload, writer.settle)
+        writer.on_commit(spooled=uploader.wake, settled=uploader.settled)
         recorder = _open_recorder(opened, node, settings, writer)
         uploader.open()
         opened.callback(uploader.close, CLOSE_S)
         workers = *uploader.workers, writer.worker
-        dropped = _until_over(recorder, workers, name, given.duration, stop)
-        if writer.manifest is None:
+        bag, dropped = _until_over(recorder, workers, name, given.duration, stop)
+        manifest = writer.manifest_of(bag)
+        if manifest is None:
             raise BagError('nothing was published on the topics that were to be recorded', topics=topics,
                            remedy=f'`ros2 topic list`; asked for was {" ".join(topics) or given.regex}')  # fmt: skip
-        waiting = _wait_for_delivery(settings, writer, workers, given.deadline)
-        return _told(writer.manifest, dropped, waiting=waiting, last_error=uploader.status().last_error)
+        waiting = _wait_for_delivery(settings, writer, workers, manifest.bag, given.deadline)
+        return _told(manifest, dropped, waiting=waiting, last_error=uploader.status().last_error)
 
 
 def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: SpoolWriter) -> Recorder:
@@ -154,8 +165,9 @@ def _topics_there(node: Node, robot: str, stop: StopSignals) -> list[str]:
     return [next((topic for topic in topics if node.count_publishers(topic)), topics[0]) for topics in sensors]
 
 
-def _until_over(recorder: Recorder, workers: Sequence[Worker], name: str, duration_s: float, stop: StopSignals) -> int:
-    """Record; how many messages were dropped meanwhile."""
+def _until_over(recorder: Recorder, workers: Sequence[Worker], name: str, duration_s: float,
+                stop: StopSignals) -> tuple[str, int]:  # fmt: skip
+    """Record; the name of the bag when it began, and how many messages were dropped meanwhile."""
     recorder.on_mission({'type': name, 'mission_id': None})
     done, text = recorder.start()
     if not done:
@@ -168,15 +180,15 @@ def _until_over(recorder: Recorder, workers: Sequence[Worker], name: str, durati
     done, text = recorder.stop()
     if not done:
         raise BagError(f'{bag} could not be ended: {text}', remedy='the next `shadowhound-data bag record` makes it whole')
-    return dropped
+    return bag, dropped
 
 
-def _wait_for_delivery(settings: Settings, writer: ManifestWriter, workers: Sequence[Worker], deadline_s: float) -> bool:
+def _wait_for_delivery(settings: Settings, writer: SpoolWriter, workers: Sequence[Worker], bag: str,
+                       deadline_s: float) -> bool:  # fmt: skip
     """Until nothing of the bag is in the spool any more; whether something still is."""
     end_s = time.monotonic() + deadline_s
     writer.prompt = True
     writer.flush(CLOSE_S)
-    bag = writer.manifest.bag if writer.manifest is not None else ''
     while (waiting := _waits(settings, bag)) and time.monotonic() < end_s:  # a second signal ends the process: the bag is safe
         time.sleep(STEP_S)
         _supervise(workers)

@@ -6,10 +6,12 @@ import ctypes
 import logging
 import os
 import signal
+import socket
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
 from types import FrameType
+from typing import Final
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -23,9 +25,10 @@ from shadowhound_data_logger.capture.front import Front
 from shadowhound_data_logger.capture.middleware import SETTING, Middleware
 from shadowhound_data_logger.capture.parameters import Parameters
 from shadowhound_data_logger.capture.pipeline import Pipeline, Ros
-from shadowhound_data_logger.capture.service import SystemdService
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
 from shadowhound_data_logger.ros_arguments import NODE, rules_for
+
+log = logging.getLogger(__name__)
 
 USAGE = """\
 usage: sensor_logger_node [--ros-args [--params-file FILE] [-p NAME:=VALUE ...] [-r __ns:=/NAMESPACE] ...]
@@ -48,6 +51,51 @@ GIVE_BACK_S = 60.0
 """How often what a crowd of topics or an outage took is given back."""
 SECOND_SIGNAL_S = 1.0
 """A second signal later than this ends the node at once; an earlier one is the same key press."""
+WATCHDOG_PART: Final = 3
+"""The node says that it lives this many times within the time that systemd allows, so that one lost word is no death."""
+
+
+class SystemdService:
+    """What the node tells systemd when it is a service: that it is ready, that it lives, that it stops (sd_notify(3)).
+
+    Without systemd it tells nobody and costs nothing. New; ``ready`` once; ``alive`` from the main loop, as often as it turns;
+    ``stopping`` once.
+    """
+
+    def __init__(self, environ: MutableMapping[str, str]) -> None:
+        """Takes the variables out of the environment: they are this process's, and none of its children's."""
+        self._address = environ.pop('NOTIFY_SOCKET', '')
+        pid, interval_us = environ.pop('WATCHDOG_PID', ''), environ.pop('WATCHDOG_USEC', '')
+        is_watched = bool(self._address) and interval_us.isdigit() and pid in {'', str(os.getpid())}
+        self._pause_s = int(interval_us) / 1e6 / WATCHDOG_PART if is_watched else None
+        self._due_s = 0.0
+        self._told = False
+
+    def ready(self, what: str) -> None:
+        """It logs now; ``what`` is shown by ``systemctl status``."""
+        self._tell(f'READY=1\nSTATUS={what}')
+
+    def alive(self) -> None:
+        """Its main loop turned; a loop that hangs lets systemd end it with SIGABRT and start it again."""
+        if self._pause_s is not None and time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + self._pause_s
+            self._tell('WATCHDOG=1')
+
+    def stopping(self) -> None:
+        self._tell('STOPPING=1\nSTATUS=closing: open batches are finished and delivered')
+
+    def _tell(self, text: str) -> None:
+        """Never raises and never waits: systemd's silence is no reason to stop logging."""
+        if not self._address:
+            return
+        name = '\0' + self._address[1:] if self._address.startswith('@') else self._address
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC) as sender:
+                sender.sendto(text.encode(), name)
+        except OSError as error:
+            if not self._told:
+                self._told = True
+                log.warning('systemd is not told how the node is: %s', error)
 
 
 class StopSignals:

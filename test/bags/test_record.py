@@ -85,7 +85,8 @@ def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
         time.sleep(0.05)
     os.kill(child.pid, signal.SIGKILL)
     child.wait()
-    assert record('next', 1.0, topics=['/text']).delivered
+    found = record('next', 1.0, topics=['/text'])
+    assert (found.delivered, list(found.topics)) == (True, ['/text'])
     (folder,) = rosbags_of(home).glob('cut_off_*')
     manifest = Manifest.from_json((folder / 'manifest.json').read_bytes())
     assert manifest.state == 'recovered'

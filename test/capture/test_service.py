@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.capture.service import SystemdService
+from shadowhound_data_logger.capture.node import SystemdService
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_it_says_that_it_is_ready_and_that_it_stops(systemd: socket.socket) -> N
 def test_it_says_that_it_lives_a_few_times_an_interval(systemd: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     """Turning the loop fifty times in two thirds of the interval is told three times."""
     now = 100.0
-    monkeypatch.setattr('shadowhound_data_logger.capture.service.time.monotonic', lambda: now)
+    monkeypatch.setattr('shadowhound_data_logger.capture.node.time.monotonic', lambda: now)
     service = SystemdService(_environ(systemd, WATCHDOG_USEC='30000000', WATCHDOG_PID=str(os.getpid())))
     for _ in range(50):
         service.alive()
