@@ -169,14 +169,15 @@ class SensorStream:
         self._sensor = sensor.name
         self._topic = topic
         self._type = type_name
-        self._accounts = accounts
+        self._entry = accounts.entry(topic)
         self._consumers = consumers
         self._choosing = [consumer for consumer in consumers if consumer.choice is None]
+        self._by_choice = [consumer for consumer in consumers if consumer.choice is not None]
         self._recent = RecentMessages()
         self._arrivals = Arrivals()
         self._counter: CounterField | None = None
         self._is_refuted = False
-        with accounts.entry(topic) as account:
+        with self._entry as account:
             account.type = type_name
             account.expect(self._expected(sensor, types))
         for consumer in self._choosing:
@@ -197,7 +198,7 @@ class SensorStream:
         fresh: list[Taken] = []
         sent: dict[str, list[int]] = {}
         counter = self._counter
-        with self._accounts.entry(self._topic) as account:
+        with self._entry as account:
             for message in taken:
                 cdr, source_ns, gid, number, _ = message
                 publisher = gid or senders.name(number, source_ns)
@@ -219,8 +220,10 @@ class SensorStream:
             text = '%s: messages come more often than %s says: how often they are published is learned instead'
             log.warning(text, self._topic, 'counter_step' if counter else 'expected_hz')
         if fresh:
-            for consumer in self._consumers:
-                if consumer.choice is None or self._topic in consumer.topics:
+            for consumer in self._choosing:
+                consumer.take(drained)
+            for consumer in self._by_choice:
+                if self._topic in consumer.topics:
                     consumer.take(drained)
 
     def look(self, now_s: float) -> None:

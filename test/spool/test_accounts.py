@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import sqlite3
+import threading
 import tracemalloc
 from contextlib import closing
 from pathlib import Path
@@ -84,6 +85,25 @@ def test_history_taken_before_a_restart_is_not_taken_again() -> None:
     assert snapshot is not None
     with Accounts(snapshot.publishers).entry('/map') as account:
         assert [account.receive('p', number) for number in (8, 9, 10, 11)] == [False, False, False, True]
+
+
+def test_an_entry_holds_the_lock_as_long_as_it_is_entered() -> None:
+    """It may be entered again, also after an error in it; what was changed meanwhile is in the next snapshot."""
+    accounts = Accounts()
+    entry = accounts.entry('/map')
+    with pytest.raises(ZeroDivisionError), entry as account:
+        account.received += 1 // 0
+    with entry as account:
+        account.received += 1
+        held = threading.Thread(target=accounts.drop, args=('/map', 'queue_full', 1))
+        held.start()
+        held.join(0.05)
+        assert held.is_alive()
+    held.join()
+    snapshot = accounts.snapshot({})
+    assert snapshot is not None
+    (row,) = snapshot.topics
+    assert (row.received, row.dropped) == (1, {'queue_full': 1})
 
 
 def test_the_gap_of_a_restart_has_its_cause() -> None:
