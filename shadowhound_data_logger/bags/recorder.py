@@ -285,7 +285,9 @@ class Recorder:
             elif self._writing is not None:
                 self._writing.write(item)
             else:
-                self._place.spool.accounts.drop(f'{BAG}{item.topic}', 'stopped', len(item.messages))
+                messages = item.messages
+                self._place.spool.accounts.drop(f'{BAG}{item.topic}', 'stopped', len(messages), messages[0].source_ns,
+                                                messages[-1].source_ns)  # fmt: skip
             self._sync()
         self._sync()
 

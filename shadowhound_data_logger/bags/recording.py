@@ -74,7 +74,7 @@ class Recording:
     def write(self, lot: Lot) -> None:
         """Record messages, or drop and count them while the disk takes nothing."""
         if self._writer is None and not self._begin():
-            self._drop(lot.topic, len(lot.messages))
+            self._drop(lot)
             return
         writer = self._writer
         assert writer is not None
@@ -262,14 +262,14 @@ class Recording:
         except OSError as error:
             log.warning('bag %s: %s', self.notes.bag, error)
 
-    def _drop(self, topic: str, count: int) -> None:
-        reason = self.refused or UNWRITABLE
-        self._lost[topic, reason] += count
-        self._count(topic, reason, count)
+    def _drop(self, lot: Lot) -> None:
+        reason, messages = self.refused or UNWRITABLE, lot.messages
+        self._lost[lot.topic, reason] += len(messages)
+        self._count(lot.topic, reason, len(messages), messages[0].source_ns, messages[-1].source_ns)
 
-    def _count(self, topic: str, reason: str, count: int) -> None:
+    def _count(self, topic: str, reason: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
         self.dropped += count
-        self._place.spool.accounts.drop(f'{self.notes.sink}{topic}', reason, count)
+        self._place.spool.accounts.drop(f'{self.notes.sink}{topic}', reason, count, from_ns, to_ns)
 
     def _refuse(self, reason: str, text: str) -> None:
         self._again_s = self._monotonic() + RETRY_S

@@ -185,16 +185,20 @@ class Claims:
                     account.receive_again(each.publisher, each.number)
                 return list(held.lot.messages)
             unknown = account.unknown
-            fresh = [each for each in held.lot.messages if account.receive(each.publisher, each.number)]
-            account.appraise(account.unknown - unknown, held.lost)
+            fresh = [each for each in held.lot.messages if account.receive(each.publisher, each.number, each.source_ns)]
+            newest_ns = held.lot.messages[-1].source_ns
+            account.appraise(account.unknown - unknown, held.lost, newest_ns)
+            account.gaps.heard_ns = newest_ns
         return fresh
 
     def lose(self, held: Iterable[Held], reason: str = RING_FULL) -> None:
         """An event asked for it and cannot have it."""
         for each in held:
-            count = len(self.receive(each))
-            self._accounts.drop(f'{EVENT}{each.lot.topic}', reason, count)
-            self._lost.append(((each.lot.topic, reason), count))
+            fresh = self.receive(each)
+            if fresh:
+                first_ns, last_ns = fresh[0].source_ns, fresh[-1].source_ns
+                self._accounts.drop(f'{EVENT}{each.lot.topic}', reason, len(fresh), first_ns, last_ns)
+                self._lost.append(((each.lot.topic, reason), len(fresh)))
 
     def take_lost(self) -> Counter[tuple[str, str]]:
         """What was lost since the last call, by topic and reason."""

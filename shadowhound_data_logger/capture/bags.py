@@ -53,17 +53,19 @@ class BagConsumer(Consumer):
             receive, unknown = account.receive, account.unknown
             fresh = [
                 message for message in drained.messages
-                if receive(message.publisher, message.number) or self._is_earlier(topic, message, account)
+                if receive(message.publisher, message.number, message.source_ns) or self._is_earlier(topic, message, account)
             ]  # fmt: skip
-            account.appraise(account.unknown - unknown, drained.lost)
-            if paused:
-                account.dropped[PAUSED] += len(fresh)
+            newest_ns = drained.messages[-1].source_ns
+            account.appraise(account.unknown - unknown, drained.lost, newest_ns)
+            if paused and fresh:
+                account.drop(PAUSED, len(fresh), fresh[0].source_ns, fresh[-1].source_ns)
+            account.gaps.heard_ns = newest_ns
         if fresh and paused:
             self._queue.leave_out(topic, PAUSED, len(fresh))
         elif fresh:
             dropped = self._queue.put(Lot(topic, type_name, self._qos_of(topic, type_name), fresh))
             if dropped:
-                self._accounts.drop(f'{BAG}{topic}', QUEUE_FULL, dropped)
+                self._accounts.drop(f'{BAG}{topic}', QUEUE_FULL, dropped, fresh[-dropped].source_ns, fresh[-1].source_ns)
 
     def _is_earlier(self, topic: str, message: Taken, account: TopicAccount) -> bool:
         """Whether it is a latched message that an earlier recording had already, and that this one has not yet: counted again."""

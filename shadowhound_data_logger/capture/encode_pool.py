@@ -176,19 +176,20 @@ class EncodePool:
                 worker.stop()
 
     def _encode(self, batch: Batch) -> None:
+        first_ns, last_ns = batch.samples[0].stamp_ns, batch.samples[-1].stamp_ns
         try:
             encoding = encode(batch, self._sensors[batch.sensor], self._robot, self._types)
         except BaseException:
-            self._accounts.reject(batch.topic, {ENCODER_FAILED: len(batch.samples)})
+            self._accounts.reject(batch.topic, {ENCODER_FAILED: len(batch.samples)}, first_ns, last_ns)
             raise
         if encoding.rejected:
-            self._accounts.reject(batch.topic, encoding.rejected)
+            self._accounts.reject(batch.topic, encoding.rejected, first_ns, last_ns)
             self._tell(batch.topic, encoding.details)
         if encoding.object is not None:
             try:
                 self._spool(encoding.object)
             except BaseException:
-                self._accounts.reject(batch.topic, {ENCODER_FAILED: encoding.object.samples})
+                self._accounts.reject(batch.topic, {ENCODER_FAILED: encoding.object.samples}, first_ns, last_ns)
                 raise
         self._observe(batch, encoding.object)
 

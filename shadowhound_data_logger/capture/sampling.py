@@ -182,7 +182,7 @@ class Sampler(Consumer):
         if kept:
             sampled.kept_ns = kept[-1].stamp_ns
         if drained.paused:
-            account.dropped[PAUSED] += len(messages)
+            account.drop(PAUSED, len(messages), messages[0].source_ns, messages[-1].source_ns)
         else:
             account.skipped += len(messages) - len(kept)
 
@@ -218,7 +218,8 @@ class Sampler(Consumer):
     def _offer(self, batch: Batch) -> None:
         """To the encoders; what their queue has no room for is dropped."""
         for lost in self._queue.put(batch, self._sensors[batch.sensor].priority):
-            self._accounts.drop(lost.topic, QUEUE_FULL, len(lost.samples))
+            samples = lost.samples
+            self._accounts.drop(lost.topic, QUEUE_FULL, len(samples), samples[0].stamp_ns, samples[-1].stamp_ns)
 
 
 class _Sampled:

@@ -18,8 +18,9 @@ from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import CounterField, MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Taken
-from shadowhound_data_logger.spool.accounts import EXACT, Accounts
+from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
+from shadowhound_data_logger.spool.gaps import EXACT
 
 log = logging.getLogger(__name__)
 
@@ -204,17 +205,19 @@ class SensorStream:
                 publisher = gid or senders.name(number, source_ns)
                 if (gid is None or number is None or account.accounting != EXACT) and self._recent.has(message):
                     continue
-                if not account.receive(publisher, number):
+                if not account.receive(publisher, number, source_ns):
                     continue
                 fresh.append(message if publisher is gid else message._replace(publisher=publisher))
                 if publisher is None or number is None:
                     sent.setdefault(gid or '', []).append(source_ns if counter is None else counter.read(cdr))
-            lost = account.observe(sent, self._arrivals.hear(senders, now_s)) if sent else None
+            newest_ns = fresh[-1].source_ns if fresh else 0
+            lost = account.observe(sent, self._arrivals.hear(senders, now_s), newest_ns) if sent else None
             is_refuted = bool(sent) and account.estimate.refuted
             if fresh:
                 drained = Drained(self._topic, self._type, self._sensor, fresh, lost, now_s, paused)
                 for consumer in self._choosing:
                     consumer.choose(drained, account)
+                account.gaps.heard_ns = newest_ns
         if is_refuted and not self._is_refuted:
             self._is_refuted = True
             text = '%s: messages come more often than %s says: how often they are published is learned instead'

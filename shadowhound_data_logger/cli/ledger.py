@@ -14,7 +14,8 @@ from rich.text import Text
 from shadowhound_data_logger.cli.audit import verify_delivered
 from shadowhound_data_logger.cli.common import as_json, spool_folder, the_spool
 from shadowhound_data_logger.cli.output import figure, number, plain, plain_table, print_json, print_page, unsure, volume
-from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, GRADES, RECEIVED_ONLY
+from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
+from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT
 from shadowhound_data_logger.spool.ledger import imbalances, read
 from shadowhound_data_logger.spool.status import robots
 

@@ -29,7 +29,8 @@ from rich.text import Text
 from shadowhound_data_logger.bags.fetch import Told
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.keys import printable
-from shadowhound_data_logger.spool.accounts import ESTIMATED, RECEIVED_ONLY
+from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
+from shadowhound_data_logger.spool.gaps import ESTIMATED
 
 BAR_COLUMNS: Final = 10
 WIDEST: Final = 1000

@@ -30,7 +30,7 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
-from shadowhound_data_logger.spool.accounts import EXACT
+from shadowhound_data_logger.spool.gaps import EXACT
 from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, read, robots
 
 LOSSES: Final = ('dropped', 'rejected')

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from shadowhound_data_logger.spool.gaps import GapRow, TakenBack
+
 
 @dataclass(frozen=True, slots=True)
 class PublisherRow:
@@ -18,6 +20,8 @@ class PublisherRow:
     published: int
     received: int
     missed: Mapping[str, int]
+    heard_ns: int = 0
+    """Stamp of the message ``last``; 0 where it is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,10 @@ class TopicRow:
     """Of ``received``, those of which only that is known."""
     missed: Mapping[str, int] = field(default_factory=dict)
     """Estimated losses by cause; those that numbers tell are in the rows of the publishers."""
+    heard_ns: int = 0
+    """Stamp of the newest message; 0 where it is not known."""
+    complete_ns: int = 0
+    """No message up to this stamp can still be lost on its way into the spool."""
 
     @property
     def open(self) -> int:
@@ -108,3 +116,5 @@ class AccountSnapshot:
     rhythms: tuple[RhythmRow, ...] = ()
     gone: tuple[tuple[str, str], ...] = ()
     """(account, publisher) whose rows of this session are in the sums of a row of their own now."""
+    gaps: tuple[GapRow, ...] = ()
+    taken_back: tuple[TakenBack, ...] = ()

@@ -12,13 +12,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
+from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, MISSED, REJECTED, Figures, TopicGaps
 from shadowhound_data_logger.spool.span import Span
 
 PAUSED: Final = 'paused'
 """Why messages are dropped that come during a pause."""
-EXACT, ESTIMATED, RECEIVED_ONLY = 'exact', 'estimated', 'received-only'
+RECEIVED_ONLY: Final = 'received-only'
 GRADES: Final = (EXACT, ESTIMATED, RECEIVED_ONLY)
 """How good the accounting of a message is, best first: what was missed beside it is known by numbers, by a rhythm, or not."""
 BAG: Final = 'bag:'
@@ -93,6 +95,12 @@ class TopicAccount:
     """First and last number of publishers whose accounts were added up."""
     removed: dict[str, Span | None] = field(default_factory=dict)
     """Those among them that the last commit has by name still; with a span without counts where earlier sessions knew it."""
+    gaps: TopicGaps = field(default_factory=TopicGaps)
+    """When its losses were."""
+    doubted_ns: int = 0
+    """Since when its messages are counted by no rhythm; 0 where they are: one that is found counts back to then."""
+    complete_ns: int = 0
+    """No message up to this stamp can still be lost on its way into the spool."""
     is_doubtful: bool = False
     """Whether nobody knows which of its messages are the topic's own: their numbers tell nothing then."""
 
@@ -115,13 +123,16 @@ class TopicAccount:
             return None
         return self.missed_estimated.total() + sum(span.missed.total() for span in self.publishers.values())
 
-    def receive(self, publisher: str | None, number: int | None) -> bool:
-        """Count one taken message; False for a repeat. One without publisher or number is unknown until ``appraise``."""
+    def receive(self, publisher: str | None, number: int | None, stamp_ns: int = 0) -> bool:
+        """Count one taken message; False for a repeat. One without publisher or number is unknown until ``appraise``.
+
+        ``stamp_ns`` is when it was sent, 0 where that is not known.
+        """
         if number is not None and number > MAX_NUMBER:
             number = None
         if publisher is not None and number is not None and (self.accounting == EXACT or self._begin_numbers()):
             span = self._span(publisher)
-            if not span.observe(number):
+            if not span.observe(number, stamp_ns):
                 return False
             span.used = self.received
         else:
@@ -130,6 +141,12 @@ class TopicAccount:
             self.unknown += 1
         self.received += 1
         return True
+
+    def drop(self, reason: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
+        """Count messages that were received and dropped; the stamps as of ``Accounts.drop``."""
+        self.dropped[reason] += count
+        if count and from_ns:
+            self.gaps.add(DROPPED, reason, count, from_ns, to_ns)
 
     def receive_again(self, publisher: str | None, number: int | None) -> None:
         """Count a message that was counted before, and that is wanted once more; arguments as above."""
@@ -143,24 +160,35 @@ class TopicAccount:
         """What is known of the stamps of messages without numbers."""
         self.estimate.expect(expected)
 
-    def observe(self, stamps: Mapping[str, Sequence[int]], hearing: Hearing) -> Losses:
-        """Estimate what was lost before messages without numbers, just received: publisher ('' where not known) -> stamps."""
+    def observe(self, stamps: Mapping[str, Sequence[int]], hearing: Hearing, newest_ns: int = 0) -> Losses:
+        """Estimate what was lost before messages without numbers, just received: publisher ('' where not known) -> stamps.
+
+        ``newest_ns`` is when the last of them was sent, whatever the stamps are; 0 where that is not known.
+        """
         found = self.estimate.observe(stamps, hearing)
         self.unknown -= found.covered
         self.estimated += found.covered
-        self.missed_estimated.update(found.missed)
+        self._estimate_lost(found.missed, self.doubted_ns or self.gaps.heard_ns, newest_ns)
+        self.doubted_ns = 0 if found.covered >= found.messages else self.doubted_ns or self.gaps.heard_ns or newest_ns
         self.accounting = ESTIMATED if self.estimate.known else RECEIVED_ONLY
         return found.lost
 
-    def appraise(self, count: int, lost: Losses) -> None:
-        """Somebody else estimated what was lost before ``count`` messages without numbers, just received."""
+    def _estimate_lost(self, lost: Mapping[str, int], from_ns: int, to_ns: int) -> None:
+        """Count an estimate, or the correction of an earlier one, whose rows are the newest ones of the journal."""
+        for cause, change in lost.items():
+            self.missed_estimated[cause] += change
+            if change > 0 and from_ns and to_ns:
+                self.gaps.add(MISSED, cause, change, from_ns, to_ns, grade=ESTIMATED)
+
+    def appraise(self, count: int, lost: Losses, newest_ns: int = 0) -> None:
+        """Somebody else estimated what was lost before ``count`` messages without numbers, just received, the last then."""
         if count:
             self.accounting = RECEIVED_ONLY if lost is None else ESTIMATED
             if lost is not None:
                 self.unknown -= count
                 self.estimated += count
-                for cause, change in lost.items():
-                    self.missed_estimated[cause] = max(0, self.missed_estimated[cause] + change)
+                self._estimate_lost(lost, self.gaps.heard_ns, newest_ns)
+                self.missed_estimated = +self.missed_estimated
 
     def find(self, count: int) -> None:
         """Messages of the session before, of which its accounts did not know yet, turned up in a file of it."""
@@ -214,12 +242,27 @@ class TopicAccount:
         if other is not None and other.messages is not None:
             other.messages += count
 
+    def figures(self) -> Figures:
+        """What was lost so far, as the gap journal has it."""
+        found = Counter[tuple[str, str, str]]()
+        for span in self.publishers.values():
+            for cause, count in span.missed.items():
+                found[MISSED, cause, EXACT] += max(0, count)
+        for cause, count in self.missed_estimated.items():
+            found[MISSED, cause, ESTIMATED] = max(0, count)
+        for reason, count in self.rejected.items():
+            found[REJECTED, reason, EXACT] = count
+        for reason, count in self.dropped.items():
+            found[DROPPED, reason, EXACT] = count
+        return found
+
     def _span(self, publisher: str) -> Span:
         span = self.publishers.get(publisher)
         if span is None:
             if len(self.publishers) >= MAX_PUBLISHERS:
                 self._add_up()
-            span = self.publishers[publisher] = Span(*self.gone.pop(publisher, ()))
+            first, last = self.gone.pop(publisher, (None, None))
+            span = self.publishers[publisher] = Span(first, last, name=publisher, gaps=self.gaps)
         return span
 
     def _add_up(self) -> None:
@@ -227,7 +270,7 @@ class TopicAccount:
         own = [name for name in self.publishers if name not in {GONE, WRONG_TYPE}]
         for name in sorted(own, key=lambda name: self.publishers[name].used)[: len(own) // 2]:
             span = self.publishers.pop(name)
-            self.publishers.setdefault(GONE, Span()).absorb(span)
+            self.publishers.setdefault(GONE, Span(gaps=self.gaps)).absorb(span)
             self.removed[name] = Span(span.first, span.last) if span.older else None
             if span.first is not None and span.last is not None:
                 self.gone[name] = span.first, span.last
@@ -259,7 +302,8 @@ class Accounts:
     """All topics of this session. Thread-safe: ``entry`` holds the lock, the other methods take it."""
 
     def __init__(self, inherited: Iterable[PublisherRow] = (), last_kept: Mapping[str, int] | None = None,
-                 rhythms: Iterable[RhythmRow] = (), grades: Mapping[str, str] | None = None) -> None:  # fmt: skip
+                 rhythms: Iterable[RhythmRow] = (), grades: Mapping[str, str] | None = None,
+                 clock: Clock | None = None) -> None:  # fmt: skip
         """``grades`` are those of the newest messages, by account: a gap after others is no loss that these numbers tell."""
         self._lock = threading.Lock()
         self._topics: dict[str, TopicAccount] = {}
@@ -272,10 +316,14 @@ class Accounts:
             row.topic: row if self._grades.get(row.topic) == ESTIMATED else replace(row, publisher='') for row in rhythms
         }
         self._carried = Counter[str]()
+        self._carried_ns: dict[str, tuple[int, int]] = {}
+        self._mission = ''
+        self._clock = clock
+        self._unwritten: list[TopicGaps] = []
         self._last_kept = dict(last_kept or {})
         for row in inherited:
             spans = self._inherited.setdefault(row.topic, {})
-            spans[row.publisher] = Span(row.first, row.last, inherited=True)
+            spans[row.publisher] = Span(row.first, row.last, inherited=True, heard_ns=row.heard_ns, name=row.publisher)
             if len(spans) >= MAX_PUBLISHERS:
                 del spans[next(iter(spans))]
 
@@ -287,9 +335,13 @@ class Accounts:
         self._dirty = True
         return self._account(topic)
 
-    def reject(self, topic: str, reasons: Mapping[str, int]) -> None:
+    def reject(self, topic: str, reasons: Mapping[str, int], from_ns: int = 0, to_ns: int = 0) -> None:
+        """Messages were rejected; the stamps as of ``drop``, of those that they came with."""
         with self.entry(topic) as account:
-            account.rejected.update(reasons)
+            for reason, count in reasons.items():
+                account.rejected[reason] += count
+                if count and from_ns:
+                    account.gaps.add(REJECTED, reason, count, from_ns, to_ns)
 
     def see_other(self, topic: str, type_name: str, nodes: Iterable[str], *, counted: bool, named: bool,
                   only_known: bool = False) -> None:  # fmt: skip
@@ -305,9 +357,10 @@ class Accounts:
         with self.entry(topic) as account:
             account.refuse(type_name, count)
 
-    def drop(self, topic: str, reason: str, count: int) -> None:
+    def drop(self, topic: str, reason: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
+        """Messages were dropped; the stamps are those of the first and the last of them, 0 where they are not known."""
         with self.entry(topic) as account:
-            account.dropped[reason] += count
+            account.drop(reason, count, from_ns, to_ns)
 
     def store(self, stored: Mapping[str, tuple[int, int]]) -> None:
         """Samples that a group commit made durable: topic -> (count, stamp of the newest)."""
@@ -327,6 +380,7 @@ class Accounts:
                 account.estimated += row.estimated
                 account.unknown += row.unknown
                 self._carried[row.topic] += row.received
+                self._carried_ns[row.topic] = row.last_kept_ns or row.heard_ns, row.heard_ns
 
     def find(self, counts: Mapping[str, int]) -> None:
         """Messages of an earlier session turned up in a file that is about to be spooled."""
@@ -343,7 +397,7 @@ class Accounts:
         with self._lock:
             carried, self._carried = +self._carried, Counter()
             for topic, count in carried.items():
-                self._account(topic).dropped[reason] += count
+                self._account(topic).drop(reason, count, *self._carried_ns[topic])
                 self._dirty = True
             return carried.total()
 
@@ -357,7 +411,7 @@ class Accounts:
             for topic, account in self._topics.items():
                 if account.open > 0 and not topic.startswith(SINKS):
                     lost += account.open
-                    account.dropped[reason] += account.open
+                    account.drop(reason, account.open, account.last_kept_ns or account.gaps.heard_ns, account.gaps.heard_ns)
                     self._dirty = True
             return lost
 
@@ -366,6 +420,13 @@ class Accounts:
         with self._lock:
             account = self._topics.get(topic)
             return max(account.last_kept_ns if account else 0, self._last_kept.get(topic, 0))
+
+    def set_mission(self, mission_id: str) -> None:
+        """What is lost from now on is lost in this mission; '' for none."""
+        with self._lock:
+            self._mission = mission_id
+            for account in self._topics.values():
+                account.gaps.mission = mission_id
 
     def rebase(self, topic: str) -> None:
         """What is published on the topic until its next message was not listened to on purpose: it is not missed."""
@@ -400,6 +461,7 @@ class Accounts:
     def snapshot(self, stored: Mapping[str, tuple[int, int]]) -> AccountSnapshot | None:
         """The state as it will be once ``stored`` is durable; None when nothing changed since the last one."""
         with self._lock:
+            self._unwritten = []
             if not self._dirty and not stored:
                 return None
             self._dirty = False
@@ -414,6 +476,8 @@ class Accounts:
             self._written = [span for _, _, span in spans]
             for span in self._written:
                 span.changed = False
+            self._unwritten = [account.gaps for account in self._topics.values()]
+            changes = [account.gaps.settle(topic, account.figures()) for topic, account in self._topics.items()]
             self._removed = {topic: account.removed for topic, account in self._topics.items() if account.removed}
             for topic, removed in self._removed.items():
                 self._topics[topic].removed = {}
@@ -423,7 +487,9 @@ class Accounts:
             return AccountSnapshot(
                 tuple(self._row(topic, account, *stored.get(topic, (0, 0))) for topic, account in self._topics.items()),
                 tuple(
-                    PublisherRow(topic, publisher, span.first, span.last, span.published, span.received, dict(+span.missed))
+                    PublisherRow(
+                        topic, publisher, span.first, span.last, span.published, span.received, dict(+span.missed), span.heard_ns
+                    )
                     for topic, publisher, span in spans
                 ),
                 tuple(
@@ -433,6 +499,8 @@ class Accounts:
                 ),
                 tuple(row for row in rhythms if row is not None),
                 tuple((topic, name) for topic, removed in self._removed.items() for name in removed),
+                tuple(row for rows, _ in changes for row in rows),
+                tuple(each for _, taken_back in changes for each in taken_back),
             )
 
     def mark_dirty(self) -> None:
@@ -443,6 +511,9 @@ class Accounts:
                 span.changed = True
             for topic, removed in self._removed.items():
                 self._topics[topic].removed = {**removed, **self._topics[topic].removed}
+            for gaps in self._unwritten:
+                gaps.undo()
+            self._unwritten = []
 
     def _rebase(self, topic: str) -> None:
         if account := self._topics.get(topic):
@@ -457,16 +528,20 @@ class Accounts:
         if account is None:
             account = self._topics[topic] = TopicAccount(
                 publishers=self._inherited.pop(topic, {}), before=self._grades.get(topic, ''),
-                estimate=TopicEstimate(before=self._rhythms.pop(topic, None)),
+                estimate=TopicEstimate(before=self._rhythms.pop(topic, None)), gaps=TopicGaps(self._mission, self._clock),
             )  # fmt: skip
+            for span in account.publishers.values():
+                span.gaps = account.gaps
         return account
 
     @staticmethod
     def _row(topic: str, account: TopicAccount, count: int, newest_ns: int) -> TopicRow:
+        if account.open <= count and account.accounting not in {'', RECEIVED_ONLY}:
+            account.complete_ns = account.gaps.heard_ns
         return TopicRow(
             topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
             dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
-            account.estimated, account.unknown, dict(+account.missed_estimated),
+            account.estimated, account.unknown, dict(+account.missed_estimated), account.gaps.heard_ns, account.complete_ns,
         )  # fmt: skip
 
 

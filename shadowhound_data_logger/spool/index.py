@@ -20,6 +20,7 @@ from typing import Any, Final
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.spool import gaps
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.schema import definitions, expected, prepare
 
@@ -205,7 +206,7 @@ class Index:
             ' AND settled_ns BETWEEN ? AND ? AND id NOT IN (SELECT id FROM uncatalogued) LIMIT ?)',
             (EARLIEST_SANE_NS, before_ns, FORGET_STEP),
         )  # fmt: skip
-        return cursor.rowcount < FORGET_STEP
+        return gaps.forget(self.db, before_ns, FORGET_STEP) and cursor.rowcount < FORGET_STEP
 
     # -- accounts --------------------------------------------------------------------------------------------------
 
@@ -220,17 +221,18 @@ class Index:
     def write(self, session: int, snapshot: AccountSnapshot) -> None:
         """Replace the session's accounts by a newer snapshot."""
         self.db.executemany(
-            'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?)',
+            'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
-              json.dumps(row.rejected), json.dumps(row.dropped), row.last_kept_ns) for row in snapshot.topics),
+              json.dumps(row.rejected), json.dumps(row.dropped), row.last_kept_ns, row.heard_ns,
+              row.complete_ns) for row in snapshot.topics),
         )  # fmt: skip
         self.db.executemany(
             'DELETE FROM publishers WHERE session = ? AND topic = ? AND publisher = ?', ((session, *row) for row in snapshot.gone)
         )
         self.db.executemany(
-            'INSERT OR REPLACE INTO publishers VALUES (?,?,?,?,?,?,?,?)',
-            ((session, row.topic, row.publisher, row.first, row.last, row.published, row.received, json.dumps(row.missed))
-             for row in snapshot.publishers),
+            'INSERT OR REPLACE INTO publishers VALUES (?,?,?,?,?,?,?,?,?)',
+            ((session, row.topic, row.publisher, row.first, row.last, row.published, row.received, json.dumps(row.missed),
+              row.heard_ns) for row in snapshot.publishers),
         )  # fmt: skip
         self.db.executemany(
             'INSERT OR REPLACE INTO estimates VALUES (?,?,?,?,?)',
@@ -241,11 +243,11 @@ class Index:
             'INSERT OR REPLACE INTO rhythms VALUES (?,?,?,?,?)',
             ((row.topic, row.publisher, row.of, row.period, row.last) for row in snapshot.rhythms),
         )
-
         self.db.executemany(
             'INSERT OR REPLACE INTO other_types VALUES (?,?,?,?,?)',
             ((session, row.topic, row.type, json.dumps(row.publishers), row.messages) for row in snapshot.other_types),
         )  # fmt: skip
+        gaps.write(self.db, session, snapshot.gaps, snapshot.taken_back)
 
     def sessions(self, *, ended: bool) -> list[int]:
         condition = 'NOT NULL' if ended else 'NULL'
@@ -255,22 +257,22 @@ class Index:
         """Accounts of one session, or of all in the order of the sessions."""
         where, values = ('WHERE session = ?', (session,)) if session is not None else ('', ())
         columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, rejected, dropped,'
-                   " ifnull(estimated, 0), ifnull(unknown, 0), ifnull(missed, '{}')")  # fmt: skip
+                   " ifnull(estimated, 0), ifnull(unknown, 0), ifnull(missed, '{}'), heard_ns, complete_ns")  # fmt: skip
         query = f'SELECT {columns} FROM accounts LEFT JOIN estimates USING (session, topic) {where} ORDER BY session'  # noqa: S608
         return [
             TopicRow(topic, kind, accounting, received, skipped, stored, json.loads(rejected), json.loads(dropped), last_ns,
-                     estimated, unknown, json.loads(missed))
-            for topic, kind, accounting, received, skipped, stored, last_ns, rejected, dropped, estimated, unknown, missed
-            in self.db.execute(query, values)
+                     estimated, unknown, json.loads(missed), heard_ns, complete_ns)
+            for topic, kind, accounting, received, skipped, stored, last_ns, rejected, dropped, estimated, unknown, missed,
+            heard_ns, complete_ns in self.db.execute(query, values)
         ]  # fmt: skip
 
     def publishers(self) -> list[PublisherRow]:
         """All spans in the order of the sessions: the last row of a publisher says where its numbers stand."""
-        columns = 'topic, publisher, first, last, published, received, missed'
+        columns = 'topic, publisher, first, last, published, received, missed, heard_ns'
         rows = self.db.execute(f'SELECT {columns} FROM publishers ORDER BY session')  # noqa: S608
         return [
-            PublisherRow(topic, publisher, first, last, published, received, json.loads(missed))
-            for topic, publisher, first, last, published, received, missed in rows
+            PublisherRow(topic, publisher, first, last, published, received, json.loads(missed), heard_ns)
+            for topic, publisher, first, last, published, received, missed, heard_ns in rows
         ]
 
     def other_types(self) -> list[OtherTypeRow]:
@@ -279,6 +281,10 @@ class Index:
             return []
         rows = self.db.execute('SELECT topic, type, publishers, messages FROM other_types ORDER BY session')
         return [OtherTypeRow(topic, kind, tuple(json.loads(nodes)), count) for topic, kind, nodes, count in rows]
+
+    def gap_sums(self) -> dict[tuple[str, str, str, str], int] | None:
+        """What the gap journal adds up to (``gaps.sums``); None for an older index, which has none."""
+        return None if self._read_only and not self._has('gaps') else gaps.sums(self.db)
 
     def _has(self, table: str) -> bool:
         """An older index is read as it is: only the node brings it up to date."""

@@ -12,7 +12,8 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import clock_record
 from shadowhound_data_logger.spool.account_rows import OtherTypeRow
-from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
+from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
+from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED
 from shadowhound_data_logger.spool.index import Index
 
 STATES: Final = tuple(state.value for state in State)
@@ -44,10 +45,13 @@ def of_index(index: Index, robot: str) -> dict[str, Any]:
     index.db.execute('BEGIN')
     try:
         topics, publishers, tally, others = index.topics(), index.publishers(), index.tally(), index.other_types()
+        journal = index.gap_sums()
     finally:
         index.db.execute('COMMIT')
     names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
     accounts = {topic: _topic(topic, topics, publishers, tally, others) for topic in sorted(names)}
+    for topic, row in accounts.items():
+        row['gaps'] = None if journal is None else _journaled(topic, journal)
     sensors = {topic: row for topic, row in accounts.items() if not topic.startswith(SINKS)}
     bags, events = ({topic.removeprefix(sink): row for topic, row in accounts.items() if topic.startswith(sink)}
                     for sink in SINKS)  # fmt: skip
@@ -68,7 +72,7 @@ def imbalances(ledger: Mapping[str, Any]) -> list[str]:
         settled = row['skipped'] + sum(row['rejected'].values()) + sum(row['dropped'].values()) + row['stored'] + row['open']
         if row['received'] != settled or row['open'] < 0:
             found.append(f'{topic}: received {row["received"]}, but skipped + rejected + dropped + stored + open = {settled}')
-        found += [f'{topic}: {sentence}' for sentence in _ungraded(row)]
+        found += [f'{topic}: {sentence}' for sentence in (*_ungraded(row), *_undated(row))]
         if row['stored'] != sum(row['stored_in'].values()):
             found.append(f'{topic}: stored {row["stored"]}, but in objects there are {sum(row["stored_in"].values())}')
     for what in ('objects', 'bytes'):
@@ -76,6 +80,33 @@ def imbalances(ledger: Mapping[str, Any]) -> list[str]:
         if ledger[what]['spooled'] != parts or min(ledger[what].values()) < 0:
             found.append(f'{what}: spooled {ledger[what]["spooled"]}, but by state {parts} ({dict(ledger[what])})')
     return found
+
+
+def _undated(row: Mapping[str, Any]) -> Iterator[str]:
+    """One sentence for each account of losses that the rows of the gap journal do not add up to."""
+    if row.get('gaps') is None:  # of an older index
+        return
+    lost = {
+        MISSED: _sum(part['missed_by'] for part in row['by_grade'].values()), REJECTED: row['rejected'], DROPPED: row['dropped'],
+    }  # fmt: skip
+    for kind, causes in lost.items():
+        gaps = row['gaps'].get(kind, {})
+        for cause in sorted(causes.keys() | gaps.keys()):
+            if causes.get(cause, 0) != gaps.get(cause, 0):
+                yield f'{kind} by {cause} {causes.get(cause, 0)}, but in the gap journal {gaps.get(cause, 0)}'
+    for kind in (EVICTED, QUARANTINED):
+        there = sum(row['gaps'].get(kind, {}).values())
+        if row['stored_in'][kind] != there:
+            yield f'{kind} {row["stored_in"][kind]}, but in the gap journal {there}'
+
+
+def _journaled(topic: str, journal: Mapping[tuple[str, str, str, str], int]) -> dict[str, dict[str, int]]:
+    """What the gap journal has of a topic: kind -> cause -> messages."""
+    found: dict[str, Counter[str]] = {}
+    for (account, kind, cause, _), count in journal.items():
+        if account == topic:
+            found.setdefault(kind, Counter())[cause] += count
+    return {kind: dict(causes) for kind, causes in found.items()}
 
 
 def _ungraded(row: Mapping[str, Any]) -> Iterator[str]:

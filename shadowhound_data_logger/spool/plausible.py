@@ -13,17 +13,18 @@ from typing import Final
 _NUMBERS: Final = {
     'objects': ('id', 'priority', 'protected', 'samples', 'bytes', 't_start_ns', 't_end_ns', 'created_ns', 'settled_ns'),
     'sessions': ('id', 'pid', 'started_ns', 'ended_ns'),
-    'accounts': ('session', 'received', 'skipped', 'stored', 'last_kept_ns'),
-    'publishers': ('session', 'first', 'last', 'published', 'received'),
+    'accounts': ('session', 'received', 'skipped', 'stored', 'last_kept_ns', 'heard_ns', 'complete_ns'),
+    'publishers': ('session', 'first', 'last', 'published', 'received', 'heard_ns'),
     'other_types': ('session', 'messages'),
     'estimates': ('session', 'estimated', 'unknown'),
     'rhythms': ('last',),
     'tally': ('objects', 'bytes', 'samples'),
     'contents': ('id', 'samples'),
+    'gaps': ('session', 'begin_ns', 'from_ns', 'to_ns', 'count', 'merged', 'version'),
     'sqlite_sequence': ('seq',),
 }
 _COUNTS: Final = frozenset({'id', 'samples', 'bytes', 'received', 'skipped', 'stored', 'published', 'objects', 'seq', 'session',
-                            'messages', 'estimated', 'unknown'})  # fmt: skip
+                            'messages', 'estimated', 'unknown', 'count', 'merged', 'version'})  # fmt: skip
 """Never below 0, and no more than can be counted. Times and the numbers of messages are whatever a publisher says."""
 _MOST: Final = 1 << 53
 _TEXTS: Final = {
@@ -36,6 +37,7 @@ _TEXTS: Final = {
     'rhythms': ('topic', 'publisher', 'of'),
     'tally': ('topic', 'state'),
     'contents': ('topic',),
+    'gaps': ('topic', 'kind', 'cause', 'grade', 'publisher', 'mission'),
     'sqlite_sequence': ('name',),
 }
 _JSON: Final = {
@@ -60,7 +62,7 @@ def check(db: sqlite3.Connection) -> None:
     """Raises sqlite3.DatabaseError for a value that cannot be."""
     for table in _NUMBERS:
         query = f'SELECT rowid FROM {table} WHERE {_wrong(table)} LIMIT 1'  # noqa: S608 - own constants only
-        if table in {'accounts', 'publishers', 'other_types', 'estimates', 'rhythms', 'tally', 'contents'}:  # these have no rowid
+        if table not in {'objects', 'sessions', 'sqlite_sequence'}:  # these have no rowid
             query = query.replace('rowid', 'topic')
         found = db.execute(query).fetchone()
         if found is not None:

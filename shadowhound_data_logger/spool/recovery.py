@@ -31,6 +31,7 @@ from shadowhound_data_logger.spool.adoption import Adoption, Recovery, place_sai
 from shadowhound_data_logger.spool.ballast import says_full
 from shadowhound_data_logger.spool.binding import renew
 from shadowhound_data_logger.spool.files import Tree
+from shadowhound_data_logger.spool.gaps import DROPPED, EXACT, GapRow, TopicGaps
 from shadowhound_data_logger.spool.index import MISSING, Index
 from shadowhound_data_logger.spool.ledger import imbalances, of_index
 
@@ -191,12 +192,17 @@ def _is_dead(tree: Tree, session: int) -> bool:
 def _settle_session(index: Index, session: int, now_ns: int, report: Recovery) -> None:
     """Close the accounts of a process that died: what was open is lost, and the ledger says so."""
     rows: list[TopicRow] = []
+    lost: list[GapRow] = []
     for row in index.topics(session):
         if row.topic.startswith(SINKS):  # what is open there is in files, which the node looks for (Spool.carry)
             continue
         dropped = {**row.dropped, 'restart': row.dropped.get('restart', 0) + row.open}
         rows.append(replace(row, dropped=dropped) if row.open else row)
         report.counts['messages lost with an open batch'] += row.open
+        if row.open > 0:
+            gaps = TopicGaps()
+            gaps.add(DROPPED, 'restart', row.open, row.last_kept_ns or row.heard_ns, row.heard_ns)
+            lost += gaps.settle(row.topic, {(DROPPED, 'restart', EXACT): row.open})[0]
     with index.transaction():
-        index.write(session, AccountSnapshot(tuple(rows), ()))
+        index.write(session, AccountSnapshot(tuple(rows), (), gaps=tuple(lost)))
         index.end_session(session, now_ns)

@@ -9,12 +9,15 @@ from typing import Final
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool.gaps import MERGE, NEXT_VERSION, UNTIMED
 
-SCHEMA_VERSION: Final = 5
+SCHEMA_VERSION: Final = 6
 CATALOGUE: Final = '_catalog'
 """The sensor of the catalogue's own objects, which have no rows in it."""
 REGRADED: Final = 5
 """The version from which on accounts have grades as they are now."""
+JOURNALED: Final = 6
+"""The version from which on losses have times."""
 VERSION_LIMIT: Final = 1000
 """A version from here on is damage, not a future."""
 _STATES: Final = ', '.join(f"'{state.value}'" for state in State)
@@ -74,6 +77,102 @@ CREATE TABLE rhythms (
   ) WITHOUT ROWID;
 """
 """Of accounts with messages that have no numbers: how many of the received ones those are."""
+_ACCOUNTS: Final = """
+CREATE TABLE accounts (
+  session INTEGER NOT NULL, topic TEXT NOT NULL, type TEXT NOT NULL, accounting TEXT NOT NULL,
+  received INTEGER NOT NULL, skipped INTEGER NOT NULL, stored INTEGER NOT NULL,
+  rejected TEXT NOT NULL, dropped TEXT NOT NULL, last_kept_ns INTEGER NOT NULL,
+  heard_ns INTEGER NOT NULL, complete_ns INTEGER NOT NULL,
+  PRIMARY KEY (session, topic)) WITHOUT ROWID;
+CREATE TABLE publishers (
+  session INTEGER NOT NULL, topic TEXT NOT NULL, publisher TEXT NOT NULL, first INTEGER, last INTEGER,
+  published INTEGER NOT NULL, received INTEGER NOT NULL, missed TEXT NOT NULL, heard_ns INTEGER NOT NULL,
+  PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
+"""
+_LOST: Final = f"('{State.EVICTED.value}', '{State.QUARANTINED.value}')"
+
+
+def _gap_of(row: str, topic: str, samples: str) -> str:
+    """The values of the gap that the samples of a lost object are."""
+    mission = f"CASE WHEN json_valid({row}.metadata) THEN ifnull(json_extract({row}.metadata, '$.mission_id'), '') ELSE '' END"
+    named = f"0, {topic}, {row}.state, ifnull({row}.reason, ''), 'exact', '', {mission}, {_begin_of(row)}"
+    return f'{named}, {row}.t_start_ns, {row}.t_end_ns, {samples}, 1, {NEXT_VERSION}'
+
+
+def _begin_of(row: str) -> str:
+    start, end = f'{row}.t_start_ns', f'{row}.t_end_ns'
+    return f'CASE WHEN {end} - {start} < 1000000000 THEN {start} / 1000000000 * 1000000000 ELSE {start} END'
+
+
+_GAP_TABLE: Final = f"""
+CREATE TABLE gaps (
+  session INTEGER NOT NULL, topic TEXT NOT NULL, kind TEXT NOT NULL, cause TEXT NOT NULL, grade TEXT NOT NULL,
+  publisher TEXT NOT NULL, mission TEXT NOT NULL, begin_ns INTEGER NOT NULL, from_ns INTEGER, to_ns INTEGER,
+  count INTEGER NOT NULL, merged INTEGER NOT NULL, version INTEGER NOT NULL,
+  PRIMARY KEY (session, topic, kind, cause, grade, begin_ns, publisher, mission)) WITHOUT ROWID;
+CREATE INDEX gaps_changed ON gaps (version);
+CREATE INDEX gaps_begun ON gaps (begin_ns);
+CREATE TRIGGER object_lost AFTER INSERT ON objects
+    WHEN NEW.state IN {_LOST} AND NEW.topic IS NOT NULL AND NEW.samples > 0 BEGIN
+  INSERT INTO gaps VALUES ({_gap_of('NEW', 'NEW.topic', 'NEW.samples')}) {MERGE};
+END;
+CREATE TRIGGER contents_lost AFTER INSERT ON contents
+    WHEN NEW.samples > 0 AND (SELECT state FROM objects WHERE id = NEW.id) IN {_LOST} BEGIN
+  INSERT INTO gaps SELECT {_gap_of('objects', 'NEW.topic', 'NEW.samples')} FROM objects WHERE id = NEW.id {MERGE};
+END;
+CREATE TRIGGER lost_or_found AFTER UPDATE OF state, reason ON objects
+    WHEN (OLD.state <> NEW.state OR OLD.reason IS NOT NEW.reason) AND (OLD.state IN {_LOST} OR NEW.state IN {_LOST}) BEGIN
+  UPDATE gaps SET version = {NEXT_VERSION}, merged = max(0, merged - 1), count = count - (
+      SELECT CASE WHEN OLD.topic IS NULL
+        THEN (SELECT samples FROM contents WHERE id = OLD.id AND topic = gaps.topic) ELSE OLD.samples END)
+    WHERE OLD.state IN {_LOST} AND session = 0 AND kind = OLD.state AND cause = ifnull(OLD.reason, '') AND grade = 'exact'
+      AND begin_ns = {_begin_of('OLD')} AND publisher = ''
+      AND mission = CASE WHEN json_valid(OLD.metadata) THEN ifnull(json_extract(OLD.metadata, '$.mission_id'), '') ELSE '' END
+      AND (topic = OLD.topic OR (OLD.topic IS NULL
+        AND topic IN (SELECT topic FROM contents WHERE id = OLD.id AND samples > 0)));
+  INSERT INTO gaps SELECT {_gap_of('NEW', 'NEW.topic', 'NEW.samples')}
+    WHERE NEW.state IN {_LOST} AND NEW.topic IS NOT NULL AND NEW.samples > 0 {MERGE};
+  INSERT INTO gaps SELECT {_gap_of('NEW', 'contents.topic', 'contents.samples')} FROM contents
+    WHERE NEW.state IN {_LOST} AND NEW.topic IS NULL AND contents.id = NEW.id AND contents.samples > 0 {MERGE};
+END;
+"""  # noqa: S608 - own constants only
+"""What was lost, and when (gaps.py). What the samples of lost objects are in it follows the objects: session 0."""
+
+
+def _untimed(table: str, column: str, kind: str, grade: str) -> str:
+    """The rows of what an older version counted: it knew of no times."""
+    return (f"INSERT INTO gaps SELECT session, topic, '{kind}', cause.key, '{grade}', '', '', {UNTIMED}, NULL, NULL,"  # noqa: S608
+            f' sum(cause.value), count(*), 1 FROM {table}, json_each({table}.{column}) AS cause WHERE cause.value > 0'
+            ' GROUP BY session, topic, cause.key;')  # fmt: skip
+
+
+_LOST_ROWS: Final = f"""
+INSERT INTO gaps SELECT {_gap_of('objects', 'objects.topic', 'objects.samples')} FROM objects
+  WHERE state IN {_LOST} AND topic IS NOT NULL AND samples > 0 {MERGE};
+INSERT INTO gaps SELECT {_gap_of('objects', 'contents.topic', 'contents.samples')}
+  FROM objects JOIN contents USING (id) WHERE state IN {_LOST} AND objects.topic IS NULL AND contents.samples > 0 {MERGE};
+INSERT INTO gaps SELECT 0, topic, 'evicted', '', 'exact', '', '', {UNTIMED}, NULL, NULL, rest, objects, 1 FROM (
+  SELECT topic, objects, samples - ifnull((SELECT sum(count) FROM gaps WHERE gaps.topic = tally.topic AND kind = 'evicted'), 0)
+    AS rest FROM tally WHERE state = 'evicted' AND topic <> '') WHERE rest > 0;
+"""  # noqa: S608 - own constants only
+"""Of the objects that an older index has lost and still remembers the times are known."""
+_JOURNALED: Final = f"""
+CREATE TEMP TABLE older_accounts AS SELECT * FROM main.accounts;
+CREATE TEMP TABLE older_publishers AS SELECT * FROM main.publishers;
+DROP TABLE main.accounts;
+DROP TABLE main.publishers;
+{_ACCOUNTS}
+INSERT INTO accounts SELECT *, 0, 0 FROM temp.older_accounts;
+INSERT INTO publishers SELECT *, 0 FROM temp.older_publishers;
+DROP TABLE temp.older_accounts;
+DROP TABLE temp.older_publishers;
+{_GAP_TABLE}
+{_untimed('publishers', 'missed', 'missed', 'exact')}
+{_untimed('estimates', 'missed', 'missed', 'estimated')}
+{_untimed('accounts', 'rejected', 'rejected', 'exact')}
+{_untimed('accounts', 'dropped', 'dropped', 'exact')}
+{_LOST_ROWS}
+"""  # noqa: S608 - own constants only
 _REGRADED: Final = """
 INSERT INTO estimates SELECT session, topic, 0, received, '{}' FROM accounts WHERE accounting <> 'exact';
 UPDATE accounts SET accounting = 'received-only' WHERE accounting <> 'exact';
@@ -117,19 +216,12 @@ END;
 CREATE TABLE sessions (
   id INTEGER PRIMARY KEY AUTOINCREMENT, robot TEXT NOT NULL, boot_id TEXT NOT NULL, pid INTEGER NOT NULL,
   started_ns INTEGER NOT NULL, ended_ns INTEGER);
-CREATE TABLE accounts (
-  session INTEGER NOT NULL, topic TEXT NOT NULL, type TEXT NOT NULL, accounting TEXT NOT NULL,
-  received INTEGER NOT NULL, skipped INTEGER NOT NULL, stored INTEGER NOT NULL,
-  rejected TEXT NOT NULL, dropped TEXT NOT NULL, last_kept_ns INTEGER NOT NULL,
-  PRIMARY KEY (session, topic)) WITHOUT ROWID;
-CREATE TABLE publishers (
-  session INTEGER NOT NULL, topic TEXT NOT NULL, publisher TEXT NOT NULL, first INTEGER, last INTEGER,
-  published INTEGER NOT NULL, received INTEGER NOT NULL, missed TEXT NOT NULL,
-  PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
+{_ACCOUNTS}
 {_CATALOGUE}
 {_CONTENTS}
 {_OTHER_TYPES}
 {_ESTIMATES}
+{_GAP_TABLE}
 PRAGMA user_version = {SCHEMA_VERSION};
 """  # noqa: S608 - own constants only
 MIGRATIONS: Final = {
@@ -137,15 +229,19 @@ MIGRATIONS: Final = {
     2: f'{_CONTENTS} {_CATALOGUE} INSERT INTO uncatalogued SELECT id FROM objects WHERE {_ARRIVED};',  # noqa: S608 - own constants only
     3: _OTHER_TYPES,
     4: f'{_ESTIMATES} {_REGRADED}',
+    5: _JOURNALED,
 }
 """Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
-_AS_NOW: Final = f"""
-CREATE TEMP TABLE accounts AS SELECT * FROM main.accounts;
-CREATE TEMP TABLE publishers AS SELECT * FROM main.publishers;
+_AS_NOW: Final = """
+CREATE TEMP TABLE accounts AS SELECT *, 0 AS heard_ns, 0 AS complete_ns FROM main.accounts;
+CREATE TEMP TABLE publishers AS SELECT *, 0 AS heard_ns FROM main.publishers;
+"""
+"""What makes the accounts of an older index readable where it may not be changed: a node of that version may be at it."""
+_AS_REGRADED: Final = f"""
 {_ESTIMATES.replace('CREATE TABLE', 'CREATE TEMP TABLE')}
 {_REGRADED}
-"""  # noqa: S608 - own constants only
-"""What makes the accounts of an older index readable where it may not be changed: a node of that version may be at it."""
+"""
+"""Besides, where they have other grades."""
 
 
 def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> None:
@@ -160,8 +256,10 @@ def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> N
         raise SpoolError(f'the spool index {path} is of version {version}, this program knows {SCHEMA_VERSION}',
                          remedy='update shadowhound_data_logger')  # fmt: skip
     if read_only:
-        if 0 < version < REGRADED:
+        if 0 < version < JOURNALED:
             connection.executescript(_AS_NOW)
+        if 0 < version < REGRADED:
+            connection.executescript(_AS_REGRADED)
         return
     connection.execute('PRAGMA journal_mode = WAL')
     connection.execute('PRAGMA synchronous = FULL')

@@ -58,6 +58,7 @@ def carry(index: Index, session: int, robot: str, sink: str) -> list[TopicRow]:
                 moved[row.topic] = replace(
                     before, type=row.type, accounting=row.accounting, received=before.received + row.open,
                     estimated=before.estimated + estimated, unknown=before.unknown + unknown,
+                    last_kept_ns=max(before.last_kept_ns, row.last_kept_ns), heard_ns=max(before.heard_ns, row.heard_ns),
                 )  # fmt: skip
                 place = number, row.topic
                 query = 'UPDATE accounts SET received = received - ? WHERE session = ? AND topic = ?'

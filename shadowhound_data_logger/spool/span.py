@@ -7,6 +7,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Final
 
+from shadowhound_data_logger.spool.gaps import MISSED, GapKey, TopicGaps
+
 MAX_RANGES: Final = 512
 """Ranges of numbers that are remembered per publisher (the newest, which may still come late): every second message lost of
 2,000 a second, between two drains. A publisher chooses its numbers, so they are never remembered one by one."""
@@ -21,7 +23,7 @@ class Ranges:
     __slots__ = ('_rows',)
 
     def __init__(self) -> None:
-        self._rows: list[tuple[int, int, str]] = []
+        self._rows: list[tuple[int, int, GapKey | str]] = []
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -29,12 +31,12 @@ class Ranges:
     def __contains__(self, number: int) -> bool:
         return self._find(number) is not None
 
-    def append(self, start: int, stop: int, word: str) -> None:
+    def append(self, start: int, stop: int, word: GapKey | str) -> None:
         """A range above all others, ``stop`` not in it."""
         self._rows.append((start, stop, word))
         del self._rows[:-MAX_RANGES]
 
-    def take(self, number: int) -> str | None:
+    def take(self, number: int) -> GapKey | str | None:
         """Take the number out; the word of its range, None where it is in none."""
         at = self._find(number)
         if at is None:
@@ -73,6 +75,11 @@ class Span:
     first: int | None = None
     last: int | None = None
     inherited: bool = False
+    heard_ns: int = 0
+    """Stamp of ``last``; 0 where it is not known."""
+    name: str = ''
+    gaps: TopicGaps = field(default_factory=TopicGaps)
+    """Where the times of what is missed go: those of its topic."""
     published: int = 0
     received: int = 0
     missed: Counter[str] = field(default_factory=Counter)
@@ -94,19 +101,23 @@ class Span:
         self._base = self.first
         self.older = self.inherited
 
-    def observe(self, number: int) -> bool:
+    def observe(self, number: int, stamp_ns: int = 0) -> bool:
         """Count a message by its sequence number; False if it was counted before (a repeat)."""
         if self.first is None or self._base is None or self.last is None:
             self.first = self._base = self.last = number
+            self.heard_ns = stamp_ns
         elif number > self.last:
             if number > self.last + 1:
-                self._skip(self.last + 1, number)
+                self._skip(self.last + 1, number, stamp_ns)
             self.last = number
+            self.heard_ns = stamp_ns
             self.inherited = self._rebased = False
-        elif (cause := self._holes.take(number)) is not None:
-            if cause and self.missed[cause] > 0:
-                self.missed[cause] -= 1
+        elif (hole := self._take_hole(number)) is not None:
+            key, more = hole
+            if isinstance(key, GapKey) and self.missed[key.cause] > 0:
+                self.missed[key.cause] -= 1
                 self.published -= 1
+                self.gaps.fill(key, more)
         elif number < self._base and number not in self._early:
             # TRANSIENT_LOCAL delivers history from before the first number taken.
             if not self._early.add(number):
@@ -164,14 +175,23 @@ class Span:
         """What is published until the next new message was not listened to on purpose: that gap is not missed."""
         self._rebased = True
 
-    def _skip(self, start: int, stop: int) -> None:
+    def _take_hole(self, number: int) -> tuple[GapKey | str, int] | None:
+        """The hole that the number was in, and how many holes more there are now; None where it was in none."""
+        before = len(self._holes)
+        hole = self._holes.take(number)
+        return None if hole is None else (hole, len(self._holes) - before)
+
+    def _skip(self, start: int, stop: int, stamp_ns: int) -> None:
         """Count the numbers of a gap as missed, unless nobody listened, and remember them: they may come late."""
         cause = '' if self._rebased else 'restart' if self.inherited else 'transport'
         if self.missed.total() + stop - start > MAX_MISSED:
             cause = ''
+        hole: GapKey | str = ''
         if cause:
             known = min(self._late, stop - start)
             self._late -= known
-            self.missed[cause] += stop - start - known
-            self.published += stop - start - known
-        self._holes.append(start, stop, cause)
+            count = stop - start - known
+            self.missed[cause] += count
+            self.published += count
+            hole = self.gaps.add(MISSED, cause, count, self.heard_ns, stamp_ns, self.name)
+        self._holes.append(start, stop, hole)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -20,13 +20,14 @@ from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, SpooledObject, State
-from shadowhound_data_logger.spool import binding
+from shadowhound_data_logger.spool import binding, gaps
 from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.adding import Adding, remove_sources, staged
 from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.ballast import Ballast
 from shadowhound_data_logger.spool.files import Tree
+from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index, spooled
 from shadowhound_data_logger.spool.piles import Piles, look
 from shadowhound_data_logger.spool.recovery import open_recovered
@@ -155,6 +156,17 @@ class Spool:
         rows = self._view.rows('bucket = ? AND key >= ? AND key < ?', (bucket, prefix, prefix + LAST))
         return {row['key']: State(row['state']) for row in rows}
 
+    def gaps_after(self, version: int, limit: int, offsets: Mapping[str, int]) -> tuple[list[Gap], list[Watermark]]:
+        """What changed in the gap journal since this version, and up to when that is complete, both of one instant.
+
+        About ``limit`` rows: the watermarks hold once no further row is left. ``offsets`` as of ``ClockRecord.offsets``. Waits
+        for no commit; raises SpoolError or sqlite3.Error.
+        """
+        with closing(Index(self.root / 'index.db', read_only=True)) as index:
+            index.open()
+            index.db.execute('BEGIN')
+            return gaps.changed(index.db, version, limit, offsets), gaps.watermarks(index.db)
+
     def free_bytes(self) -> int:
         """What this user may still write to the spool's file system. Raises OSError."""
         return self._tree.free_bytes()
@@ -223,7 +235,7 @@ class Spool:
                 self._index = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
                 self._view.open()
                 self._session = Session.begin(self._index, self._tree, self._robot, self._clock)
-                self.accounts = _continued(self._index)
+                self.accounts = _continued(self._index, self._clock)
         except (OSError, sqlite3.Error):
             self._index.close()
             self._view.close()
@@ -280,7 +292,7 @@ class Spool:
             self._forgot_ns = now_ns if done else 0
 
 
-def _continued(index: Index) -> Accounts:
+def _continued(index: Index, clock: Clock) -> Accounts:
     """Accounts of a session that goes on where the earlier ones ended."""
     last: dict[tuple[str, str], PublisherRow] = {}
     for row in index.publishers():
@@ -292,7 +304,7 @@ def _continued(index: Index) -> Accounts:
         kept[account.topic] = max(kept.get(account.topic, 0), account.last_kept_ns)
         if account.received:
             grades[account.topic] = account.accounting
-    return Accounts(last.values(), kept, index.rhythms(), grades)
+    return Accounts(last.values(), kept, index.rhythms(), grades, clock)
 
 
 def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, int]]:

@@ -43,8 +43,9 @@ class Outcome:
         with self.lock:
             self.objects.append(item)
 
-    def reject(self, topic: str, reasons: Mapping[str, int]) -> None:
+    def reject(self, topic: str, reasons: Mapping[str, int], from_ns: int, to_ns: int) -> None:
         assert topic == '/talk'
+        assert 0 < from_ns <= to_ns
         with self.lock:
             self.rejected.update(reasons)
 

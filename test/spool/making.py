@@ -20,6 +20,13 @@ NOON_NS = 1_760_788_800 * SECOND
 BUCKET = 'sensor-data'
 READY = f'ready/{BUCKET}'
 KEY = 'thor/camera/20251018/120000_front.jpg'
+WITHOUT_GAPS = """
+DROP TRIGGER object_lost; DROP TRIGGER contents_lost; DROP TRIGGER lost_or_found; DROP TABLE gaps;
+ALTER TABLE accounts DROP COLUMN heard_ns; ALTER TABLE accounts DROP COLUMN complete_ns;
+ALTER TABLE publishers DROP COLUMN heard_ns;
+PRAGMA user_version = 5;
+"""
+"""What makes an index of version 5, the last without times of losses, of a new one."""
 IN_SPOOL = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine'}
 
 

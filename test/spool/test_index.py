@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from spool.conftest import Open
-from spool.making import NOON_NS, assert_whole, files, make, put, reopened, rows
+from spool.making import NOON_NS, WITHOUT_GAPS, assert_whole, files, make, put, reopened, rows
 
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.index import Index
@@ -17,7 +17,8 @@ from shadowhound_data_logger.spool.schema import SCHEMA_VERSION
 
 FEW, MANY = 300, 15_000
 STEP = 20
-VERSION_1 = """
+VERSION_1 = f"""
+{WITHOUT_GAPS}
 DROP INDEX pending; DROP INDEX waiting; DROP INDEX held;
 DROP TABLE contents; DROP TRIGGER contents_moved; DROP TRIGGER contents_forgotten;
 DROP TABLE uncatalogued; DROP TRIGGER arrived; DROP TRIGGER known; DROP TRIGGER forgotten; DROP TABLE other_types;

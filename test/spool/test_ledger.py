@@ -50,6 +50,8 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
                 'by_grade': {'exact': {'published': 11, 'published_estimated': None, 'received': 9, 'missed': 2,
                                        'missed_estimated': None, 'missed_by': {'transport': 2}}},
                 'skipped': 3, 'rejected': {'truncated': 1}, 'dropped': {'queue_full': 1},
+                'gaps': {'missed': {'transport': 2}, 'rejected': {'truncated': 1}, 'dropped': {'queue_full': 1},
+                         'quarantined': {'refused': 1}},
                 'other_types': {}, 'stored': 3, 'open': 1, 'stored_in': {
                     'delivered': 1, 'pending': 1, 'held': 0, 'evicted': 0, 'quarantined': 1, 'deduplicated': 0,
                 },
@@ -59,7 +61,8 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
                 'published_estimated': None, 'missed_estimated': None, 'by_grade': {
                     'received-only': {'published': None, 'published_estimated': None, 'received': 5, 'missed': None,
                                       'missed_estimated': None, 'missed_by': {}}},
-                'skipped': 0, 'rejected': {}, 'dropped': {}, 'other_types': {}, 'stored': 0, 'open': 5, 'stored_in': {
+                'skipped': 0, 'rejected': {}, 'dropped': {}, 'gaps': {}, 'other_types': {}, 'stored': 0, 'open': 5,
+                'stored_in': {
                     'delivered': 0, 'pending': 0, 'held': 0, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0,
                 },
             },

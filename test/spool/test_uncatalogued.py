@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from spool.conftest import Moments, Open
-from spool.making import FakeClock, abandon, assert_whole, make, new_spool, put, rows, settle
+from spool.making import WITHOUT_GAPS, FakeClock, abandon, assert_whole, make, new_spool, put, rows, settle
 
 from shadowhound_data_logger.model import DataObject, Outcome, State
 from shadowhound_data_logger.spool import uncatalogued
@@ -138,7 +138,8 @@ def test_a_spool_from_before_the_catalogue(opened: Open, root: Path) -> None:
     spool.close()
     with closing(sqlite3.connect(root / 'index.db')) as connection:
         connection.executescript(
-            'DROP TABLE contents; DROP TRIGGER contents_moved; DROP TRIGGER contents_forgotten; DROP TABLE uncatalogued;'
+            f'{WITHOUT_GAPS}'
+            ' DROP TABLE contents; DROP TRIGGER contents_moved; DROP TRIGGER contents_forgotten; DROP TABLE uncatalogued;'
             ' DROP TRIGGER arrived; DROP TRIGGER known; DROP TRIGGER forgotten; DROP TABLE other_types;'
             ' DROP TABLE estimates; DROP TABLE rhythms;'
             ' PRAGMA user_version = 2;'

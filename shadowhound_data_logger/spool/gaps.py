@@ -1,0 +1,332 @@
+"""The gap journal: when messages were lost, how many and why, a row of the index for each second, topic and cause.
+
+The accounts say how many; a row says when. Whoever counts a loss adds its times (``TopicGaps.add``). At each commit
+``TopicGaps.settle`` compares what was added with the accounts: losses without times get those of the newest messages at this
+commit and at the one before, and counts that the accounts took back leave the newest rows. So for each topic, kind and cause
+the rows add up to the account at every commit, in the same transaction. Objects that are evicted or quarantined have theirs
+by triggers (schema.py).
+
+Changed rows get a new version, and a row that says nothing any more stays with the count 0 until it is forgotten: whoever
+copies the journal asks for what is newer than the last version that it saw.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Final, NamedTuple
+
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
+
+MISSED, REJECTED, DROPPED, EVICTED, QUARANTINED = 'missed', 'rejected', 'dropped', 'evicted', 'quarantined'
+"""Kinds."""
+EXACT, ESTIMATED = 'exact', 'estimated'
+"""Grades."""
+UNTIMED: Final = -1
+"""The beginning of a row whose times nobody knows: of an older home, say."""
+FORGOTTEN: Final = -2
+"""The beginning of a row that holds the sum of those that were forgotten: when they were, the store knows."""
+OBJECTS, BAGS, EVENTS = 'objects', 'bags', 'events'
+"""Sinks."""
+_SINKS: Final = {'bag:': BAGS, 'event:': EVENTS}
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Losses of one sink, topic, kind and cause, of one publisher where that is known, that began within one second."""
+
+    sink: str
+    topic: str
+    publisher: str | None
+    session: int | None
+    """Of the index; None for objects that were evicted or are quarantined."""
+    kind: str
+    cause: str
+    from_ns: int | None
+    """UTC stamp of the last message before; of an object, of its first. None where no clock knows it."""
+    to_ns: int | None
+    """UTC stamp of the first message after; of an object, of its last."""
+    count: int | None
+    """Messages; 0 for a row that was true once, and is not any more. None where nobody knows."""
+    merged: int
+    """How many gaps are in it."""
+    grade: str
+    mission_id: str | None
+    robot: str | None = None
+    boot_id: str | None = None
+    """Where the wall clock was not set: of which boot the next two are."""
+    from_boot_ns: int | None = None
+    to_boot_ns: int | None = None
+    began_ns: int | None = None
+    """When its session began: numbers of sessions begin anew with a new index."""
+    begin_ns: int = UNTIMED
+    """With sink, topic, publisher, session, kind, cause, grade and mission this names the row."""
+    version: int = 0
+    """Rises with each change of any row."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """As ``shadowhound-data ledger --gaps --json`` prints it."""
+        return {name: getattr(self, name) for name in _PRINTED}
+
+
+_PRINTED: Final = tuple(each.name for each in fields(Gap))[:12]
+
+
+class Watermark(NamedTuple):
+    """Up to when the journal of a topic is complete: no message before it can still be lost on its way into the spool."""
+
+    robot: str
+    sink: str
+    topic: str
+    complete_ns: int
+    """UTC stamp of a message."""
+
+
+class GapKey(NamedTuple):
+    """What names a row beside its session and topic."""
+
+    kind: str
+    cause: str
+    grade: str
+    publisher: str
+    mission: str
+    begin_ns: int
+
+
+class GapRow(NamedTuple):
+    """A change of a row: times that it comprises, and how many messages and gaps more."""
+
+    topic: str
+    """The account: with the prefix of its sink."""
+    key: GapKey
+    from_ns: int | None
+    to_ns: int | None
+    messages: int
+    merged: int
+
+
+class TakenBack(NamedTuple):
+    """Losses that were none, of whatever rows are the newest."""
+
+    topic: str
+    kind: str
+    cause: str
+    grade: str
+    messages: int
+
+
+Figures = Mapping[tuple[str, str, str], int]
+"""(kind, cause, grade) -> messages, as an account has them."""
+
+
+@dataclass(slots=True)
+class TopicGaps:
+    """What the next commit changes in the journal of one account. Guarded as that is."""
+
+    mission: str = ''
+    """The one that is active now."""
+    clock: Clock | None = None
+    """Of this machine: of stamps from before it was set."""
+    heard_ns: int = 0
+    """Stamp of the newest message; 0 before the first."""
+    _changes: dict[GapKey, GapRow] = field(default_factory=dict)
+    _journaled: dict[tuple[str, str, str], int] = field(default_factory=dict)
+    _since_ns: int = 0
+    """``heard_ns`` at the last commit."""
+    _before: tuple[dict[GapKey, GapRow], dict[tuple[str, str, str], int], int] | None = None
+
+    def add(self, kind: str, cause: str, messages: int, from_ns: int, to_ns: int, publisher: str = '',
+            grade: str = EXACT) -> GapKey:  # fmt: skip
+        """Messages were lost between these stamps, 0 where they are not known. Returns the row's key.
+
+        Stamps of a wall clock that was never set become those of the boot clock, as in ``clock.stamp_of``.
+        """
+        from_ns, to_ns = self._time(from_ns), self._time(to_ns)
+        from_ns, to_ns = from_ns or to_ns, to_ns or from_ns
+        if from_ns <= 0 or to_ns <= 0:
+            begin_ns, start_ns, end_ns = UNTIMED, None, None
+        else:
+            start_ns, end_ns = min(from_ns, to_ns), max(from_ns, to_ns)
+            begin_ns = start_ns // SECOND * SECOND if end_ns - start_ns < SECOND else start_ns
+        key = GapKey(kind, cause, grade, publisher, self.mission, begin_ns)
+        self._change(GapRow('', key, start_ns, end_ns, messages, 1))
+        return key
+
+    def fill(self, key: GapKey, merged: int) -> None:
+        """One message of a gap came after all; ``merged`` is the change of how many gaps there are."""
+        self._change(GapRow('', key, None, None, -1, merged))
+
+    def settle(self, topic: str, figures: Figures) -> tuple[list[GapRow], list[TakenBack]]:
+        """What a commit with these figures has to change in the journal; ``undo`` if it fails."""
+        added = Counter[tuple[str, str, str]]()
+        for key, row in self._changes.items():
+            added[key[:3]] += row.messages
+        taken_back: list[TakenBack] = []
+        for what in figures.keys() | self._journaled.keys() | added.keys():
+            rest = figures.get(what, 0) - self._journaled.get(what, 0) - added[what]
+            kind, cause, grade = what
+            if rest > 0:
+                self.add(kind, cause, rest, self._since_ns or self.heard_ns, self.heard_ns, grade=grade)
+            elif rest < 0:
+                taken_back.append(TakenBack(topic, kind, cause, grade, -rest))
+        self._before = self._changes, self._journaled, self._since_ns
+        changes, self._changes = self._changes, {}
+        self._journaled, self._since_ns = {what: count for what, count in figures.items() if count}, self.heard_ns
+        return [row._replace(topic=topic) for row in changes.values() if row.messages or row.merged], taken_back
+
+    def undo(self) -> None:
+        """The commit did not become durable."""
+        if self._before is None:
+            return
+        newer = self._changes
+        self._changes, self._journaled, self._since_ns = self._before
+        self._before = None
+        for row in newer.values():
+            self._change(row)
+
+    def _time(self, stamp_ns: int) -> int:
+        if stamp_ns >= EARLIEST_SANE_NS or self.clock is None or stamp_ns <= 0:
+            return stamp_ns
+        age_ns, boot_ns = self.clock.wall_ns() - stamp_ns, self.clock.boot_ns()
+        return boot_ns - age_ns if 0 <= age_ns < boot_ns else 0
+
+    def _change(self, row: GapRow) -> None:
+        known = self._changes.get(row.key)
+        if known is not None:
+            starts = [stamp for stamp in (known.from_ns, row.from_ns) if stamp is not None]
+            ends = [stamp for stamp in (known.to_ns, row.to_ns) if stamp is not None]
+            row = GapRow('', known.key, min(starts, default=None), max(ends, default=None), known.messages + row.messages,
+                         known.merged + row.merged)  # fmt: skip
+        self._changes[row.key] = row
+
+
+NEXT_VERSION: Final = '(SELECT ifnull(max(version), 0) + 1 FROM gaps)'
+_NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
+MERGE: Final = """
+  ON CONFLICT DO UPDATE SET version = excluded.version, count = count + excluded.count, merged = merged + excluded.merged,
+    from_ns = CASE WHEN count > 0 THEN min(from_ns, excluded.from_ns) ELSE excluded.from_ns END,
+    to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END"""
+"""What an INSERT does where the row is there."""
+
+
+def write(db: sqlite3.Connection, session: int, rows: Iterable[GapRow], taken_back: Iterable[TakenBack]) -> None:
+    """Change the journal, in the transaction that writes the accounts."""
+    less: list[TakenBack] = []
+    for row in rows:
+        key = row.key
+        if row.messages <= 0:
+            changed = db.execute(
+                f'UPDATE gaps SET version = {NEXT_VERSION}, count = count + ?, merged = max(0, merged + ?) WHERE {_NAMED}'  # noqa: S608
+                ' AND publisher = ? AND mission = ? AND begin_ns = ? AND count + ? >= 0',
+                (row.messages, row.merged, session, row.topic, *key, row.messages),
+            ).rowcount  # fmt: skip
+            if not changed and row.messages:
+                less.append(TakenBack(row.topic, *key[:3], -row.messages))
+            continue
+        db.execute(
+            f'INSERT INTO gaps VALUES (?,?,?,?,?,?,?,?,?,?,?,?,{NEXT_VERSION}) {MERGE}',  # noqa: S608 - own constants only
+            (session, row.topic, *key, row.from_ns, row.to_ns, row.messages, row.merged),
+        )
+    for each in (*less, *taken_back):
+        _take_back(db, session, each)
+
+
+def _take_back(db: sqlite3.Connection, session: int, given: TakenBack) -> None:
+    named = (session, given.topic, given.kind, given.cause, given.grade)
+    rest = given.messages
+    newest = db.execute(
+        f'SELECT publisher, mission, begin_ns, count FROM gaps WHERE {_NAMED} AND count > 0 ORDER BY begin_ns DESC',  # noqa: S608
+        named,
+    ).fetchall()
+    for publisher, mission, begin_ns, count in newest:
+        part = min(rest, count)
+        db.execute(
+            f'UPDATE gaps SET version = {NEXT_VERSION}, count = count - ?1, merged = CASE WHEN count > ?1 THEN merged ELSE 0 END'  # noqa: S608
+            ' WHERE session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ? AND publisher = ? AND mission = ?'
+            ' AND begin_ns = ?',
+            (part, *named, publisher, mission, begin_ns),
+        )
+        rest -= part
+        if not rest:
+            return
+
+
+def forget(db: sqlite3.Connection, before_ns: int, limit: int) -> bool:
+    """Drop rows of before then, their sums stay; False when there may be more of them. In a transaction."""
+    old = db.execute(
+        'SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged FROM gaps'
+        " WHERE begin_ns BETWEEN ? AND ? AND kind <> 'quarantined' LIMIT ?", (EARLIEST_SANE_NS, before_ns, limit),
+    ).fetchall()  # fmt: skip
+    sums = Counter[tuple[Any, ...]]()
+    merged = Counter[tuple[Any, ...]]()
+    for row in old:
+        sums[row[:5]] += row[8]
+        merged[row[:5]] += row[9]
+    db.executemany(
+        f"INSERT INTO gaps VALUES (?,?,?,?,?,'','',{FORGOTTEN},NULL,NULL,?,?,{NEXT_VERSION}) {MERGE}",  # noqa: S608
+        ((*what, count, merged[what]) for what, count in sums.items()),
+    )
+    db.executemany(
+        f'DELETE FROM gaps WHERE {_NAMED} AND publisher = ? AND mission = ? AND begin_ns = ?',  # noqa: S608
+        (row[:8] for row in old),
+    )
+    return len(old) < limit
+
+
+def changed(db: sqlite3.Connection, after: int, limit: int, offsets: Mapping[str, int]) -> list[Gap]:
+    """The rows whose versions are greater, by version: about ``limit``, and all of the last version.
+
+    ``offsets`` are UTC less boot clock by boot (``ClockRecord.offsets``). Sums of what was forgotten are left out.
+    """
+    query = 'SELECT version FROM gaps WHERE version > ? ORDER BY version LIMIT 1 OFFSET ?'
+    last = db.execute(query, (after, limit - 1)).fetchone()
+    upto = (1 << 62) if last is None else last[0]
+    return list(_gaps(db, 'version > ? AND version <= ? AND begin_ns <> ? ORDER BY version', (after, upto, FORGOTTEN), offsets))
+
+
+def known(db: sqlite3.Connection, offsets: Mapping[str, int]) -> list[Gap]:
+    """All that is lost, in the order of time; what has no time comes first."""
+    return list(_gaps(db, 'count > 0 ORDER BY begin_ns, topic', (), offsets))
+
+
+def watermarks(db: sqlite3.Connection) -> list[Watermark]:
+    """Of each sink and topic that has one."""
+    query = ('SELECT robot, topic, max(complete_ns) FROM accounts JOIN sessions ON id = session WHERE complete_ns >= ?'
+             ' GROUP BY robot, topic ORDER BY robot, topic')  # fmt: skip
+    return [Watermark(robot, *split(account), stamp) for robot, account, stamp in db.execute(query, (EARLIEST_SANE_NS,))]
+
+
+def sums(db: sqlite3.Connection) -> dict[tuple[str, str, str, str], int]:
+    """(account, kind, cause, grade) -> messages, over all rows."""
+    query = 'SELECT topic, kind, cause, grade, sum(count) FROM gaps GROUP BY topic, kind, cause, grade HAVING sum(count) <> 0'
+    return {(*what,): count for *what, count in db.execute(query)}
+
+
+def split(account: str) -> tuple[str, str]:
+    """Sink and topic of an account."""
+    for prefix, sink in _SINKS.items():
+        if account.startswith(prefix):
+            return sink, account.removeprefix(prefix)
+    return OBJECTS, account
+
+
+def _gaps(db: sqlite3.Connection, where: str, values: tuple[object, ...], offsets: Mapping[str, int]) -> Iterator[Gap]:
+    columns = ('session, topic, kind, cause, grade, publisher, mission, begin_ns, from_ns, to_ns, count, merged, version, robot,'
+               ' boot_id, started_ns')  # fmt: skip
+    query = f'SELECT {columns} FROM gaps LEFT JOIN sessions ON sessions.id = session WHERE {where}'  # noqa: S608 - own conditions
+    for (session, account, kind, cause, grade, publisher, mission, begin_ns, from_ns, to_ns, count, merged, version,
+         robot, boot_id, started_ns) in db.execute(query, values):  # fmt: skip
+        sink, topic = split(account)
+        is_boot = from_ns is not None and from_ns < EARLIEST_SANE_NS
+        offset_ns = offsets.get(boot_id) if is_boot else 0
+        yield Gap(
+            sink, topic, publisher or None, session or None, kind, cause, _plus(from_ns, offset_ns), _plus(to_ns, offset_ns),
+            count, merged, grade, mission or None, robot, boot_id if is_boot else None, from_ns if is_boot else None,
+            to_ns if is_boot else None, started_ns, begin_ns, version,
+        )  # fmt: skip
+
+
+def _plus(stamp_ns: int | None, offset_ns: int | None) -> int | None:
+    return None if stamp_ns is None or offset_ns is None else stamp_ns + offset_ns

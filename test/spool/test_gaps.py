@@ -1,0 +1,333 @@
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from spool.conftest import Open
+from spool.making import NOON_NS, WITHOUT_GAPS, FakeClock, abandon, make, new_spool, put
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.model import Outcome, SpooledObject, State
+from shadowhound_data_logger.spool import gaps, ledger
+from shadowhound_data_logger.spool.accounts import BAG
+from shadowhound_data_logger.spool.gaps import Gap, TopicGaps
+from shadowhound_data_logger.spool.spool import Spool
+
+MS = SECOND // 1000
+CAMERA = '/camera'
+
+
+def journal(root: Path) -> list[Gap]:
+    """All of it, read by somebody else."""
+    with closing(sqlite3.connect(root / 'index.db')) as db:
+        return gaps.known(db, {})
+
+
+def short(root: Path) -> list[tuple[str, str, int | None, float | None, float | None]]:
+    """(kind, cause, count, from, to) with seconds since noon."""
+    return [
+        (gap.kind, gap.cause, gap.count, *(None if at is None else (at - NOON_NS) / SECOND for at in (gap.from_ns, gap.to_ns)))
+        for gap in journal(root)
+    ]
+
+
+def hear(spool: Spool, *numbers: int, publisher: str = 'p', topic: str = CAMERA, period_ns: int = 100 * MS) -> None:
+    """Take the messages with these numbers, sent at noon and a period later for each."""
+    with spool.accounts.entry(topic) as account:
+        for number in numbers:
+            account.receive(publisher, number, NOON_NS + number * period_ns)
+            account.gaps.heard_ns = NOON_NS + number * period_ns
+
+
+def test_a_gap_has_the_times_of_its_neighbours(spool: Spool, root: Path) -> None:
+    """From the stamp of the last message before to that of the first after, of its publisher, in its mission."""
+    hear(spool, 1, 2)
+    spool.commit()
+    spool.accounts.set_mission('patrol-7')
+    hear(spool, 6)
+    spool.commit()
+    (gap,) = journal(root)
+    assert gap.as_dict() == {
+        'sink': 'objects', 'topic': CAMERA, 'publisher': 'p', 'session': 1, 'kind': 'missed', 'cause': 'transport',
+        'from_ns': NOON_NS + 200 * MS, 'to_ns': NOON_NS + 600 * MS, 'count': 3, 'merged': 1, 'grade': 'exact',
+        'mission_id': 'patrol-7',
+    }  # fmt: skip
+    assert (gap.robot, gap.began_ns) == ('thor', NOON_NS)
+
+
+def test_gaps_merge_within_a_second(spool: Spool, root: Path) -> None:
+    """A topic that loses every other message is a row a second, in however many commits."""
+    for number in range(0, 600, 2):
+        hear(spool, number, period_ns=10 * MS)
+        if number % 50 == 0:
+            spool.commit()
+    spool.commit()
+    found = journal(root)
+    assert len(found) == 6
+    assert sum(gap.count or 0 for gap in found) == 299
+    assert sum(gap.merged for gap in found) == 299
+
+
+@pytest.mark.parametrize('commit', [True, False], ids=['committed', 'not yet'])
+def test_a_late_number_takes_its_loss_out_of_the_journal(spool: Spool, root: Path, commit: bool) -> None:
+    """In the commit that has it as received; with the last one the row says nothing any more."""
+    hear(spool, 1, 5)
+    if commit:
+        spool.commit()
+    hear(spool, 3)
+    spool.commit()
+    assert [(gap.count, gap.merged) for gap in journal(root)] == [(2, 2)]
+    hear(spool, 2, 4)
+    spool.commit()
+    assert journal(root) == []
+    assert ledger.read(root, 'thor')['balanced']
+
+
+def test_who_copies_the_journal_hears_of_every_change(spool: Spool, root: Path) -> None:
+    """By version: new rows, changed ones, and those that say nothing any more."""
+    hear(spool, 1, 5)
+    spool.commit()
+    (first,), _ = spool.gaps_after(0, 10, {})
+    assert spool.gaps_after(first.version, 10, {})[0] == []
+    hear(spool, 2, 3, 4, 25)
+    spool.commit()
+    changed, _ = spool.gaps_after(first.version, 10, {})
+    assert {(gap.begin_ns == first.begin_ns, gap.count) for gap in changed} == {(True, 0), (False, 19)}
+    assert [gap.version for gap in changed] == sorted(gap.version for gap in changed)
+
+
+def test_the_watermark_stands_before_what_is_open(spool: Spool) -> None:
+    """While a message has no outcome yet it may still be lost; once it is durable the journal is complete up to it."""
+    hear(spool, 1)
+    spool.commit([make('a')])
+    hear(spool, 2)
+    spool.commit()
+    (watermark,) = spool.gaps_after(0, 10, {})[1]
+    assert watermark == ('thor', 'objects', CAMERA, NOON_NS + 100 * MS)
+    spool.commit([make('b')])
+    (watermark,) = spool.gaps_after(0, 10, {})[1]
+    assert watermark.complete_ns == NOON_NS + 200 * MS
+
+
+def test_what_a_death_cost(root: Path, opened: Open) -> None:
+    """Open batches: dropped, between what was durable and what was heard; what nobody heard: missed, until it was."""
+    spool = new_spool(root)
+    spool.open()
+    hear(spool, 10)
+    spool.commit([make('a', t_end_ns=NOON_NS + SECOND)])
+    hear(spool, 11, 12, 13)
+    spool.commit()
+    abandon(spool)
+    spool = opened()
+    assert short(root) == [('dropped', 'restart', 3, 1.0, 1.3)]
+    hear(spool, 20)
+    spool.commit()
+    assert short(root) == [('dropped', 'restart', 3, 1.0, 1.3), ('missed', 'restart', 6, 1.3, 2.0)]
+
+
+def test_an_object_is_in_the_journal_while_it_is_quarantined(spool: Spool, root: Path) -> None:
+    """A retry takes its messages out again; of an object of several topics those of each."""
+    with spool.accounts.entry(CAMERA) as account:
+        account.receive('p', 1)
+    with spool.accounts.entry(f'{BAG}/imu') as account:
+        for number in range(3):
+            account.receive('p', number)
+    one, two = spool.commit([make('a'), make('b', topic=None, samples=0, counts={f'{BAG}/imu': 3})])
+    spool.commit(outcomes=[Outcome(each, State.QUARANTINED, 'refused') for each in (one, two)])
+    assert [(gap.sink, gap.topic, gap.kind, gap.cause, gap.count) for gap in journal(root)] == [
+        ('objects', CAMERA, 'quarantined', 'refused', 1), ('bags', '/imu', 'quarantined', 'refused', 3),
+    ]  # fmt: skip
+    with closing(sqlite3.connect(root / 'index.db')) as db:
+        db.execute("UPDATE objects SET state = 'pending', reason = NULL")
+        db.commit()
+    assert journal(root) == []
+
+
+def test_an_object_without_room_is_in_the_journal(root: Path) -> None:
+    """With the times of its messages, whether it was in the spool before or never got in."""
+    spool = new_spool(root, max_bytes=20_000)
+    spool.open()
+    put(spool, make('a', b'1' * 9_000, t_start_ns=NOON_NS + SECOND, t_end_ns=NOON_NS + 3 * SECOND))
+    put(spool, make('b', b'2' * 9_000, t_start_ns=NOON_NS + 4 * SECOND, t_end_ns=NOON_NS + 4 * SECOND))
+    put(spool, make('c', b'3' * 9_000, priority=9, t_start_ns=NOON_NS + 5 * SECOND, t_end_ns=NOON_NS + 5 * SECOND))
+    spool.close()
+    found = short(root)
+    assert ('evicted', 'no_room', 1, 5.0, 5.0) in found
+    assert ledger.read(root, 'thor')['balanced']
+
+
+def test_losses_of_older_homes_have_no_times(root: Path, opened: Open) -> None:
+    """A row for each session, topic, kind and cause of what was counted; of objects that are remembered the times are known."""
+    spool = opened()
+    hear(spool, 1, 5)
+    spool.accounts.drop(CAMERA, 'queue_full', 1)
+    spool.accounts.reject(CAMERA, {'truncated': 1})
+    hear(spool, 6)
+    (item,) = spool.commit([make('a')])
+    spool.commit(outcomes=[Outcome(item, State.QUARANTINED, 'refused')])
+    spool.close()
+    with closing(sqlite3.connect(root / 'index.db')) as db:
+        db.executescript(WITHOUT_GAPS)
+    assert ledger.read(root, 'thor')['topics'][CAMERA]['gaps'] is None
+    opened()
+    found = journal(root)
+    assert sorted((gap.kind, gap.cause, gap.count, gap.from_ns) for gap in found if gap.kind != 'quarantined') == [
+        ('dropped', 'queue_full', 1, None), ('missed', 'transport', 3, None), ('rejected', 'truncated', 1, None),
+    ]  # fmt: skip
+    assert [(gap.kind, gap.from_ns) for gap in found if gap.kind == 'quarantined'] == [('quarantined', NOON_NS)]
+    assert ledger.read(root, 'thor')['balanced']
+
+
+def test_what_is_forgotten_stays_in_the_sums(root: Path) -> None:
+    """Rows go with the keys that are remembered no longer, and the ledger still closes."""
+    clock = FakeClock()
+    spool = new_spool(root, clock)
+    spool.open()
+    hear(spool, 1, 5, 25, 50)
+    spool.commit()
+    clock.now_ns += 1000 * 24 * 3600 * SECOND
+    spool.commit()
+    assert short(root) == [('missed', 'transport', 46, None, None)]
+    hear(spool, 30, 3, 60)
+    spool.commit()
+    assert sum(gap.count or 0 for gap in journal(root)) == 53
+    assert ledger.read(root, 'thor')['balanced']
+    spool.close()
+
+
+def test_before_the_clock_is_set_losses_have_times_since_boot() -> None:
+    """A publisher on this machine stamps by the same wrong clock; an offset that is known later dates them."""
+    clock = FakeClock(now_ns=5 * SECOND)
+    found = TopicGaps(clock=clock)
+    key = found.add('missed', 'transport', 2, 3 * SECOND, 4 * SECOND)
+    assert key.begin_ns == 3 * SECOND
+
+
+def test_a_commit_that_fails_loses_no_time(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next one has what it had, once."""
+    hear(spool, 1, 3)
+    spool.commit()
+    hear(spool, 6)
+    with monkeypatch.context() as patch:
+        patch.setattr(gaps, 'write', _full)
+        for _ in range(2):
+            with pytest.raises(sqlite3.OperationalError):
+                spool.commit()
+            hear(spool, 5)
+    spool.commit()
+    assert short(root) == [('missed', 'transport', 2, 0.1, 0.6)]
+    assert ledger.read(root, 'thor')['balanced']
+
+
+def _full(*_: object) -> None:
+    raise sqlite3.OperationalError('database or disk is full')
+
+
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just('take'), st.sampled_from('pq'), st.integers(0, 60)),
+        st.tuples(st.sampled_from(['commit', 'fail', 'die', 'stop', 'forget', 'rebase', 'find', 'drop', 'reject', 'unnumbered']),
+                  st.just(''), st.integers(1, 3)),
+        st.tuples(st.sampled_from(['store', 'quarantine', 'retry', 'evict', 'deliver']), st.just(''), st.integers(0, 4)),
+    ), max_size=40,
+)  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(steps=STEPS)
+def test_the_journal_adds_up_at_every_commit(tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, int]]) -> None:
+    """Whatever comes late, fails, dies, is evicted, quarantined, tried again or forgotten."""
+    root = tmp_path_factory.mktemp('any') / 'spool'
+    clock = FakeClock()
+    spool = new_spool(root, clock)
+    spool.open()
+    items: list[SpooledObject] = []
+    try:
+        for step in steps:
+            clock.now_ns += 300 * MS
+            spool = _do(spool, root, clock, step, items)
+            spool.commit()
+            found = ledger.read(root, 'thor')
+            assert found['balanced'], ledger.imbalances(found)
+            assert all((gap.count or 0) > 0 for gap in journal(root))
+    finally:
+        spool.close()
+
+
+def _do(spool: Spool, root: Path, clock: FakeClock, step: tuple[str, str, int], items: list[SpooledObject]) -> Spool:
+    what, publisher, number = step
+    if what == 'take':
+        hear(spool, number, publisher=publisher)
+    elif what in {'die', 'stop'}:
+        abandon(spool) if what == 'die' else spool.close()
+        spool = new_spool(root, clock)
+        spool.open()
+    elif what == 'forget':
+        clock.now_ns += number * 20 * 24 * 3600 * SECOND
+    elif what in {'store', 'quarantine', 'deliver', 'retry', 'evict'}:
+        _do_with_objects(spool, root, clock, what, number, items)
+    else:
+        _count(spool, clock, what, number)
+    return spool
+
+
+def _count(spool: Spool, clock: FakeClock, what: str, number: int) -> None:
+    accounts = spool.accounts
+    if what == 'fail':
+        accounts.reject(CAMERA, {'nothing': 0})
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(gaps, 'write', _full)
+            with pytest.raises(sqlite3.OperationalError):
+                spool.commit()
+    elif what == 'rebase':
+        accounts.rebase(CAMERA)
+    with accounts.entry(CAMERA) as account:
+        count = min(number, account.open)
+        if what == 'find':
+            account.find(number)
+        elif what == 'unnumbered':
+            account.receive(None, None)
+            account.appraise(1, {'transport': number - 2}, clock.now_ns)
+    if what == 'drop':
+        accounts.drop(CAMERA, 'queue_full', count, clock.now_ns - SECOND, clock.now_ns)
+    elif what == 'reject':
+        accounts.reject(CAMERA, {'truncated': count})
+
+
+def _do_with_objects(spool: Spool, root: Path, clock: FakeClock, what: str, number: int, items: list[SpooledObject]) -> None:
+    if what == 'store':
+        with spool.accounts.entry(CAMERA) as account:
+            is_open = account.open > 0
+        if is_open:
+            made = make(f'{clock.now_ns}', t_start_ns=clock.now_ns, t_end_ns=clock.now_ns + number * SECOND)
+            items += spool.commit([made])
+    elif items:
+        item = items[number % len(items)]
+        if what == 'quarantine':
+            spool.commit(outcomes=[Outcome(item, State.QUARANTINED, 'refused')])
+        elif what == 'deliver':
+            spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
+        elif what == 'retry':
+            _run(root, "UPDATE objects SET state = 'pending', reason = NULL WHERE id = ? AND state = 'quarantined'", item.id)
+        else:
+            _run(root, "UPDATE objects SET state = 'evicted', reason = 'no_room' WHERE id = ? AND state = 'pending'", item.id)
+
+
+def _run(root: Path, query: str, number: int) -> None:
+    with closing(sqlite3.connect(root / 'index.db')) as db:
+        db.execute(query, (number,))
+        db.commit()
+
+
+def test_a_home_with_losses_reads_in_the_order_of_time(spool: Spool, root: Path) -> None:
+    """Of all sinks and topics."""
+    hear(spool, 20, 30, topic='/b')
+    hear(spool, 1, 9, topic=f'{BAG}/a')
+    spool.commit()
+    assert [(gap.sink, gap.topic) for gap in journal(root)] == [('bags', '/a'), ('objects', '/b')]
+    assert Counter(gap.kind for gap in journal(root)) == {'missed': 2}
