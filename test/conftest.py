@@ -33,8 +33,8 @@ ENGINE = ('DaftBackgroundEventLoop', 'Dummy-')
 MOST_WORKERS = 6
 """Each starts servers of its own; beyond that the longest group of tests decides how long all takes."""
 ONE_ROBOT_AT_A_TIME = (
-    'test/e2e/test_bag.py', 'test/e2e/test_go2_profile.py', 'test/e2e/test_killed.py', 'test/e2e/test_raw_camera.py',
-    'test/sim/test_demo.py', 'test/sim/test_sim_go2_node.py',
+    'test/e2e/test_bag.py', 'test/e2e/test_catalogue.py', 'test/e2e/test_go2_profile.py', 'test/e2e/test_killed.py',
+    'test/e2e/test_raw_camera.py', 'test/sim/test_demo.py', 'test/sim/test_sim_go2_node.py',
 )  # fmt: skip
 """Files with robots at full rate, of which nothing may be missed. They come first, after one another, and others make way."""
 MAKE_WAY = 10

@@ -1,4 +1,4 @@
-"""One run of the simulated Go2 whose sensors and bags several files of tests look at."""
+"""One run of the simulated Go2 whose sensors, bags and catalogue several files of tests look at."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from shadowhound_data_logger.stores.base import ObjectStore
 
 DURATION_S = 60.0 if LONG else 7.0
 SLICE_S = 2.0
+CATALOGUE_S = 2.0
 BEST_EFFORT = {'/point_cloud2', '/camera/camera_info'}
 
 
@@ -43,7 +44,8 @@ class Session:
 
     @classmethod
     def of(cls, processes: Processes, seaweed: Tower, store: ObjectStore) -> Session:
-        node = processes.node(seaweed.environment(), {'bag.record': 'always', 'bag.slice_s': SLICE_S})
+        parameters = {'bag.record': 'always', 'bag.slice_s': SLICE_S, 'catalogue.period_s': CATALOGUE_S}
+        node = processes.node(seaweed.environment(), parameters)
         recording = processes.folder / 'witness'
         witness = processes.witness(TYPES, recording, best_effort=BEST_EFFORT)
         said = published(processes.sim(f'duration_s:={DURATION_S}'), DURATION_S + 60)
