@@ -96,6 +96,7 @@ def test_a_store_that_fails_and_recovers(
     assert wired.node.ledger()['objects']['quarantined'] == 0
 
 
+@pytest.mark.long('a Tower of its own')
 def test_a_server_that_is_not_there_yet(processes: Processes, tmp_path: Path) -> None:
     """A node that is started before its server delivers once the server is started."""
     with Tower(tmp_path / 'tower') as late, closing(S3Store(late.store_settings(), UploadSettings())) as store:

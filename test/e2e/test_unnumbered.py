@@ -54,6 +54,7 @@ def test_without_a_rhythm_nothing_is_claimed(processes: Processes, tmp_path: Pat
         assert row['stored'] == row['received'] >= COUNT
 
 
+@pytest.mark.long('a kill')
 def test_what_is_lost_is_estimated(processes: Processes, tmp_path: Path) -> None:
     """By the rate of a publisher that goes on while the node is stopped, and while it is dead: to 5 %, and marked as such."""
     for name in ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE'):

@@ -122,7 +122,11 @@ def test_batches_are_large_and_never_too_large(tmp_path: Path) -> None:
     assert len([point for point in tracking.points if point.key == 'battery_pct']) == 3000
 
 
-@pytest.mark.parametrize('seed', range(12))
+SOME = 4
+MORE = (pytest.param(seed, marks=pytest.mark.long('more of the same')) for seed in range(SOME, 12))
+
+
+@pytest.mark.parametrize('seed', [*range(SOME), *MORE])
 def test_any_failure_changes_nothing(tmp_path: Path, seed: int) -> None:
     """Requests and answers get lost, the replayer dies in between: afterwards all is there, each thing once to effect."""
     rng = random.Random(seed)

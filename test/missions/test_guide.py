@@ -152,6 +152,7 @@ def test_the_guide_s_executor_and_query(
     assert {'camera/frame_000000.jpg', 'trajectories/trajectory.csv', 'trajectory.png'} <= server.artifacts(run_id)
 
 
+@pytest.mark.long('a program of many imports that walks for seconds')
 def test_the_example(server: Server, warm_home: Path) -> None:
     """examples/mission_executor.py flies a mission of its simulated robot, whole and with all three pictures."""
     example = Path(__file__).parents[2] / 'examples' / 'mission_executor.py'

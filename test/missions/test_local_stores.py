@@ -14,15 +14,21 @@ from shadowhound_data_logger.missions.tracking import MISSION_TAG, MlflowTrackin
 POINTS = [Point('battery_pct', 90.0 - number, 1_760_788_800_000 + number, number) for number in range(5)]
 
 
+@pytest.fixture(scope='module')
+def database(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A SQLite file, whose tables take a second to make; each test has an experiment of its own in it."""
+    return f'sqlite:///{tmp_path_factory.mktemp("local")}/mlflow.db'
+
+
 def run_of(tracking: MlflowTracking) -> Run:
     return tracking.run_of('patrol_1', 'patrol', 1_760_788_800_000, {'mlflow.user': 'thor'})
 
 
 @pytest.fixture(params=['sqlite', 'file'])
-def tracking(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MlflowTracking:
+def tracking(request: pytest.FixtureRequest, database: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MlflowTracking:
     monkeypatch.setenv('MLFLOW_ALLOW_FILE_STORE', 'true')
     monkeypatch.setenv('MLFLOW_DISABLE_TELEMETRY', 'true')
-    uri = f'sqlite:///{tmp_path}/mlflow.db' if request.param == 'sqlite' else (tmp_path / 'mlruns').as_uri()
+    uri = database if request.param == 'sqlite' else (tmp_path / 'mlruns').as_uri()
     return MlflowTracking(uri, 'thor_missions', tmp_path / 'artifacts')
 
 
@@ -56,9 +62,9 @@ def test_an_address_that_this_mlflow_cannot_do_with_is_waited_for(uri: str) -> N
 
 
 @pytest.mark.filterwarnings('ignore')
-def test_a_duplicate_is_closed(tmp_path: Path) -> None:
+def test_a_duplicate_is_closed(database: str, tmp_path: Path) -> None:
     """A run that a lost request made after all goes when the mission ends, and says whose duplicate it was."""
-    tracking = MlflowTracking(f'sqlite:///{tmp_path}/mlflow.db', 'thor_missions', tmp_path / 'artifacts')
+    tracking = MlflowTracking(database, 'duplicates', tmp_path / 'artifacts')
     run = run_of(tracking)
     twin = tracking._client.create_run(run.experiment_id, start_time=1_760_788_800_001, tags={MISSION_TAG: 'patrol_1'})
     assert run_of(tracking) == run

@@ -91,6 +91,7 @@ def test_a_run_lives_while_its_mission_does(server: Server, warm_home: Path) -> 
     until(lambda: complete(warm_home, 2), 'both are sent')
 
 
+@pytest.mark.long('a kill')
 def test_tower_away_for_the_whole_mission(server: Server, home: Path, tmp_path: Path) -> None:
     """No call waits for it; when it is back, after the robot's next start, the run is whole with the original times."""
     server.wire.set(HANG)

@@ -68,7 +68,7 @@ def test_an_outage_is_probed_ever_more_rarely(tmp_path: Path) -> None:
     replay = new_replay(tmp_path, tracking, now)
     while now() < 3600:
         replay.step()
-        now.seconds += 0.5
+        now.seconds += 1.0
     assert 60 < len(asked) < 300
     assert max(later - sooner for sooner, later in pairwise(asked)) <= 61
     assert replay.owes

@@ -106,6 +106,7 @@ def under_way(client: Any, prefix: str = '') -> list[str]:
     return [upload['Key'] for upload in client.list_multipart_uploads(Bucket='sensor-data', Prefix=prefix).get('Uploads', ())]
 
 
+@pytest.mark.long('a kill')
 def test_a_slice_that_a_kill_interrupted(
     server: Tower, as_user: Callable[[str], Any], through: Callable[[Front], S3Store], file: Path
 ) -> None:
