@@ -114,7 +114,10 @@ def test_a_node_that_is_killed_leaves_nothing_out(processes: Processes, seaweed:
     try:
         until(lambda: node.topic('/odom').get('stored', 0) >= 2, 'the robot walks')
         logger.start_mission('patrol', 'go round')
-        until(lambda: any(store.list(schema.BUCKET, schema.OBJECTS.prefix(processes.robot))), 'a part is there while the robot walks')
+        until(
+            lambda: any(store.list(schema.BUCKET, schema.OBJECTS.prefix(processes.robot))),
+            'a part is there while the robot walks',
+        )
         node.kill()
         node = processes.node(seaweed.environment(), FAST)
         stored = node.topic('/odom')['stored']
