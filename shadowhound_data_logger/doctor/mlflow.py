@@ -8,18 +8,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import closing
 from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import urlsplit
 
 from shadowhound_data_logger.clock import iso
-from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.doctor import s3_put, services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.mlflow_rest import MlflowRest
 from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, skipped, warning
-from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S
 from shadowhound_data_logger.errors import StoreError, TrackingError, TrackingRefused, TrackingUnavailable
 
 NAME: Final = 'mlflow'
@@ -196,8 +193,6 @@ def _proxied(rest: MlflowRest, folder: str) -> Result:
 
 def _direct(location: str, context: Context) -> Iterator[Result]:
     """The client itself writes to S3."""
-    from shadowhound_data_logger.stores.s3_requests import S3Requests  # noqa: PLC0415 - botocore costs half a second
-
     url, endpoint = urlsplit(location), context.environ.get('MLFLOW_S3_ENDPOINT_URL') or context.settings.store.endpoint_url
     if not endpoint:
         yield error(
@@ -209,10 +204,8 @@ def _direct(location: str, context: Context) -> Iterator[Result]:
         return
     settings = replace(context.settings.store, endpoint_url=endpoint)
     key = f'{url.path.strip("/")}/_doctor/probe.txt'.lstrip('/')
-    upload = UploadSettings(threads=1, connect_timeout_s=CONNECT_S, read_timeout_s=ANSWER_S)
     try:
-        with closing(S3Requests(settings, upload)) as requests:
-            requests.open()
+        with s3_put.single_requests(settings) as requests:
             item = s3_put.probe(url.netloc, key)
             requests.put(item, s3_put.BODY, s3_put.crc32(s3_put.BODY), conditional=False)
             b''.join(requests.content(url.netloc, key))

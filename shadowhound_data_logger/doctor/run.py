@@ -14,15 +14,13 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.doctor.context import to_child
 from shadowhound_data_logger.doctor.model import Check, Context, Result, Severity, error
-from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S
+from shadowhound_data_logger.doctor.s3_put import single_requests
 from shadowhound_data_logger.errors import DataLoggerError
 
 TIMEOUT_S: Final = 12.0
@@ -203,9 +201,5 @@ def _fixed(what: tuple[str, ...], context: Context) -> str:
 
 
 def _create(bucket: str, context: Context) -> None:
-    from shadowhound_data_logger.stores.s3_requests import S3Requests  # noqa: PLC0415 - botocore costs half a second
-
-    upload = UploadSettings(threads=1, connect_timeout_s=CONNECT_S, read_timeout_s=ANSWER_S)
-    with closing(S3Requests(context.settings.store, upload)) as requests:
-        requests.open()
+    with single_requests(context.settings.store) as requests:
         requests.create_bucket(bucket)

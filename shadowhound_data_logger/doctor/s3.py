@@ -12,13 +12,11 @@ import ssl
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import closing
 from email.utils import parsedate_to_datetime
 from typing import TYPE_CHECKING, Final
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
-from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.doctor import network, s3_put, services
 from shadowhound_data_logger.doctor.model import (
     Context,
@@ -33,7 +31,7 @@ from shadowhound_data_logger.doctor.model import (
     skipped,
     warning,
 )
-from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S, TowerService
+from shadowhound_data_logger.doctor.services import ANSWER_S, TowerService
 from shadowhound_data_logger.errors import (
     AccessDenied,
     BucketMissing,
@@ -72,21 +70,17 @@ def check(context: Context) -> Iterator[Result]:
         yield result
         if result.check == 's3.answer' and result.is_finding:
             return
-    from shadowhound_data_logger.stores.s3_requests import S3Requests  # noqa: PLC0415 - botocore costs half a second
-
-    upload = UploadSettings(threads=1, connect_timeout_s=CONNECT_S, read_timeout_s=ANSWER_S)
-    with closing(S3Requests(context.settings.store, upload)) as requests:
-        try:
-            requests.open()
+    try:
+        with s3_put.single_requests(context.settings.store) as requests:
             requests.probe()
             yield ok('s3.signature', 'the server takes our signature')
             yield from _use(requests, context)
-        except SettingError as problem:
-            yield of_error('s3.setting', problem)
-        except CredentialsRejected as problem:
-            yield of_error('s3.signature', problem, 'the key pair is not one of this server: mistyped, or changed on Tower')
-        except StoreError as problem:
-            yield _away(problem)
+    except SettingError as problem:
+        yield of_error('s3.setting', problem)
+    except CredentialsRejected as problem:
+        yield of_error('s3.signature', problem, 'the key pair is not one of this server: mistyped, or changed on Tower')
+    except StoreError as problem:
+        yield _away(problem)
 
 
 def _away(problem: StoreError) -> Result:

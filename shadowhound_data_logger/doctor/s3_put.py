@@ -8,11 +8,13 @@ import os
 import time
 import zlib
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.config import Settings, StoreSettings, UploadSettings
 from shadowhound_data_logger.doctor.model import Result, error, measured, of_error, ok, warning
+from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S
 from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.model import SpooledObject
 
@@ -28,6 +30,21 @@ LARGE_WITHIN_S: Final = 4.0
 """The large one is tried where the small one says that it takes no longer."""
 SLOW_MBPS: Final = 4.0
 """The default settings need 3.3 Mbit/s on average (docs/thor.md)."""
+
+
+@contextmanager
+def single_requests(settings: StoreSettings) -> Iterator[S3Requests]:
+    """Requests that are sent as they are asked for, one try each. Raises SettingError.
+
+    A store (``stores/base.py``) hides what a check wants to see: it creates a bucket that is missing, looks by itself where a
+    condition is not honoured, sends no wrong checksum, and lists all of a prefix where the first page is enough.
+    """
+    from shadowhound_data_logger.stores.s3_requests import S3Requests  # noqa: PLC0415 - botocore costs half a second
+
+    upload = UploadSettings(threads=1, connect_timeout_s=CONNECT_S, read_timeout_s=ANSWER_S)
+    with closing(S3Requests(settings, upload)) as requests:
+        requests.open()
+        yield requests
 
 
 def buckets(settings: Settings) -> tuple[str, ...]:
