@@ -12,8 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from shadowhound_data_logger.bags.queue import QUEUE_FULL, BagQueue, Lot
-from shadowhound_data_logger.capture.consumers import Consumer, Drained
-from shadowhound_data_logger.capture.extra_topics import TopicChoice
+from shadowhound_data_logger.capture.consumers import Consumer, Drained, TopicChoice
 from shadowhound_data_logger.mcap.rosbag2_metadata import offered_qos
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.options import BagSettings

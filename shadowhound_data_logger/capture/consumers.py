@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+import logging
+import re
+from collections.abc import Iterable, Sequence
+from typing import Final, NamedTuple, Protocol
 
 from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.options import BagSettings, EventSettings
 from shadowhound_data_logger.spool.accounts import Losses, TopicAccount
 
-if TYPE_CHECKING:
-    from shadowhound_data_logger.capture.extra_topics import TopicChoice
+log = logging.getLogger(__name__)
+
+_FULL_NAME: Final = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+', re.ASCII)
+MAX_NAME: Final = 247
+"""rmw/types.h, and https://design.ros2.org/articles/topic_and_service_names.html"""
 
 
 class Drained(NamedTuple):
@@ -30,10 +36,45 @@ class Drained(NamedTuple):
     """Whether messages are only counted now."""
 
 
+class TopicChoice:
+    """Which topics a consumer wants, by its settings, the sensors and the graph. New for each set of settings."""
+
+    def __init__(self, settings: BagSettings | EventSettings, named: Iterable[str]) -> None:
+        """``named`` are the settings' topics as full names."""
+        self._named = frozenset(named)
+        self._regex = re.compile(settings.regex) if settings.regex else None
+        self._exclude = re.compile(settings.exclude) if settings.exclude else None
+
+    @property
+    def asks_graph(self) -> bool:
+        return self._regex is not None
+
+    def names(self, topic: str) -> bool:
+        """Whether the settings name this very topic."""
+        return topic in self._named
+
+    def wanted(self, sensors: Iterable[str], graph: Iterable[str]) -> frozenset[str]:
+        """Full names; ``sensors`` are the topics that sensors take, ``graph`` all that there are (asked for a regex only)."""
+        if self._regex is None:
+            return self._named or frozenset(sensors)
+        return self._named | {topic for topic in graph if self._matches(topic)}
+
+    def _matches(self, topic: str) -> bool:
+        """As rosbag2: any part of the name has to match; hidden topics (a part begins with ``_``) are left out.
+
+        So are names that are none of ROS, which another DDS program may well have: nobody can subscribe to them in ROS.
+        """
+        assert self._regex is not None
+        if '/_' in topic or not _FULL_NAME.fullmatch(topic) or len(topic) > MAX_NAME or not self._regex.search(topic):
+            return False
+        return self._exclude is None or not self._exclude.search(topic)
+
+
 class Consumer(Protocol):
     """Whoever listens to what the robot publishes: derive from it, and name it in ``Pipeline._make_stages``.
 
-    The intake thread calls all of it, in the order in which messages came, and nothing in it may wait.
+    The intake thread calls all of it, in the order in which messages came, and nothing in it may wait. One that raises in
+    ``choose`` or ``take`` does not get these messages; the others do, and ``failures`` counts it.
     """
 
     choice: TopicChoice | None = None
@@ -44,6 +85,9 @@ class Consumer(Protocol):
     """With a choice: whether it listens as soon as the intake is open, or once ``Intake.listen`` says so."""
     wants_latched: bool = False
     """With a choice: whether it begins with what latched publishers sent before, with subscriptions of its own for that."""
+    failures: int = 0
+    """How often it failed to take messages."""
+    last_error: str = ''
 
     def enter(self, topic: str, type_name: str, sensor: str) -> None:  # noqa: ARG002
         """Without a choice: messages of a sensor's topic begin here, of this type."""
@@ -75,3 +119,21 @@ class Consumer(Protocol):
     def flush(self) -> None:
         """Hand on what was gathered, as if no further message came."""
         return
+
+
+def hand_on(drained: Drained, consumers: Iterable[Consumer]) -> None:
+    """Each of them takes the messages, whatever happens to one."""
+    for consumer in consumers:
+        try:
+            consumer.take(drained)
+        except Exception as error:  # noqa: BLE001 - a defect of one is none of the others'
+            count_failure(consumer, drained.topic, error)
+
+
+def count_failure(consumer: Consumer, topic: str, error: Exception) -> None:
+    """Count it; the 1st, 10th, 100th, ... is said."""
+    consumer.failures += 1
+    consumer.last_error = f'{type(error).__name__}: {error}'
+    if str(consumer.failures).strip('0') == '1':
+        text = '%s fails to take messages of %s (%d times so far), which all others get: %s'
+        log.error(text, type(consumer).__name__, topic, consumer.failures, error, exc_info=error)

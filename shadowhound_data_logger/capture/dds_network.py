@@ -276,5 +276,5 @@ TEMPLATE: Final = """\
 """
 """Announcements: docs/decisions/0004-announce-often.md; where each goes to many ports there are fewer of them.
 
-A reader begins with room for one message; as rmw_fastrtps has it, each takes 88 KB before its first (docs/reliability.md).
+A reader begins with room for one message; as rmw_fastrtps has it, each takes 88 KB before its first.
 Its policy is not DYNAMIC: with Fast DDS 3.2.3 a take then crashed the process, mostly after it had been stopped and went on."""

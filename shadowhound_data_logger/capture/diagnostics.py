@@ -47,7 +47,7 @@ def entries(status: Mapping[str, Any], earlier: Mapping[str, Any]) -> Iterator[E
     yield _spool(status['spool'])
     yield _store(status['store'], earlier['store'], stalls.get('delivery', ''))
     yield _clock(status['clock'])
-    yield _workers(status['workers'], earlier['workers'], stalls)
+    yield _workers(status, earlier, stalls)
 
 
 def _node(status: Mapping[str, Any]) -> Entry:
@@ -137,13 +137,17 @@ def _clock(clock: Mapping[str, Any]) -> Entry:
     return 'clock', OK, 'set', clock
 
 
-def _workers(workers: Mapping[str, Any], before: Mapping[str, Any], stalls: Mapping[str, str]) -> Entry:
+def _workers(status: Mapping[str, Any], earlier: Mapping[str, Any], stalls: Mapping[str, str]) -> Entry:
+    workers, before = status['workers'], earlier['workers']
     failing = [f'{name} fails: {row["last_error"]}' for name, row in workers.items() if row['failing']]
     failing += [f'{name} failed lately and works again: {row["last_error"]}' for name, row in workers.items()
                 if not row['failing'] and row['failures'] > before.get(name, row)['failures']]  # fmt: skip
+    failing += [f'{name} failed lately to take messages: {row["last_error"]}' for name, row in status['consumers'].items()
+                if row['failures'] > earlier['consumers'].get(name, {'failures': 0})['failures']]  # fmt: skip
     stuck = [f'{name}: {text}' for name, text in stalls.items() if name in workers or name == 'encode']
     figures = {f'{name} {what}': row[what] for name, row in workers.items() for what in ('failures', 'deaths')}
     figures |= {f'{name} last error': row['last_error'] for name, row in workers.items() if row['last_error']}
+    figures |= {f'{name} {what}': row[what] for name, row in status['consumers'].items() for what in row}
     level = ERROR if failing else WARN if stuck else OK
     return 'workers', level, '; '.join((*failing, *stuck)) or 'all work', figures
 

@@ -19,8 +19,7 @@ from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.ring import Claims, Held, Ring
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.capture.bags import profiles_offered
-from shadowhound_data_logger.capture.consumers import Consumer, Drained
-from shadowhound_data_logger.capture.extra_topics import TopicChoice
+from shadowhound_data_logger.capture.consumers import Consumer, Drained, TopicChoice
 from shadowhound_data_logger.capture.triggers import EventWatch, Inbox
 from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.config import Settings

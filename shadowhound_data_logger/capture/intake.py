@@ -77,6 +77,10 @@ class Intake:
         """Of topics that no sensor has."""
         return [subscriber for extra in self._extra for subscriber in extra.own]
 
+    def consumer_failures(self) -> Mapping[str, tuple[int, str]]:
+        """Of each consumer that failed to take messages: how often, and the newest error."""
+        return {type(each).__name__: (each.failures, each.last_error) for each in self._consumers if each.failures}
+
     def left_out(self, consumer: Consumer) -> int:
         """Topics that a consumer would have by an expression, and does not: there are too many."""
         return next((extra.left_out for extra in self._extra if extra.consumer is consumer), 0)

@@ -121,6 +121,8 @@ class Status:
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
             'spool': {'path': str(self._stages.spool.root), **asdict(piles), **asdict(self._settings.spool)},
             'store': self._store(upload, now_s), 'clock': asdict(self._clock.state()),
+            'consumers': {name: {'failures': count, 'last_error': text}
+                          for name, (count, text) in self._stages.intake.consumer_failures().items()},
             'workers': {worker.name: asdict(worker.status()) for worker in self._stages.workers},
         }  # fmt: skip
         status['stalls'] = self._watchdog.look(status, now_s)

@@ -12,7 +12,7 @@ from math import inf
 from typing import Final
 from zlib import crc32
 
-from shadowhound_data_logger.capture.consumers import Consumer, Drained
+from shadowhound_data_logger.capture.consumers import Consumer, Drained, count_failure, hand_on
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import CounterField, MessageTypes
@@ -145,10 +145,7 @@ class TopicStream:
         lost = self._estimate.observe(sent, self._arrivals.hear(senders, now_s)).lost if sent else None
         if fresh:
             drained = Drained(self._topic, self._type, '', fresh, lost, now_s, paused)
-            self._owner.take(drained)
-            for consumer in self._others:
-                if self._topic in consumer.topics:
-                    consumer.take(drained)
+            hand_on(drained, [self._owner, *(each for each in self._others if self._topic in each.topics)])
 
     def look(self, now_s: float) -> None:
         """All that waited was taken."""
@@ -199,6 +196,7 @@ class SensorStream:
         fresh: list[Taken] = []
         sent: dict[str, list[int]] = {}
         counter = self._counter
+        failed: dict[Consumer, Exception] = {}
         with self._entry as account:
             for message in taken:
                 cdr, source_ns, gid, number, _ = message
@@ -216,18 +214,20 @@ class SensorStream:
             if fresh:
                 drained = Drained(self._topic, self._type, self._sensor, fresh, lost, now_s, paused)
                 for consumer in self._choosing:
-                    consumer.choose(drained, account)
+                    try:
+                        consumer.choose(drained, account)
+                    except Exception as error:  # noqa: BLE001 - a defect of one is none of the others'
+                        failed[consumer] = error
                 account.gaps.heard_ns = newest_ns
         if is_refuted and not self._is_refuted:
             self._is_refuted = True
             text = '%s: messages come more often than %s says: how often they are published is learned instead'
             log.warning(text, self._topic, 'counter_step' if counter else 'expected_hz')
+        for consumer, defect in failed.items():
+            count_failure(consumer, self._topic, defect)
         if fresh:
-            for consumer in self._choosing:
-                consumer.take(drained)
-            for consumer in self._by_choice:
-                if self._topic in consumer.topics:
-                    consumer.take(drained)
+            hand_on(drained, [each for each in self._choosing if each not in failed] if failed else self._choosing)
+            hand_on(drained, [each for each in self._by_choice if self._topic in each.topics])
 
     def look(self, now_s: float) -> None:
         """All that waited was taken."""

@@ -13,8 +13,8 @@ from capture.test_stream import NOON_NS, TOPIC, TYPE, Batches
 
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
 from shadowhound_data_logger.capture.bags import BagConsumer
-from shadowhound_data_logger.capture.consumers import Consumer, Drained
-from shadowhound_data_logger.capture.extra_topics import ExtraTopics, TopicChoice
+from shadowhound_data_logger.capture.consumers import Consumer, Drained, TopicChoice
+from shadowhound_data_logger.capture.extra_topics import ExtraTopics
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.capture.subscriber import Surroundings

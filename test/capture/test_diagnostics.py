@@ -30,6 +30,7 @@ STATUS: dict[str, Any] = {
     'store': {'target': 'the S3 server', 'state': 'idle', 'last_error': 'refused', 'delivered': 5, 'in_flight': 0, 'deferred': 0,
               'retries': 0, 'quarantined': 1, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
     'workers': {'intake': {'failing': False, 'failures': 1, 'deaths': 0, 'last_error': 'ValueError: x'}}, 'stalls': {},
+    'consumers': {'Sampler': {'failures': 1, 'last_error': 'ValueError: x'}},
     'clock': {'is_set': True, 'gave_up': False, 'unset_s': 0.0, 'steps': 2, 'last_step_s': 3.5, 'last_step_age_s': 61.0},
 }  # fmt: skip
 
@@ -126,6 +127,8 @@ def test_a_topic(values: dict[str, Any], level: Any, words: str) -> None:
          'intake fails: KeyError: y'),
         ('workers', {'workers__intake': {'failing': False, 'failures': 2, 'deaths': 1, 'last_error': 'SystemExit: '}}, ERROR,
          'intake failed lately and works again: SystemExit'),
+        ('workers', {'consumers__RobotTrack': {'failures': 1, 'last_error': 'KeyError: y'}}, ERROR,
+         'RobotTrack failed lately to take messages: KeyError: y'),
         ('workers', {'stalls': {'intake': 'it takes no messages'}}, WARN, 'intake: it takes no messages'),
         ('workers', {'stalls': {'encode': 'no batch', 'delivery': 'x'}}, WARN, 'encode: no batch'),
     ],

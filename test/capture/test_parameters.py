@@ -17,6 +17,7 @@ from rclpy.parameter import Parameter
 
 from shadowhound_data_logger.capture.parameters import Parameters, live
 from shadowhound_data_logger.config import SensorSettings, Settings
+from shadowhound_data_logger.errors import SettingError
 
 pytestmark = pytest.mark.ros
 
@@ -157,3 +158,22 @@ def test_a_live_parameter_is_not_deleted(node: Node, loaded: tuple[Parameters, S
     assert not result.successful
     assert loaded[0].changed() is None
     assert node.has_parameter('camera.rate_hz')
+
+
+@pytest.mark.parametrize('other', ['/mine', 'mine', '/talk'])
+def test_two_sensors_with_one_topic_stop_the_start(other: str) -> None:
+    """Also under two names for it, with and without the slash or by a remapping: each topic has one sensor."""
+    context = Context()
+    given = {'sensors': ['first', 'second'], 'first.topics': ['mine'], 'second.topics': [other]}
+    with free_domain() as domain:
+        rclpy.init(context=context, domain_id=domain)
+        node = Node('sensor_logger_node', context=context, automatically_declare_parameters_from_overrides=True,
+                    cli_args=['--ros-args', '-r', '/talk:=/mine'],
+                    parameter_overrides=[Parameter(name, value=value) for name, value in given.items()])  # fmt: skip
+        try:
+            with pytest.raises(SettingError, match=r'second\.topics') as refused:
+                Parameters(node).load()
+        finally:
+            node.destroy_node()
+            rclpy.shutdown(context=context)
+    assert 'first.topics' in str(refused.value)

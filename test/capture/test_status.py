@@ -40,6 +40,9 @@ class Intake:
     def left_out(self, _: object) -> int:
         return 0
 
+    def consumer_failures(self) -> dict[str, tuple[int, str]]:
+        return {'Sampler': (2, 'ValueError: x')}
+
     def status(self) -> list[SubscriberStatus]:
         return self.sources
 

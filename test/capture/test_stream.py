@@ -10,7 +10,7 @@ import pytest
 
 from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.capture.sampling import Sampler
-from shadowhound_data_logger.capture.stream import Senders, SensorStream
+from shadowhound_data_logger.capture.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import IntakeSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -278,3 +278,51 @@ def test_a_history_that_comes_again_when_a_second_sender_appears() -> None:
     talk.add([*talk.messages(1, publisher=None), *taken])
     assert talk.account.received == 4
     assert talk.kept() == [1, 2, 3, 4]
+
+
+class Drains(Consumer):
+    """How many messages each had."""
+
+    def __init__(self) -> None:
+        self.sizes: list[int] = []
+
+    def take(self, drained: Drained) -> None:
+        self.sizes.append(len(drained.messages))
+
+
+class Broken(Consumer):
+    """Raises where it is told to."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+
+    def choose(self, drained: Drained, account: TopicAccount) -> None:
+        if self._where == 'choose':
+            raise ValueError('a defect')
+
+    def take(self, drained: Drained) -> None:
+        assert self._where == 'take', 'it takes what it could not choose of'
+        raise KeyError(drained.topic)
+
+
+@pytest.mark.parametrize(('where', 'said'), [('choose', 'ValueError: a defect'), ('take', "KeyError: '/talk'")])
+def test_a_consumer_that_raises_keeps_no_other_from_its_messages(where: str, said: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Those before it and after it get every drain; it is counted, and named in the log, not each time."""
+    talk, broken, last = Talk(), Broken(where), Drains()
+    talk.listen(broken, talk.sampler, last)
+    for _ in range(3):
+        talk.add(talk.messages(2))
+    assert talk.kept() == [1, 2, 3, 4, 5, 6]
+    assert last.sizes == [2, 2, 2]
+    assert (broken.failures, broken.last_error) == (3, said)
+    assert (talk.sampler.failures, last.failures) == (0, 0)
+    (record,) = caplog.records
+    assert 'Broken fails to take messages of /talk (1 times so far)' in record.message
+
+
+def test_a_topic_of_no_sensor_goes_to_the_others_too() -> None:
+    """As above, where the consumers themselves asked for it."""
+    broken, other = Broken('take'), Drains()
+    other.topics = frozenset({TOPIC})
+    TopicStream(TOPIC, TYPE, (broken, other)).add(Talk().messages(4), Senders(), 0.0, paused=False)
+    assert (other.sizes, broken.failures) == ([4], 1)
