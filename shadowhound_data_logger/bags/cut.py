@@ -16,11 +16,10 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Final, Protocol
 
+from shadowhound_data_logger.bags.contents import Packed, Plain, is_plain
 from shadowhound_data_logger.bags.description import BagPart, Description, of_metadata
 from shadowhound_data_logger.bags.fetch import fetch, on_disk
 from shadowhound_data_logger.bags.naming import BUCKET, METADATA
-from shadowhound_data_logger.bags.packed import Packed
-from shadowhound_data_logger.bags.plain import Plain, is_plain
 from shadowhound_data_logger.bags.remote import RemoteBag, document, natural
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError

@@ -1,4 +1,4 @@
-"""Bags that are no plain MCAP: SQLite, and those that are compressed outside the storage. They lie on the disk.
+"""The messages of a bag's files, whatever their storage: MCAP as it lies, also in a store; SQLite and packed files from the disk.
 
 rosbags reads the SQLite, once it is known that its tables are tables: a view would be a program of whoever wrote the file.
 """
@@ -8,8 +8,10 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
+from functools import cache
 from pathlib import Path
 from typing import IO, Final
 
@@ -17,16 +19,18 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.metadata import dump_qos_v8
 
-from shadowhound_data_logger.bags.description import Description
-from shadowhound_data_logger.bags.plain import Plain
+from shadowhound_data_logger.bags.description import BagPart, Description
 from shadowhound_data_logger.encode.definitions import describe
 from shadowhound_data_logger.errors import BagDamaged, DataLoggerError
-from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage
-from shadowhound_data_logger.mcap.ranges import LocalFile
+from shadowhound_data_logger.mcap.index import McapIndex, read_index
+from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage, read_messages
+from shadowhound_data_logger.mcap.ranges import LocalFile, Ranged
 from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, path_below, unpacked
 from shadowhound_data_logger.zstd import ZstdError, ZstdFile
 
+THREADS: Final = 8
+"""Slices that are opened at a time."""
 PIECE_BYTES: Final = 1 << 20
 MOST_RATIO: Final = 1000
 """Of a file that is unpacked onto the disk, to what it is packed; half of the disk's free room is never exceeded."""
@@ -34,8 +38,67 @@ _ENCODINGS = {MessageDefinitionFormat.MSG: 'ros2msg', MessageDefinitionFormat.ID
 _TABLES: Final = {'messages', 'topics', 'schema', 'metadata', 'message_definitions'}
 
 
+def is_plain(told: Description | None, slices: Sequence[str]) -> bool:
+    """Whether a bag is of MCAP files that can be read as they lie."""
+    if told is None:
+        return bool(slices) and all(name.endswith('.mcap') for name in slices)
+    return told.storage == 'mcap' and not told.compression
+
+
+class Plain:
+    """The slices of an MCAP bag as one row of messages. A slice is opened when something of it is wanted, by its summary first.
+
+    Life: New; used by one thread. ``told`` saves opening slices of which it says that they are of another time.
+    """
+
+    def __init__(self, sources: Sequence[Ranged], told: Description | None) -> None:
+        self._sources = sources
+        self._told = told
+        self._times = _times(told, sources)
+        self._index: Callable[[int], McapIndex] = cache(lambda place: read_index(sources[place]))
+
+    def span(self) -> tuple[int, int]:
+        if self._told is not None and self._told.messages:
+            return self._told.t_start_ns, self._told.t_end_ns
+        self._open(range(len(self._sources)))
+        found = [index for index in map(self._index, range(len(self._sources))) if index.messages]
+        return min((index.t_start_ns for index in found), default=0), max((index.t_end_ns for index in found), default=0)
+
+    def topics(self) -> set[str]:
+        if self._told is not None:
+            return {topic.name for topic in self._told.topics}
+        places = range(len(self._sources))
+        self._open(places)
+        return {channel.topic for place in places for channel in self._index(place).channels.values()}
+
+    def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
+        places = [place for place in range(len(self._sources)) if self._may_have(place, wanted)]
+        self._open(places)
+        for place in places:
+            yield from read_messages(self._sources[place], self._index(place), wanted)
+
+    def _open(self, places: Sequence[int]) -> None:
+        """Several at a time."""
+        with ThreadPoolExecutor(THREADS, 'bag-open') as pool:
+            list(pool.map(self._index, places))
+
+    def _may_have(self, place: int, wanted: MessageFilter) -> bool:
+        part = self._times[place]
+        if part is None or part.t_start_ns is None or part.t_end_ns is None:
+            return part is None or part.messages != 0
+        return part.t_start_ns < wanted.end_ns and part.t_end_ns >= wanted.start_ns
+
+
+def _times(told: Description | None, sources: Sequence[Ranged]) -> list[BagPart | None]:
+    parts = {part.name: part for part in told.parts} if told else {}
+    return [parts.get(source.name.rpartition('/')[2]) for source in sources]
+
+
 class Packed:
-    """The files of a folder that its metadata name. SQLite knows one stamp alone, when a message came; it stands for both."""
+    """A bag that is no plain MCAP: SQLite, or compressed outside the storage. Its files are those that the metadata name.
+
+    SQLite knows one stamp alone, when a message came; it stands for both.
+    """
 
     def __init__(self, folder: Path, told: Description) -> None:
         self._folder = folder
