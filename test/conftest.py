@@ -11,9 +11,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import botocore.loaders
+import botocore.session
 import profiles
 import pytest
+from botocore.loaders import create_loader
 from domains import free_domain
 
 from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE
@@ -47,7 +48,7 @@ def pytest_configure() -> None:
     Nodes of the tests, in this process and in others, are among themselves.
     """
     os.environ.update(THIS_MACHINE)
-    botocore.loaders.create_loader = lru_cache(botocore.loaders.create_loader)  # whose descriptions of S3 each store would read
+    botocore.session.create_loader = lru_cache(create_loader)  # whose descriptions of S3 each store would read
     profiles.load()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
