@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 from botocore import exceptions as boto
 from botocore.parsers import ResponseParserError
+from urllib3 import exceptions as urllib3
 
 from shadowhound_data_logger.errors import (
     AccessDenied,
@@ -25,8 +26,11 @@ from shadowhound_data_logger.errors import (
 )
 from shadowhound_data_logger.tls import causes, distrust, distrust_told
 
-REQUEST_ERRORS: Final = (boto.BotoCoreError, boto.ClientError, ResponseParserError, OSError, ValueError)
-"""Everything a request through botocore can raise; ValueError comes of a header that broke off."""
+REQUEST_ERRORS: Final = (boto.BotoCoreError, boto.ClientError, ResponseParserError, urllib3.HTTPError, OSError, ValueError)
+"""Everything a request through botocore can raise; ValueError comes of a header that broke off.
+
+urllib3's own come of an error whose body broke off, where a body was asked for: botocore then reads it outside its translation.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +112,9 @@ _CODES: Final[dict[str, _Row]] = {
 
 _NO_KEYS: Final = (boto.NoCredentialsError, boto.PartialCredentialsError, boto.CredentialRetrievalError, boto.NoAuthTokenError,
                    boto.ProfileNotFound, boto.ConfigParseError)  # fmt: skip
-_BROKEN: Final = (boto.ConnectionClosedError, boto.ResponseStreamingError, boto.IncompleteReadError, ConnectionResetError)
+_SLOW: Final = (boto.ReadTimeoutError, urllib3.ReadTimeoutError)
+_BROKEN: Final = (boto.ConnectionClosedError, boto.ResponseStreamingError, boto.IncompleteReadError, urllib3.ProtocolError,
+                  ConnectionResetError)  # fmt: skip
 
 _SILENT: Final[_Row] = (StoreUnavailable, 'Tower at {endpoint} gave no answer for {bucket}/{key}', 'is Tower on, and the WiFi?')
 _FAILURES: Final[tuple[tuple[type[BaseException] | tuple[type[BaseException], ...], _Row], ...]] = (
@@ -122,8 +128,8 @@ _FAILURES: Final[tuple[tuple[type[BaseException] | tuple[type[BaseException], ..
     (boto.ProxyConnectionError, (StoreUnavailable, 'the proxy to {endpoint} cannot be reached', 'add Tower to NO_PROXY')),
     (boto.ConnectTimeoutError, (StoreUnavailable, 'no connection to Tower at {endpoint} within {connect_timeout_s:g} s',
                                 'is Tower on, and the WiFi?')),
-    (boto.ReadTimeoutError, (StoreUnavailable, 'Tower at {endpoint} gave no answer within {read_timeout_s:g} s',
-                             'does the server hang? look at its log')),
+    (_SLOW, (StoreUnavailable, 'Tower at {endpoint} gave no answer within {read_timeout_s:g} s',
+             'does the server hang? look at its log')),
     (ConnectionRefusedError, (StoreUnavailable, 'Tower at {endpoint} refused the connection',
                               'is the S3 server running? `curl -i {endpoint}`')),
     (socket.gaierror, (StoreUnavailable, 'the name of Tower at {endpoint} cannot be resolved',

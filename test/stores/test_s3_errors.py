@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from botocore import exceptions as boto
 from botocore.parsers import ResponseParserError
+from urllib3 import exceptions as urllib3
 
 from shadowhound_data_logger.errors import (
     AccessDenied,
@@ -78,6 +79,8 @@ FAILURES: tuple[tuple[Exception, type[StoreError], str], ...] = (
     (boto.ConnectionClosedError(endpoint_url=URL), StoreUnavailable, 'broke the connection off'),
     (boto.IncompleteReadError(actual_bytes=1, expected_bytes=2), StoreUnavailable, 'broke the connection off'),
     (boto.ResponseStreamingError(error='x'), StoreUnavailable, 'broke the connection off'),
+    (urllib3.ReadTimeoutError(None, None, 'x'), StoreUnavailable, 'no answer within 30 s'),  # type: ignore[arg-type]
+    (urllib3.ProtocolError('x'), StoreUnavailable, 'broke the connection off'),
     (boto.SSLError(endpoint_url=URL, error='x'), StoreUnavailable, 'no TLS connection'),
     (boto.ProxyConnectionError(proxy_url='http://p'), StoreUnavailable, 'NO_PROXY'),
     (boto.HTTPClientError(error='x'), StoreUnavailable, 'HTTPClientError'),

@@ -36,6 +36,7 @@ FAULTS: dict[str, tuple[Faulty, str]] = {
     'reset before the answer': (lambda: fake_s3.resetting(b''), 'broke the connection off'),
     'reset in the answer': (lambda: fake_s3.resetting(b'HTTP/1.1 200 OK\r\nContent-Le'), 'broke the connection off'),
     'reset in the body': (lambda: fake_s3.resetting(b'HTTP/1.1 200 OK\r\nContent-Length: 1\r\nETag: x\r\n\r\n'), 'broke the'),
+    'reset in an error': (lambda: fake_s3.resetting(b'HTTP/1.1 500 No\r\nContent-Length: 9\r\n\r\n<Error>'), 'broke the'),
 }
 
 
