@@ -276,10 +276,13 @@ class Spool:
                 self._tree.remove(self._tree.waiting(item.id, item.bucket, item.key))
 
     def _set_apart(self, item: SpooledObject, reason: str | None) -> None:
-        """Unless a retry, or another process's start, lets it wait again by now; where one is at it, the next start does it."""
+        """Unless a retry, or another process's start, lets it wait again by now; where one is at it, the next start does it.
+
+        The writing connection is asked: the reading one tells of no later commit while another thread is half through its answer.
+        """
         try:
-            with flock(self.root / 'recovery.lock', wait=False) as mine:
-                if mine and self._view.rows("id = ? AND state = 'quarantined'", (item.id,)):
+            with flock(self.root / 'recovery.lock', wait=False) as mine, self._lock:
+                if mine and self._index.rows("id = ? AND state = 'quarantined'", (item.id,)):
                     source = self._tree.waiting(item.id, item.bucket, item.key)
                     self._tree.place(source, self._tree.path(State.QUARANTINED, reason, item.bucket, item.key))
         except (OSError, sqlite3.Error) as error:

@@ -1,8 +1,7 @@
 """Random bad days: everything is delivered once to effect, nothing is overwritten, the ledger closes.
 
-``SHADOWHOUND_SEED`` names the first seed. ``SHADOWHOUND_TEST_LONG=1`` runs as many in virtual time as the campaign
-(``python -m torture.faults``),
-which runs more over real sockets.
+``SHADOWHOUND_SEED`` names the first seed. ``SHADOWHOUND_TEST_LONG=1`` runs as many days in virtual time as the campaign
+(``python -m torture.faults``), and a few over real sockets, of which the campaign runs more.
 """
 
 from __future__ import annotations

@@ -109,6 +109,17 @@ def test_quarantine_moves_the_file(spool: Spool, root: Path, reason: str | None,
     assert spool.pending(1) == []
 
 
+def test_quarantine_moves_the_file_while_somebody_reads(spool: Spool, root: Path) -> None:
+    """A question to the index that is half answered meanwhile, as a status is on a busy machine, does not hide the outcome."""
+    (item,) = put(spool, make())
+    half = spool._view.db.execute('SELECT * FROM tally')
+    assert half.fetchone()
+    settle(spool, item, State.QUARANTINED, 'foreign')
+    assert half.fetchone(), 'it was not at its end'
+    half.close()
+    assert_whole(root)
+
+
 def test_held_objects_wait(spool: Spool, root: Path) -> None:
     """An object without a final name is durable, but not offered for delivery."""
     assert put(spool, make(held='clock')) == []
