@@ -55,7 +55,7 @@ class BatchQueue:
         self._lock = threading.Lock()
         self._ready = threading.Condition(self._lock)
         self._left = threading.Condition(self._lock)
-        self._unfinished: dict[int, int] = {}  # id of a batch -> its number, rising
+        self._unfinished: dict[int, tuple[int, Batch]] = {}  # id of a batch -> its number, rising
         self._put = self._finished = 0
         self._lanes: dict[int, deque[Batch]] = {}
         self._messages = 0
@@ -72,7 +72,7 @@ class BatchQueue:
                 self._lanes = dict(sorted(self._lanes.items()))
             lane.append(batch)
             self._put += 1
-            self._unfinished[id(batch)] = self._put
+            self._unfinished[id(batch)] = self._put, batch
             self._messages += len(batch.samples)
             self._bytes += batch.size
             while self._messages > self._settings.max_messages or self._bytes > self._settings.max_bytes:
@@ -101,7 +101,16 @@ class BatchQueue:
         """Whether every batch that was put before this call is done, or dropped, in time."""
         with self._lock:
             last = self._put
-            return self._left.wait_for(lambda: next(iter(self._unfinished.values()), last + 1) > last, max(0.0, deadline_s))
+            return self._left.wait_for(lambda: self._first() > last, max(0.0, deadline_s))
+
+    def oldest(self) -> dict[str, int]:
+        """Topic -> the first stamp of its batches that are not done."""
+        with self._lock:
+            found: dict[str, int] = {}
+            for _, batch in self._unfinished.values():
+                first_ns = batch.samples[0].stamp_ns
+                found[batch.topic] = min(first_ns, found.get(batch.topic, first_ns))
+            return found
 
     def close(self) -> None:
         """Wake all who wait; what is inside can still be taken."""
@@ -117,6 +126,10 @@ class BatchQueue:
     def status(self) -> QueueStatus:
         with self._lock:
             return QueueStatus(sum(len(lane) for lane in self._lanes.values()), self._messages, self._bytes, self._finished)
+
+    def _first(self) -> int:
+        """The number of the oldest batch that is not done, or of the next one."""
+        return next((number for number, _ in self._unfinished.values()), self._put + 1)
 
     def _remove(self, lane: deque[Batch]) -> Batch:
         batch = lane.popleft()

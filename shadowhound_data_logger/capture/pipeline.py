@@ -130,6 +130,7 @@ class Pipeline:
         sensors = {sensor.name: sensor for sensor in settings.sensors}
         track = RobotTrack(settings.mission, types, self._clock, node.resolve_topic_name)
         sampler = Sampler(sensors, settings.intake, accounts, types, self._clock, queue)
+        accounts.oldest_open = sampler.oldest_open
         bags = BagConsumer(node, settings.bag, accounts, bag_queue)
         consumers = (track, sampler, *self.event_buffer.consumers, bags)
         self.intake = Intake(node, sensors, settings.intake, accounts, types, consumers, first=[track.odometry])
@@ -260,6 +261,7 @@ class Pipeline:
                        lambda topic: {publisher.gid for publisher in endpoints(node, topic)})  # fmt: skip
 
     def _tell_mission(self, mission: Mapping[str, Any]) -> None:
+        self.spool.accounts.set_mission(str(mission.get('mission_id', '')))
         if self._interface is not None:
             self._interface.tell_mission(mission)
         self.recorder.on_mission(mission)

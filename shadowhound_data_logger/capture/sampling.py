@@ -134,6 +134,11 @@ class Batcher:
     def __len__(self) -> int:
         return len(self._samples)
 
+    @property
+    def first_ns(self) -> int:
+        """Stamp of the first open sample; 0 without any."""
+        return self._samples[0].stamp_ns if self._samples else 0
+
     def close(self) -> Batch:
         """The open samples as a batch; there must be some."""
         batch = Batch(self._sensor, self._topic, self._type, tuple(self._samples), self._size)
@@ -181,6 +186,7 @@ class Sampler(Consumer):
         sampled.chosen = kept
         if kept:
             sampled.kept_ns = kept[-1].stamp_ns
+            sampled.open_ns = sampled.open_ns or kept[0].stamp_ns
         if drained.paused:
             account.drop(PAUSED, len(messages), messages[0].source_ns, messages[-1].source_ns)
         else:
@@ -193,6 +199,7 @@ class Sampler(Consumer):
         for sample in chosen:
             for batch in add(sample, now_s):
                 self._offer(batch)
+        sampled.open_ns = sampled.batcher.first_ns
 
     def leave(self, topic: str) -> None:
         sampled = self._sampled.pop(topic, None)
@@ -214,6 +221,15 @@ class Sampler(Consumer):
     def _close(self, sampled: _Sampled) -> None:
         if len(sampled.batcher):
             self._offer(sampled.batcher.close())
+            sampled.open_ns = 0
+
+    def oldest_open(self) -> dict[str, int]:
+        """Topic -> the first stamp of what was kept of it and is not encoded yet; from any thread."""
+        # A batch goes from here to the queue, so this order sees each of them.
+        found = {topic: sampled.open_ns for topic, sampled in list(self._sampled.items()) if sampled.open_ns}
+        for topic, first_ns in self._queue.oldest().items():
+            found[topic] = min(first_ns, found.get(topic, first_ns))
+        return found
 
     def _offer(self, batch: Batch) -> None:
         """To the encoders; what their queue has no room for is dropped."""
@@ -230,6 +246,8 @@ class _Sampled:
         """Stamp of the newest message that was kept: no period is stored twice."""
         self.has_header = has_header
         self.rule = rule_for(sensor, has_header=has_header, last_kept_ns=kept_ns)
+        self.open_ns = 0
+        """Stamp of the first message that was kept and is not in the queue yet; 0 where there is none."""
         self.chosen: Sequence[Sample] = ()
         """Of the drain under way, what is kept."""
         self.batcher = Batcher(sensor, topic, type_name)

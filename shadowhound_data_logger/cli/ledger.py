@@ -13,11 +13,24 @@ from rich.text import Text
 
 from shadowhound_data_logger.cli.audit import verify_delivered
 from shadowhound_data_logger.cli.common import as_json, spool_folder, the_spool
-from shadowhound_data_logger.cli.output import figure, number, plain, plain_table, print_json, print_page, unsure, volume
+from shadowhound_data_logger.cli.output import (
+    duration,
+    figure,
+    number,
+    plain,
+    plain_table,
+    print_json,
+    print_page,
+    shown_time,
+    unsure,
+    volume,
+)
+from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
-from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT
-from shadowhound_data_logger.spool.ledger import imbalances, read
+from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT, Gap
+from shadowhound_data_logger.spool.ledger import imbalances, journal, read
 from shadowhound_data_logger.spool.status import robots
+from shadowhound_data_logger.times import moment
 
 COLUMNS: Final = ('published', 'received', 'missed', 'skipped', 'rejected', 'dropped', 'stored', 'open')
 ALWAYS: Final = frozenset({'published', 'received', 'missed', 'skipped', 'stored'})
@@ -37,25 +50,75 @@ ACCOUNTING: Final = {
 @click.option('--verify', 'ask', is_flag=True, help='Ask the store for every delivered object: is it there, with its checksum?')
 @click.option('--deep', is_flag=True, help='Verify by reading every object back.')
 @click.option('--again', is_flag=True, help='Verify from the beginning, also where a run was interrupted.')
-def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: bool) -> int:
+@click.option('--gaps', 'when', is_flag=True, help='When messages were lost, how many, why, and in which mission.')
+@click.option('--topic', default='', metavar='TOPIC', help='With --gaps: of this topic.')
+@click.option('--since', default='', metavar='TIME', help='With --gaps: that end then or later: yesterday, 2h, 2026-11-20T12:30.')
+@click.option('--until', default='', metavar='TIME', help='With --gaps: that begin then or earlier.')
+@click.option(
+    '--cause', default='', metavar='WORD', help='With --gaps: for this cause or of this kind: restart, missed, no_room.'
+)
+def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: bool, when: bool, topic: str, since: str,  # noqa: PLR0913 - one an option
+           until: str, cause: str) -> int:  # fmt: skip
     """What became of the messages: stored and where, or lost and why. ~ is an estimate, - is not known.
 
     Reads the spool while the node runs and when it does not. Exit code 1 when the ledger does not balance, or when the store
-    does not hold what was delivered; an interrupted --verify goes on where it was.
+    does not hold what was delivered; an interrupted --verify goes on where it was. Times are UTC.
     """
     folder = the_spool(spool)
+    if when:
+        now_ns = SystemClock.of_this_machine().wall_ns()
+        begin_ns, end_ns = (moment(name, given, now_ns) if given else None
+                            for name, given in (('--since', since), ('--until', until)))  # fmt: skip
+        rows = [gap for gap in journal(folder, _robot(folder)) if _is_asked_for(gap, topic, begin_ns, end_ns, cause)]
+        if as_json:
+            print_json({'gaps': [gap.as_dict() for gap in rows]})
+        else:
+            print_page(*gaps_page(rows))
+        return 0
+    if topic or since or until or cause:
+        raise click.UsageError('--topic, --since, --until and --cause are for --gaps')
     if ask or deep:
         return verify_delivered(folder, deep=deep, again=again, as_json=as_json)
     if again:
         raise click.UsageError('--again is for --verify or --deep')
     names = robots(folder)
-    found = read(folder, os.environ.get('SHADOWHOUND_ROBOT') or next(iter(names), 'thor'))
+    found = read(folder, _robot(folder))
     found['robots'] = names if len(names) > 1 else [found['robot']]  # a spool that several share has one ledger of them all
     if as_json:
         print_json(found)
     else:
         print_page(*page(found))
     return 0 if found['balanced'] else 1
+
+
+def _robot(folder: Path) -> str:
+    return os.environ.get('SHADOWHOUND_ROBOT') or next(iter(robots(folder)), 'thor')
+
+
+def _is_asked_for(gap: Gap, topic: str, begin_ns: int | None, end_ns: int | None, cause: str) -> bool:
+    """What has no time is left out as soon as one is asked for."""
+    if (topic and gap.topic != topic) or (cause and cause not in {gap.cause, gap.kind}):
+        return False
+    if begin_ns is not None and (gap.to_ns is None or gap.to_ns < begin_ns):
+        return False
+    return end_ns is None or (gap.from_ns is not None and gap.from_ns <= end_ns)
+
+
+def gaps_page(rows: Sequence[Gap]) -> list[RenderableType]:
+    """A line a gap, the oldest first; what has no time comes first."""
+    if not rows:
+        return [Text('No message was lost there.', 'green')]
+    columns = ['topic', 'sink', 'from', 'for', 'messages', 'gaps', 'what', 'cause', 'mission']
+    shown = [name for name in columns if name != 'mission' or any(gap.mission_id for gap in rows)]
+    table = plain_table('Gaps (UTC)', shown, left=('topic', 'sink', 'from', 'what', 'cause', 'mission'))
+    for gap in rows:
+        span = '-' if gap.from_ns is None or gap.to_ns is None else duration((gap.to_ns - gap.from_ns) / SECOND)
+        count = number(gap.count) if gap.grade == EXACT else f'~{number(gap.count)}'
+        cells = {'topic': gap.topic, 'sink': gap.sink, 'from': shown_time(gap.from_ns), 'for': span, 'messages': count,
+                 'gaps': number(gap.merged), 'what': gap.kind, 'cause': gap.cause, 'mission': gap.mission_id or ''}  # fmt: skip
+        table.add_row(*(plain(cells[name]) for name in shown))
+    lost = sum(gap.count or 0 for gap in rows)
+    return [table, '', Text(f'{lost:,} messages in {len(rows):,} rows; gaps of one kind and cause within a second are one row.')]
 
 
 def page(found: Mapping[str, Any]) -> list[RenderableType]:

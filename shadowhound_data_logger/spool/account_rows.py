@@ -89,6 +89,10 @@ class Totals:
     other_types: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Type that is published there besides and not logged -> nodes that publish it, and how many messages of it were
     counted; ``messages`` is None where nobody listened to all of them."""
+    missed_by: Mapping[str, int] = field(default_factory=dict)
+    """By cause, those that are estimated among them."""
+    gaps: int = 0
+    """How often messages were lost in a row, for whatever cause."""
 
 
 @dataclass(frozen=True, slots=True)

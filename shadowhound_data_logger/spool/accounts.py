@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from shadowhound_data_logger.clock import Clock
+from shadowhound_data_logger.clock import MAX_AGE_NS, Clock
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, MISSED, REJECTED, Figures, TopicGaps
@@ -99,6 +99,8 @@ class TopicAccount:
     """When its losses were."""
     doubted_ns: int = 0
     """Since when its messages are counted by no rhythm; 0 where they are: one that is found counts back to then."""
+    settled_ns: int = 0
+    """No message up to this stamp was open at the last commit: the next one makes what became of them durable."""
     complete_ns: int = 0
     """No message up to this stamp can still be lost on its way into the spool."""
     is_doubtful: bool = False
@@ -315,6 +317,8 @@ class Accounts:
         self._rhythms = {
             row.topic: row if self._grades.get(row.topic) == ESTIMATED else replace(row, publisher='') for row in rhythms
         }
+        self.oldest_open: Callable[[], Mapping[str, int]] = lambda: dict.fromkeys(self._topics, 1)
+        """Says of which topics messages have no outcome yet that are not in the writer, and the stamp of the first: set it."""
         self._carried = Counter[str]()
         self._carried_ns: dict[str, tuple[int, int]] = {}
         self._mission = ''
@@ -460,6 +464,16 @@ class Accounts:
 
     def snapshot(self, stored: Mapping[str, tuple[int, int]]) -> AccountSnapshot | None:
         """The state as it will be once ``stored`` is durable; None when nothing changed since the last one."""
+        taken = self._snapshot(stored)
+        if taken is not None:
+            oldest = self.oldest_open()
+            with self._lock:
+                for row in taken.topics:
+                    account = self._topics[row.topic]
+                    account.settled_ns = min(row.heard_ns, oldest.get(row.topic, row.heard_ns + 1) - 1)
+        return taken
+
+    def _snapshot(self, stored: Mapping[str, tuple[int, int]]) -> AccountSnapshot | None:
         with self._lock:
             self._unwritten = []
             if not self._dirty and not stored:
@@ -536,8 +550,13 @@ class Accounts:
 
     @staticmethod
     def _row(topic: str, account: TopicAccount, count: int, newest_ns: int) -> TopicRow:
-        if account.open <= count and account.accounting not in {'', RECEIVED_ONLY}:
-            account.complete_ns = account.gaps.heard_ns
+        if account.accounting not in {'', RECEIVED_ONLY}:
+            settled_ns = account.settled_ns
+            if account.open <= count:
+                settled_ns = account.gaps.heard_ns
+            elif topic.startswith(SINKS):  # written in the order of arrival
+                settled_ns = newest_ns - MAX_AGE_NS
+            account.complete_ns = max(account.complete_ns, settled_ns)
         return TopicRow(
             topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
             dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
@@ -547,9 +566,14 @@ class Accounts:
 
 def _totals(account: TopicAccount) -> Totals:
     paused = account.dropped[PAUSED]
+    missed_by = Counter[str]()
+    for (kind, cause, _), count in account.figures().items():
+        if kind == MISSED and count:
+            missed_by[cause] += count
     return Totals(
         account.type, account.accounting or None, account.received, account.stored, account.skipped, account.rejected.total(),
         account.dropped.total() - paused, paused, account.missed, account.about_missed, account.open,
         account.rejected[WRONG_TYPE],
         {name: {'publishers': list(other.publishers), 'messages': other.messages} for name, other in account.other_types.items()},
+        dict(missed_by), account.gaps.count,
     )  # fmt: skip

@@ -75,7 +75,10 @@ _PRINTED: Final = tuple(each.name for each in fields(Gap))[:12]
 
 
 class Watermark(NamedTuple):
-    """Up to when the journal of a topic is complete: no message before it can still be lost on its way into the spool."""
+    """Up to when the journal of a topic is complete: what was lost on the way into the spool, all of it is there.
+
+    What lies in the spool may still be evicted or quarantined; its objects are pending, held or quarantined until then.
+    """
 
     robot: str
     sink: str
@@ -131,6 +134,8 @@ class TopicGaps:
     """Of this machine: of stamps from before it was set."""
     heard_ns: int = 0
     """Stamp of the newest message; 0 before the first."""
+    count: int = 0
+    """Gaps so far, of whatever kind."""
     _changes: dict[GapKey, GapRow] = field(default_factory=dict)
     _journaled: dict[tuple[str, str, str], int] = field(default_factory=dict)
     _since_ns: int = 0
@@ -151,11 +156,13 @@ class TopicGaps:
             start_ns, end_ns = min(from_ns, to_ns), max(from_ns, to_ns)
             begin_ns = start_ns // SECOND * SECOND if end_ns - start_ns < SECOND else start_ns
         key = GapKey(kind, cause, grade, publisher, self.mission, begin_ns)
+        self.count += 1
         self._change(GapRow('', key, start_ns, end_ns, messages, 1))
         return key
 
     def fill(self, key: GapKey, merged: int) -> None:
         """One message of a gap came after all; ``merged`` is the change of how many gaps there are."""
+        self.count += merged
         self._change(GapRow('', key, None, None, -1, merged))
 
     def settle(self, topic: str, figures: Figures) -> tuple[list[GapRow], list[TakenBack]]:

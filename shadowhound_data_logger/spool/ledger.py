@@ -5,15 +5,16 @@ from __future__ import annotations
 import sqlite3
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool import clock_record
+from shadowhound_data_logger.spool import clock_record, gaps
 from shadowhound_data_logger.spool.account_rows import OtherTypeRow
 from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
-from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED
+from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED, Gap
 from shadowhound_data_logger.spool.index import Index
 
 STATES: Final = tuple(state.value for state in State)
@@ -24,15 +25,33 @@ def read(spool: Path, robot: str) -> dict[str, Any]:
 
     Raises SpoolError when there is no spool or it cannot be read. Unknown figures are None, never 0.
     """
+    with _reading(spool) as index:
+        known = clock_record.read(spool, robot)
+        del known['offsets']
+        return {**of_index(index, robot), 'clock': {**known, 'held': index.held_count('clock')}}
+
+
+def journal(spool: Path, robot: str) -> list[Gap]:
+    """What the gap journal of a spool folder has, in the order of time; works while a node runs.
+
+    Raises SpoolError as ``read``, and for an index of a version that had no journal.
+    """
+    with _reading(spool) as index:
+        if index.gap_sums() is None:
+            raise SpoolError(f'the spool {spool} is of an older version, which kept no times of losses',
+                             remedy='start the node once: it brings the spool up to date')  # fmt: skip
+        return gaps.known(index.db, clock_record.read(spool, robot)['offsets'])
+
+
+@contextmanager
+def _reading(spool: Path) -> Iterator[Index]:
     path = spool / 'index.db'
     if not path.is_file():
         raise SpoolError(f'there is no spool in {spool}', remedy='has the node run here? SHADOWHOUND_HOME names its folder')
     index = Index(path, read_only=True)
     try:
         index.open()
-        known = clock_record.read(spool, robot)
-        del known['offsets']
-        return {**of_index(index, robot), 'clock': {**known, 'held': index.held_count('clock')}}
+        yield index
     except (sqlite3.Error, ValueError) as error:
         raise SpoolError(f'the spool index {path} cannot be read: {error}',
                          remedy='a start of the node rebuilds a damaged one') from error  # fmt: skip

@@ -33,7 +33,7 @@ _TOPIC: Final[dict[str, Any]] = {
     'sensor': '', 'type': '', 'enabled': True, 'publishers': 0, 'matched': 0, 'may_be_silent': False, 'unavailable': '',
     'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
     'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': None, 'missed_estimated': None, 'open': 0,
-    'accounting': None, 'wrong_type': 0, 'other_types': {},
+    'accounting': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0,
 }  # fmt: skip
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
@@ -188,13 +188,12 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
     yield from (f'{name} fails: {row["last_error"]}' for name, row in found['workers'].items() if row['failing'])
     yield from (f'{name}: {text}' for name, text in found['stalls'].items())
     yield from (row['text'] for row in (found['middleware']['unheard'] or {}).values())
-    for what in ('missed', 'dropped', 'rejected'):
+    yield from _missed(found['topics'], 'missed', 'missed in this session', '')
+    for what in ('dropped', 'rejected'):
         lost = {topic: row[what] for topic, row in found['topics'].items() if row[what]}
         if lost:
             yield f'{what} in this session: {_most(lost)}'
-    about = {topic: row['missed_estimated'] for topic, row in found['topics'].items() if row['missed_estimated']}
-    if about:
-        yield f'missed in this session, as estimated: {_most(about, "~")}'
+    yield from _missed(found['topics'], 'missed_estimated', 'missed in this session, as estimated', '~')
     yield from _other_types(found)
     yield from _left_out(found)
     if store['quarantined']:
@@ -221,6 +220,17 @@ def _other_type(topic: str, row: Mapping[str, Any], name: str, other: Mapping[st
     count = other['messages']
     what = 'nobody listened to it: how many messages is not known' if count is None else f'{count:,} messages were refused'
     return f'{topic} was published as {name} too, by {by}, and is logged as {row["type"] or "nothing"} alone; {what}'
+
+
+def _missed(topics: Mapping[str, Any], what: str, text: str, mark: str) -> Iterator[str]:
+    """A line for each cause, so that what a restart cost is told from what the network lost."""
+    rows = {topic: row for topic, row in topics.items() if row[what]}
+    told = {
+        topic: row['missed_by'] or {'': row[what]} for topic, row in rows.items()
+    }  # a node of an older version tells no cause
+    for cause in sorted({cause for causes in told.values() for cause in causes}):
+        lost = {topic: causes[cause] for topic, causes in told.items() if cause in causes}
+        yield f'{text}{cause and f" by {cause}"}: {_most(lost, mark)}'
 
 
 def _most(counts: Mapping[str, int], mark: str = '') -> str:

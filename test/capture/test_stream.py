@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 
 from shadowhound_data_logger.capture.consumers import Consumer, Drained
+from shadowhound_data_logger.capture.encode_pool import BatchQueue
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.config import IntakeSettings, QueueSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, Taken
 from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, RECEIVED_ONLY, Accounts, TopicAccount
@@ -326,3 +327,33 @@ def test_a_topic_of_no_sensor_goes_to_the_others_too() -> None:
     other.topics = frozenset({TOPIC})
     TopicStream(TOPIC, TYPE, (broken, other)).add(Talk().messages(4), Senders(), 0.0, paused=False)
     assert (other.sizes, broken.failures) == ([4], 1)
+
+
+def test_the_journal_is_complete_up_to_what_has_an_outcome() -> None:
+    """A message that is kept may still be lost while it is in the open batch, in the queue or in an encoder."""
+    talk = Talk(batch_s=1.0)
+    queue = talk.sampler._queue = BatchQueue(QueueSettings())
+    talk.accounts.oldest_open = talk.sampler.oldest_open
+
+    def complete() -> int:
+        """In messages, after two commits: what had its outcome at the first is durable with the second."""
+        for _ in range(2):
+            talk.accounts.reject(TOPIC, {})
+            taken = talk.accounts.snapshot({})
+            assert taken is not None
+        return max(0, taken.topics[0].complete_ns - NOON_NS) * 10 // SECOND
+
+    def finish() -> None:
+        batch = queue.get(0.0)
+        assert batch is not None
+        assert complete() in {0, 9}
+        talk.accounts.store({TOPIC: (len(batch.samples), 0)})
+        queue.done(batch)
+
+    talk.add(talk.messages(12))  # a batch of 9 in the queue, another one open
+    assert complete() == 0
+    finish()
+    assert complete() == 9
+    talk.sampler.flush()
+    finish()
+    assert complete() == 12

@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
-from spool.making import abandon, make, new_spool, put, settle
+from spool.making import NOON_NS, abandon, make, new_spool, put, settle
 
 from shadowhound_data_logger.cli.ledger import ledger, page
 from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.output import print_page
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.model import State
 
 STATES = ('delivered', 'pending', 'held', 'evicted', 'quarantined', 'deduplicated')
@@ -259,3 +260,77 @@ def test_what_the_clock_did_is_said(clock: dict[str, Any], words: list[str]) -> 
     for part in words:
         assert part in text
     assert ('clock of the robot' in text) is bool(words)
+
+
+def lossy(root: Path) -> None:
+    """A home with a transport loss at noon, and two samples dropped a minute later, in a mission."""
+    spool = new_spool(root)
+    spool.open()
+    with spool.accounts.entry('/camera') as account:
+        for number in (1, 5, 6, 7):
+            account.receive('p', number, NOON_NS + number * 100_000_000)
+        account.skipped += 2
+    spool.accounts.set_mission('patrol-7')
+    spool.accounts.drop('/camera', 'queue_full', 2, NOON_NS + 60 * SECOND, NOON_NS + 61 * SECOND)
+    spool.commit()
+    spool.close()
+
+
+def gaps(root: Path, *options: str) -> tuple[Any, list[dict[str, Any]]]:
+    """The page of ``--gaps``, and the rows of its JSON."""
+    given = ['--gaps', '--spool', str(root), *options]
+    text = CliRunner().invoke(ledger, given, standalone_mode=False)
+    as_json = CliRunner().invoke(ledger, [*given, '--json'], standalone_mode=False)
+    return text, json.loads(as_json.stdout)['gaps'] if as_json.exit_code == 0 else []
+
+
+def test_gaps_say_when_how_long_how_many_and_why(tmp_path: Path) -> None:
+    """As a table, and as the JSON of the contract."""
+    lossy(tmp_path / 'spool')
+    text, rows = gaps(tmp_path / 'spool')
+    assert text.return_value == 0
+    lines = [line.split() for line in text.stdout.splitlines()]
+    assert ['/camera', 'objects', '2025-10-18', '12:00:00.100', '0.4', 's', '3', '1', 'missed', 'transport'] in lines
+    assert [
+        '/camera',
+        'objects',
+        '2025-10-18',
+        '12:01:00.000',
+        '1.0',
+        's',
+        '2',
+        '1',
+        'dropped',
+        'queue_full',
+        'patrol-7',
+    ] in lines
+    assert rows[0] == {
+        'sink': 'objects', 'topic': '/camera', 'publisher': 'p', 'session': 1, 'kind': 'missed', 'cause': 'transport',
+        'from_ns': NOON_NS + 100_000_000, 'to_ns': NOON_NS + 500_000_000, 'count': 3, 'merged': 1, 'grade': 'exact',
+        'mission_id': None,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('options', 'causes'),
+    [
+        (['--topic', '/camera'], ['transport', 'queue_full']),
+        (['--topic', '/imu'], []),
+        (['--since', '2025-10-18T12:00:30'], ['queue_full']),
+        (['--until', '2025-10-18T12:00:00.2'], ['transport']),
+        (['--cause', 'queue_full'], ['queue_full']),
+        (['--cause', 'missed'], ['transport']),
+    ],
+)
+def test_gaps_can_be_asked_for_by_topic_time_and_cause(tmp_path: Path, options: list[str], causes: list[str]) -> None:
+    """What has no time is left out once one is asked for."""
+    lossy(tmp_path / 'spool')
+    _, rows = gaps(tmp_path / 'spool', *options)
+    assert sorted(row['cause'] for row in rows) == sorted(causes)
+
+
+def test_questions_about_gaps_need_gaps(tmp_path: Path) -> None:
+    """An option that would do nothing is refused."""
+    found = CliRunner().invoke(ledger, ['--topic', '/camera', '--spool', str(tmp_path)])
+    assert found.exit_code == 2
+    assert 'are for --gaps' in found.output
