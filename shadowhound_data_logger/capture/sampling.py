@@ -188,7 +188,7 @@ class Sampler(Consumer):
             sampled.kept_ns = kept[-1].stamp_ns
             sampled.open_ns = sampled.open_ns or kept[0].stamp_ns
         if drained.paused:
-            account.drop(PAUSED, len(messages), messages[0].source_ns, messages[-1].source_ns)
+            account.drop(PAUSED, len(messages), account.gaps.heard_ns or messages[0].source_ns, messages[-1].source_ns)
         else:
             account.skipped += len(messages) - len(kept)
 

@@ -1,0 +1,364 @@
+"""Loses messages on purpose and holds the gap journal to what was sent: when, how many, and why.
+
+A publisher numbers and stamps what it sends on four topics, RELIABLE and BEST_EFFORT, small and large, and the node stores every
+message of them. Meanwhile the node is stopped for seconds, starved, paused, and killed and started again. A second node has no
+store and room for few objects, which it evicts. What is not in the store, between two messages that are, is a gap: the journal
+must have it from the one message to the other, within a period, with its count and its cause, and nothing else. All the time
+somebody reads the ledger, whose every commit must balance.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from domains import free_domain
+from e2e.numbered import told
+from e2e.processes import Node, Processes, Publisher, until
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.accounts import WRONG_TYPE
+from shadowhound_data_logger.spool.control import connect
+from shadowhound_data_logger.spool.gaps import Gap
+from shadowhound_data_logger.spool.index import Index
+from torture._command import Bar, parser, progress, verdict, workshop
+
+DISTURBANCES: Final = 200
+SHORT_DISTURBANCES: Final = 8
+ROBOT: Final = 'torture'
+STRING: Final = 'std_msgs/msg/String'
+NO_STORE: Final = {'AWS_ENDPOINT_URL': 'http://127.0.0.1:9', 'AWS_ACCESS_KEY_ID': 'a', 'AWS_SECRET_ACCESS_KEY': 'b'}
+STOPPED_S: Final = 3.0
+STARVED_S: Final = 4.5
+STARVED_EACH_S: Final = 1.5
+STARVED_TURN_S: Final = 0.05
+PAUSED_S: Final = 1.5
+KILLED_S: Final = 1.0
+EVICTED_S: Final = 8.0
+STEADY_S: Final = 2.5
+BATCH_S: Final = 0.5
+SMALL_ROOM: Final = 4_000_000
+BESIDE_S: Final = 0.5
+"""So long before and after a disturbance a loss is its doing: a commit, a poll."""
+LATE_NS: Final = 40_000_000
+"""So much late the publisher may send a message: its machine does other things as well."""
+RESTARTED_S: Final = 10.0
+"""What a kill cost ends with the first message of the next start."""
+
+
+class Stream(NamedTuple):
+    """One topic."""
+
+    topic: str
+    reliable: bool
+    size: int
+    period_s: float
+
+
+STREAMS: Final = tuple(
+    Stream(f'/{what}_{"reliable" if reliable else "best_effort"}', reliable, size, period_s)
+    for what, size, period_s in (('small', 40, 0.02), ('large', 60_000, 0.1))
+    for reliable in (True, False)
+)
+ALLOWED: Final = {
+    'stopped': {'transport'}, 'starved': {'transport'}, 'paused': {'paused', 'transport'}, 'killed': {'restart', 'transport'},
+    'evicted': {'no_room'},
+}  # fmt: skip
+"""By disturbance, the causes that its losses may have."""
+
+
+class Loss(NamedTuple):
+    """Messages that are not in the store, between two that are; or a row of the journal."""
+
+    from_ns: int
+    to_ns: int
+    count: int
+    cause: str = ''
+
+
+class Done(NamedTuple):
+    """A disturbance."""
+
+    what: str
+    from_ns: int
+    to_ns: int
+
+
+@dataclass(slots=True)
+class Found:
+    """What the audit says; ``wrong`` by bar."""
+
+    done: list[Done] = field(default_factory=list)
+    wrong: dict[str, list[str]] = field(default_factory=dict)
+    lost: Counter[str] = field(default_factory=Counter)
+    """Messages by cause."""
+    gaps: int = 0
+    commits: int = 0
+
+    def say(self, bar: str, text: str, *, holds: bool) -> None:
+        self.wrong.setdefault(bar, [])
+        if not holds:
+            self.wrong[bar].append(text)
+
+    def bars(self) -> list[Bar]:
+        return [Bar(what, not said, '; '.join(said[:3])) for what, said in self.wrong.items()]
+
+
+class Reader:
+    """Reads the ledger of a home again and again, and keeps what does not balance. New; open; close."""
+
+    def __init__(self, home: Path) -> None:
+        self._spool = home / 'spool'
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self.unbalanced: list[str] = []
+        self.count = 0
+
+    def open(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _read(self) -> None:
+        while not self._over.wait(0.05):
+            try:
+                found = ledger.read(self._spool, ROBOT)
+            except SpoolError:
+                continue  # it is not there yet
+            self.count += 1
+            self.unbalanced += ledger.imbalances(found)
+
+
+def began(node: Node) -> dict[str, int]:
+    """By topic, the number of the first message that was heard; DDS counts from 1."""
+    with closing(Index(node.home / 'spool' / 'index.db', read_only=True)) as index:
+        index.open()
+        return {row.topic: (row.first or 1) - 1 for row in reversed(index.publishers()) if row.publisher != WRONG_TYPE}
+
+
+def absent(roots: Iterable[Path], first: Mapping[str, tuple[int, int]]) -> dict[str, list[Loss]]:
+    """What the objects below these folders lack, by topic, in the order of time.
+
+    ``first`` are number and time of the first message that was heard: it may be gone.
+    """
+    came: dict[str, dict[int, int]] = {stream.topic: {} for stream in STREAMS}
+    for root in roots:
+        for path in root.rglob('*.json'):
+            if '_ledger' not in path.parts:
+                document = json.loads(path.read_bytes())
+                for sample in document['samples']:
+                    came[document['topic']][told(sample['data'])[1]] = sample['stamp_ns']
+    for topic, (number, stamp_ns) in first.items():
+        if number not in came[topic]:
+            came[topic][number - 1] = stamp_ns
+    return {
+        topic: [Loss(numbers[one], numbers[two], two - one - 1) for one, two in pairwise(sorted(numbers)) if two > one + 1]
+        for topic, numbers in came.items()
+    }  # fmt: skip
+
+
+def journaled(rows: Sequence[Gap]) -> dict[str, list[Loss]]:
+    """What the journal has of objects, by topic."""
+    found: dict[str, list[Loss]] = {stream.topic: [] for stream in STREAMS}
+    for row in rows:
+        found[row.topic].append(Loss(row.from_ns or 0, row.to_ns or 0, row.count or 0, row.cause))
+    return {topic: sorted(losses) for topic, losses in found.items()}
+
+
+def together(real: Sequence[Loss], said: Sequence[Loss], near_ns: int) -> list[tuple[list[Loss], list[Loss]]]:
+    """What was lost and what is said of it, in groups that lie apart."""
+    groups: list[tuple[list[Loss], list[Loss]]] = []
+    end_ns = 0
+    for loss in sorted((*real, *said)):
+        if not groups or loss.from_ns > end_ns + near_ns:
+            groups.append(([], []))
+            end_ns = 0
+        groups[-1][bool(loss.cause)].append(loss)
+        end_ns = max(end_ns, loss.to_ns)
+    return groups
+
+
+def audit(found: Found, node: Node, roots: Iterable[Path], who: str) -> None:
+    """One node's journal against what it stored."""
+    rows = ledger.journal(node.home / 'spool', ROBOT)
+    found.say('every loss has a time', f'{who}: {[row for row in rows if row.from_ns is None]}',
+              holds=all(row.from_ns is not None for row in rows))  # fmt: skip
+    said = journaled([row for row in rows if row.from_ns is not None])
+    real = absent(roots, {topic: (first, said[topic][0].from_ns) for topic, first in began(node).items() if said.get(topic)})
+    for stream in STREAMS:
+        near_ns = round(stream.period_s * SECOND) + LATE_NS
+        found.gaps += len(real[stream.topic])
+        for lost, journal in together(real[stream.topic], said[stream.topic], near_ns):
+            text = f'{who} {stream.topic}: in truth {lost}, in the journal {journal}'
+            found.say('every loss is in the journal, and nothing else', text, holds=bool(lost) and bool(journal))
+            if not (lost and journal):
+                continue
+            begin_ns, end_ns = min(loss.from_ns for loss in lost), max(loss.to_ns for loss in lost)
+            counts = [sum(loss.count for loss in each) for each in (lost, journal)]
+            found.say('with its count', text, holds=counts[0] == counts[1])
+            off_ns = max(abs(min(loss.from_ns for loss in journal) - begin_ns), abs(max(loss.to_ns for loss in journal) - end_ns))
+            found.say('within a period of its time', text, holds=off_ns <= near_ns)
+            for loss in journal:
+                found.lost[loss.cause] += loss.count
+            causes = {loss.cause for loss in journal}
+            why = [each.what for each in found.done if each.from_ns <= end_ns and each.to_ns >= begin_ns]
+            allowed = set[str]().union(*(ALLOWED[what] for what in why))
+            found.say('with its cause', f'{text}, after {why}', holds=causes <= allowed)
+
+
+@dataclass(slots=True)
+class Scene:
+    """The node that is disturbed, and who publishes."""
+
+    processes: Processes
+    publisher: Publisher
+    node: Node
+    done: list[Done]
+
+    def heard(self) -> None:
+        """Wait until more has come of each topic."""
+        before = {stream.topic: self.node.topic(stream.topic).get('received', 0) for stream in STREAMS}
+        for topic, count in before.items():
+            self.node.received(topic, count + 1)
+
+    def stopped(self) -> None:
+        self.node.signal(signal.SIGSTOP)
+        time.sleep(STOPPED_S)
+        self.node.signal(signal.SIGCONT)
+
+    def starved(self) -> None:
+        end_s = time.monotonic() + STARVED_S
+        while time.monotonic() < end_s:
+            self.node.signal(signal.SIGSTOP)
+            time.sleep(STARVED_EACH_S - STARVED_TURN_S)
+            self.node.signal(signal.SIGCONT)
+            time.sleep(STARVED_TURN_S)
+
+    def paused(self) -> None:
+        self._ask(paused=True)
+        time.sleep(PAUSED_S)
+        self._ask(paused=False)
+
+    def killed(self) -> None:
+        self.node.kill()
+        time.sleep(KILLED_S)
+        self.node = start(self.processes)
+        self.heard()
+
+    def disturb(self, what: str) -> None:
+        """Do it, and note when it was done."""
+        begin_ns = time.time_ns()
+        getattr(self, what)()
+        after_s = BESIDE_S + (RESTARTED_S if what == 'killed' else STEADY_S)
+        self.done.append(Done(what, begin_ns - round((BATCH_S + 2.0) * SECOND), time.time_ns() + round(after_s * SECOND)))
+        time.sleep(STEADY_S)
+
+    def _ask(self, *, paused: bool) -> None:
+        with closing(connect(self.node.home / 'spool', ROBOT)) as connection:
+            connection.ask('pause' if paused else 'resume')
+
+
+def start(processes: Processes, home: str = '', tower: dict[str, str] | None = None, **more: Any) -> Node:
+    """A node that stores every message of each topic."""
+    given: dict[str, Any] = {'sensors': [stream.topic.strip('/') for stream in STREAMS], 'robot': ROBOT,
+                             'intake.history_bytes': 256 << 20, 'queue.max_bytes': 256 << 20, **more}  # fmt: skip
+    for stream in STREAMS:
+        name = stream.topic.strip('/')
+        given |= {f'{name}.topics': [name], f'{name}.types': [STRING], f'{name}.rate_hz': 0.0, f'{name}.batch_s': BATCH_S}
+    return processes.node(tower, given, home=home or 'home')
+
+
+def campaign(folder: Path, disturbances: int, rng: random.Random) -> Found:
+    """Run and judge."""
+    found = Found()
+    with free_domain() as domain:
+        processes = Processes(folder, domain, ROBOT)
+        try:
+            publisher = processes.publisher()
+            for stream in STREAMS:
+                publisher.create(stream.topic, STRING, reliable=stream.reliable, depth=10)
+            node = start(processes)
+            small = start(processes, 'small', NO_STORE, **{'spool.max_bytes': SMALL_ROOM, 'shutdown.drain_s': 0.0})
+            for stream in STREAMS:
+                publisher.matched(stream.topic, 2)
+                publisher.begin_numbered(stream.topic, 'p', stream.size, stream.period_s)
+            readers = [Reader(each.home) for each in (node, small)]
+            for reader in readers:
+                reader.open()
+            began_ns = time.time_ns()
+            scene = Scene(processes, publisher, node, found.done)
+            scene.heard()
+            time.sleep(STEADY_S)
+            kinds = ('stopped', 'killed', 'paused', 'starved')
+            for turn in range(disturbances):
+                what = kinds[turn % 4] if turn < 4 else rng.choice(kinds)
+                progress(f'{turn + 1}: {what}')
+                scene.disturb(what)
+            scene.heard()
+            time.sleep(max(STEADY_S, EVICTED_S - (time.time_ns() - began_ns) / SECOND))
+            for stream in STREAMS:
+                publisher.halt_numbered(stream.topic)
+            _quiet((scene.node, small))
+            for each in (scene.node, small):
+                each.stop()
+            for reader in readers:
+                reader.close()
+                found.commits += reader.count
+                found.say('the ledger balances at every commit', '; '.join(reader.unbalanced[:3]), holds=not reader.unbalanced)
+        finally:
+            processes.end()
+    audit(found, scene.node, [scene.node.home / 'store' / 'sensor-data' / ROBOT], 'disturbed')
+    own, found.done = found.done, [Done('evicted', began_ns - 60 * SECOND, time.time_ns())]
+    audit(found, small, [small.home / 'spool' / 'ready' / 'sensor-data' / ROBOT], 'without room')
+    found.done = own
+    for cause in ('transport', 'restart', 'paused', 'no_room'):
+        found.say(f'messages were lost by {cause}', f'{found.lost}', holds=found.lost[cause] > 0)
+    return found
+
+
+def _quiet(nodes: Sequence[Node]) -> None:
+    """Returns once nothing comes any more."""
+    seen: list[int] = []
+
+    def quiet() -> bool:
+        seen.append(sum(row['received'] for node in nodes for row in node.ledger()['topics'].values()))
+        time.sleep(0.5)
+        return len(seen) > 2 and seen[-1] == seen[-3]
+
+    until(quiet, 'nothing is on its way any more')
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The campaign; 0 when everything held."""
+    options = parser('gaps', __doc__ or '')
+    options.add_argument('--disturbances', type=int, default=0, help=f'how many, {DISTURBANCES} unless told')
+    given = options.parse_args(argv)
+    count = given.disturbances or (SHORT_DISTURBANCES if given.short else DISTURBANCES)
+    progress(f'{count} disturbances, seed {given.seed}')
+    with workshop(given) as shop:
+        found = campaign(shop.folder, count, random.Random(given.seed))
+        shop.passed = all(bar.holds for bar in found.bars())
+    figures = {'seed': given.seed, 'disturbances': Counter(each.what for each in found.done), 'gaps': found.gaps,
+               'lost': found.lost, 'readings': found.commits}  # fmt: skip
+    if not given.json:
+        print(figures)
+    return verdict(figures, found.bars(), as_json=given.json)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
