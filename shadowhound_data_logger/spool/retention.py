@@ -14,6 +14,7 @@ from typing import Final
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.spool.ballast import BALLAST_BYTES
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 
@@ -61,6 +62,11 @@ def make_room(index: Index, tree: Tree, settings: SpoolSettings, objects: Sequen
     if taken and taken - free <= sum(evictable.values()):
         evicted = _evict(index, tree, settings, taken - leaving, there, now_ns)
     return RoomNeeded(frozenset(given_up), evicted)
+
+
+def fits(tree: Tree, objects: Sequence[DataObject]) -> bool:
+    """Whether the disk takes these objects as it is, before anything leaves it, and the index's log beside them."""
+    return tree.free_bytes() >= sum(map(_cost, objects)) + BALLAST_BYTES
 
 
 def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, there: int, now_ns: int) -> int:

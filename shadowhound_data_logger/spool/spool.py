@@ -32,7 +32,7 @@ from shadowhound_data_logger.spool.index import Index, spooled
 from shadowhound_data_logger.spool.piles import Piles, look
 from shadowhound_data_logger.spool.recovery import open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
-from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, make_room
+from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, fits, make_room
 from shadowhound_data_logger.spool.session import Session, carry
 from shadowhound_data_logger.spool.uncatalogued import take
 
@@ -116,6 +116,10 @@ class Spool:
             self._settle(outcomes)
             remove_sources(self._tree, objects, ready)
         return placed
+
+    def fits(self, objects: Sequence[DataObject]) -> bool:
+        """Whether there is room for all of them before anything leaves the disk. Raises OSError."""
+        return fits(self._tree, objects)
 
     def knows(self, bucket: str, key: str, sha256: str) -> bool:
         """Whether this content was spooled under this (wanted) key, whatever became of it: a source of it is not needed any more.

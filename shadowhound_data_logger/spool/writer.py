@@ -110,12 +110,18 @@ class SpoolWriter:
             objects, outcomes = list(self._objects), list(self._outcomes)
         self._last_commit = time.monotonic()
         try:
-            self.spool.commit(objects, outcomes, durable=lambda spooled: self._committed(objects, outcomes, spooled))
+            if objects and outcomes and not self.spool.fits(objects):  # what was delivered leaves only after its commit
+                self._commit([], outcomes)
+                outcomes = []
+            self._commit(objects, outcomes)
         except (OSError, sqlite3.OperationalError) as error:
             raise self.spool.unwritable(error) from error
         except sqlite3.DatabaseError:
             self.damaged = True
             raise
+
+    def _commit(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> None:
+        self.spool.commit(objects, outcomes, durable=lambda spooled: self._committed(objects, outcomes, spooled))
 
     def _due(self) -> bool:
         """Whether there is something that waits for a commit; the caller holds the lock."""

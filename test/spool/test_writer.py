@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-from spool.making import assert_whole, make, receive, rows
+from spool.making import assert_whole, files, make, receive, rows
 
 from shadowhound_data_logger import worker
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.spool import writer as writer_module
+from shadowhound_data_logger.spool.files import Tree
+from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES
 from shadowhound_data_logger.spool.spool import Outcome, Spool
 from shadowhound_data_logger.spool.writer import MANY_OUTCOMES, SpoolWriter
 
@@ -152,6 +156,36 @@ def test_a_failing_disk_loses_nothing(opened: Callable[..., SpoolWriter], spool:
     assert writing.flush(10)
     assert writing.worker.failures == 3
     assert assert_whole(root)['topics']['/camera']['stored'] == 5
+
+
+def test_what_was_delivered_leaves_a_full_disk_first(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
+                                                     monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """A disk that is full of what was delivered has room for as much again: the spool does not wait for it for ever."""
+    body, write_part = bytes(200_000), Tree.write_part
+
+    def free(tree: Tree) -> int:
+        return 5 * (len(body) + OVERHEAD_BYTES) - sum(map(len, files(tree.root).values()))
+
+    def writes_if_it_fits(tree: Tree, number: int, content: bytes, said: Mapping[str, Any]) -> None:
+        if len(content) > free(tree):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write_part(tree, number, content, said)
+
+    monkeypatch.setattr(Tree, 'free_bytes', free)
+    monkeypatch.setattr(Tree, 'write_part', writes_if_it_fits)
+    writing = opened(60.0)
+    for number in range(5):
+        receive(spool)
+        writing.put(make(f'old{number}', body))
+    assert writing.flush(10)
+    writing.settle([Outcome(item, State.DELIVERED) for item in spool.pending(5)])
+    for number in range(4):
+        receive(spool)
+        writing.put(make(f'new{number}', body))
+    assert writing.flush(10)
+    found = assert_whole(root)['objects']
+    assert (found['delivered'], found['pending'], found['evicted']) == (5, 4, 0)
+    assert not writing.worker.failures
 
 
 def test_encoders_wait_while_too_much_waits(opened: Callable[..., SpoolWriter], spool: Spool,
