@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import threading
@@ -48,6 +49,7 @@ def pytest_configure() -> None:
     Nodes of the tests, in this process and in others, are among themselves.
     """
     os.environ.update(THIS_MACHINE)
+    gc.disable()
     botocore.session.create_loader = lru_cache(create_loader)  # whose descriptions of S3 each store would read
     profiles.load()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -90,6 +92,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason=f'{marker.args[0]}: set SHADOWHOUND_TEST_LONG=1'))
     if hasattr(config, 'workerinput'):
         items.sort(key=lambda item: not has_robot(item.nodeid))
+
+
+def pytest_collection_finish() -> None:
+    """Four thousand tests and what they import stay for good: looking through all of it again and again takes seconds."""
+    gc.enable()
+    gc.freeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

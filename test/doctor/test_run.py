@@ -44,7 +44,7 @@ def test_a_check_that_hangs_is_a_finding_in_time(scene: Scene) -> None:
 
     def hangs(_: Context) -> Iterator[Result]:
         yield ok('hangs.one', 'so far')
-        over.wait(30.0)
+        over.wait(120.0)
         yield ok('hangs.two', 'too late')
 
     began = time.monotonic()
@@ -53,15 +53,15 @@ def test_a_check_that_hangs_is_a_finding_in_time(scene: Scene) -> None:
     over.set()
     assert [result.check for result in found] == ['hangs.one', 'hangs.deadline', 'fine']
     assert found[2].severity is Severity.SKIPPED
-    assert took < 5.0
+    assert took < 60.0
     assert '--only hangs' in found[1].remedy
 
 
 def test_a_deadline_of_its_own(scene: Scene) -> None:
     """A check that hangs leaves the rest of the time to what comes after it."""
     over = threading.Event()
-    hangs = Check(name='hangs', run=lambda _: iter([ok('hangs.one', str(over.wait(30.0)))]), deadline_s=LIMIT_S)
-    found = run(scene, hangs, Check(name='fine', run=fine, after=('hangs',)), timeout_s=12.0)
+    hangs = Check(name='hangs', run=lambda _: iter([ok('hangs.one', str(over.wait(120.0)))]), deadline_s=LIMIT_S)
+    found = run(scene, hangs, Check(name='fine', run=fine, after=('hangs',)), timeout_s=60.0)
     over.set()
     assert [result.check for result in found] == ['hangs.deadline', 'fine.one']
 
@@ -84,7 +84,7 @@ def test_what_was_found_before_is_known_after(scene: Scene) -> None:
 
 def test_checks_run_side_by_side(scene: Scene) -> None:
     """Two that wait for each other both end."""
-    meeting = threading.Barrier(2, timeout=30.0)
+    meeting = threading.Barrier(2, timeout=60.0)
     wait = [Check(name=name, run=lambda _: iter([ok('met', str(meeting.wait()))])) for name in ('a', 'b')]
     assert sorted(result.check for result in run(scene, *wait)) == ['met', 'met']
 
@@ -103,7 +103,7 @@ def test_a_process_that_hangs_is_killed(scene: Scene) -> None:
     running.adopt(children[0])
     running.give_up()
     running.adopt(children[1])
-    assert [child.wait(30.0) for child in children] == [-9, -9]
+    assert [child.wait(60.0) for child in children] == [-9, -9]
 
 
 @pytest.mark.parametrize('role', Role)
@@ -120,7 +120,7 @@ def test_a_dead_network(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     over = threading.Event()
 
     def resolve(*_: object, **__: object) -> list[object]:
-        over.wait(60.0)
+        over.wait(120.0)
         raise OSError('no answer')
 
     monkeypatch.setattr('socket.getaddrinfo', resolve)
@@ -131,7 +131,7 @@ def test_a_dead_network(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     found = Examination(wanted, scene.context()).run()
     took = time.monotonic() - began
     over.set()
-    assert took < 15.0
+    assert took < 60.0
     told = {result.check: result.severity for result in found}
     assert told['network.s3.deadline'] == told['network.mlflow.deadline'] == Severity.ERROR
     assert told['s3'] == told['mlflow'] == Severity.SKIPPED

@@ -53,7 +53,7 @@ def robot(scene: Scene, servers: Tower) -> Scene:
     patch = scene.stack.enter_context(pytest.MonkeyPatch.context())
     patch.setattr(s3_put, 'SLOW_MBPS', 0.0)
     patch.setattr(s3, 'SLOW_S', 60.0)
-    scene.stack.enter_context(patient(30.0))
+    scene.stack.enter_context(patient(60.0))
     scene.environ |= servers.environment('thor')
     return scene
 
@@ -74,7 +74,7 @@ def rest(tower: Tower, path: str, **body: Any) -> Any:
     login = 'Basic ' + base64.b64encode(f'tower:{password}'.encode()).decode()
     headers = {'Content-Type': 'application/json', 'Authorization': login}
     request = urllib.request.Request(url, json.dumps(body).encode(), headers)  # noqa: S310 - ours
-    with urllib.request.urlopen(request, timeout=30.0) as answer:  # noqa: S310
+    with urllib.request.urlopen(request, timeout=60.0) as answer:  # noqa: S310
         return json.loads(answer.read())
 
 
@@ -126,7 +126,7 @@ def test_ports_of_something_else_are_no_finding(robot: Scene) -> None:
         for url in (mute, other.url, nothing):
             port = int(url.rpartition(':')[2])
             assert not seaweedfs.answers_anybody('127.0.0.1', port, seaweedfs.S3.method)
-    assert time.monotonic() - began < 10 * seaweedfs.ANSWER_S
+    assert time.monotonic() - began < 40 * seaweedfs.ANSWER_S
 
 
 def keys(**changes: str) -> Inject:

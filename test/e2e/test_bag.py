@@ -15,7 +15,7 @@ from e2e.station import Station
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.base import ObjectStore
 
-SOON_NS = 10 * 10**9
+SOON_NS = 30 * 10**9
 """From the end of a slice to its delivery."""
 
 pytestmark = pytest.mark.timeout(120 + 2 * DURATION_S)

@@ -104,7 +104,8 @@ def test_a_sensor_is_switched_off_and_on(operated: Operated) -> None:
     operated.publish('switched', range(COUNT))
     assert operated.station.set(switched__enabled=False) == ''
     until(lambda: operated.node.topic('/switched')['stored'] == COUNT, 'its open batch is spooled')
-    until(lambda: not operated.station.node.count_subscribers('/switched'), 'nobody listens')
+    listening = operated.station.node.get_subscriptions_info_by_topic
+    until(lambda: not listening('/switched'), lambda: f'nobody listens: {[str(each) for each in listening("/switched")]}')
     operated.publisher.publish('/switched', texts(range(COUNT, 2 * COUNT)))
     assert operated.station.set(switched__enabled=True) == ''
     operated.publisher.heard('/switched', operated.node, texts(['again'])[0])

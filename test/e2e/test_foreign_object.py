@@ -40,11 +40,11 @@ def deliver(folder: Path, store: S3Store, *objects: DataObject) -> dict[str, int
     try:
         for item in objects:
             writer.put(item)
-        assert writer.flush(10)
-        assert uploader.drain(20)
+        assert writer.flush(60)
+        assert uploader.drain(60)
     finally:
-        uploader.close(5)
-        writer.close(5)
+        uploader.close(60)
+        writer.close(60)
         spool.close()
     found = ledger.read(folder, 'thor')
     assert found['balanced']

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import simplejpeg
-from e2e.processes import Processes, until
+from e2e.processes import GENTLE, Processes, until
 from e2e.reading import STRING, Objects, cdr, message_class, texts
 from e2e.wire import HANG, PASS, Wire
 
@@ -185,7 +185,7 @@ def test_go2_interfaces_is_not_installed(processes: Processes, tmp_path: Path) -
     environ = without_go2_interfaces()
     environ['PYTHONPATH'] = os.pathsep.join(filter(None, (str(tmp_path / 'hidden'), environ['PYTHONPATH'])))
     node = processes.node(None, {}, environ=environ)
-    sim = processes.sim()
+    sim = processes.sim(GENTLE)
     node.received('/odom', 30)
     node.received('/camera/compressed', 10)
     sim.signal(signal.SIGINT)

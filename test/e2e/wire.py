@@ -37,7 +37,7 @@ class Wire:
 
     def set(self, mode: str | tuple[int, str]) -> None:
         """Ends all connections and treats new ones so."""
-        asyncio.run_coroutine_threadsafe(self._set(mode), self._loop).result(10)
+        asyncio.run_coroutine_threadsafe(self._set(mode), self._loop).result(60)
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -45,7 +45,7 @@ class Wire:
         return self
 
     def __exit__(self, *_: object) -> None:
-        asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(30)
+        asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(60)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()

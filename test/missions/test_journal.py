@@ -151,11 +151,11 @@ def test_the_last_record_replaces_what_is_torn(journal: Journal) -> None:
 def test_syncing_does_not_hold_up_writers(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
     """While the disk is busy with a sync, records go on."""
     entered, leave = threading.Event(), threading.Event()
-    monkeypatch.setattr(os, 'fsync', lambda _: (entered.set(), leave.wait(10)))
+    monkeypatch.setattr(os, 'fsync', lambda _: (entered.set(), leave.wait(60)))
     thread = threading.Thread(target=journal.sync)
     thread.start()
     try:
-        assert entered.wait(10)
+        assert entered.wait(60)
         journal.append({'a': 1})
         assert records(journal.path) == [{'a': 1}]
     finally:

@@ -99,7 +99,7 @@ def test_tower_away_for_the_whole_mission(server: Server, home: Path, tmp_path: 
     began = time.monotonic()
     given = fly(logger, 'away', tmp_path)
     logger.close()
-    assert time.monotonic() - began < 1.5
+    assert time.monotonic() - began < 5.0
     assert (home / FOLDER / given / 'journal').is_file()
     until(lambda: read_json(home / FOLDER / 'replay.json').get('errors'), 'the replayer says what is wrong')
     os.kill(read_json(home / FOLDER / 'replay.json')['pid'], signal.SIGKILL)  # the robot is switched off

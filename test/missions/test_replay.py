@@ -205,7 +205,7 @@ def test_a_byte_wakes_it() -> None:
     reader, writer = os.pipe()
     parent = Parent(reader)
     os.write(writer, b'\n')
-    assert parent.wait(5.0)
+    assert parent.wait(60.0)
     assert not parent.wait(0.0)
     os.close(writer)
     assert not parent.wait(5.0)
@@ -224,7 +224,7 @@ def test_a_second_one_waits_and_ends_with_its_agent(tmp_path: Path) -> None:
         with pytest.raises(subprocess.TimeoutExpired):
             waiting.wait(1.0)
         waiting.stdin.close()
-        assert waiting.wait(10.0) == 0
+        assert waiting.wait(60.0) == 0
 
 
 def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

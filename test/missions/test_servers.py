@@ -84,7 +84,7 @@ def served(running: ExitStack, folder: Path, programs: Path, backend: str) -> st
 
     def answers() -> bool:
         try:
-            with urllib.request.urlopen(f'{url}/health', timeout=5.0) as answer:  # noqa: S310 - http, by us
+            with urllib.request.urlopen(f'{url}/health', timeout=30.0) as answer:  # noqa: S310 - http, by us
                 return bool(answer.status == 200)
         except OSError:
             return False

@@ -108,13 +108,13 @@ class Run:
                 env=environment(domain),
             )
             self.endpoints: dict[str, Any] = {}
-            end = time.monotonic() + 60
+            end = time.monotonic() + 120
             while process.poll() is None and time.monotonic() < end:
                 listener.poll()
                 if len(self.endpoints) < len(RATES):
                     self._look(listener)
                 time.sleep(0.02)
-            output, self.errors = process.communicate(timeout=10)
+            output, self.errors = process.communicate(timeout=60)
             listener.poll()
         finally:
             process.kill()

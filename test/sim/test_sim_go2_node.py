@@ -97,7 +97,7 @@ def test_stamps_are_the_time_of_the_sample_in_utc(some_seconds: Run) -> None:
     odometry = [deserialize_message(cdr, listener.types['odom']).header.stamp for cdr, _ in listener.taken['odom']]
     stamps = [stamp.sec * 10**9 + stamp.nanosec for stamp in odometry]
     assert np.abs(np.diff(stamps) - 20_000_000).max() <= 1
-    assert 0 < some_seconds.ended_ns - stamps[-1] < 10 * 10**9
+    assert 0 < some_seconds.ended_ns - stamps[-1] < 60 * 10**9
 
 
 def test_messages_look_like_the_drivers(some_seconds: Run) -> None:
@@ -141,7 +141,7 @@ def test_a_signal_ends_it_with_its_account(number: signal.Signals, domain: int) 
     try:
         assert _wait_for_publisher(process, domain), 'it never published'
         process.send_signal(number)
-        output, _ = process.communicate(timeout=30)
+        output, _ = process.communicate(timeout=60)
     finally:
         process.kill()
     assert process.returncode == 0

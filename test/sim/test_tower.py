@@ -245,7 +245,7 @@ def test_in_the_foreground_it_prints_what_a_shell_needs(tmp_path: Path) -> None:
         environ = dict(shlex.split(line)[1].split('=', 1) for line in lines)
         _probe(store_settings(environ, tmp_path))
         process.terminate()
-        assert process.wait(20) == 0
+        assert process.wait(60) == 0
     finally:
         process.kill()
         process.communicate()
@@ -262,9 +262,9 @@ def test_mlflow_keeps_runs_and_artifacts_in_the_folder(tower: Tower) -> None:
     login = f'{environ["MLFLOW_TRACKING_USERNAME"]}:{environ["MLFLOW_TRACKING_PASSWORD"]}'
     artifact = f'{tower.tracking_uri}/api/2.0/mlflow-artifacts/artifacts/1/note.txt'
     http = urllib3.PoolManager(headers=urllib3.make_headers(basic_auth=login))
-    assert http.request('GET', f'{tower.tracking_uri}/version', timeout=10).status == 200
-    assert http.request('PUT', artifact, body=b'kept', timeout=30).status == 200
-    assert http.request('GET', artifact, timeout=30).data == b'kept'
+    assert http.request('GET', f'{tower.tracking_uri}/version', timeout=60).status == 200
+    assert http.request('PUT', artifact, body=b'kept', timeout=60).status == 200
+    assert http.request('GET', artifact, timeout=60).data == b'kept'
     http.clear()
 
 

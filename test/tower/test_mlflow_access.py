@@ -157,7 +157,7 @@ def test_the_body_of_a_user_has_a_bound(users: dict[str, User], run: dict[str, A
 
 def _without_body(tower: Tower, method: str, path: str, headers: dict[str, str]) -> HTTPResponse:
     """What is answered to a request that says that it has a body, before it sends any."""
-    asked = HTTPConnection(tower.tracking_uri.removeprefix('http://'), timeout=20)
+    asked = HTTPConnection(tower.tracking_uri.removeprefix('http://'), timeout=60)
     try:
         asked.putrequest(method, path)
         for name, value in headers.items():

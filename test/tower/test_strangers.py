@@ -332,7 +332,7 @@ def test_only_its_own_certificate_opens_a_port(closed: Running, tmp_path: Path) 
 
 
 def _status(target: Running, server: str, method: str, path: str) -> int:
-    connection = http.client.HTTPConnection(HOST, target.ports[server], timeout=20.0)
+    connection = http.client.HTTPConnection(HOST, target.ports[server], timeout=60.0)
     try:
         connection.request(method, path, body=b'x' if method in {'POST', 'PUT'} else None)
         return connection.getresponse().status
