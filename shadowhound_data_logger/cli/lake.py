@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from datetime import timedelta
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
+from rich.console import RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.cli.audit import finding_lines, findings
 from shadowhound_data_logger.cli.common import as_json, the_store, the_store_settings
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
-from shadowhound_data_logger.clock import SystemClock, utc
+from shadowhound_data_logger.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.ship.audit import KINDS, Audit, audit
 from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.times import moment
 
 if TYPE_CHECKING:
+    from shadowhound_data_logger.lake.gaps import Coverage
     from shadowhound_data_logger.lake.verify import Rows
 
 UNLISTED: Final = 'unlisted'
+DAY_NS: Final = 24 * 3600 * SECOND
+MOST_COVERED_NS: Final = 400 * DAY_NS
 WORDS: Final = {**KINDS, UNLISTED: "not in the store's own catalogue; `lake reindex` adds those that are there"}
 COLUMNS: Final = ('robot', 'days', 'first', 'last', 'files', 'size', 'compacted', 'to compact', 'stood for')
 _robot = click.option('--robot', metavar='NAME', help='Of this robot alone.')
@@ -165,6 +170,95 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
         print_page(*_page(said))
         tell_left_out(left_out)
     return 0 if said['ok'] else 1
+
+
+@lake.command('coverage')
+@_robot
+@click.option('--topic', metavar='NAME', help='Of this topic alone.')
+@click.option('--sink', type=click.Choice(['objects', 'bags', 'events']), default='objects', show_default=True,
+              help='Of what was stored by the sensors, recorded in bags, or kept by events.')  # fmt: skip
+@click.option(
+    '--since', metavar='TIME', default='1d', show_default=True, help='From then on: yesterday, 2h, 2026-11-20T12:30 (UTC).'
+)
+@click.option('--until', metavar='TIME', default='now', show_default=True, help='Until before that.')
+@click.option('--map', 'chart', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw it, a line a topic.')
+@as_json
+def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str, until: str, chart: Path | None,
+                  as_json: bool) -> int:  # fmt: skip
+    """How much of the time is in the store, by topic and hour, what was lost and why, and what is not known yet.
+
+    Below a topic's watermark everything is known: it is stored, downsampled by the settings, or in a gap. Above it, and while the
+    robot was off or cannot be reached, nobody knows.
+    """
+    with asking():
+        from shadowhound_data_logger.lake import gaps as library  # noqa: PLC0415 - pyarrow takes a moment
+        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+        now_ns = SystemClock.of_this_machine().wall_ns()
+        since_ns, until_ns = moment('--since', since, now_ns), moment('--until', until, now_ns)
+        if not 0 < until_ns - since_ns <= MOST_COVERED_NS:
+            raise click.UsageError(f'--since {since} --until {until} is not a time of up to {MOST_COVERED_NS // DAY_NS} days')
+        left_out = quietly()
+        found = library.coverage(since_ns, until_ns, robot=robot, topic=topic, sink=sink, findings=left_out,
+                                 source=default_source(the_store_settings()))  # fmt: skip
+        if chart and found:
+            from shadowhound_data_logger.lake import pictures  # noqa: PLC0415
+
+            pictures.coverage(found, f'{sink}, {utc(since_ns):%Y-%m-%d %H:%M} to {utc(until_ns):%Y-%m-%d %H:%M} UTC', chart)
+            click.echo(f'Wrote {chart}', err=True)
+    if as_json:
+        print_json([_told(each) for each in found])
+    else:
+        print_page(*_covered(found))
+    return tell_left_out(left_out)
+
+
+def _told(each: Coverage) -> dict[str, Any]:
+    known = each.known
+    return {
+        'robot': known.robot, 'sink': known.sink, 'topic': known.topic, 'since_ns': known.begin_ns, 'until_ns': known.end_ns,
+        'complete_ns': known.complete_ns, 'gaps': len(known.gaps), 'untimed': len(known.untimed),
+        'hours': [{'begin': f'{utc(begin_ns):%Y-%m-%dT%H:%MZ}', 'seconds': seconds} for begin_ns, seconds in each.hours],
+    }  # fmt: skip
+
+
+def _covered(found: Sequence[Coverage]) -> Iterator[RenderableType]:
+    """A line an hour; hours one after the other of which nothing is known are one line."""
+    from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED  # noqa: PLC0415
+
+    if not found:
+        yield plain('Nothing is known: no robot has told of its gaps yet. It does so each minute while it delivers.')
+        return
+    table = plain_table('', ('robot', 'topic', 'hour (UTC)', 'stored', 'downsampled', 'gaps', 'not known yet', 'why'),
+                        ('robot', 'topic', 'hour (UTC)', 'why'))  # fmt: skip
+    table.title = None
+    for each in found:
+        for is_open, hours in groupby(each.hours, lambda hour: set(hour[1]) <= {NOT_KNOWN}):
+            some = list(hours)
+            for begin_ns, seconds in some[:1] if is_open else some:
+                lost = {word: part for word, part in seconds.items() if word not in {STORED, DOWNSAMPLED, NOT_KNOWN}}
+                whole = sum(seconds.values())
+                shares = (
+                    seconds.get(STORED, 0.0),
+                    seconds.get(DOWNSAMPLED, 0.0),
+                    sum(lost.values()),
+                    seconds.get(NOT_KNOWN, 0.0),
+                )
+                hour = f'{utc(begin_ns):%m-%d %H:%M}' + (f' and {len(some) - 1} more' if is_open and len(some) > 1 else '')
+                why = ', '.join(f'{word} {duration(part)}' for word, part in sorted(lost.items(), key=lambda pair: -pair[1]))
+                table.add_row(*map(plain, (each.known.robot, each.known.topic, hour)), *(_share(part, whole) for part in shares),
+                              plain(why))  # fmt: skip
+    yield table
+    for each in (each for each in found if each.known.untimed):
+        count = sum(gap.count or 0 for gap in each.known.untimed)
+        yield plain(f'{each.known.robot} {each.known.topic}: {number(count)} messages were lost at times that nobody knows.')
+
+
+def _share(part: float, whole: float) -> str:
+    """Nothing is 100 % that is not all of it, nor 0 % that is some."""
+    if not part:
+        return '-'
+    return '100 %' if part == whole else f'{min(99.9, max(0.1, 100 * part / whole)):.1f} %'
 
 
 def _said(rows: Rows, found: Audit, lacking: list[Any], *, deep: bool) -> dict[str, Any]:

@@ -12,14 +12,23 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED, Coverage, named
 from shadowhound_data_logger.missions.contact_sheet import MOST, LoggedFrame, contact_sheet
-from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
+from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, visible
 
 IMAGES: Final = ('.jpg', '.jpeg', '.png')
 THREADS: Final = 8
 PALE: Final = '#c7cfd6'
+SKY: Final = '#9cc4e4'
+LOST: Final = ('#c0392b', '#e08e0b', '#8e44ad', '#d35400', '#7f1d1d', '#b0578d')
+"""Causes of gaps, by name."""
+MOST_LINES: Final = 60
+LINE_DOTS: Final = 700
+"""Across a line of coverage: a gap is drawn at least so wide."""
+DAY_NS: Final = 24 * 3600 * SECOND
 FARTHEST_M: Final = 1e6
 LETTERS: Final = 56
 """Of a line of the title."""
@@ -98,6 +107,53 @@ def ground(
         (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
         figure.set_size_inches(plots.WIDTH_IN, min(max(0.8 * plots.WIDTH_IN * (y1 - y0) / (x1 - x0), 2.5), 12.0) + 1.3)
         figure.legend(loc='outside lower center', ncols=3)
+        try:
+            figure.savefig(target, format='png')
+        except OSError as error:
+            raise LakeError(f'{target} cannot be made: {error}') from error
+
+
+def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
+    """A PNG: a line a topic over the time, each stretch in the colour of what became of it. Raises LakeError.
+
+    At least one topic, and no more than ``MOST_LINES``.
+    """
+    from matplotlib import rc_context  # noqa: PLC0415
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.patches import Patch  # noqa: PLC0415
+
+    from shadowhound_data_logger.missions import plots  # noqa: PLC0415
+
+    if len(found) > MOST_LINES:
+        raise LakeError(f'{len(found):,} topics do not fit into a picture', remedy='ask with --robot or --topic')
+    spans: dict[str, dict[int, list[tuple[int, int]]]] = {STORED: {}, DOWNSAMPLED: {}}
+    for line, each in enumerate(found):
+        for begin_ns, end_ns, word in named(each.known, each.thinned):
+            spans.setdefault(word, {}).setdefault(line, []).append((begin_ns, end_ns))
+    open_ = spans.pop(NOT_KNOWN, {})
+    causes = sorted(spans.keys() - {STORED, DOWNSAMPLED})
+    colours = {STORED: plots.BLUE, DOWNSAMPLED: SKY, **{cause: LOST[place % len(LOST)] for place, cause in enumerate(causes)},
+               NOT_KNOWN: PALE}  # fmt: skip
+    begin_ns, end_ns = found[0].known.begin_ns, found[0].known.end_ns
+    least_ns = (end_ns - begin_ns) // LINE_DOTS
+    with rc_context({**plots.STYLE, 'text.parse_math': False}):  # a topic's name is no formula
+        figure = Figure(figsize=(plots.WIDTH_IN, 1.8 + 0.42 * len(found)), dpi=plots.DPI, layout='constrained')
+        axes = figure.add_subplot()
+        for word, lines in {**spans, NOT_KNOWN: open_}.items():
+            widest = least_ns if word in causes else 0  # a short gap is as wide as can be seen
+            for line, some in lines.items():
+                axes.broken_barh([(date2num(utc(first)), max(last - first, widest) / DAY_NS) for first, last in some],
+                                 (line - 0.36, 0.72), fc=colours[word], lw=0, zorder=3 if word in causes else 2)  # fmt: skip
+        axes.set_yticks(range(len(found)), [visible(f'{each.known.robot} {each.known.topic}') for each in found])
+        axes.set(xlim=(date2num(utc(begin_ns)), date2num(utc(end_ns))), ylim=(len(found) - 0.5, -0.5))
+        axes.xaxis.set_major_locator(locator := AutoDateLocator())
+        axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+        axes.set_title('\n'.join(textwrap.wrap(title, LETTERS)))
+        shown = [word for word in colours if spans.get(word) or (word == NOT_KNOWN and open_)]
+        figure.legend(
+            handles=[Patch(fc=colours[word], label=visible(word)) for word in shown], loc='outside lower center', ncols=4
+        )
         try:
             figure.savefig(target, format='png')
         except OSError as error:

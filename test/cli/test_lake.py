@@ -7,8 +7,11 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
-from lake.making import fill, folder_store
+from lake.gap_parts import IMU, lost, mark, tell
+from lake.making import NOON_NS, fill, folder_store
+from PIL import Image
 
+from shadowhound_data_logger.catalogue.gaps import GAP, statement
 from shadowhound_data_logger.cli.lake import lake
 
 
@@ -60,3 +63,57 @@ def test_bad_usage(home: Path) -> None:
     assert run(home, 'compact', '--before', 'soon').exit_code == 2
     assert run(home, 'compact', '--before', '3000d').exit_code == 0
     assert run(home, 'reindex').exit_code == 2
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> Path:
+    """Two topics of two hours: one downsampled and with a gap, one of which nothing is known in the second hour."""
+    hour = 3600
+    rows = [mark(hour), mark(2 * hour, 2), lost('1', 600, 660), lost('2', 7000, 7010, cause='queue_full'),
+            mark(hour, topic='/odom', skipped=7)]  # fmt: skip
+    untimed = statement('thor', GAP, 'j/u', 1, **{**IMU, 'topic': '/odom'}, count=12)
+    tell(folder_store(tmp_path), tmp_path, *rows, untimed)
+    return tmp_path
+
+
+TWO_HOURS = ('coverage', '--since', '2026-10-28T12:00', '--until', '2026-10-28T14:00')
+
+
+def test_coverage_as_a_table(told: Path) -> None:
+    """What was stored, downsampled, lost and why, and what nobody knows, an hour a line."""
+    found = run(told, *TWO_HOURS)
+    assert found.exit_code == 0
+    lines = [line.split() for line in found.stdout.splitlines()]
+    assert lines[1:5] == [
+        ['thor', '/imu', '10-28', '12:00', '98.3', '%', '-', '1.7', '%', '-', 'transport', '1', 'min'],
+        ['thor', '/imu', '10-28', '13:00', '99.7', '%', '-', '0.3', '%', '-', 'queue_full', '10', 's'],
+        ['thor', '/odom', '10-28', '12:00', '-', '100', '%', '-', '-'],
+        ['thor', '/odom', '10-28', '13:00', '-', '-', '-', '100', '%'],
+    ]
+    assert 'thor /odom: 12 messages were lost at times that nobody knows.' in found.stdout
+
+
+def test_coverage_for_programs(told: Path) -> None:
+    """Seconds of each hour, and up to when it is known."""
+    (imu,) = json.loads(run(told, *TWO_HOURS, '--topic', '/imu', '--json').stdout)
+    assert imu['hours'] == [
+        {'begin': '2026-10-28T12:00Z', 'seconds': {'stored': 3540.0, 'transport': 60.0}},
+        {'begin': '2026-10-28T13:00Z', 'seconds': {'queue_full': 10.0, 'stored': 3590.0}},
+    ]
+    assert (imu['complete_ns'], imu['gaps'], imu['untimed']) == (NOON_NS + 7200 * 10**9, 2, 0)
+
+
+def test_coverage_as_a_picture(told: Path, tmp_path: Path) -> None:
+    """Blue where it is stored, red where it is lost, grey where nobody knows."""
+    assert run(told, *TWO_HOURS, '--map', str(tmp_path / 'coverage.png')).exit_code == 0
+    with Image.open(tmp_path / 'coverage.png') as picture:
+        colours = {colour for _, colour in picture.convert('RGB').getcolors(1 << 24) or ()}
+    assert colours >= {(0x1F, 0x6F, 0xB2), (0xC0, 0x39, 0x2B), (0x9C, 0xC4, 0xE4), (0xC7, 0xCF, 0xD6)}
+
+
+def test_coverage_of_what_nobody_told(told: Path) -> None:
+    """A topic of which nothing is known is not known; a time that is none is bad usage."""
+    assert '100 %' in run(told, *TWO_HOURS, '--robot', 'thor', '--topic', '/scan').stdout
+    assert 'Nothing is known' in run(told, *TWO_HOURS, '--robot', 'tachi').stdout
+    assert run(told, 'coverage', '--since', '2026-10-28', '--until', '2026-10-27').exit_code == 2
+    assert run(told, 'coverage', '--since', '1971-01-01').exit_code == 2

@@ -25,9 +25,10 @@ LONG: Final = 'thor/camera/' + 42_000 * 'a'
 ROWS: Final = 1_000_000
 
 
-def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str = 'thor') -> str:
+def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str = 'thor',
+        of: schema.TableSchema = schema.OBJECTS) -> str:  # fmt: skip
     """As a robot that may write below its own prefix puts it; its key."""
-    key = f'{schema.OBJECTS.prefix(robot)}date={DATE}/{name}.parquet'
+    key = f'{of.prefix(robot)}date={DATE}/{name}.parquet'
     path = settings.directory / schema.BUCKET / key
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(body)

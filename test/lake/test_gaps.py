@@ -12,11 +12,11 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lake.making import DAY_NS, MINUTE_NS, NOON_NS, add, folder_store
+from lake.gap_parts import IMU, lost, mark, tell
+from lake.making import DAY_NS, MINUTE_NS, NOON_NS, folder_store
 
 from shadowhound_data_logger import lake
-from shadowhound_data_logger.catalogue import parts
-from shadowhound_data_logger.catalogue.gaps import GAP, GAPS, WITHDRAWN, Statement, complete, date_of, statement
+from shadowhound_data_logger.catalogue.gaps import GAP, GAPS, WITHDRAWN, Statement, statement
 from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.config import UploadSettings
@@ -28,35 +28,10 @@ from shadowhound_data_logger.lake.reading import arrow_schema
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
-IMU = {'sink': 'objects', 'topic': '/imu', 'session': 1, 'grade': 'exact'}
-
-
-def lost(name: str, first_s: float, last_s: float, revision: int = 1, what: str = GAP, **columns: Any) -> Statement:
-    """A gap so many seconds after noon."""
-    columns = {'kind': 'missed', 'cause': 'transport', 'count': 5, 'merged': 1, 'publisher': 'imu', **IMU, **columns}
-    times = {'from_ns': NOON_NS + int(first_s * SECOND), 'to_ns': NOON_NS + int(last_s * SECOND)}
-    return statement('thor', what, f'j/{name}', revision, **columns, **times)
-
-
-def mark(last_s: float, revision: int = 1, first_s: float = 0.0, **columns: Any) -> Statement:
-    """A watermark that reaches from one second after noon to another."""
-    columns = {**IMU, 'received': int(last_s * 50), 'skipped': 0, **columns}
-    return complete(
-        'thor', 'j', revision, from_ns=NOON_NS + int(first_s * SECOND), to_ns=NOON_NS + int(last_s * SECOND), **columns
-    )
-
 
 @pytest.fixture
 def store(tmp_path: Path) -> StoreSettings:
     return folder_store(tmp_path)
-
-
-def tell(store: StoreSettings, folder: Path, *rows: Statement, name: str = 'a') -> None:
-    """Parts with these statements, as a robot delivers them."""
-    with closing(open_store(store, UploadSettings())) as target:
-        for date in sorted({date_of(row) for row in rows}):
-            found = [row for row in rows if date_of(row) == date]
-            add(target, folder / 'tmp', GAPS.part_key('thor', date, name), parts.encode(found, GAPS), {'robot': 'thor'})
 
 
 def ask(store: StoreSettings, first_s: float, last_s: float, topic: str = '/imu') -> lake.Known:

@@ -1,0 +1,41 @@
+"""Statements of the gap journal of a robot ``thor``, told in seconds after ``NOON_NS``, and parts that have them."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from lake.making import NOON_NS, add
+
+from shadowhound_data_logger.catalogue import parts
+from shadowhound_data_logger.catalogue.gaps import GAP, GAPS, Statement, complete, date_of, statement
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.stores import open_store
+
+IMU = {'sink': 'objects', 'topic': '/imu', 'session': 1, 'grade': 'exact'}
+
+
+def lost(name: str, first_s: float, last_s: float, revision: int = 1, what: str = GAP, **columns: Any) -> Statement:
+    """A gap so many seconds after noon."""
+    columns = {'kind': 'missed', 'cause': 'transport', 'count': 5, 'merged': 1, 'publisher': 'imu', **IMU, **columns}
+    times = {'from_ns': NOON_NS + int(first_s * SECOND), 'to_ns': NOON_NS + int(last_s * SECOND)}
+    return statement('thor', what, f'j/{name}', revision, **columns, **times)
+
+
+def mark(last_s: float, revision: int = 1, first_s: float = 0.0, **columns: Any) -> Statement:
+    """A watermark that reaches from one second after noon to another."""
+    columns = {**IMU, 'received': int(last_s * 50), 'skipped': 0, **columns}
+    return complete(
+        'thor', 'j', revision, from_ns=NOON_NS + int(first_s * SECOND), to_ns=NOON_NS + int(last_s * SECOND), **columns
+    )
+
+
+def tell(store: StoreSettings, folder: Path, *rows: Statement, name: str = 'a') -> None:
+    """Parts with these statements, as a robot delivers them."""
+    with closing(open_store(store, UploadSettings())) as target:
+        for date in sorted({date_of(row) for row in rows}):
+            found = [row for row in rows if date_of(row) == date]
+            add(target, folder / 'tmp', GAPS.part_key('thor', date, name), parts.encode(found, GAPS), {'robot': 'thor'})
