@@ -48,6 +48,10 @@ REPEATS: Final = 'repeats'
 REPEATS_OF: Final = 'repeats_of'
 REPEATS_UNTIL_NS: Final = 'repeats_until_ns'
 
+# A part of the gap journal.
+GAP_VERSION: Final = 'gap_version'
+"""Up to which change of the journal in the index all is told (``spool/gaps.py``), in the last part of those of one moment."""
+
 # A file of a bag.
 BAG: Final = 'bag'
 SLICE: Final = 'slice'

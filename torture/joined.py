@@ -212,7 +212,7 @@ def judge_marks(found: Found, flights: Sequence[Flight], objects: Mapping[str, O
     spans = {flight.folder.mission_id: flight.span_ns for flight in flights}
     runs = {flight.folder.mission_id: run.run_id for flight in flights if (run := flight.folder.run())}
     for key, info in objects.items():
-        if key.split('/')[1] in {'missions', '_ledger', '_catalog'} or 't_start_ns' not in info.metadata:
+        if key.split('/')[1] in {'missions', '_ledger', '_catalog', '_gaps'} or 't_start_ns' not in info.metadata:
             continue
         at_ns, said = int(info.metadata['t_start_ns']), info.metadata.get('mission_id')
         found.looked['marked' if said else 'unmarked'] += 1

@@ -266,6 +266,8 @@ class Pipeline:
             self._interface.tell_mission(mission)
         self.recorder.on_mission(mission)
         self.event_buffer.on_mission(mission)
+        if not mission:
+            self._catalogue.hasten()
 
     def _tell(self, *, ended: bool = False) -> None:
         status = self._status.look(ended=ended)

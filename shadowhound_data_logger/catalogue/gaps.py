@@ -12,6 +12,7 @@ time looks at its own date and at the later ones.
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any, Final
 
 from shadowhound_data_logger.catalogue.parquet import INT32, INT64, STRING, TIME
@@ -75,6 +76,11 @@ def statement(robot: str, what: str, name: str, revision: int, **columns: Any) -
         stamp_ns = found[stamp]
         found[time] = stamp_ns // 1000 if is_dated and stamp_ns is not None and stamp_ns >= EARLIEST_SANE_NS else None
     return found
+
+
+def name_of(*parts: object) -> str:
+    """What tells a gap from all others of a robot, by whatever names it in the journal."""
+    return hashlib.blake2b('\0'.join(map(str, parts)).encode(errors='replace'), digest_size=10).hexdigest()
 
 
 def complete(robot: str, journal: str, revision: int, **columns: Any) -> Statement:

@@ -1,4 +1,4 @@
-"""The robot's side of the catalogue: what was delivered since the last time becomes parts, spooled like everything else.
+"""The robot's side of the catalogue and the gap journal: what is new since the last time becomes parts, spooled like all else.
 
 Every delivered object is in exactly one part, whoever delivered it and whenever a process died: the list of what is in none
 yet is the spool index's, and a part takes its rows off it in the transaction that makes the part durable.
@@ -6,23 +6,31 @@ yet is the spool index's, and a part takes its rows off it in the transaction th
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue import parts
+from shadowhound_data_logger.catalogue.gaps import GAP, GAPS, WITHDRAWN, Statement, complete, date_of, name_of, statement
 from shadowhound_data_logger.catalogue.schema import BUCKET, OBJECTS, SENSOR, Row, row_of
 from shadowhound_data_logger.clock import Clock, utc
 from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.model import DataObject
-from shadowhound_data_logger.spool import uncatalogued
+from shadowhound_data_logger.spool import clock_record, gaps, uncatalogued
+from shadowhound_data_logger.spool.index import Index
 
 MOST_ROWS: Final = 5000
 """At a time: a tenth of a second of CPU. While there are more, the next ones come with the next look."""
+SOON_S: Final = 5.0
+"""After a mission: until then its last objects are usually delivered."""
 PRIORITY: Final = 1
 """As a mission's summary: a part has what the store holds already."""
 
@@ -40,6 +48,7 @@ class CatalogueWriter:
         self._due_s = monotonic()
         self._handed: dict[int, frozenset[int]] = {}
         """Id -> the ids of all the rows of its part, which is on its way."""
+        self._gaps = _GapParts(spool, robot, clock)
 
     def due(self) -> list[DataObject]:
         """The parts of a period that is over, at first of what an earlier process left.
@@ -50,12 +59,19 @@ class CatalogueWriter:
         if now_s < self._due_s:
             return []
         made = self.parts()
-        if sum(len(part.catalogues) for part in made) < MOST_ROWS:
+        if sum(len(part.catalogues) for part in made) < MOST_ROWS and not self._gaps.has_more:
             self._due_s = now_s + self._settings.period_s
         return made
 
+    def hasten(self) -> None:
+        """Somebody waits for what happened until now: the end of a mission. Any thread."""
+        self._due_s = min(self._due_s, self._monotonic() + SOON_S)
+
     def parts(self) -> list[DataObject]:
-        """Parts of what is delivered and in none yet, nor handed out before. Raises SpoolError or sqlite3.Error."""
+        """Parts of what is in none yet, nor handed out before: objects that were delivered, and what is known of gaps.
+
+        Raises SpoolError or sqlite3.Error.
+        """
         if not self._settings.enabled:
             uncatalogued.clear(self._spool)
             return []
@@ -67,7 +83,7 @@ class CatalogueWriter:
         rows = [(item.id, row_of(item.bucket, item.key, item.size, item.content_type, item.metadata)) for item in new]
         made = [self._part(robot, date, found) for robot, date, found in parts.by_folder(rows)]
         self._handed.update((number, frozenset(part.catalogues)) for part in made for number in part.catalogues)
-        return made
+        return [*made, *self._gaps.parts()]
 
     def _part(self, robot: str | None, date: str, found: list[tuple[int, Row]]) -> DataObject:
         robot, rows = self._named(robot), [row for _, row in found]
@@ -87,3 +103,98 @@ class CatalogueWriter:
             return check_name(robot or '', 'the robot name')
         except NameRefused:
             return self._robot
+
+
+class _GapParts:
+    """What changed in the gap journal of one robot since its last part, wherever that was written.
+
+    A part that is spooled says up to which version of the journal all is told: so a death costs nothing, and what is told
+    twice is the same. A watermark is told once all rows are.
+    """
+
+    def __init__(self, spool: Path, robot: str, clock: Clock) -> None:
+        self._spool = spool
+        self._robot = robot
+        self._clock = clock
+        self._version: int | None = None
+        self._boots: frozenset[str] = frozenset()
+        self._marks: dict[tuple[str, str, int], gaps.Watermark] = {}
+        self.has_more = False
+        """Whether there are further rows already."""
+
+    def parts(self) -> list[DataObject]:
+        """Raises SpoolError or sqlite3.Error."""
+        offsets = clock_record.read(self._spool, self._robot)['offsets']
+        with closing(Index(self._spool / 'index.db', read_only=True)) as index:
+            index.open()
+            index.db.execute('BEGIN')
+            if self._version is None:
+                self._version = _told(index, self._robot)
+            newest, began_ns, others = gaps.extent(index.db, self._robot)
+            is_dated_now = not self._boots.issuperset(offsets) and gaps.has_undated(index.db)
+            self._boots = frozenset(offsets)
+            if is_dated_now or self._version > newest:  # an index that was made anew begins anew
+                self._version = 0
+            found = gaps.changed(index.db, self._version, MOST_ROWS, offsets)
+            self.has_more = bool(found) and found[-1].version < newest and len(found) >= MOST_ROWS
+            marks = [] if self.has_more else gaps.watermarks(index.db)
+        if found:
+            self._version = found[-1].version
+        rows = [
+            self._row(gap, began_ns)
+            for gap in found
+            if gap.robot == self._robot or (gap.robot is None and gap.topic not in others)
+        ]
+        for mark in marks:
+            name = mark.sink, mark.topic, mark.session
+            if mark.robot == self._robot and self._marks.get(name) != mark:
+                self._marks[name] = mark
+                rows.append(complete(
+                    self._robot, f'{began_ns:x}', began_ns + newest, sink=mark.sink, topic=mark.topic, session=mark.session,
+                    from_ns=mark.since_ns, to_ns=mark.complete_ns, grade=mark.grade, received=mark.received, skipped=mark.skipped,
+                ))  # fmt: skip
+        return self._made(rows, self._version)
+
+    def _row(self, gap: gaps.Gap, began_ns: int) -> Statement:
+        """Revisions go on where an index was damaged, and versions begin anew: the new one began later."""
+        is_dated = gap.boot_id is None or gap.from_ns is not None
+        clock = None if gap.boot_id is None else words.SET_LATER if is_dated else words.UNSET
+        name = name_of(
+            gap.began_ns, gap.sink, gap.topic, gap.kind, gap.cause, gap.grade, gap.publisher, gap.mission_id, gap.begin_ns
+        )
+        return statement(
+            self._robot, GAP if gap.count != 0 else WITHDRAWN, name, began_ns + gap.version, sink=gap.sink, topic=gap.topic,
+            publisher=gap.publisher, session=gap.session, kind=gap.kind, cause=gap.cause, count=gap.count, merged=gap.merged,
+            grade=gap.grade, mission_id=gap.mission_id, clock=clock, from_ns=gap.from_ns if is_dated else gap.from_boot_ns,
+            to_ns=gap.to_ns if is_dated else gap.to_boot_ns,
+        )  # fmt: skip
+
+    def _made(self, rows: list[Statement], version: int) -> list[DataObject]:
+        """A part a date; the last of them says how far all is told."""
+        if not rows:
+            return []
+        now_ns = self._clock.wall_ns()
+        name = f'{utc(now_ns):%Y%m%dT%H%M%S}_{self._clock.boot_id[:8]}'
+        made = []
+        for date, found in groupby(sorted(rows, key=date_of), key=date_of):
+            some = list(found)
+            metadata = {words.ROBOT: self._robot, words.COUNT: str(len(some))}
+            made.append(DataObject(
+                bucket=BUCKET, key=GAPS.part_key(self._robot, date, name), body=parts.encode(some, GAPS),
+                content_type=parts.CONTENT_TYPE, sensor=SENSOR, topic=None, type='', samples=0,
+                t_start_ns=now_ns, t_end_ns=now_ns, priority=PRIORITY, protected=True, metadata=metadata,
+            ))  # fmt: skip
+        made[-1] = replace(made[-1], metadata={**made[-1].metadata, words.GAP_VERSION: str(version)})
+        return made
+
+
+def _told(index: Index, robot: str) -> int:
+    """Up to which version of the journal parts were written by whoever was here before; 0 where nobody knows."""
+    said = index.db.execute(
+        'SELECT metadata FROM objects WHERE sensor = ? AND key >= ? AND key < ? AND metadata LIKE ? ORDER BY id DESC LIMIT 1',
+        (SENSOR, GAPS.prefix(robot), GAPS.prefix(robot) + '\uffff', f'%"{words.GAP_VERSION}"%'),
+    ).fetchone()  # fmt: skip
+    try:
+        return max(0, int(json.loads(said[0])[words.GAP_VERSION])) if said else 0
+    except (ValueError, TypeError, KeyError):
+        return 0

@@ -15,7 +15,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.catalogue.schema import is_row
+from shadowhound_data_logger.catalogue.schema import SENSOR, is_row
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.index import Index
@@ -144,7 +144,7 @@ def _catalogued(bodies: Mapping[str, bytes]) -> Counter[str]:
 
     rows: Counter[str] = Counter()
     for key, body in bodies.items():
-        if not is_row(BUCKET, key):
+        if key.split('/')[1:2] == [SENSOR]:
             rows.update(read_table(BytesIO(body), columns=['key']).column('key').to_pylist())
     return rows
 

@@ -55,6 +55,8 @@ class TopicRow:
     """Of ``received``, those of which only that is known."""
     missed: Mapping[str, int] = field(default_factory=dict)
     """Estimated losses by cause; those that numbers tell are in the rows of the publishers."""
+    first_ns: int = 0
+    """Stamp of a message from which on all are counted, the first by a clock that was set; 0 where it is not known."""
     heard_ns: int = 0
     """Stamp of the newest message; 0 where it is not known."""
     complete_ns: int = 0

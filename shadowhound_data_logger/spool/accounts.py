@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from shadowhound_data_logger.clock import MAX_AGE_NS, Clock
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, MAX_AGE_NS, Clock
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, MISSED, REJECTED, Figures, TopicGaps
@@ -101,6 +101,8 @@ class TopicAccount:
     """Since when its messages are counted by no rhythm; 0 where they are: one that is found counts back to then."""
     settled_ns: int = 0
     """No message up to this stamp was open at the last commit: the next one makes what became of them durable."""
+    first_ns: int = 0
+    """Stamp of a message from which on all are counted, the first by a clock that was set."""
     complete_ns: int = 0
     """No message up to this stamp can still be lost on its way into the spool."""
     is_doubtful: bool = False
@@ -550,6 +552,8 @@ class Accounts:
 
     @staticmethod
     def _row(topic: str, account: TopicAccount, count: int, newest_ns: int) -> TopicRow:
+        if account.first_ns < EARLIEST_SANE_NS:
+            account.first_ns = account.gaps.heard_ns
         if account.accounting not in {'', RECEIVED_ONLY}:
             settled_ns = account.settled_ns
             if account.open <= count:
@@ -560,7 +564,8 @@ class Accounts:
         return TopicRow(
             topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
             dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
-            account.estimated, account.unknown, dict(+account.missed_estimated), account.gaps.heard_ns, account.complete_ns,
+            account.estimated, account.unknown, dict(+account.missed_estimated), account.first_ns, account.gaps.heard_ns,
+            account.complete_ns,
         )  # fmt: skip
 
 

@@ -75,16 +75,20 @@ _PRINTED: Final = tuple(each.name for each in fields(Gap))[:12]
 
 
 class Watermark(NamedTuple):
-    """Up to when the journal of a topic is complete: what was lost on the way into the spool, all of it is there.
-
-    What lies in the spool may still be evicted or quarantined; its objects are pending, held or quarantined until then.
-    """
+    """From when until when the journal of a topic is complete: what was lost between is in it, the rest is in the store."""
 
     robot: str
     sink: str
     topic: str
+    session: int
+    since_ns: int
+    """UTC stamp of a message, and so is the next one."""
     complete_ns: int
-    """UTC stamp of a message."""
+    grade: str
+    """Whether losses are known by numbers or estimated; there is no watermark where only the received is known."""
+    received: int
+    """Messages of the session so far."""
+    skipped: int
 
 
 class GapKey(NamedTuple):
@@ -209,6 +213,16 @@ class TopicGaps:
         self._changes[row.key] = row
 
 
+LATELY_NS: Final = 60 * SECOND
+MOST_WAITING: Final = 20_000
+"""Objects that are looked at for the first stamp of each account: some 50 ms."""
+_SESSIONS: Final = """
+SELECT session, robot, started_ns, received = skipped + stored
+    + ifnull((SELECT sum(value) FROM json_each(rejected)), 0) + ifnull((SELECT sum(value) FROM json_each(dropped)), 0),
+  topic, accounting, received, skipped, first_ns, heard_ns, complete_ns, ended_ns IS NOT NULL
+FROM accounts JOIN sessions ON id = session
+WHERE session > (SELECT max(id) FROM sessions) - 20 AND heard_ns >= ? AND accounting IN ('exact', 'estimated')
+ORDER BY robot, topic, session"""
 NEXT_VERSION: Final = '(SELECT ifnull(max(version), 0) + 1 FROM gaps)'
 _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
 MERGE: Final = """
@@ -293,16 +307,78 @@ def changed(db: sqlite3.Connection, after: int, limit: int, offsets: Mapping[str
     return list(_gaps(db, 'version > ? AND version <= ? AND begin_ns <> ? ORDER BY version', (after, upto, FORGOTTEN), offsets))
 
 
+def extent(db: sqlite3.Connection, robot: str) -> tuple[int, int, set[str]]:
+    """The newest version; when the journal began; and topics that other robots of this spool have, and this one has not."""
+    newest = db.execute('SELECT ifnull(max(version), 0) FROM gaps').fetchone()[0]
+    began_ns = db.execute('SELECT ifnull(min(started_ns), 0) FROM sessions').fetchone()[0]
+    topics: dict[bool, set[str]] = {True: set(), False: set()}
+    for account, is_own in db.execute('SELECT DISTINCT topic, robot = ? FROM accounts JOIN sessions ON id = session', (robot,)):
+        topics[bool(is_own)].add(split(account)[1])
+    return newest, began_ns, topics[False] - topics[True]
+
+
+def has_undated(db: sqlite3.Connection) -> bool:
+    """Whether there are rows of a time before the clock was set."""
+    return db.execute('SELECT 1 FROM gaps WHERE begin_ns BETWEEN 0 AND ? LIMIT 1', (EARLIEST_SANE_NS,)).fetchone() is not None
+
+
 def known(db: sqlite3.Connection, offsets: Mapping[str, int]) -> list[Gap]:
     """All that is lost, in the order of time; what has no time comes first."""
     return list(_gaps(db, 'count > 0 ORDER BY begin_ns, topic', (), offsets))
 
 
 def watermarks(db: sqlite3.Connection) -> list[Watermark]:
-    """Of each sink and topic that has one."""
-    query = ('SELECT robot, topic, max(complete_ns) FROM accounts JOIN sessions ON id = session WHERE complete_ns >= ?'
-             ' GROUP BY robot, topic ORDER BY robot, topic')  # fmt: skip
-    return [Watermark(robot, *split(account), stamp) for robot, account, stamp in db.execute(query, (EARLIEST_SANE_NS,))]
+    """Of each sink and topic of the newest sessions that has one.
+
+    Before the first message that still waits for delivery, since that may yet be evicted; and before the last message of each
+    publisher that was heard lately, since what it sent after that may be found to be missed.
+    """
+    waiting = _waiting(db)
+    silent = {
+        (session, account): stamp
+        for session, account, stamp in db.execute(
+            'SELECT session, topic, min(publishers.heard_ns) FROM publishers JOIN accounts USING (session, topic)'
+            ' JOIN sessions ON id = session WHERE ended_ns IS NULL AND publishers.heard_ns > accounts.heard_ns - ?'
+            ' GROUP BY session, topic', (LATELY_NS,),
+        )
+    }  # fmt: skip
+    found = []
+    for (session, robot, started_ns, is_over, account, grade, received, skipped, first_ns, heard_ns, complete_ns,
+         has_ended) in db.execute(_SESSIONS, (EARLIEST_SANE_NS,)):  # fmt: skip
+        sink, topic = split(account)
+        if has_ended and sink == OBJECTS and is_over:
+            complete_ns = heard_ns  # noqa: PLW2901 - nothing was lost on its way after all, or it is in the journal
+        end_ns = min(complete_ns, silent.get((session, account), complete_ns), waiting.get(account, complete_ns))
+        since_ns = max(first_ns, started_ns)
+        if since_ns <= end_ns:
+            found.append(Watermark(robot, sink, topic, session, since_ns, end_ns, grade, received, skipped))
+    return found
+
+
+def _waiting(db: sqlite3.Connection) -> dict[str, int]:
+    """Account -> the first stamp of what waits for delivery or a name; 0 where so much waits that nobody looks for it."""
+    buckets = [bucket for (bucket,) in db.execute("SELECT DISTINCT bucket FROM objects WHERE state = 'pending'")]
+    waiting: dict[str, int] = {}
+    is_all = True
+    for state, column, values in (('pending', 'bucket', buckets), ('held', 'reason', _reasons(db))):
+        for value in values:
+            rows = db.execute(
+                f'SELECT ifnull(contents.topic, one.topic), min(t_start_ns), count(*) FROM (SELECT id, topic, t_start_ns'  # noqa: S608
+                f" FROM objects WHERE state = '{state}' AND {column} IS ? ORDER BY id LIMIT {MOST_WAITING}) AS one"
+                ' LEFT JOIN contents USING (id) GROUP BY 1', (value,),
+            ).fetchall()  # fmt: skip
+            is_all &= sum(count for _, _, count in rows) < MOST_WAITING
+            for account, stamp, _ in rows:
+                waiting[account] = min(stamp, waiting.get(account, stamp))
+    if not is_all:
+        query = "SELECT topic FROM tally WHERE state IN ('pending', 'held') AND samples > 0"
+        for (account,) in db.execute(query):
+            waiting.setdefault(account, 0)
+    return waiting
+
+
+def _reasons(db: sqlite3.Connection) -> list[str | None]:
+    return [reason for (reason,) in db.execute("SELECT DISTINCT reason FROM objects WHERE state = 'held'")]
 
 
 def sums(db: sqlite3.Connection) -> dict[tuple[str, str, str, str], int]:

@@ -221,10 +221,10 @@ class Index:
     def write(self, session: int, snapshot: AccountSnapshot) -> None:
         """Replace the session's accounts by a newer snapshot."""
         self.db.executemany(
-            'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?)',
+            'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
-              json.dumps(row.rejected), json.dumps(row.dropped), row.last_kept_ns, row.heard_ns,
-              row.complete_ns) for row in snapshot.topics),
+              json.dumps(row.rejected), json.dumps(row.dropped), row.last_kept_ns, row.first_ns,
+              row.heard_ns, row.complete_ns) for row in snapshot.topics),
         )  # fmt: skip
         self.db.executemany(
             'DELETE FROM publishers WHERE session = ? AND topic = ? AND publisher = ?', ((session, *row) for row in snapshot.gone)
@@ -256,14 +256,14 @@ class Index:
     def topics(self, session: int | None = None) -> list[TopicRow]:
         """Accounts of one session, or of all in the order of the sessions."""
         where, values = ('WHERE session = ?', (session,)) if session is not None else ('', ())
-        columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, rejected, dropped,'
-                   " ifnull(estimated, 0), ifnull(unknown, 0), ifnull(missed, '{}'), heard_ns, complete_ns")  # fmt: skip
+        columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, rejected, dropped, ifnull(estimated, 0),'
+                   " ifnull(unknown, 0), ifnull(missed, '{}'), first_ns, heard_ns, complete_ns")  # fmt: skip
         query = f'SELECT {columns} FROM accounts LEFT JOIN estimates USING (session, topic) {where} ORDER BY session'  # noqa: S608
         return [
             TopicRow(topic, kind, accounting, received, skipped, stored, json.loads(rejected), json.loads(dropped), last_ns,
-                     estimated, unknown, json.loads(missed), heard_ns, complete_ns)
+                     estimated, unknown, json.loads(missed), first_ns, heard_ns, complete_ns)
             for topic, kind, accounting, received, skipped, stored, last_ns, rejected, dropped, estimated, unknown, missed,
-            heard_ns, complete_ns in self.db.execute(query, values)
+            first_ns, heard_ns, complete_ns in self.db.execute(query, values)
         ]  # fmt: skip
 
     def publishers(self) -> list[PublisherRow]:

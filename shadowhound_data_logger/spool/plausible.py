@@ -13,7 +13,7 @@ from typing import Final
 _NUMBERS: Final = {
     'objects': ('id', 'priority', 'protected', 'samples', 'bytes', 't_start_ns', 't_end_ns', 'created_ns', 'settled_ns'),
     'sessions': ('id', 'pid', 'started_ns', 'ended_ns'),
-    'accounts': ('session', 'received', 'skipped', 'stored', 'last_kept_ns', 'heard_ns', 'complete_ns'),
+    'accounts': ('session', 'received', 'skipped', 'stored', 'last_kept_ns', 'first_ns', 'heard_ns', 'complete_ns'),
     'publishers': ('session', 'first', 'last', 'published', 'received', 'heard_ns'),
     'other_types': ('session', 'messages'),
     'estimates': ('session', 'estimated', 'unknown'),

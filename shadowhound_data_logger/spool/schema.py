@@ -82,7 +82,7 @@ CREATE TABLE accounts (
   session INTEGER NOT NULL, topic TEXT NOT NULL, type TEXT NOT NULL, accounting TEXT NOT NULL,
   received INTEGER NOT NULL, skipped INTEGER NOT NULL, stored INTEGER NOT NULL,
   rejected TEXT NOT NULL, dropped TEXT NOT NULL, last_kept_ns INTEGER NOT NULL,
-  heard_ns INTEGER NOT NULL, complete_ns INTEGER NOT NULL,
+  first_ns INTEGER NOT NULL, heard_ns INTEGER NOT NULL, complete_ns INTEGER NOT NULL,
   PRIMARY KEY (session, topic)) WITHOUT ROWID;
 CREATE TABLE publishers (
   session INTEGER NOT NULL, topic TEXT NOT NULL, publisher TEXT NOT NULL, first INTEGER, last INTEGER,
@@ -162,7 +162,7 @@ CREATE TEMP TABLE older_publishers AS SELECT * FROM main.publishers;
 DROP TABLE main.accounts;
 DROP TABLE main.publishers;
 {_ACCOUNTS}
-INSERT INTO accounts SELECT *, 0, 0 FROM temp.older_accounts;
+INSERT INTO accounts SELECT *, 0, 0, 0 FROM temp.older_accounts;
 INSERT INTO publishers SELECT *, 0 FROM temp.older_publishers;
 DROP TABLE temp.older_accounts;
 DROP TABLE temp.older_publishers;
@@ -233,7 +233,7 @@ MIGRATIONS: Final = {
 }
 """Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
 _AS_NOW: Final = """
-CREATE TEMP TABLE accounts AS SELECT *, 0 AS heard_ns, 0 AS complete_ns FROM main.accounts;
+CREATE TEMP TABLE accounts AS SELECT *, 0 AS first_ns, 0 AS heard_ns, 0 AS complete_ns FROM main.accounts;
 CREATE TEMP TABLE publishers AS SELECT *, 0 AS heard_ns FROM main.publishers;
 """
 """What makes the accounts of an older index readable where it may not be changed: a node of that version may be at it."""

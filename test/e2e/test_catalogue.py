@@ -15,9 +15,11 @@ import pytest
 from e2e.processes import Processes, until
 from e2e.session import DURATION_S, Session
 
-from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger import MissionDataLogger, lake
 from shadowhound_data_logger.catalogue import schema
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.lake import reading
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.sim.world import World
@@ -105,6 +107,39 @@ def test_every_object_has_one_row_and_the_right_pose(session: Session, store: S3
     assert len(list(store.list(schema.BUCKET, schema.OBJECTS.prefix(session.robot)))) > 1
 
 
+def judge_gaps(source: Bucket, robot: str, ledger: dict[str, Any]) -> None:
+    """What left the robot adds up to its ledger, and it is known how far that is all."""
+    told = Counter[tuple[str, str, str]]()
+    for row in lake.sql('SELECT sink, topic, kind, count FROM gaps', source, robot=robot).to_pylist():
+        told[row['sink'], row['topic'], row['kind']] += row['count']
+    for sink, accounts in (('objects', ledger['topics']), ('bags', ledger['bags'])):
+        for topic, account in accounts.items():
+            missed = account['missed'] if account['missed'] is not None else told[sink, topic, 'missed']
+            figures = missed, sum(account['dropped'].values()), sum(account['rejected'].values())
+            assert tuple(told[sink, topic, kind] for kind in ('missed', 'dropped', 'rejected')) == figures, topic
+
+
+def spans(source: Bucket, robot: str, topic: str) -> list[tuple[int, int]]:
+    """Of its watermarks, one a session."""
+    query = "SELECT from_ns, to_ns FROM watermarks WHERE sink = 'objects' ORDER BY from_ns"
+    return [(row['from_ns'], row['to_ns']) for row in lake.sql(query, source, robot=robot, topic=topic).to_pylist()]
+
+
+@pytest.mark.timeout(120 + 2 * DURATION_S)
+def test_what_was_lost_is_told_to_the_store_and_how_far_that_is_all(session: Session, seaweed: Tower) -> None:
+    """The journal in the store adds up to the ledger; a node that ended by itself leaves nothing open of what it heard."""
+    source = Bucket(seaweed.store_settings(), schema.BUCKET)
+    judge_gaps(source, session.robot, session.ledger)
+    for topic in ('/imu', '/odom', '/joint_states'):
+        ((first_ns, last_ns),) = spans(source, session.robot, topic)
+        stamps = sorted(session.by_stamp[topic])
+        assert first_ns - stamps[0] < 2 * SECOND
+        assert abs(last_ns - stamps[-1]) < SECOND // 2
+        known = lake.known(session.robot, topic, stamps[0], stamps[-1] + SECOND, source=source)
+        assert [each.is_open for each in known.stretches][-1], 'what comes after the last message nobody knows'
+        assert not any(each.is_open for each in known.between(first_ns, last_ns).stretches)
+
+
 @pytest.mark.long('a kill')
 def test_a_node_that_is_killed_leaves_nothing_out(processes: Processes, seaweed: Tower, store: S3Store) -> None:
     """In the middle of a mission, once a part is there, and started again: each object has one row, with its mission."""
@@ -127,7 +162,13 @@ def test_a_node_that_is_killed_leaves_nothing_out(processes: Processes, seaweed:
         logger.end_mission(True, 0.0, 0.0)
     finally:
         logger.close()
-    assert node.stop()['objects']['pending'] == 0
+    ledger = node.stop()
+    assert ledger['objects']['pending'] == 0
+    source = Bucket(seaweed.store_settings(), schema.BUCKET)
+    judge_gaps(source, processes.robot, ledger)
+    (_, died_ns), (again_ns, _) = spans(source, processes.robot, '/odom')
+    known = lake.known(processes.robot, '/odom', died_ns, again_ns, source=source)
+    assert ('restart',) in [each.causes for each in known.stretches]
     rows = catalogued(store, processes.robot)
     check(rows, listed(store, processes.robot), store)
     assert {row['mission_type'] for row in rows} == {None, 'patrol'}

@@ -22,7 +22,8 @@ READY = f'ready/{BUCKET}'
 KEY = 'thor/camera/20251018/120000_front.jpg'
 WITHOUT_GAPS = """
 DROP TRIGGER object_lost; DROP TRIGGER contents_lost; DROP TRIGGER lost_or_found; DROP TABLE gaps;
-ALTER TABLE accounts DROP COLUMN heard_ns; ALTER TABLE accounts DROP COLUMN complete_ns;
+ALTER TABLE accounts DROP COLUMN first_ns; ALTER TABLE accounts DROP COLUMN heard_ns;
+ALTER TABLE accounts DROP COLUMN complete_ns;
 ALTER TABLE publishers DROP COLUMN heard_ns;
 PRAGMA user_version = 5;
 """

@@ -102,16 +102,31 @@ def test_who_copies_the_journal_hears_of_every_change(spool: Spool, root: Path) 
 
 
 def test_the_watermark_stands_before_what_is_open(spool: Spool) -> None:
-    """While a message has no outcome yet it may still be lost; once it is durable the journal is complete up to it."""
+    """While a message has no outcome yet, or is not delivered, it may still be lost; the journal is complete up to it."""
     hear(spool, 1)
-    spool.commit([make('a')])
+    (item,) = spool.commit([make('a')])
+    assert spool.gaps_after(0, 10, {})[1] == []
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
     hear(spool, 2)
     spool.commit()
     (watermark,) = spool.gaps_after(0, 10, {})[1]
-    assert watermark == ('thor', 'objects', CAMERA, NOON_NS + 100 * MS)
-    spool.commit([make('b')])
+    assert (watermark.robot, watermark.sink, watermark.topic, watermark.received) == ('thor', 'objects', CAMERA, 2)
+    assert (watermark.since_ns, watermark.complete_ns) == (NOON_NS + 100 * MS, NOON_NS + 100 * MS)
+    (item,) = spool.commit([make('b')])
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
     (watermark,) = spool.gaps_after(0, 10, {})[1]
     assert watermark.complete_ns == NOON_NS + 200 * MS
+
+
+def test_a_publisher_that_was_heard_lately_holds_the_watermark(spool: Spool) -> None:
+    """What it sent since may be found to be missed; after a minute nobody waits for it."""
+    hear(spool, 10, publisher='slow')
+    for number, ends_s in ((100, 1), (580, 1), (700, 70)):
+        hear(spool, number)
+        (item,) = spool.commit([make(f'n{number}', samples=1 if number > 100 else 2)])
+        spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
+        (watermark,) = spool.gaps_after(0, 10, {})[1] or [None]
+        assert (watermark.complete_ns if watermark else NOON_NS + SECOND) == NOON_NS + ends_s * SECOND
 
 
 def test_what_a_death_cost(root: Path, opened: Open) -> None:
