@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 from missions.fakes import FakeShelf, FakeTracking, journalling
 
+from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import TrackingUnavailable
@@ -113,15 +113,17 @@ def test_either_id_finds_a_mission(tmp_path: Path, which: str) -> None:
 
 
 @pytest.mark.parametrize('wanted', ['nobody', '', 'p'])
-def test_an_id_that_finds_none_or_several_is_bad_usage(tmp_path: Path, wanted: str) -> None:
+def test_an_id_that_finds_none_or_several_is_bad_usage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], wanted: str
+) -> None:
     """Exit code 2."""
     for mission_type in ('patrol', 'parade'):
         fly(tmp_path, mission_type)
-    ran = subprocess.run(
-        [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'missions', 'show', wanted],
-        env={'SHADOWHOUND_HOME': str(tmp_path), 'PYTHONPATH': ':'.join(sys.path)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert (ran.returncode, 'mission' in ran.stderr) == (2, True)
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.setattr(sys, 'argv', ['shadowhound-data', 'missions', 'show', wanted])
+    with pytest.raises(SystemExit, match=r'\A2\Z'):
+        main()
+    assert 'mission' in capsys.readouterr().err
 
 
 def test_a_page_tells_why_something_is_not_sent(tmp_path: Path) -> None:

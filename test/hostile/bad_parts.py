@@ -22,7 +22,6 @@ from shadowhound_data_logger.options import StoreSettings
 
 DATE: Final = '2026-10-28'
 LONG: Final = 'thor/camera/' + 42_000 * 'a'
-ROWS: Final = 1_000_000
 
 
 def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str = 'thor',
@@ -52,24 +51,26 @@ def written(table: pa.Table, about: Mapping[str, str] | None = None, *, group: i
     return body.getvalue()
 
 
-def dictionary_bomb(row: schema.Row) -> bytes:
-    """Some kilobytes that are a million rows of one key of 42 KB: 42 GB."""
+def dictionary_bomb(row: schema.Row, count: int = 1_000_000) -> bytes:
+    """Some kilobytes that are so many rows of one key of 42 KB: 42 GB of a million."""
     whole = pa.Table.from_pylist([row], schema=reading.arrow_schema())
-    columns = [_repeated(whole[name][0], LONG if name == 'key' else None) for name in schema.COLUMNS if row[name] is not None]
+    columns = [
+        _repeated(whole[name][0], LONG if name == 'key' else None, count) for name in schema.COLUMNS if row[name] is not None
+    ]
     table = pa.table(columns, names=[name for name in schema.COLUMNS if row[name] is not None])
     return written(table)
 
 
-def _repeated(value: pa.Scalar, text: str | None) -> pa.Array:
+def _repeated(value: pa.Scalar, text: str | None, count: int) -> pa.Array:
     values = pa.array([text]) if text else pa.array([value.as_py()], value.type)
-    return pa.DictionaryArray.from_arrays(pa.array(memoryview(bytes(4 * ROWS)).cast('i'), pa.int32()), values)
+    return pa.DictionaryArray.from_arrays(pa.array(memoryview(bytes(4 * count)).cast('i'), pa.int32()), values)
 
 
-def zeros_bomb(rows: Sequence[schema.Row]) -> bytes:
-    """A page of a quarter of a gigabyte of zeros, as zstd makes some kilobytes of it."""
+def zeros_bomb(rows: Sequence[schema.Row], size: int = 1 << 26) -> bytes:
+    """A page of a text of so many zeros in each row, as zstd makes some kilobytes of it."""
     table = pa.Table.from_pylist(list(rows), schema=reading.arrow_schema())
     place = table.column_names.index('topic')
-    return written(table.set_column(place, 'topic', pa.array(['\0' * (1 << 26)] * len(table))), use_dictionary=False)
+    return written(table.set_column(place, 'topic', pa.array(['\0' * size] * len(table))), use_dictionary=False)
 
 
 def lying_page(rows: Sequence[schema.Row], claim: int = (1 << 31) - 1) -> bytes:

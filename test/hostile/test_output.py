@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
-import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -17,6 +15,7 @@ from click.testing import CliRunner, Result
 from hostile import bad_parts
 from lake.making import NOON_NS, add_part, folder_store, row
 
+from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.config import UploadSettings
@@ -94,20 +93,24 @@ def test_a_mission_is_exported_the_same_way(tmp_path: Path) -> None:
     assert "'@x" in found.output
 
 
-def test_an_error_names_it_without_obeying_it(home: Path) -> None:
-    """On standard error, of the program as it is started."""
+def test_an_error_names_it_without_obeying_it(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On standard error, by the console script's own way out."""
     key = bad_parts.put(folder_store(home), b'', f'thor_{CLIPBOARD}')
-    environ = {**os.environ, 'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': ''}
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(home))
+    monkeypatch.setenv('AWS_ENDPOINT_URL', '')
     for arguments in (
         ['query', '--json'],
         ['bag', 'fetch', CLIPBOARD, '--to', str(home)],
     ):
-        command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', *arguments]
-        ran = subprocess.run(command, env=environ, capture_output=True, text=True, check=False, timeout=60)
-        assert ran.returncode in {1, 2}
-        assert is_harmless(ran.stderr)
-        assert is_harmless(ran.stdout)
-        assert visible(CLIPBOARD)[4:10] in ran.stderr
+        monkeypatch.setattr(sys, 'argv', ['shadowhound-data', *arguments])
+        with pytest.raises(SystemExit, match=r'\A[12]\Z'):
+            main()
+        said = capsys.readouterr()
+        assert is_harmless(said.err)
+        assert is_harmless(said.out)
+        assert visible(CLIPBOARD)[4:10] in said.err
     assert CLIPBOARD in key
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 from hostile.rounds import KINDS, Shop
+from profiles import examples
 
 from shadowhound_data_logger.lake import reading
 
-ROUNDS = 25
+ROUNDS = examples(25)
 
 
 @pytest.mark.parametrize('kind', KINDS)
