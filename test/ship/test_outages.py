@@ -115,8 +115,8 @@ def test_the_pause_grows_to_the_cap_and_no_further(drive: Drive) -> None:
 
 def test_a_long_outage_does_not_touch_ever_more_objects(drive: Drive) -> None:
     """The failures that are remembered stay few, however long it lasts."""
-    drive.spool.add(2000)
-    for _ in range(1500):
+    drive.spool.add(1000)
+    for _ in range(800):
         drive.fail(drive.wait(), AWAY)
     assert drive.schedule.snapshot().deferred < 200
     while drive.spool.items:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from profiles import LONG
 from spool.child import started
 from spool.conftest import Moments, Open
 from spool.making import BUCKET, abandon, assert_whole, files, make, new_spool, put, receive, rows, settle
@@ -147,7 +148,7 @@ def test_death_at_any_time(opened: Open, root: Path) -> None:
     durable: dict[str, str] = {}
     delivered: set[str] = set()
     kills = 0
-    while kills < 12 or len(durable) <= 50:  # a busy machine has done little when it is killed so soon
+    while kills < (24 if LONG else 6) or len(durable) <= 50:  # a busy machine has done little when it is killed so soon
         kills += 1
         with started('load', root) as child:
             assert child.stdout is not None

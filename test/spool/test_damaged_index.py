@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from profiles import examples
 from spool.conftest import Open
 from spool.making import BUCKET, abandon, assert_whole, files, make, new_spool, put, reopened, rows, settle
 
@@ -105,7 +106,8 @@ def test_flipped_bits_in_the_index(opened: Open, root: Path, used: dict[str, byt
     rng = random.Random(5)
     rebuilt = 0
     used_bytes = [place for place, byte in enumerate(whole) if byte]
-    for number in range(120):
+    times = examples(120)
+    for number in range(times):
         flipped = bytearray(whole)
         for _ in range(rng.choice((1, 1, 3, 30))):
             flipped[rng.choice(used_bytes)] ^= 1 << rng.randrange(8)
@@ -130,7 +132,7 @@ def test_flipped_bits_in_the_index(opened: Open, root: Path, used: dict[str, byt
         rebuilt += spool.recovery.counts['damaged index rebuilt']
         if spool.recovery.counts['damaged index rebuilt']:
             assert_whole(root)
-    assert rebuilt > 20
+    assert rebuilt > times // 6
 
 
 def use(spool: Spool, number: int) -> None:

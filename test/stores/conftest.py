@@ -47,9 +47,19 @@ def moto() -> Iterator[StoreSettings]:
     server.stop()
 
 
+@pytest.fixture(scope='module')
+def owner(seaweed: Tower) -> Iterator[S3Store]:
+    """Who may delete buckets."""
+    with closing(S3Store(seaweed.store_settings(), QUICK)) as opened:
+        opened.open()
+        yield opened
+
+
 @pytest.fixture(params=STORES)
 def store(request: pytest.FixtureRequest, tmp_path: Path, bucket: str) -> Iterator[ObjectStore]:
     """Each store, open."""
+    if request.param in {'seaweed', 'obstore'}:
+        owner: S3Store = request.getfixturevalue('owner')
     opened: ObjectStore = MemoryStore()
     if request.param == 'directory':
         opened = open_store(StoreSettings(directory=tmp_path / 'store'), QUICK)
@@ -64,8 +74,7 @@ def store(request: pytest.FixtureRequest, tmp_path: Path, bucket: str) -> Iterat
     yield opened
     opened.close()
     if request.param in {'seaweed', 'obstore'}:  # a server has room for so many buckets
-        with closing(S3Store(tower.store_settings(), QUICK)) as owner, suppress(ClientError):
-            owner.open()
+        with suppress(ClientError):
             owner._s3._client.delete_bucket(Bucket=bucket)
 
 
