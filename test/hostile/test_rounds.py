@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 from hostile.rounds import KINDS, Shop
-from profiles import examples
 
 from shadowhound_data_logger.lake import reading
 
-ROUNDS = examples(25)
+ROUNDS = 25
 
 
 @pytest.mark.parametrize('kind', KINDS)
