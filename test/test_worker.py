@@ -14,7 +14,7 @@ from shadowhound_data_logger.worker import Worker
 
 
 def until(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + 60.0
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.001)
@@ -31,10 +31,10 @@ def test_it_goes_round_until_it_is_stopped() -> None:
     worker = Worker('rounds', rounds.release)
     worker.start()
     for _ in range(3):
-        assert rounds.acquire(timeout=10)
+        assert rounds.acquire(timeout=60)
     assert not worker.stopping
     worker.stop()
-    assert worker.join(10)
+    assert worker.join(60)
     assert worker.stopping
     assert (worker.failures, worker.failing) == (0, False)
 
@@ -54,9 +54,9 @@ def test_a_failure_is_counted_said_and_survived(caplog: pytest.LogCaptureFixture
 
     worker = Worker('faulty', step)
     worker.start()
-    assert well.wait(10)
+    assert well.wait(60)
     worker.stop()
-    assert worker.join(10)
+    assert worker.join(60)
     assert (worker.failures, worker.failing, worker.last_error) == (2, False, 'ZeroDivisionError: by nothing')
     assert caplog.text.count('faulty failed (1 times so far) and tries again: by nothing') == 1
     assert 'faulty failed (2' not in caplog.text, 'the same failure is said once'
@@ -74,9 +74,9 @@ def test_a_stop_ends_the_pause(monkeypatch: pytest.MonkeyPatch) -> None:
 
     worker = Worker('waiting', step)
     worker.start()
-    assert failed.wait(10)
+    assert failed.wait(60)
     worker.stop()
-    assert worker.join(10)
+    assert worker.join(60)
     assert worker.failing
 
 
@@ -89,7 +89,7 @@ def test_a_round_that_hangs_is_told() -> None:
     worker.stop()
     assert not worker.join(0.01)
     released.set()
-    assert worker.join(10)
+    assert worker.join(60)
 
 
 @pytest.mark.parametrize('death', [SystemExit(1), KeyboardInterrupt(), GeneratorExit(), MemoryError('no room')])
@@ -104,11 +104,11 @@ def test_nothing_a_round_raises_ends_the_thread(death: BaseException) -> None:
 
     worker = Worker('tough', step)
     worker.start()
-    assert well.wait(10)
+    assert well.wait(60)
     assert (worker.failures, worker.deaths, worker.alive) == (1, 0, True)
     assert worker.last_error.startswith(type(death).__name__)
     worker.stop()
-    assert worker.join(10)
+    assert worker.join(60)
 
 
 def test_a_thread_that_ends_is_started_again(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
@@ -132,12 +132,12 @@ def test_a_thread_that_ends_is_started_again(monkeypatch: pytest.MonkeyPatch, ca
     assert worker.status().last_error == 'MemoryError: for the log'
     assert not well.is_set()
     until(lambda: worker.look() or worker.alive)  # type: ignore[func-returns-value]
-    assert well.wait(10)
+    assert well.wait(60)
     until(lambda: not worker.failing)
     assert (worker.failures, worker.deaths) == (1, 1)
     assert 'mortal died (1 times so far) and tries again: for the log' in caplog.text
     worker.stop()
-    assert worker.join(10)
+    assert worker.join(60)
 
 
 def test_a_system_that_gives_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +152,7 @@ def test_a_system_that_gives_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
         until(lambda: worker.look() or worker.deaths > 2)  # type: ignore[func-returns-value]
     until(lambda: worker.look() or well.is_set())  # type: ignore[func-returns-value]
     worker.stop()
-    assert worker.join(10)
+    assert worker.join(60)
 
 
 def test_looking_at_one_that_is_not_wanted_starts_nothing() -> None:
@@ -162,7 +162,7 @@ def test_looking_at_one_that_is_not_wanted_starts_nothing() -> None:
     assert not worker.alive
     worker.start()
     worker.stop()
-    assert worker.join(10)
+    assert worker.join(60)
     worker.look()
     assert (worker.alive, worker.failures) == (False, 0)
 
@@ -172,7 +172,7 @@ def test_how_long_a_round_lasts_is_told() -> None:
     released = threading.Event()
 
     def step() -> None:
-        assert released.wait(30)
+        assert released.wait(60)
         worker.stop()
 
     worker = Worker('slow', step, patience_s=3.0)
@@ -180,7 +180,7 @@ def test_how_long_a_round_lasts_is_told() -> None:
     until(lambda: worker.status().busy_s >= 0.1)
     assert worker.status().patience_s == 3.0
     released.set()
-    assert worker.join(10)
+    assert worker.join(60)
     assert worker.status().busy_s == 0.0
 
 
@@ -193,7 +193,7 @@ def test_workers_that_share_what_was_told(caplog: pytest.LogCaptureFixture) -> N
     until(lambda: all(worker.failures > 2 for worker in workers))
     for worker in workers:
         worker.stop()
-        assert worker.join(10)
+        assert worker.join(60)
     (record,) = caplog.records
     assert record.exc_info
 

@@ -166,4 +166,4 @@ def write_out(it: Desk) -> None:
         done.set()
 
     it.queue.mark(sync)
-    assert done.wait(10.0)
+    assert done.wait(60)

@@ -34,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
 def recovered(home: Path) -> dict[str, Path]:
     """What is in the spool after a start."""
     with desk(home) as it:
-        it.recorder._salvage.worker.join(20.0)
+        it.recorder._salvage.worker.join(60)
         assert it.recorder._salvage.worker.failures == 0
         return dict(it.objects())
 

@@ -209,7 +209,7 @@ def test_a_stop_of_the_node_ends_the_bag(tmp_path: Path) -> None:
     with desk(tmp_path, record='always') as it:
         name = it.recorder.status().bag
         it.hear(range(100))
-        assert it.recorder.close(10.0)
+        assert it.recorder.close(60)
         assert manifest(it.objects(), name)['state'] == 'complete'
         assert it.row()['stored'] == 100
 
@@ -244,7 +244,7 @@ def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path, sync
     clock.set()
     clock.wait(60.0)
     with desk(left, clock) as it:
-        it.recorder._salvage.worker.join(20.0)
+        it.recorder._salvage.worker.join(60)
         found = it.objects()
         slices = 2 if synced else 1
         assert sorted(found) == [f'{name}/{file}' for file in ('manifest.json', 'metadata.yaml')] + [
@@ -268,7 +268,7 @@ def test_a_start_that_is_cut_short_is_done_again(tmp_path: Path) -> None:
         assert it.row()['open'] == 10
         left = kill(home)
     with desk(left) as it:
-        it.recorder._salvage.worker.join(20.0)
+        it.recorder._salvage.worker.join(60)
         shutil.copytree(home / 'bags', tmp_path / 'again')  # the folder as it was, beside a spool that has the bag
         again = kill(left)
     shutil.rmtree(again / 'bags', ignore_errors=True)
@@ -276,6 +276,6 @@ def test_a_start_that_is_cut_short_is_done_again(tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     shutil.copy(next(again.glob('spool/ready/*/*/rosbags/*/*_0.mcap')), folder / f'{name}_0.mcap')
     with desk(again) as it:
-        it.recorder._salvage.worker.join(20.0)
+        it.recorder._salvage.worker.join(60)
         assert sorted(path for path in it.objects() if path.endswith('.mcap')) == [f'{name}/{name}_0.mcap']
         assert (it.row()['stored'], it.row()['received']) == (10, 10)

@@ -48,7 +48,7 @@ def _retry(it: Desk) -> None:
         done.set()
 
     it.queue.mark(again)
-    assert done.wait(10.0)
+    assert done.wait(60)
 
 
 @pytest.mark.parametrize(('where', 'number', 'reason'), [

@@ -51,7 +51,7 @@ def bags_of(found: dict[str, Path]) -> dict[str, list[int]]:
 
 
 def is_whole(it: Desk) -> None:
-    it.recorder._salvage.worker.join(20.0)
+    it.recorder._salvage.worker.join(60)
     assert not it.recorder._salvage.is_busy
 
 

@@ -68,7 +68,7 @@ def test_get_waits_for_a_batch() -> None:
     thread = threading.Thread(target=lambda: got.append(queue.get(30.0)))
     thread.start()
     queue.put(batch('imu'), 4)
-    thread.join(10)
+    thread.join(60)
     assert not thread.is_alive()
     assert names(got) == ['imu']
 
@@ -81,7 +81,7 @@ def test_a_closed_queue_is_emptied_and_does_not_wait() -> None:
         thread.start()
     queue.close()
     for thread in threads:
-        thread.join(10)
+        thread.join(60)
     assert not any(thread.is_alive() for thread in threads)
     queue.put(batch('late'), 4)
     assert names([queue.get(30.0) or batch('nothing')]) == ['late']
@@ -137,5 +137,5 @@ def test_waiting_ends_with_the_last_of_them() -> None:
         queue.done(item)
     while (item := queue.get(0.0)) is not None:
         queue.done(item)
-    thread.join(10)
+    thread.join(60)
     assert waited == [True]

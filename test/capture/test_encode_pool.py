@@ -64,7 +64,7 @@ def test_good_and_bad_samples_are_told_apart() -> None:
     outcome.pool.open()
     outcome.queue.put(talk(TEXT, b'bad', TEXT), 5)
     outcome.queue.put(talk(b'bad'), 5)
-    assert outcome.pool.close(10)
+    assert outcome.pool.close(60)
     assert (outcome.samples, outcome.rejected) == (2, {'malformed': 2})
     assert [item.key.split('/')[:2] for item in outcome.objects] == [['thor', 'talk']]
 
@@ -75,7 +75,7 @@ def test_what_is_wrong_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
     outcome.queue.put(talk(b'bad', b'bad'), 5)
     outcome.queue.put(talk(b'bad'), 5)
     outcome.pool.open()
-    assert outcome.pool.close(10)
+    assert outcome.pool.close(60)
     assert outcome.rejected == {'malformed': 3}
     (record,) = caplog.records
     assert record.getMessage().startswith('/talk: a message cannot be stored: malformed: ')
@@ -95,7 +95,7 @@ def test_an_observer_with_a_fault_costs_nothing() -> None:
     outcome.queue.put(talk(TEXT, TEXT), 5)
     outcome.pool.open()
     assert outcome.queue.finished(10)
-    assert outcome.pool.close(10)
+    assert outcome.pool.close(60)
     assert [(len(batch.samples), stored) for batch, stored in seen] == [(2, 2)]
     assert (outcome.samples, outcome.rejected, outcome.pool.workers[0].failures) == (2, {}, 1)
 
@@ -106,7 +106,7 @@ def test_close_encodes_what_is_queued() -> None:
     for _ in range(200):
         outcome.queue.put(talk(TEXT), 5)
     outcome.pool.open()
-    assert outcome.pool.close(30)
+    assert outcome.pool.close(60)
     assert outcome.pool.close(1)
     assert outcome.samples == 200
 
@@ -127,7 +127,7 @@ def test_an_encoder_with_a_fault_of_its_own(monkeypatch: pytest.MonkeyPatch) -> 
     done = threading.Event()
     while not outcome.samples:
         done.wait(0.01)
-    assert outcome.pool.close(10)
+    assert outcome.pool.close(60)
     assert (outcome.samples, outcome.rejected) == (1, {'encoder_failed': 3})
     assert [worker.failures for worker in outcome.pool.workers] == [1]
 
@@ -149,7 +149,7 @@ def test_a_thread_that_dies(monkeypatch: pytest.MonkeyPatch, death: BaseExceptio
     outcome.queue.put(talk(TEXT), 5)
     outcome.pool.open()
     assert outcome.queue.finished(10)
-    assert outcome.pool.close(10)
+    assert outcome.pool.close(60)
     assert (outcome.samples, outcome.rejected) == (1, {'encoder_failed': 3})
     assert [worker.failures for worker in outcome.pool.workers] == [1]
     assert outcome.queue.status().finished == 2
@@ -161,12 +161,12 @@ def test_a_close_that_takes_too_long_says_so(monkeypatch: pytest.MonkeyPatch) ->
 
     def put(_: DataObject) -> None:
         entered.set()
-        assert blocked.wait(30)
+        assert blocked.wait(60)
 
     monkeypatch.setattr(outcome, 'put', put)
     outcome.queue.put(talk(TEXT), 5)
     outcome.pool.open()
-    assert entered.wait(10)
+    assert entered.wait(60)
     assert not outcome.pool.close(0.05)
     blocked.set()
-    assert outcome.pool.close(10)
+    assert outcome.pool.close(60)

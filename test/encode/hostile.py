@@ -30,7 +30,7 @@ LENGTHS: Final = (0, 1, 2, 3, 4, 5, 0x7F, 0xFF, 0x100, 0xFFFF, 0x10000, 0xFF_FFF
 SHARE: Final = 100
 """Bytes that encoding may take for each byte of a message: Python objects of small records are the most wasteful."""
 FLOOR_BYTES: Final = 2 << 20
-SLOWEST_S: Final = 10.0
+SLOWEST_S: Final = 30.0
 """A second would do; other processes may have the machine meanwhile."""
 TYPES: Final = (
     'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/Image', 'sensor_msgs/msg/PointCloud2', 'sensor_msgs/msg/JointState',

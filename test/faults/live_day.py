@@ -60,7 +60,7 @@ class Process:
     def close(self) -> None:
         """Stop, whatever is on its way; idempotent."""
         self.uploader.close(0.05)
-        assert self.writer.close(5.0)
+        assert self.writer.close(60)
         self.store.close()
         self.spool.close()
         assert self.uploader.status().worker_failures == 0, self.uploader.status().last_error

@@ -26,7 +26,7 @@ def clock() -> Time:
 @pytest.fixture(autouse=True)
 def no_thread_is_left() -> Iterator[None]:
     yield
-    until(lambda: not [thread for thread in threading.enumerate() if thread.name.startswith('upload-')], seconds=20.0)
+    until(lambda: not [thread for thread in threading.enumerate() if thread.name.startswith('upload-')])
 
 
 @pytest.fixture

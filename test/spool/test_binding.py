@@ -165,7 +165,7 @@ def test_how_long_it_waits_is_told_from_a_clock_that_is_set(spool: Spool, root: 
 def test_killed_between_two_steps(opened: Open, root: Path, moment: str, state: str, index: str) -> None:
     """Until it is committed all are held, from then on all are bound: rows, files and descriptions agree after the next start."""
     with started('bind', root, moment) as child:
-        assert child.wait(30) == -9
+        assert child.wait(60) == -9
     assert sorted(name.split('/')[0] for name in files(root)) == ['incoming', 'incoming']
     opened().close()
     if index == 'lost':
@@ -236,7 +236,7 @@ def test_a_start_of_another_process_keeps_out_of_a_binding(spool: Spool, root: P
     monkeypatch.setattr(recovery, '_follow_rows', follows)
     monkeypatch.setattr(Tree, 'sync_incoming', syncs)
     bound = spool.bind(bindings)
-    start.join(10.0)
+    start.join(60)
     assert looked.is_set()
     assert not other.recovery.found_anything
     other.close()

@@ -200,6 +200,6 @@ def test_files_take_no_memory_in_the_queue(root: Path, tmp_path: Path) -> None:
         writer.put(make(f'{number}', FileBody(path, 1 << 30, SHA256), topic=None))
     writer.put(make('small'))
     writer.open()
-    assert writer.close(10.0)
+    assert writer.close(60)
     assert len(rows(root)) == 4
     spool.close()

@@ -23,15 +23,15 @@ def hanging(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spool]:
 
     def sync(_: Tree) -> None:
         entered.set()
-        assert let_go.wait(30.0)
+        assert let_go.wait(60)
 
     monkeypatch.setattr(Tree, 'sync_incoming', sync)
     thread = threading.Thread(target=put, args=(spool, make('thor/second.jpg')))
     thread.start()
-    assert entered.wait(10.0)
+    assert entered.wait(60)
     yield spool
     let_go.set()
-    thread.join(10.0)
+    thread.join(60)
 
 
 def test_what_is_pending_is_told_while_a_commit_hangs(hanging: Spool) -> None:

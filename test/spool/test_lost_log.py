@@ -14,7 +14,7 @@ from shadowhound_data_logger.model import State
 
 def died(root: Path, moment: str) -> None:
     with started('die', root, moment) as child:
-        assert child.wait(30) < 0
+        assert child.wait(60) < 0
     assert len(list((root / 'incoming').iterdir())) == 2
 
 

@@ -123,7 +123,7 @@ def writing(root: Path) -> Iterator[Callable[..., tuple[Spool, SpoolWriter]]]:
 
     yield open_one
     for spool, writer in opened:
-        assert writer.close(10)
+        assert writer.close(60)
         spool.close()
 
 
@@ -141,7 +141,7 @@ def test_a_disk_that_takes_nothing(
     connection = spool._index.db
     receive(spool, 3)
     writer.put(make('0', bytes(MEBI)))
-    assert writer.flush(10)
+    assert writer.flush(60)
     filler = fill(disk) if trouble == 'full' else None
     if trouble == 'read-only':
         connection.execute('PRAGMA query_only = 1')
@@ -155,7 +155,7 @@ def test_a_disk_that_takes_nothing(
         filler.unlink()
     else:
         connection.execute('PRAGMA query_only = 0')
-    assert writer.flush(10)
+    assert writer.flush(60)
     assert assert_whole(root)['topics']['/camera']['stored'] == 3
     until(lambda: not writer.worker.failing)  # it says so after the commit
     told = [record.getMessage() for record in caplog.records if record.name.endswith('worker')]

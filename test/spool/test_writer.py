@@ -60,7 +60,7 @@ def test_what_was_put_is_durable_after_a_flush(opened: Callable[..., SpoolWriter
     for number in range(20):
         receive(spool)
         writing.put(make(f'{number}'))
-    assert writing.flush(10)
+    assert writing.flush(60)
     assert assert_whole(root)['objects']['pending'] == 20
     assert writing.written() == (20, 20)
     assert sorted(item.key for item in told) == sorted(str(number) for number in range(20))
@@ -70,11 +70,11 @@ def test_objects_share_commits(opened: Callable[..., SpoolWriter], spool: Spool,
     """After the first commit the others wait for the next one, which takes all of them."""
     writing = opened(60.0)
     writing.put(make('first', topic=None))
-    assert writing.flush(10)
+    assert writing.flush(60)
     for number in range(50):
         writing.put(make(f'{number}', topic=None))
     assert commits == [1]
-    assert writing.flush(10)
+    assert writing.flush(60)
     assert sum(commits) == 51
     assert len(commits) <= 3
 
@@ -97,7 +97,7 @@ def test_outcomes_wait_for_an_object(
     writing.settle([Outcome(item, State.DELIVERED) for item in items])
     assert settled.wait(10.0 if commits_alone else 0.1) is commits_alone
     writing.put(make('next', topic=None))
-    assert settled.wait(10.0)
+    assert settled.wait(60)
 
 
 def test_a_thread_that_dies_in_a_commit(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
@@ -115,7 +115,7 @@ def test_a_thread_that_dies_in_a_commit(opened: Callable[..., SpoolWriter], spoo
     writing = opened()
     receive(spool)
     writing.put(make())
-    assert writing.flush(10)
+    assert writing.flush(60)
     assert writing.worker.failures == 2
     assert assert_whole(root)['objects']['pending'] == 1
 
@@ -132,7 +132,7 @@ def test_outcomes_are_durable_before_they_are_told(opened: Callable[..., SpoolWr
     writing = opened(settled=told)
     (item,) = spool.commit([make(topic=None)])
     writing.settle([Outcome(item, State.DELIVERED)])
-    assert writing.close(10)
+    assert writing.close(60)
     assert (settled, states) == ([item.id], ['delivered'])
     assert_whole(root)
 
@@ -153,7 +153,7 @@ def test_a_failing_disk_loses_nothing(opened: Callable[..., SpoolWriter], spool:
     for number in range(5):
         receive(spool)
         writing.put(make(f'{number}'))
-    assert writing.flush(10)
+    assert writing.flush(60)
     assert writing.worker.failures == 3
     assert assert_whole(root)['topics']['/camera']['stored'] == 5
 
@@ -177,12 +177,12 @@ def test_what_was_delivered_leaves_a_full_disk_first(opened: Callable[..., Spool
     for number in range(5):
         receive(spool)
         writing.put(make(f'old{number}', body))
-    assert writing.flush(10)
+    assert writing.flush(60)
     writing.settle([Outcome(item, State.DELIVERED) for item in spool.pending(5)])
     for number in range(4):
         receive(spool)
         writing.put(make(f'new{number}', body))
-    assert writing.flush(10)
+    assert writing.flush(60)
     found = assert_whole(root)['objects']
     assert (found['delivered'], found['pending'], found['evicted']) == (5, 4, 0)
     assert not writing.worker.failures
@@ -195,7 +195,7 @@ def test_encoders_wait_while_too_much_waits(opened: Callable[..., SpoolWriter], 
     commit, hung = spool.commit, threading.Event()
 
     def hanging(*arguments: object, **told: object) -> list[SpooledObject]:
-        assert hung.wait(30)
+        assert hung.wait(60)
         return commit(*arguments, **told)  # type: ignore[arg-type]
 
     monkeypatch.setattr(spool, 'commit', hanging)
@@ -207,9 +207,9 @@ def test_encoders_wait_while_too_much_waits(opened: Callable[..., SpoolWriter], 
     assert second.is_alive()
     assert not writing.flush(0.01)
     hung.set()
-    second.join(10)
+    second.join(60)
     assert not second.is_alive()
-    assert writing.flush(10)
+    assert writing.flush(60)
     assert spool.pending_count() == 2
 
 
@@ -219,7 +219,7 @@ def test_a_bad_key_is_refused_at_once(opened: Callable[..., SpoolWriter]) -> Non
     with pytest.raises(NameRefused):
         writing.put(make('../etc/passwd', topic=None))
     writing.put(make('good', topic=None))
-    assert writing.close(10)
+    assert writing.close(60)
 
 
 def test_the_accounts_become_durable_without_objects(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
@@ -238,5 +238,5 @@ def test_the_accounts_become_durable_without_objects(opened: Callable[..., Spool
 
     monkeypatch.setattr(spool, 'commit', noticed)
     opened()
-    assert written.wait(10)
+    assert written.wait(60)
     assert assert_whole(root)['topics']['/camera']['skipped'] == 1

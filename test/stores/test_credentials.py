@@ -201,7 +201,7 @@ def test_every_refusal_of_keys_reads_them_again(
         error_of(CredentialsRejected, lambda: store.put(spool('a', b'x')))
         assert store._s3.generation == 1
         assert len(server.requests) <= 4, 'HEAD and GET for the reason, twice'
-        assert time.monotonic() - began_s < 10
+        assert time.monotonic() - began_s < 50
 
 
 def test_nothing_shows_a_secret(file: File) -> None:

@@ -19,9 +19,6 @@ from shadowhound_data_logger.model import Put
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_http import UNASKED_BYTES
 
-SLACK_S = 0.25
-"""What a busy machine may add to an arrival."""
-
 
 class Wire(ThreadingHTTPServer):
     """An S3 look-alike that notes when how much of a body arrives."""
@@ -128,16 +125,17 @@ def proved(wire: Wire, spool: Spool) -> Iterator[S3Store]:
 def test_a_body_arrives_evenly_and_outlasts_every_timeout(wire: Wire, spool: Spool, proved: S3Store) -> None:
     """Timeouts are over single pieces; nothing arrives sooner than the cap allows, neither at the beginning nor after a pause."""
     proved.close()
-    store = opened(wire, 2.0, timeout_s=0.5)
-    size, rate = 300_000, 2.0 * BYTES_PER_MEGABIT
+    timeout_s, cap, size = 1.0, 1.0, 300_000
+    rate = cap * BYTES_PER_MEGABIT
+    store = opened(wire, cap, timeout_s)
+    began = time.monotonic()
     store.put(spool('large', bytes(size)))
     store.close()
-    began = wire.arrivals[0][0]
     arrived = 0
     for moment, count in wire.arrivals[: len(wire.arrivals) // 2]:  # the rest is the proof: the same again
         arrived += count
-        assert arrived <= rate * (moment - began + LATE_S + SLACK_S)
-    assert wire.arrivals[-1][0] - began > 2 * 0.5
+        assert arrived <= rate * (moment - began + LATE_S)
+    assert wire.arrivals[-1][0] - began > 2 * timeout_s
     assert store.pace.sent_bytes == 2 * size
 
 
@@ -177,7 +175,7 @@ def test_a_large_body_that_is_refused_stays_here(wire: Wire, spool: Spool, prove
         proved.put(spool('there', bytes(4 * UNASKED_BYTES)))
     assert wire.arrivals == []
     assert proved.pace.sent_bytes == counted
-    assert time.monotonic() - began < 10.0  # at this cap it would be 84 s
+    assert time.monotonic() - began < 60.0  # at this cap it would be 84 s
 
 
 def test_a_put_that_is_given_up_breaks_off(wire: Wire, spool: Spool, proved: S3Store) -> None:
@@ -195,7 +193,7 @@ def test_a_put_that_is_given_up_breaks_off(wire: Wire, spool: Spool, proved: S3S
     thread.start()
     until(lambda: wire.arrivals)
     proved.close()
-    thread.join(5.0)
+    thread.join(60)
     assert failed
     until(lambda: wire.broken)
     assert sum(count for _, count in wire.arrivals) < 100_000
@@ -209,6 +207,6 @@ def test_a_new_cap_holds_for_the_body_under_way(wire: Wire, spool: Spool, proved
     thread.start()
     until(lambda: wire.arrivals)
     proved.pace.set(0.0)
-    thread.join(5.0)
+    thread.join(60)
     assert not thread.is_alive()
     assert sum(count for _, count in wire.arrivals) == 500_000
