@@ -106,9 +106,9 @@ class OtherTypes:
             self._context = None
 
     def _count(self, topic: str, reader: Reader) -> None:
-        count = sum(1 for _ in reader.drain())
-        if count:
-            self._accounts.refuse(topic, reader.plan.type, count)
+        refused = reader.drain()
+        if refused:
+            self._accounts.refuse(topic, reader.plan.type, len(refused), refused[0].source_ns, refused[-1].source_ns)
 
     def _make(self, topic: str, type_name: str) -> Reader | None:
         """None where that cannot be done; whether it can be done at all is tried once."""

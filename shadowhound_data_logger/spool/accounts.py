@@ -237,10 +237,12 @@ class TopicAccount:
             self.accounting, self.is_doubtful, is_new = RECEIVED_ONLY, True, True
         return other.see(nodes, counted=counted) or is_new
 
-    def refuse(self, type_name: str, count: int) -> None:
-        """Messages of another type came, and were thrown away."""
+    def refuse(self, type_name: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
+        """Messages of another type came, and were thrown away; the stamps as of ``Accounts.drop``."""
         self.received += count
         self.rejected[WRONG_TYPE] += count
+        if count and from_ns:
+            self.gaps.add(REJECTED, WRONG_TYPE, count, from_ns, to_ns)
         self._span(WRONG_TYPE).late(count)
         other = self.other_types.get(type_name)
         if other is not None and other.messages is not None:
@@ -307,8 +309,11 @@ class Accounts:
 
     def __init__(self, inherited: Iterable[PublisherRow] = (), last_kept: Mapping[str, int] | None = None,
                  rhythms: Iterable[RhythmRow] = (), grades: Mapping[str, str] | None = None,
-                 clock: Clock | None = None) -> None:  # fmt: skip
-        """``grades`` are those of the newest messages, by account: a gap after others is no loss that these numbers tell."""
+                 clock: Clock | None = None, heard: Mapping[str, int] | None = None) -> None:  # fmt: skip
+        """``grades`` are those of the newest messages, by account: a gap after others is no loss that these numbers tell.
+
+        ``heard`` are the stamps of the newest messages of earlier sessions, by account.
+        """
         self._lock = threading.Lock()
         self._topics: dict[str, TopicAccount] = {}
         self._dirty = False
@@ -325,6 +330,7 @@ class Accounts:
         self._carried_ns: dict[str, tuple[int, int]] = {}
         self._mission = ''
         self._clock = clock
+        self._heard = dict(heard or {})
         self._unwritten: list[TopicGaps] = []
         self._last_kept = dict(last_kept or {})
         for row in inherited:
@@ -358,10 +364,10 @@ class Accounts:
             if self._account(topic).see_other(type_name, nodes, counted=counted, named=named):
                 self._dirty = True
 
-    def refuse(self, topic: str, type_name: str, count: int) -> None:
-        """Messages came that are of another type than the topic's."""
+    def refuse(self, topic: str, type_name: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
+        """Messages came that are of another type than the topic's; the stamps as of ``drop``."""
         with self.entry(topic) as account:
-            account.refuse(type_name, count)
+            account.refuse(type_name, count, from_ns, to_ns)
 
     def drop(self, topic: str, reason: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
         """Messages were dropped; the stamps are those of the first and the last of them, 0 where they are not known."""
@@ -544,7 +550,8 @@ class Accounts:
         if account is None:
             account = self._topics[topic] = TopicAccount(
                 publishers=self._inherited.pop(topic, {}), before=self._grades.get(topic, ''),
-                estimate=TopicEstimate(before=self._rhythms.pop(topic, None)), gaps=TopicGaps(self._mission, self._clock),
+                estimate=TopicEstimate(before=self._rhythms.pop(topic, None)),
+                gaps=TopicGaps(self._mission, self._clock, self._heard.get(topic, 0)),
             )  # fmt: skip
             for span in account.publishers.values():
                 span.gaps = account.gaps

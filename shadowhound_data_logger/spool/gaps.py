@@ -257,11 +257,9 @@ def write(db: sqlite3.Connection, session: int, rows: Iterable[GapRow], taken_ba
 def _take_back(db: sqlite3.Connection, session: int, given: TakenBack) -> None:
     named = (session, given.topic, given.kind, given.cause, given.grade)
     rest = given.messages
-    newest = db.execute(
-        f'SELECT publisher, mission, begin_ns, count FROM gaps WHERE {_NAMED} AND count > 0 ORDER BY begin_ns DESC',  # noqa: S608
-        named,
-    ).fetchall()
-    for publisher, mission, begin_ns, count in newest:
+    newest = f'SELECT publisher, mission, begin_ns, count FROM gaps WHERE {_NAMED} AND count > 0 ORDER BY begin_ns DESC LIMIT 1'  # noqa: S608
+    while rest and (row := db.execute(newest, named).fetchone()) is not None:
+        publisher, mission, begin_ns, count = row
         part = min(rest, count)
         db.execute(
             f'UPDATE gaps SET version = {NEXT_VERSION}, count = count - ?1, merged = CASE WHEN count > ?1 THEN merged ELSE 0 END'  # noqa: S608
@@ -270,8 +268,6 @@ def _take_back(db: sqlite3.Connection, session: int, given: TakenBack) -> None:
             (part, *named, publisher, mission, begin_ns),
         )
         rest -= part
-        if not rest:
-            return
 
 
 def forget(db: sqlite3.Connection, before_ns: int, limit: int) -> bool:

@@ -193,5 +193,5 @@ class Span:
             count = stop - start - known
             self.missed[cause] += count
             self.published += count
-            hole = self.gaps.add(MISSED, cause, count, self.heard_ns, stamp_ns, self.name)
+            hole = self.gaps.add(MISSED, cause, count, self.heard_ns or self.gaps.heard_ns, stamp_ns, self.name)
         self._holes.append(start, stop, hole)

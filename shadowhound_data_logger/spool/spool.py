@@ -307,11 +307,13 @@ def _continued(index: Index, clock: Clock) -> Accounts:
         last[row.topic, row.publisher] = row
     kept: dict[str, int] = {}
     grades: dict[str, str] = {}
+    heard: dict[str, int] = {}
     for account in index.topics():
         kept[account.topic] = max(kept.get(account.topic, 0), account.last_kept_ns)
+        heard[account.topic] = account.heard_ns or account.last_kept_ns or heard.get(account.topic, 0)
         if account.received:
             grades[account.topic] = account.accounting
-    return Accounts(last.values(), kept, index.rhythms(), grades, clock)
+    return Accounts(last.values(), kept, index.rhythms(), grades, clock, heard)
 
 
 def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, int]]:

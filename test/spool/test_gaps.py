@@ -145,6 +145,32 @@ def test_what_a_death_cost(root: Path, opened: Open) -> None:
     assert short(root) == [('dropped', 'restart', 3, 1.0, 1.3), ('missed', 'restart', 6, 1.3, 2.0)]
 
 
+def test_what_is_estimated_to_be_lost_with_a_restart_has_its_time(root: Path) -> None:
+    """From the newest message of the session before; where numbers tell, but not who sent the last one when, as well."""
+    spool = new_spool(root)
+    spool.open()
+    hear(spool, 10)
+    spool.close()
+    spool = new_spool(root)
+    spool.open()
+    with spool.accounts.entry(CAMERA) as account:
+        account.receive(None, None)
+        account.appraise(1, {'restart': 4}, NOON_NS + 5 * SECOND)
+    spool.commit()
+    found = [gap for gap in journal(root) if gap.grade == 'estimated']
+    spool.close()
+    assert [(gap.cause, gap.count, gap.from_ns, gap.to_ns) for gap in found] == [
+        ('restart', 4, NOON_NS + SECOND, NOON_NS + 5 * SECOND),
+    ]  # fmt: skip
+
+
+def test_messages_of_another_type_have_their_time(spool: Spool, root: Path) -> None:
+    """Though none of the topic's own came."""
+    spool.accounts.refuse(CAMERA, 'x/msg/Y', 3, NOON_NS, NOON_NS + SECOND)
+    spool.commit()
+    assert short(root) == [('rejected', 'wrong_type', 3, 0.0, 1.0)]
+
+
 def test_an_object_is_in_the_journal_while_it_is_quarantined(spool: Spool, root: Path) -> None:
     """A retry takes its messages out again; of an object of several topics those of each."""
     with spool.accounts.entry(CAMERA) as account:
