@@ -191,8 +191,8 @@ class _GapParts:
 def _told(index: Index, robot: str) -> int:
     """Up to which version of the journal parts were written by whoever was here before; 0 where nobody knows."""
     said = index.db.execute(
-        'SELECT metadata FROM objects WHERE sensor = ? AND key >= ? AND key < ? AND metadata LIKE ? ORDER BY id DESC LIMIT 1',
-        (SENSOR, GAPS.prefix(robot), GAPS.prefix(robot) + '\uffff', f'%"{words.GAP_VERSION}"%'),
+        'SELECT metadata FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND metadata LIKE ? ORDER BY +id DESC LIMIT 1',
+        (BUCKET, GAPS.prefix(robot), GAPS.prefix(robot) + '\uffff', f'%"{words.GAP_VERSION}"%'),
     ).fetchone()  # fmt: skip
     try:
         return max(0, int(json.loads(said[0])[words.GAP_VERSION])) if said else 0

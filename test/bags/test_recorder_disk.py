@@ -6,13 +6,18 @@ import errno
 import os
 import threading
 from collections import Counter
+from io import BytesIO
 from pathlib import Path
 
 import pytest
 from bags.recording import ROBOT, Desk, desk, manifest, numbers, start, write_out
+from clocks import Clocks
+from pyarrow.parquet import read_table
 
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.overview import overview
+from shadowhound_data_logger.catalogue.writer import CatalogueWriter
+from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.spool import ledger
@@ -36,6 +41,35 @@ def test_a_disk_without_room_costs_what_comes_meanwhile(tmp_path: Path) -> None:
         found = it.objects()
         assert [numbers(found[f'{name}/{name}_{number}.mcap']) for number in range(2)] == [[*range(5)], [*range(10, 15)]]
         assert it.row()['dropped'] == {'no_room': 5}
+
+
+def test_the_manifest_and_what_the_store_is_told_of_gaps_agree(tmp_path: Path) -> None:
+    """What was dropped for want of room: as many messages by topic and reason in both."""
+    with desk(tmp_path) as it:
+        name = start(it.recorder)
+        it.hear(range(5))
+        write_out(it)
+        it.room[0] = False
+        write_out(it)
+        it.hear(range(5, 10))
+        it.hear(range(3), topic='/other')
+        it.room[0] = True
+        _retry(it)
+        it.hear(range(10, 20))
+        it.recorder.stop()
+        it.row()
+        bag = manifest(it.objects(), name)
+        said = Counter[tuple[str, str]]()
+        for missing in bag['missing']:
+            said[missing['topic'], missing['reason']] += missing['messages']
+        told = Counter[tuple[str, str]]()
+        for part in CatalogueWriter(it.spool.root, CatalogueSettings(), ROBOT, Clocks()).parts():
+            assert isinstance(part.body, bytes)
+            for row in read_table(BytesIO(part.body)).to_pylist() if '/_gaps/' in part.key else ():
+                if row['what'] == 'gap':
+                    assert (row['sink'], row['kind']) == ('bags', 'dropped')
+                    told[row['topic'], row['cause']] += row['count']
+        assert told == said == {('/talk', 'no_room'): 5, ('/other', 'no_room'): 3}
 
 
 def _retry(it: Desk) -> None:
