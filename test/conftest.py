@@ -86,8 +86,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """The longest group first; with it a worker of its own that is not nice yet. Long tests only where they are asked for."""
     for item in items:
         if profiles.LONG:
-            if getattr(getattr(item, 'function', None), 'is_hypothesis_test', False):
-                item.add_marker(pytest.mark.long('all that hypothesis tries'))
+            by_hypothesis = getattr(getattr(item, 'function', None), 'is_hypothesis_test', False)
+            if by_hypothesis or item.get_closest_marker('sampled'):
+                item.add_marker(pytest.mark.long('all that it tries'))
         elif marker := item.get_closest_marker('long'):
             item.add_marker(pytest.mark.skip(reason=f'{marker.args[0]}: set SHADOWHOUND_TEST_LONG=1'))
     if hasattr(config, 'workerinput'):

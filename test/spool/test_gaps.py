@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from profiles import examples
 from spool.conftest import Open
 from spool.making import NOON_NS, WITHOUT_GAPS, FakeClock, abandon, make, new_spool, put
 
@@ -279,7 +280,7 @@ STEPS = st.lists(
 )  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(60), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=STEPS)
 def test_the_journal_adds_up_at_every_commit(tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, int]]) -> None:
     """Whatever comes late, fails, dies, is evicted, quarantined, tried again or forgotten."""

@@ -9,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from profiles import examples
 from spool import editing, rotting
 from spool.conftest import Open
 from spool.making import make, put, settle
@@ -16,7 +17,7 @@ from spool.making import make, put, settle
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import plausible
 
-ROUNDS = 40
+ROUNDS = examples(40)
 
 
 @pytest.fixture
@@ -68,6 +69,7 @@ def test_totals_of_other_objects_are_told(index: Path, opened: Open, caplog: pyt
     assert '/other: pending None, but in the spool (1, 7, 1)' in caplog.text
 
 
+@pytest.mark.sampled
 def test_random_edits(tmp_path: Path) -> None:
     """Whatever is changed in an index, a start works, ships nothing else than what was spooled, and sums close or it is told."""
     bodies = rotting.new_base(tmp_path / 'base')

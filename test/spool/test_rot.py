@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from profiles import examples
 from spool import rotting
 from spool.conftest import Open
 from spool.making import READY, files, make, put, rows
@@ -15,7 +16,7 @@ from spool.making import READY, files, make, put, rows
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.files import Tree
 
-ROUNDS = 40
+ROUNDS = examples(40)
 
 
 @pytest.fixture(scope='module')
@@ -25,6 +26,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, byte
     return root, rotting.new_base(root)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize('part', range(4))
 def test_random_damage(base: tuple[Path, dict[str, bytes]], tmp_path: Path, part: int) -> None:
     """After any damage a start works, no damaged object is shipped, what is whole is kept, and the ledger closes or tells."""
