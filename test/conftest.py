@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -39,6 +39,10 @@ ONE_ROBOT_AT_A_TIME = (
     'test/e2e/test_raw_camera.py', 'test/sim/test_demo.py', 'test/sim/test_sim_go2_node.py',
 )  # fmt: skip
 """Files with robots at full rate, of which nothing may be missed. They come first, after one another, and others make way."""
+ONE_SENDER = ('test/missions/test_guide.py', 'test/missions/test_mlflow.py')
+"""Files whose missions one process sends, which has loaded MLflow."""
+WAITING = ('test/doctor/', 'test/e2e/', 'test/missions/', 'test/sim/', 'test/tower/')
+"""Folders whose tests mostly wait for other processes."""
 MAKE_WAY = 10
 """How nice the other workers are."""
 
@@ -72,6 +76,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
 
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
+            if nodeid.startswith(ONE_SENDER):
+                return 'sender'
             return 'robots' if has_robot(nodeid) else str(super()._split_scope(nodeid))
 
     return Scheduling(config, log)
@@ -83,7 +89,10 @@ def has_robot(nodeid: str) -> bool:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """The longest group first; with it a worker of its own that is not nice yet. Long tests only where they are asked for."""
+    """The longest group first; with it a worker of its own that is not nice yet. Then what waits between what computes.
+
+    Long tests only where they are asked for.
+    """
     for item in items:
         if profiles.LONG:
             by_hypothesis = getattr(getattr(item, 'function', None), 'is_hypothesis_test', False)
@@ -92,7 +101,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         elif marker := item.get_closest_marker('long'):
             item.add_marker(pytest.mark.skip(reason=f'{marker.args[0]}: set SHADOWHOUND_TEST_LONG=1'))
     if hasattr(config, 'workerinput'):
-        items.sort(key=lambda item: not has_robot(item.nodeid))
+        place = places(item.nodeid.partition('::')[0] for item in items)
+        items.sort(key=lambda item: (not has_robot(item.nodeid), place[item.nodeid.partition('::')[0]]))
+
+
+def places(names: Iterable[str]) -> dict[str, float]:
+    """Where a file comes, 0 to 1: those that wait and those that compute are spread evenly, each in their order."""
+    found: dict[str, float] = {}
+    files = list(dict.fromkeys(names))
+    for kind in (True, False):
+        of_kind = [name for name in files if name.startswith(WAITING) is kind]
+        found |= {name: number / len(of_kind) for number, name in enumerate(of_kind)}
+    return found
 
 
 def pytest_collection_finish() -> None:
