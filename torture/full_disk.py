@@ -44,6 +44,8 @@ FULL_S: Final = 60.0
 SHORT_FULL_S: Final = 8.0
 EVENTS: Final = 8
 SLICE_S: Final = 3.0
+RECORDED_S: Final = 300.0
+"""Slices are the least important: where the machine is too busy to send all that the robot publishes, they wait."""
 BUCKET: Final = 'sensor-data'
 
 
@@ -161,7 +163,7 @@ class FullDisk:
         def is_recorded() -> bool:
             return bool(node.ledger()['bags']['/imu']['stored_in']['delivered'])
 
-        until(is_recorded, 'a slice of after it is delivered', 60.0)
+        until(is_recorded, 'a slice of after it is delivered', RECORDED_S)
 
     def _at_the_end(self, said: dict[str, Any], published: dict[str, int]) -> None:
         found, objects = self.found, said['objects']
