@@ -30,7 +30,7 @@ from e2e.numbered import Numbered
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-MATCH_S = 60.0
+MATCH_S = 120.0
 BLOCK_S = 1.0
 """As rmw_cyclonedds_cpp: how long a RELIABLE writer waits for readers that do not keep up."""
 TAKE_S = 0.002

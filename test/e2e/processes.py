@@ -22,7 +22,7 @@ NODE = 'shadowhound_data_logger.capture.sensor_logger_node'
 SIM = 'shadowhound_data_logger.sim.sim_go2_node'
 LONG = bool(os.environ.get('SHADOWHOUND_TEST_LONG'))
 """``SHADOWHOUND_TEST_LONG=1 make test PYTEST_ARGS=test/e2e`` runs the minutes that are promised, instead of seconds."""
-WAIT_S = 60.0
+WAIT_S = 120.0
 """Longer than anything takes that works, on a machine that does other things as well; a node starts in two when it is idle."""
 GENTLE = 'rate_scale:=0.3'
 """Of a simulated Go2, for tests that are not about its rates: it and the node cost a third."""

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-MATCH_S = 60.0
+MATCH_S = 120.0
 ends: dict[str, threading.Event] = {}
 """By topics that are published evenly."""
 

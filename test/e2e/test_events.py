@@ -91,7 +91,7 @@ def test_what_came_before_a_trigger_and_after_it_is_in_a_bag(
 def test_conditions_and_what_an_agent_logs_trigger(processes: Processes, seaweed: Tower, store: ObjectStore) -> None:
     """Over all topics of the robot, from the subscriptions that serve objects and a bag as well; nothing of it is lost."""
     parameters = {
-        'events.regex': '.*', 'events.exclude': 'image_raw|rosout|events|sensor_logger_node|diagnostics', 'events.post_s': 5.0,
+        'events.regex': '.*', 'events.exclude': 'image_raw|rosout|events|sensor_logger_node|diagnostics', 'events.post_s': 8.0,
         'events.conditions': ['awake: imu:temperature > -100 for 1', 'never: odom:pose.pose.position.x > 1e9'],
         'events.log_event': '^f', 'bag.record': 'always',
     }  # fmt: skip

@@ -23,7 +23,7 @@ from shadowhound_data_logger.stores.s3 import S3Store
 FOREIGN: Final = ('AWS_', 'MLFLOW_', 'SHADOWHOUND_')
 
 
-def until(found: Callable[[], Any], what: str, seconds: float = 60.0) -> Any:
+def until(found: Callable[[], Any], what: str, seconds: float = 120.0) -> Any:
     """What it finds; fails after a while."""
     end = time.monotonic() + seconds
     while not (answer := found()):
