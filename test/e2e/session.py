@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from e2e.bag_reading import Bag, Recorded, bags, by_topic
-from e2e.processes import LONG, Node, Processes, published
+from e2e.processes import LONG, WAIT_S, Node, Processes, published
 from e2e.reading import TYPES, Objects, decode, stamp_ns
 from e2e.witness import Heard, recorded
 
@@ -48,7 +48,7 @@ class Session:
         node = processes.node(seaweed.environment(), parameters)
         recording = processes.folder / 'witness'
         witness = processes.witness(TYPES, recording, best_effort=BEST_EFFORT)
-        said = published(processes.sim(f'duration_s:={DURATION_S}'), DURATION_S + 60)
+        said = published(processes.sim(f'duration_s:={DURATION_S}'), DURATION_S + WAIT_S)
         ledger = node.stop()
         witness.signal(signal.SIGTERM)
         assert witness.wait() == 0

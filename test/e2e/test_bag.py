@@ -18,7 +18,7 @@ from shadowhound_data_logger.stores.base import ObjectStore
 SOON_NS = 30 * 10**9
 """From the end of a slice to its delivery."""
 
-pytestmark = pytest.mark.timeout(120 + 2 * DURATION_S)
+pytestmark = pytest.mark.timeout(300 + 2 * DURATION_S)
 
 
 def test_the_bag_is_whole_to_every_reader(session: Session) -> None:

@@ -100,7 +100,7 @@ def check(rows: list[dict[str, Any]], objects: dict[tuple[str, str], ObjectInfo]
         assert row['battery_pct'] is None or abs(row['battery_pct'] - world.power(t).soc) < 4.0, row
 
 
-@pytest.mark.timeout(120 + 2 * DURATION_S)
+@pytest.mark.timeout(300 + 2 * DURATION_S)
 def test_every_object_has_one_row_and_the_right_pose(session: Session, store: S3Store) -> None:
     """Those of the sensors and the slices of the bag, in several parts."""
     check(catalogued(store, session.robot), listed(store, session.robot), store)
@@ -125,7 +125,7 @@ def spans(source: Bucket, robot: str, topic: str) -> list[tuple[int, int]]:
     return [(row['from_ns'], row['to_ns']) for row in lake.sql(query, source, robot=robot, topic=topic).to_pylist()]
 
 
-@pytest.mark.timeout(120 + 2 * DURATION_S)
+@pytest.mark.timeout(300 + 2 * DURATION_S)
 def test_what_was_lost_is_told_to_the_store_and_how_far_that_is_all(session: Session, seaweed: Tower) -> None:
     """The journal in the store adds up to the ledger; a node that ended by itself leaves nothing open of what it heard."""
     source = Bucket(seaweed.store_settings(), schema.BUCKET)

@@ -24,7 +24,7 @@ KEYS = {
     **{name: rf'{name}/\d{{8}}/\d{{6}}_{name}\.json' for name in ('imu', 'states', 'joints', 'lowstate')},
 }  # fmt: skip
 
-pytestmark = pytest.mark.timeout(120 + 2 * DURATION_S)
+pytestmark = pytest.mark.timeout(300 + 2 * DURATION_S)
 
 
 def test_default_profile_is_accounted_for(session: Session) -> None:
