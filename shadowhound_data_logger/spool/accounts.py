@@ -15,7 +15,7 @@ from typing import Final
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, MAX_AGE_NS, Clock
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
-from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, MISSED, REJECTED, Figures, TopicGaps
+from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, MISSED, REJECTED, Figures, TopicGaps, latest
 from shadowhound_data_logger.spool.span import Span
 
 PAUSED: Final = 'paused'
@@ -423,7 +423,8 @@ class Accounts:
             for topic, account in self._topics.items():
                 if account.open > 0 and not topic.startswith(SINKS):
                     lost += account.open
-                    account.drop(reason, account.open, account.last_kept_ns or account.gaps.heard_ns, account.gaps.heard_ns)
+                    since_ns = account.complete_ns or account.last_kept_ns or account.gaps.heard_ns
+                    account.drop(reason, account.open, since_ns, account.gaps.heard_ns)
                     self._dirty = True
             return lost
 
@@ -506,8 +507,11 @@ class Accounts:
                 spans += [(topic, name, span) for name, span in removed.items()
                           if span is not None and name not in self._topics[topic].publishers]  # fmt: skip
             rhythms = (account.estimate.row(topic) for topic, account in self._topics.items())
+            latest_ns = latest(self._clock)
             return AccountSnapshot(
-                tuple(self._row(topic, account, *stored.get(topic, (0, 0))) for topic, account in self._topics.items()),
+                tuple(
+                    self._row(topic, account, *stored.get(topic, (0, 0)), latest_ns) for topic, account in self._topics.items()
+                ),
                 tuple(
                     PublisherRow(
                         topic, publisher, span.first, span.last, span.published, span.received, dict(+span.missed), span.heard_ns
@@ -536,6 +540,16 @@ class Accounts:
             for gaps in self._unwritten:
                 gaps.undo()
             self._unwritten = []
+            self._unsettle()
+
+    def unsettle(self) -> None:
+        """The next commit may not have all objects that were made until the last one: it says of none that it is settled."""
+        with self._lock:
+            self._unsettle()
+
+    def _unsettle(self) -> None:
+        for account in self._topics.values():
+            account.settled_ns = 0
 
     def _rebase(self, topic: str) -> None:
         if account := self._topics.get(topic):
@@ -558,20 +572,21 @@ class Accounts:
         return account
 
     @staticmethod
-    def _row(topic: str, account: TopicAccount, count: int, newest_ns: int) -> TopicRow:
-        if account.first_ns < EARLIEST_SANE_NS:
-            account.first_ns = account.gaps.heard_ns
+    def _row(topic: str, account: TopicAccount, count: int, newest_ns: int, latest_ns: int) -> TopicRow:
+        heard_ns = min(account.gaps.heard_ns, latest_ns)
+        if not EARLIEST_SANE_NS <= account.first_ns <= latest_ns and account.gaps.has_heard:
+            account.first_ns = heard_ns
         if account.accounting not in {'', RECEIVED_ONLY}:
             settled_ns = account.settled_ns
             if account.open <= count:
-                settled_ns = account.gaps.heard_ns
+                settled_ns = heard_ns
             elif topic.startswith(SINKS):  # written in the order of arrival
                 settled_ns = newest_ns - MAX_AGE_NS
-            account.complete_ns = max(account.complete_ns, settled_ns)
+            account.complete_ns = min(max(account.complete_ns, settled_ns), latest_ns)
         return TopicRow(
             topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
             dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
-            account.estimated, account.unknown, dict(+account.missed_estimated), account.first_ns, account.gaps.heard_ns,
+            account.estimated, account.unknown, dict(+account.missed_estimated), account.first_ns, heard_ns,
             account.complete_ns,
         )  # fmt: skip
 

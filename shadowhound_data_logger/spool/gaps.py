@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Final, NamedTuple
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, FUTURE_SLACK_NS, SECOND, Clock
 
 MISSED, REJECTED, DROPPED, EVICTED, QUARANTINED = 'missed', 'rejected', 'dropped', 'evicted', 'quarantined'
 """Kinds."""
@@ -137,24 +137,36 @@ class TopicGaps:
     clock: Clock | None = None
     """Of this machine: of stamps from before it was set."""
     heard_ns: int = 0
-    """Stamp of the newest message; 0 before the first."""
+    """Stamp of the newest message, first of an earlier session; 0 before the first."""
     count: int = 0
     """Gaps so far, of whatever kind."""
     _changes: dict[GapKey, GapRow] = field(default_factory=dict)
     _journaled: dict[tuple[str, str, str], int] = field(default_factory=dict)
     _since_ns: int = 0
     """``heard_ns`` at the last commit."""
+    _inherited_ns: int = field(init=False)
     _before: tuple[dict[GapKey, GapRow], dict[tuple[str, str, str], int], int] | None = None
+
+    def __post_init__(self) -> None:
+        self._inherited_ns = self.heard_ns
+
+    @property
+    def has_heard(self) -> bool:
+        """Whether a message came in this session."""
+        return self.heard_ns != self._inherited_ns
 
     def add(self, kind: str, cause: str, messages: int, from_ns: int, to_ns: int, publisher: str = '',
             grade: str = EXACT) -> GapKey:  # fmt: skip
         """Messages were lost between these stamps, 0 where they are not known. Returns the row's key.
 
-        Stamps of a wall clock that was never set become those of the boot clock, as in ``clock.stamp_of``.
+        Stamps of a wall clock that was never set become those of the boot clock, as in ``clock.stamp_of``. What is no time, or
+        more than a day ahead of our clock, is not known; of a UTC stamp and one since boot the first counts.
         """
         from_ns, to_ns = self._time(from_ns), self._time(to_ns)
+        if (from_ns < EARLIEST_SANE_NS) != (to_ns < EARLIEST_SANE_NS):
+            from_ns = to_ns = max(from_ns, to_ns)
         from_ns, to_ns = from_ns or to_ns, to_ns or from_ns
-        if from_ns <= 0 or to_ns <= 0:
+        if not from_ns:
             begin_ns, start_ns, end_ns = UNTIMED, None, None
         else:
             start_ns, end_ns = min(from_ns, to_ns), max(from_ns, to_ns)
@@ -198,7 +210,9 @@ class TopicGaps:
             self._change(row)
 
     def _time(self, stamp_ns: int) -> int:
-        if stamp_ns >= EARLIEST_SANE_NS or self.clock is None or stamp_ns <= 0:
+        if stamp_ns <= 0 or stamp_ns - FUTURE_SLACK_NS > latest(self.clock):
+            return 0
+        if stamp_ns >= EARLIEST_SANE_NS or self.clock is None:
             return stamp_ns
         age_ns, boot_ns = self.clock.wall_ns() - stamp_ns, self.clock.boot_ns()
         return boot_ns - age_ns if 0 <= age_ns < boot_ns else 0
@@ -213,15 +227,23 @@ class TopicGaps:
         self._changes[row.key] = row
 
 
+def latest(clock: Clock | None) -> int:
+    """The time until which anything can have happened: now, where the clock is set. A publisher may stamp as it likes."""
+    now_ns = 0 if clock is None else clock.wall_ns()
+    return now_ns if now_ns >= EARLIEST_SANE_NS else _LAST_NS
+
+
+_LAST_NS: Final = (1 << 63) - 1
 LATELY_NS: Final = 60 * SECOND
 MOST_WAITING: Final = 5_000
 """Objects of a bucket that are looked at for the first stamp of each account: some 20 ms."""
 _SESSIONS: Final = """
 SELECT session, robot, started_ns, received = skipped + stored
-    + ifnull((SELECT sum(value) FROM json_each(rejected)), 0) + ifnull((SELECT sum(value) FROM json_each(dropped)), 0),
+    + ifnull((SELECT sum(value) FROM json_each(rejected)), 0) + ifnull((SELECT sum(value) FROM json_each(dropped)), 0)
+    AND ifnull(json_extract(dropped, '$.restart'), 0) = 0,
   topic, accounting, received, skipped, first_ns, heard_ns, complete_ns, ended_ns IS NOT NULL
 FROM accounts JOIN sessions ON id = session
-WHERE session > (SELECT max(id) FROM sessions) - 20 AND heard_ns >= ? AND accounting IN ('exact', 'estimated')
+WHERE session > (SELECT max(id) FROM sessions) - 20 AND first_ns >= ? AND accounting IN ('exact', 'estimated')
 ORDER BY robot, topic, session"""
 NEXT_VERSION: Final = '(SELECT ifnull(max(version), 0) + 1 FROM gaps)'
 _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
@@ -343,7 +365,7 @@ def watermarks(db: sqlite3.Connection) -> list[Watermark]:
          has_ended) in db.execute(_SESSIONS, (EARLIEST_SANE_NS,)):  # fmt: skip
         sink, topic = split(account)
         if has_ended and sink == OBJECTS and is_over:
-            complete_ns = heard_ns  # noqa: PLW2901 - nothing was lost on its way after all, or it is in the journal
+            complete_ns = heard_ns  # noqa: PLW2901 - nothing was lost on its way after all
         end_ns = min(complete_ns, silent.get((session, account), complete_ns), waiting.get(account, complete_ns))
         since_ns = max(first_ns, started_ns)
         if since_ns <= end_ns:

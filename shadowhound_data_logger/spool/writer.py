@@ -111,7 +111,9 @@ class SpoolWriter:
         self._last_commit = time.monotonic()
         try:
             if objects and outcomes and not self.spool.fits(objects):  # what was delivered leaves only after its commit
+                self.spool.accounts.unsettle()
                 self._commit([], outcomes)
+                self.spool.accounts.unsettle()
                 outcomes = []
             self._commit(objects, outcomes)
         except (OSError, sqlite3.OperationalError) as error:

@@ -60,6 +60,9 @@ def hear(spool: Spool, *numbers: int, topic: str = CAMERA) -> None:
         for number in numbers:
             account.receive('p', number, NOON_NS + number * SECOND // 10)
             account.gaps.heard_ns = NOON_NS + number * SECOND // 10
+    clock = spool._clock
+    assert isinstance(clock, FakeClock)
+    clock.now_ns = max(clock.now_ns, NOON_NS + max(numbers) * SECOND // 10)
 
 
 def store(spool: Spool, name: str, state: State = State.DELIVERED, **fields: Any) -> SpooledObject:

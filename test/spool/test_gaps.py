@@ -18,6 +18,7 @@ from shadowhound_data_logger.spool import gaps, ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.gaps import Gap, TopicGaps
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
 
 MS = SECOND // 1000
 CAMERA = '/camera'
@@ -43,6 +44,9 @@ def hear(spool: Spool, *numbers: int, publisher: str = 'p', topic: str = CAMERA,
         for number in numbers:
             account.receive(publisher, number, NOON_NS + number * period_ns)
             account.gaps.heard_ns = NOON_NS + number * period_ns
+    clock = spool._clock
+    assert isinstance(clock, FakeClock)
+    clock.now_ns = max(clock.now_ns, NOON_NS + max(numbers) * period_ns)
 
 
 def test_a_gap_has_the_times_of_its_neighbours(spool: Spool, root: Path) -> None:
@@ -128,6 +132,128 @@ def test_a_publisher_that_was_heard_lately_holds_the_watermark(spool: Spool) -> 
         spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
         (watermark,) = spool.gaps_after(0, 10, {})[1] or [None]
         assert (watermark.complete_ns if watermark else NOON_NS + SECOND) == NOON_NS + ends_s * SECOND
+
+
+def deliver(spool: Spool, *items: SpooledObject) -> None:
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
+
+
+def watermark(spool: Spool) -> tuple[float, float]:
+    """From and to, in seconds since noon."""
+    (found,) = spool.gaps_after(0, 10, {})[1]
+    return (found.since_ns - NOON_NS) / SECOND, (found.complete_ns - NOON_NS) / SECOND
+
+
+def test_a_stamp_of_the_future_moves_no_watermark_beyond_now(spool: Spool) -> None:
+    """Whoever publishes may stamp as it likes: it vouches for no time to come, in this session or later."""
+    hear(spool, 1, 2)
+    with spool.accounts.entry(CAMERA) as account:
+        account.receive('hostile', 1, NOON_NS + 365 * 24 * 3600 * SECOND)
+        account.gaps.heard_ns = NOON_NS + 365 * 24 * 3600 * SECOND
+    deliver(spool, *spool.commit([make('a', samples=3)]))
+    assert watermark(spool) == (0.2, 0.2)
+    hear(spool, 4)
+    deliver(spool, *spool.commit([make('b')]))
+    assert watermark(spool) == (0.2, 0.4)
+
+
+def test_a_stamp_of_the_future_is_the_time_of_no_loss() -> None:
+    """More than a day ahead of our clock nobody believes it: the other end of the gap counts, or nothing."""
+    found = TopicGaps(clock=FakeClock())
+    later_ns = NOON_NS + 25 * 3600 * SECOND
+    assert found.add('missed', 'transport', 2, NOON_NS, later_ns).begin_ns == NOON_NS
+    assert found.add('missed', 'transport', 2, later_ns, later_ns).begin_ns == gaps.UNTIMED
+    assert found.add('missed', 'transport', 2, -5, NOON_NS).begin_ns == NOON_NS
+
+
+def test_a_loss_is_not_timed_by_two_clocks() -> None:
+    """One publisher with UTC and one with a clock that was never set: no gap is from the one to the other."""
+    found = TopicGaps(clock=FakeClock(now_ns=50 * SECOND))
+    key = found.add('missed', 'transport', 2, NOON_NS, 40 * SECOND)
+    ((row,), _) = found.settle(CAMERA, {key[:3]: 2})
+    assert (row.from_ns, row.to_ns) == (NOON_NS, NOON_NS)
+
+
+def test_a_clock_that_is_set_back_takes_the_watermark_along(spool: Spool) -> None:
+    """What was complete by the wrong clock says nothing of the same time by the right one."""
+    hear(spool, 100)
+    deliver(spool, *spool.commit([make('a')]))
+    clock = spool._clock
+    assert isinstance(clock, FakeClock)
+    clock.now_ns = NOON_NS
+    with spool.accounts.entry(CAMERA) as account:
+        account.receive('p', 101, NOON_NS)
+        account.gaps.heard_ns = NOON_NS
+    deliver(spool, *spool.commit([make('b')]))
+    assert watermark(spool) == (0, 0)
+
+
+def test_the_watermark_begins_with_the_first_message_of_the_session(root: Path, opened: Open) -> None:
+    """Who began to publish before a node listened has sent messages that nobody counts."""
+    spool = opened()
+    hear(spool, 10)
+    deliver(spool, *spool.commit([make('a')]))
+    spool.close()
+    spool = opened()
+    with spool.accounts.entry(CAMERA):
+        pass
+    spool.commit()
+    hear(spool, 40, publisher='new')
+    spool.commit()
+    hear(spool, 41, publisher='new')
+    deliver(spool, *spool.commit([make('b', samples=2)]))
+    found = [mark for mark in spool.gaps_after(0, 10, {})[1] if mark.session == 2]
+    assert [mark.since_ns for mark in found] == [NOON_NS + 4 * SECOND]
+
+
+def test_a_batch_that_overtook_another_claims_nothing_for_it(root: Path, opened: Open) -> None:
+    """Two encoders: the later batch is durable, a death takes the earlier one; its time is not known to be complete."""
+    spool = new_spool(root)
+    spool.open()
+    hear(spool, 1)
+    items = spool.commit([make('a', t_start_ns=NOON_NS + 100 * MS, t_end_ns=NOON_NS + 100 * MS)])
+    spool.accounts.oldest_open = lambda: {CAMERA: NOON_NS + 200 * MS}
+    hear(spool, 2, 3, 4, 5)
+    items += spool.commit([make('b', samples=2, t_start_ns=NOON_NS + 400 * MS, t_end_ns=NOON_NS + 500 * MS)])
+    deliver(spool, *items)
+    abandon(spool)
+    spool = opened()
+    assert watermark(spool)[1] < 0.2
+
+
+def test_a_commit_that_is_tried_again_claims_nothing_for_what_came_meanwhile(
+    spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has the objects that it had before; one that was made since then is only in memory."""
+    spool.accounts.oldest_open = dict
+    hear(spool, 1)
+    items = spool.commit([make('a')])
+    hear(spool, 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(gaps, 'write', _full)
+        with pytest.raises(sqlite3.OperationalError):
+            spool.commit()
+    deliver(spool, *items)
+    assert watermark(spool) == (0.1, 0.1)
+
+
+def test_what_waits_while_a_full_disk_empties_is_not_settled(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Outcomes are committed first, without the objects that have no room yet."""
+    spool.accounts.oldest_open = dict
+    hear(spool, 1)
+    items = spool.commit([make('a')])
+    hear(spool, 2)
+    writer = SpoolWriter(spool, 0.0)
+    monkeypatch.setattr(spool, 'fits', lambda _: False)
+    told = []
+    writer.on_commit(settled=lambda _: told.append(watermark(spool)))
+    writer.put(make('b'))
+    spool.commit()
+    hear(spool, 3)
+    writer.settle([Outcome(items[0], State.DELIVERED)])
+    writer.open()
+    assert writer.close(10)
+    assert told == [(0.1, 0.1)]
 
 
 def test_what_a_death_cost(root: Path, opened: Open) -> None:
