@@ -76,8 +76,7 @@ class Tree:
     def write_part(self, number: int, body: bytes, said: Mapping[str, Any]) -> None:
         """Write and sync the bytes; raises OSError (a full disk, say) and then leaves nothing behind."""
         path = self.part(number)
-        if os.path.lexists(path):  # none of ours: no two objects have one number, and a part that failed is gone
-            self.set_aside(path)
+        self._clear(path)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             with os.fdopen(descriptor, 'wb') as file:
@@ -92,8 +91,7 @@ class Tree:
     def take_part(self, number: int, source: Path, said: Mapping[str, Any]) -> None:
         """Make a whole and synced file of this file system the part; raises OSError, and the file may then still be there."""
         path = self.part(number)
-        if os.path.lexists(path):
-            self.set_aside(path)
+        self._clear(path)
         descriptor = os.open(source, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
             describe(descriptor, said)
@@ -140,12 +138,22 @@ class Tree:
 
     def set_aside(self, path: Path) -> None:
         """Move a file that is none of the spool's to ``foreign/``, over no other one."""
+        self.place(path, self._foreign(path))
+
+    def _foreign(self, path: Path) -> Path:
         target = wanted = self.root / 'foreign' / path.relative_to(self.root)
         number = 0
         while os.path.lexists(target):
             number += 1
             target = wanted.with_name(f'{wanted.name}.{number}')
-        self.place(path, target)
+        return target
+
+    def _clear(self, part: Path) -> None:
+        """What lies where a part is to be is none of ours, or failed on a disk that then became read-only; raises OSError."""
+        if os.path.lexists(part):
+            target = self._foreign(part)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(part, target)
 
     @staticmethod
     def size(path: Path) -> int | None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from spool.conftest import Open
-from spool.making import FakeClock, assert_whole, files, make, put, rows, settle
+from spool.making import FakeClock, assert_whole, files, make, put, receive, rows, settle
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import SpoolError
@@ -175,6 +175,26 @@ def test_a_payload_that_cannot_be_written(spool: Spool, root: Path, monkeypatch:
         with pytest.raises(OSError, match='No space left'):
             put(spool, make())
     assert files(root) == {}
+    assert len(spool.commit([make()])) == 1
+    assert_whole(root)
+
+
+def test_a_part_that_cannot_be_removed(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch,
+                                       caplog: pytest.LogCaptureFixture) -> None:  # fmt: skip
+    """A disk that is read-only from the middle of a part on says so each time, and nothing else; later it goes on."""
+
+    def read_only(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    receive(spool)
+    with monkeypatch.context() as patch:
+        patch.setattr('shadowhound_data_logger.spool.files.describe', read_only)
+        patch.setattr(Path, 'unlink', read_only)
+        patch.setattr(os, 'replace', read_only)
+        for _ in range(3):
+            with pytest.raises(OSError, match='Read-only'):
+                spool.commit([make()])
+    assert not caplog.records
     assert len(spool.commit([make()])) == 1
     assert_whole(root)
 
