@@ -25,7 +25,7 @@ from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.spool import clock_record, gaps, uncatalogued
-from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.index import MISSING, Index
 
 MOST_ROWS: Final = 5000
 """At a time: a tenth of a second of CPU. While there are more, the next ones come with the next look."""
@@ -109,7 +109,7 @@ class _GapParts:
     """What changed in the gap journal of one robot since its last part, wherever that was written.
 
     A part that is spooled says up to which version of the journal all is told: so a death costs nothing, and what is told
-    twice is the same. A watermark is told once all rows are.
+    twice is the same. A watermark is told once all rows are: in the part that has the last of them, or after that is delivered.
     """
 
     def __init__(self, spool: Path, robot: str, clock: Clock) -> None:
@@ -119,6 +119,7 @@ class _GapParts:
         self._version: int | None = None
         self._boots: frozenset[str] = frozenset()
         self._marks: dict[tuple[str, str, int], gaps.Watermark] = {}
+        self._missing: frozenset[int] = frozenset()
         self.has_more = False
         """Whether there are further rows already."""
 
@@ -133,11 +134,12 @@ class _GapParts:
             newest, began_ns, others = gaps.extent(index.db, self._robot)
             is_dated_now = not self._boots.issuperset(offsets) and gaps.has_undated(index.db)
             self._boots = frozenset(offsets)
-            if is_dated_now or self._version > newest:  # an index that was made anew begins anew
+            before, self._missing = self._missing, _missing(index, self._robot)
+            if is_dated_now or self._version > newest or not self._missing <= before:  # an index that was made anew begins anew
                 self._version = 0
             found = gaps.changed(index.db, self._version, MOST_ROWS, offsets)
             self.has_more = bool(found) and found[-1].version < newest and len(found) >= MOST_ROWS
-            marks = [] if self.has_more else gaps.watermarks(index.db)
+            marks = [] if self.has_more or _is_waiting(index, self._robot) else gaps.watermarks(index.db)
         if found:
             self._version = found[-1].version
         rows = [
@@ -145,14 +147,17 @@ class _GapParts:
             for gap in found
             if gap.robot == self._robot or (gap.robot is None and gap.topic not in others)
         ]
+        dates = {date_of(row) for row in rows}
         for mark in marks:
             name = mark.sink, mark.topic, mark.session
             if mark.robot == self._robot and self._marks.get(name) != mark:
-                self._marks[name] = mark
-                rows.append(complete(
+                said = complete(
                     self._robot, f'{began_ns:x}', began_ns + newest, sink=mark.sink, topic=mark.topic, session=mark.session,
                     from_ns=mark.since_ns, to_ns=mark.complete_ns, grade=mark.grade, received=mark.received, skipped=mark.skipped,
-                ))  # fmt: skip
+                )  # fmt: skip
+                if dates <= {date_of(said)}:  # else rows and watermark are in two parts, and either may be delivered first
+                    self._marks[name] = mark
+                    rows.append(said)
         return self._made(rows, self._version)
 
     def _row(self, gap: gaps.Gap, began_ns: int) -> Statement:
@@ -186,6 +191,25 @@ class _GapParts:
             ))  # fmt: skip
         made[-1] = replace(made[-1], metadata={**made[-1].metadata, words.GAP_VERSION: str(version)})
         return made
+
+
+_OF_GAPS: Final = 'bucket = ? AND sensor = ? AND key >= ? AND key < ?'
+
+
+def _is_waiting(index: Index, robot: str) -> bool:
+    """Whether a part with gaps is not in the store yet: a watermark must not be there before it."""
+    place = BUCKET, SENSOR, GAPS.prefix(robot), GAPS.prefix(robot) + '\uffff'
+    return any(
+        index.rows(f'{condition} AND {_OF_GAPS} LIMIT 1', (*values, *place))
+        for condition, values in (("state = 'pending' AND priority = ?", (PRIORITY,)),
+                                  ("state = 'quarantined' AND reason <> ?", (MISSING,)))
+    )  # fmt: skip
+
+
+def _missing(index: Index, robot: str) -> frozenset[int]:
+    """Parts with gaps whose files are gone: what they told has to be told again."""
+    values = MISSING, BUCKET, SENSOR, GAPS.prefix(robot), GAPS.prefix(robot) + '\uffff'
+    return frozenset(row['id'] for row in index.rows(f"state = 'quarantined' AND reason = ? AND {_OF_GAPS}", values))
 
 
 def _told(index: Index, robot: str) -> int:

@@ -23,6 +23,7 @@ from shadowhound_data_logger.spool.listing import retry
 from shadowhound_data_logger.spool.spool import Spool
 
 CAMERA = '/camera'
+DAY_NS = 24 * 3600 * SECOND
 
 
 @pytest.fixture
@@ -138,6 +139,47 @@ def test_the_watermark_waits_for_what_is_not_delivered(spool: Spool, root: Path)
     newest = folded(pyarrow.Table.from_pylist([*rows, *again], schema=arrow_schema(GAPS))).to_pylist()
     known = of_rows('thor', 'objects', CAMERA, NOON_NS + SECOND, NOON_NS + 4 * SECOND, newest)
     assert known.complete_ns == NOON_NS + 2 * SECOND
+
+
+def test_no_watermark_overtakes_its_gaps(spool: Spool, root: Path) -> None:
+    """While a part with gaps is on its way, or refused, the store must not hear that all is known."""
+    catalogue = writer(root)
+    hear(spool, 1, 6)
+    item = store(spool, 'a', State.PENDING, samples=2)
+    made = catalogue.parts()
+    assert [row['what'] for row in told(made)] == ['gap']
+    (part,) = spool.commit(made)
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
+    assert told(catalogue.parts()) == []
+    spool.commit(outcomes=[Outcome(part, State.QUARANTINED, 'AccessDenied')])
+    assert told(catalogue.parts()) == []
+    assert retry(root).objects == 1
+    spool.commit(outcomes=[Outcome(part, State.DELIVERED)])
+    assert [row['what'] for row in told(catalogue.parts())] == ['complete']
+
+
+def test_gaps_of_another_date_are_told_before_the_watermark(spool: Spool, root: Path) -> None:
+    """They are parts of their own, of which any may come first."""
+    catalogue = writer(root)
+    hear(spool, 1)
+    store(spool, 'a')
+    store(spool, 'b', State.QUARANTINED, topic='/old', t_start_ns=NOON_NS - DAY_NS, t_end_ns=NOON_NS - DAY_NS)
+    hear(spool, 2)
+    store(spool, 'c')
+    assert [row['what'] for row in told(catalogue.parts())] == ['gap']
+    assert [row['what'] for row in told(catalogue.parts())] == ['complete']
+
+
+def test_what_a_lost_part_told_is_told_again(spool: Spool, root: Path) -> None:
+    """Somebody deleted its file before it was delivered."""
+    catalogue = writer(root)
+    hear(spool, 1, 6)
+    spool.commit()
+    (part,) = spool.commit(catalogue.parts())
+    assert catalogue.parts() == []
+    spool.commit(outcomes=[Outcome(part, State.QUARANTINED, 'missing')])
+    assert [row['what'] for row in told(catalogue.parts())] == ['gap']
+    assert catalogue.parts() == []
 
 
 def test_a_session_that_died_ends_where_it_was_heard_last(root: Path) -> None:
