@@ -39,6 +39,9 @@ HOUR_NS: Final = 3600 * SECOND
 OTHER_TYPE: Final = 'wrong_type'
 """Rejected messages of another type than the topic's: nothing of the topic's own is missing."""
 RECEIVED_ONLY: Final = 'received-only'
+MOST_CAUSES: Final = 64
+"""Of a topic, by name; all further ones are one, ``MORE_CAUSES``. Ours are some twenty; a part may have one for each row."""
+MORE_CAUSES: Final = '(more)'
 _ORDER: Final = [('robot', 'ascending'), ('id', 'ascending'), ('revision', 'descending'), ('what', 'ascending')]
 _FIRST: Final = [*_ORDER, *((name, 'descending') for name in GAPS.columns if name not in dict(_ORDER))]
 """The newest statement first; a gap before the withdrawal of the same revision, with which it moved to another day."""
@@ -196,9 +199,9 @@ def of_rows(robot: str, sink: str, topic: str, begin_ns: int, end_ns: int, rows:
     rows = list(rows)
     told = [_gap(row) for row in rows if row['what'] == GAP]
     gaps = sorted((gap for gap in told if _reaches(gap.from_ns, gap.to_ns, begin_ns, end_ns)), key=_by_time)
-    untimed = tuple(gap for gap in told if gap.from_ns is None or gap.to_ns is None or gap.clock == 'unset')
+    untimed = tuple(gap for gap in told if _is_untimed(gap))
     marks = [(row['from_ns'], row['to_ns'], row['grade']) for row in watermarks(rows) if row['grade'] != RECEIVED_ONLY]
-    stretches = _stretches(begin_ns, end_ns, marks, [gap for gap in gaps if gap.cause != OTHER_TYPE and gap not in untimed])
+    stretches = _stretches(begin_ns, end_ns, marks, [gap for gap in gaps if gap.cause != OTHER_TYPE and not _is_untimed(gap)])
     return Known(robot, sink, topic, begin_ns, end_ns, tuple(stretches), tuple(gaps), untimed)
 
 
@@ -218,6 +221,10 @@ def _gap(row: Mapping[str, Any]) -> StatedGap:
     return StatedGap(*(row[name] for name in StatedGap.__slots__))
 
 
+def _is_untimed(gap: StatedGap) -> bool:
+    return gap.from_ns is None or gap.to_ns is None or gap.clock == 'unset'
+
+
 def _by_time(gap: StatedGap) -> tuple[int, int, str]:
     return gap.from_ns or 0, gap.to_ns or 0, gap.cause or ''
 
@@ -232,7 +239,12 @@ def _stretches(
     """One pass over all times at which something begins or ends."""
     changes: defaultdict[int, list[tuple[Counter[str], str, int]]] = defaultdict(list)
     causes, grades = Counter[str](), Counter[str]()
-    for active, spans in ((causes, [(gap.from_ns, gap.to_ns, gap.cause or gap.kind or '?') for gap in gaps]), (grades, marks)):
+    words: dict[str, str] = {}
+    for gap in gaps:
+        word = gap.cause or gap.kind or '?'
+        words.setdefault(word, word if len(words) < MOST_CAUSES else MORE_CAUSES)
+    spans_of = [(gap.from_ns, gap.to_ns, words[gap.cause or gap.kind or '?']) for gap in gaps]
+    for active, spans in ((causes, spans_of), (grades, marks)):
         for from_ns, to_ns, name in spans:
             low, high = max(from_ns or 0, begin_ns), min(to_ns or 0, end_ns)
             if low < high:

@@ -23,7 +23,7 @@ from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
-from shadowhound_data_logger.lake.gaps import Stretch, coverage, folded, known, of_rows
+from shadowhound_data_logger.lake.gaps import MOST_CAUSES, Stretch, coverage, folded, known, of_rows
 from shadowhound_data_logger.lake.reading import arrow_schema
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
@@ -254,6 +254,15 @@ def test_coverage_by_the_hour(store: StoreSettings, tmp_path: Path) -> None:
     half = NOON_NS + 30 * MINUTE_NS
     (part,) = coverage(half, half + MINUTE_NS, robot='thor', topic='/imu', source=Bucket(store, BUCKET))
     assert dict(part.hours) == {NOON_NS: {'downsampled': 60.0}}
+
+
+def test_a_part_with_a_cause_for_each_row_is_answered_with_few() -> None:
+    """What a part says is hostile: a list of all causes at each time would take hours, and all memory."""
+    rows = [lost(f'{number}', number, 5000 - number, cause=f'cause-{number}') for number in range(1000)]
+    found = of_rows('thor', 'objects', '/imu', NOON_NS, NOON_NS + 5000 * SECOND, rows)
+    assert max(len(each.causes) for each in found.stretches) == MOST_CAUSES + 1
+    assert found.stretches[0].causes == ('cause-0',)
+    assert found.stretches[-1].causes == ('cause-0',)
 
 
 def test_a_stretch_says_what_it_is() -> None:
