@@ -9,7 +9,7 @@ from typing import Final
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool.gaps import MERGE, NEXT_VERSION, UNTIMED
+from shadowhound_data_logger.spool.gaps import FORGOTTEN, MERGE, NEXT_VERSION, UNTIMED
 
 SCHEMA_VERSION: Final = 6
 CATALOGUE: Final = '_catalog'
@@ -94,9 +94,12 @@ _LOST: Final = f"('{State.EVICTED.value}', '{State.QUARANTINED.value}')"
 
 def _gap_of(row: str, topic: str, samples: str) -> str:
     """The values of the gap that the samples of a lost object are."""
-    mission = f"CASE WHEN json_valid({row}.metadata) THEN ifnull(json_extract({row}.metadata, '$.mission_id'), '') ELSE '' END"
-    named = f"0, {topic}, {row}.state, ifnull({row}.reason, ''), 'exact', '', {mission}, {_begin_of(row)}"
+    named = f"0, {topic}, {row}.state, ifnull({row}.reason, ''), 'exact', '', {_mission_of(row)}, {_begin_of(row)}"
     return f'{named}, {row}.t_start_ns, {row}.t_end_ns, {samples}, 1, {NEXT_VERSION}'
+
+
+def _mission_of(row: str) -> str:
+    return f"CASE WHEN json_valid({row}.metadata) THEN ifnull(json_extract({row}.metadata, '$.mission_id'), '') ELSE '' END"
 
 
 def _begin_of(row: str) -> str:
@@ -126,8 +129,18 @@ CREATE TRIGGER lost_or_found AFTER UPDATE OF state, reason ON objects
       SELECT CASE WHEN OLD.topic IS NULL
         THEN (SELECT samples FROM contents WHERE id = OLD.id AND topic = gaps.topic) ELSE OLD.samples END)
     WHERE OLD.state IN {_LOST} AND session = 0 AND kind = OLD.state AND cause = ifnull(OLD.reason, '') AND grade = 'exact'
+      AND begin_ns = {FORGOTTEN} AND publisher = '' AND mission = ''
+      AND (topic = OLD.topic OR (OLD.topic IS NULL
+        AND topic IN (SELECT topic FROM contents WHERE id = OLD.id AND samples > 0)))
+      AND NOT EXISTS (SELECT 1 FROM gaps AS own WHERE own.session = 0 AND own.topic = gaps.topic AND own.kind = OLD.state
+        AND own.cause = ifnull(OLD.reason, '') AND own.grade = 'exact' AND own.begin_ns = {_begin_of('OLD')}
+        AND own.publisher = '' AND own.mission = {_mission_of('OLD')});
+  UPDATE gaps SET version = {NEXT_VERSION}, merged = max(0, merged - 1), count = count - (
+      SELECT CASE WHEN OLD.topic IS NULL
+        THEN (SELECT samples FROM contents WHERE id = OLD.id AND topic = gaps.topic) ELSE OLD.samples END)
+    WHERE OLD.state IN {_LOST} AND session = 0 AND kind = OLD.state AND cause = ifnull(OLD.reason, '') AND grade = 'exact'
       AND begin_ns = {_begin_of('OLD')} AND publisher = ''
-      AND mission = CASE WHEN json_valid(OLD.metadata) THEN ifnull(json_extract(OLD.metadata, '$.mission_id'), '') ELSE '' END
+      AND mission = {_mission_of('OLD')}
       AND (topic = OLD.topic OR (OLD.topic IS NULL
         AND topic IN (SELECT topic FROM contents WHERE id = OLD.id AND samples > 0)));
   INSERT INTO gaps SELECT {_gap_of('NEW', 'NEW.topic', 'NEW.samples')}

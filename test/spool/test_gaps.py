@@ -368,6 +368,23 @@ def test_what_is_forgotten_stays_in_the_sums(root: Path) -> None:
     spool.close()
 
 
+@pytest.mark.parametrize('counts', [{}, {CAMERA: 1}], ids=['of one topic', 'of several'])
+def test_an_old_object_that_was_evicted_on_its_way_and_arrived_is_no_loss(root: Path, counts: dict[str, int]) -> None:
+    """Its row is forgotten as soon as it is written, since its messages are that old; the sum is put right all the same."""
+    clock = FakeClock()
+    spool = new_spool(root, clock)
+    spool.open()
+    hear(spool, 1)
+    (item,) = spool.commit([make('a', counts=counts, **({'topic': None, 'samples': 0} if counts else {}))])
+    clock.now_ns += 1000 * 24 * 3600 * SECOND
+    spool.commit(outcomes=[Outcome(item, State.EVICTED, 'no_room')])
+    assert short(root) == [('evicted', 'no_room', 1, None, None)]
+    deliver(spool, item)
+    assert journal(root) == []
+    assert ledger.read(root, 'thor')['balanced']
+    spool.close()
+
+
 def test_before_the_clock_is_set_losses_have_times_since_boot() -> None:
     """A publisher on this machine stamps by the same wrong clock; an offset that is known later dates them."""
     clock = FakeClock(now_ns=5 * SECOND)
