@@ -15,7 +15,7 @@ from typing import Final
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, MAX_AGE_NS, Clock
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
-from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, MISSED, REJECTED, Figures, TopicGaps, latest
+from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, LATELY_NS, MISSED, REJECTED, Figures, TopicGaps, latest
 from shadowhound_data_logger.spool.span import Span
 
 PAUSED: Final = 'paused'
@@ -247,6 +247,14 @@ class TopicAccount:
         other = self.other_types.get(type_name)
         if other is not None and other.messages is not None:
             other.messages += count
+
+    def is_awaiting(self, heard_ns: int) -> bool:
+        """Whether some publishers of the session before are heard again, and others, which may have sent more, not yet."""
+        if heard_ns - self.first_ns > LATELY_NS:
+            return False
+        older = [span for span in self.publishers.values() if span.older]
+        since_ns = self.gaps.before_ns - LATELY_NS
+        return not all(span.inherited for span in older) and any(span.inherited and span.heard_ns > since_ns for span in older)
 
     def figures(self) -> Figures:
         """What was lost so far, as the gap journal has it."""
@@ -576,7 +584,7 @@ class Accounts:
         heard_ns = min(account.gaps.heard_ns, latest_ns)
         if not EARLIEST_SANE_NS <= account.first_ns <= latest_ns and account.gaps.has_heard:
             account.first_ns = heard_ns
-        if account.accounting not in {'', RECEIVED_ONLY}:
+        if account.accounting not in {'', RECEIVED_ONLY} and not account.is_awaiting(heard_ns):
             settled_ns = account.settled_ns
             if account.open <= count:
                 settled_ns = heard_ns

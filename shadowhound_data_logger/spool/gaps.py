@@ -138,22 +138,23 @@ class TopicGaps:
     """Of this machine: of stamps from before it was set."""
     heard_ns: int = 0
     """Stamp of the newest message, first of an earlier session; 0 before the first."""
+    before_ns: int = field(init=False)
+    """The same of the earlier session; 0 where there is none."""
     count: int = 0
     """Gaps so far, of whatever kind."""
     _changes: dict[GapKey, GapRow] = field(default_factory=dict)
     _journaled: dict[tuple[str, str, str], int] = field(default_factory=dict)
     _since_ns: int = 0
     """``heard_ns`` at the last commit."""
-    _inherited_ns: int = field(init=False)
     _before: tuple[dict[GapKey, GapRow], dict[tuple[str, str, str], int], int] | None = None
 
     def __post_init__(self) -> None:
-        self._inherited_ns = self.heard_ns
+        self.before_ns = self.heard_ns
 
     @property
     def has_heard(self) -> bool:
         """Whether a message came in this session."""
-        return self.heard_ns != self._inherited_ns
+        return self.heard_ns != self.before_ns
 
     def add(self, kind: str, cause: str, messages: int, from_ns: int, to_ns: int, publisher: str = '',
             grade: str = EXACT) -> GapKey:  # fmt: skip

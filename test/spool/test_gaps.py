@@ -206,6 +206,23 @@ def test_the_watermark_begins_with_the_first_message_of_the_session(root: Path, 
     assert [mark.since_ns for mark in found] == [NOON_NS + 4 * SECOND]
 
 
+def test_the_watermark_waits_for_publishers_of_the_session_before(root: Path, opened: Open) -> None:
+    """One of two is discovered later: what it sent meanwhile is missed by the restart, which nobody knows before."""
+    spool = opened()
+    hear(spool, 10)
+    hear(spool, 10, publisher='q')
+    deliver(spool, *spool.commit([make('a', samples=2)]))
+    spool.close()
+    spool = opened()
+    hear(spool, 20)
+    deliver(spool, *spool.commit([make('b')]))
+    assert [mark.session for mark in spool.gaps_after(0, 10, {})[1]] == [1]
+    hear(spool, 25, publisher='q')
+    hear(spool, 26)
+    deliver(spool, *spool.commit([make('c', samples=2)]))
+    assert [mark.session for mark in spool.gaps_after(0, 10, {})[1]] == [1, 2]
+
+
 def test_a_batch_that_overtook_another_claims_nothing_for_it(root: Path, opened: Open) -> None:
     """Two encoders: the later batch is durable, a death takes the earlier one; its time is not known to be complete."""
     spool = new_spool(root)
