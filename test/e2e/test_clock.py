@@ -103,7 +103,7 @@ def test_a_clock_that_is_set_later(robot: Robot) -> None:
     robot.start()
     robot.publish()
     until(lambda: robot.node.topic('/talk')['stored_in']['held'] >= 2, 'objects are held')
-    assert robot.node.ledger()['objects']['delivered'] == 0
+    assert [robot.node.topic(topic)['stored_in']['delivered'] for topic in ('/talk', '/slow')] == [0, 0]
     robot.set_clock()
     robot.publish()
     robot.settled()
