@@ -12,7 +12,7 @@ from ship.fakes import until
 from stores.fake_s3 import error, etag
 from stores.spooled import Spool
 
-from shadowhound_data_logger.bandwidth import BYTES_PER_MEGABIT, LATE_S
+from shadowhound_data_logger.bandwidth import BYTES_PER_MEGABIT, LATE_S, PIECE_S
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import ForeignObject, StoreUnavailable
 from shadowhound_data_logger.model import Put
@@ -134,7 +134,7 @@ def test_a_body_arrives_evenly_and_outlasts_every_timeout(wire: Wire, spool: Spo
     arrived = 0
     for moment, count in wire.arrivals[: len(wire.arrivals) // 2]:  # the rest is the proof: the same again
         arrived += count
-        assert arrived <= rate * (moment - began + LATE_S)
+        assert arrived <= rate * (moment - began + LATE_S + PIECE_S)  # the first piece leaves at once
     assert wire.arrivals[-1][0] - began > 2 * timeout_s
     assert store.pace.sent_bytes == 2 * size
 
