@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Final
 
 from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject
+from shadowhound_data_logger.model import DataObject, FileBody, Outcome, SpooledObject
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.worker import Worker
 
@@ -26,6 +26,9 @@ MANY_OUTCOMES: Final = 64
 """So many outcomes are worth a commit of their own."""
 HANGING_S: Final = 10.0
 """A commit that takes longer hangs in the disk: usual is a hundredth of a second, a slow card at its worst takes a few."""
+
+
+_Group = tuple[Sequence[DataObject], Sequence[Outcome]]
 
 
 class SpoolWriter:
@@ -110,17 +113,28 @@ class SpoolWriter:
             objects, outcomes = list(self._objects), list(self._outcomes)
         self._last_commit = time.monotonic()
         try:
-            if objects and outcomes and not self.spool.fits(objects):  # what was delivered leaves only after its commit
-                self.spool.accounts.unsettle()
-                self._commit([], outcomes)
-                self.spool.accounts.unsettle()
-                outcomes = []
-            self._commit(objects, outcomes)
+            groups = self._groups(objects, outcomes)
+            for group in groups:
+                if len(groups) > 1:
+                    self.spool.accounts.unsettle()
+                self._commit(*group)
         except (OSError, sqlite3.OperationalError) as error:
             raise self.spool.unwritable(error) from error
         except sqlite3.DatabaseError:
             self.damaged = True
             raise
+
+    def _groups(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> list[_Group]:
+        """One commit of all; where the disk has no room for it several, since files leave only after the commit that says so.
+
+        First what was delivered, then the files, which lie there already and of which some may be given up, last what is written.
+        """
+        if not objects or self.spool.fits(objects):
+            return [(objects, outcomes)]
+        files = [item for item in objects if isinstance(item.body, FileBody)]
+        rest = [item for item in objects if not isinstance(item.body, FileBody)]
+        groups: list[_Group] = [([], outcomes), (files, []), (rest, [])]
+        return [group for group in groups if any(group)]
 
     def _commit(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> None:
         self.spool.commit(objects, outcomes, durable=lambda spooled: self._committed(objects, outcomes, spooled))
@@ -132,8 +146,9 @@ class SpoolWriter:
     def _committed(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome], spooled: Sequence[SpooledObject]) -> None:
         """All of it is durable: let it go and tell who waits for that."""
         with self._changed:
-            for _ in objects:
-                self._bytes -= _in_memory(self._objects.popleft())
+            done = {id(item) for item in objects}
+            self._objects = deque(item for item in self._objects if id(item) not in done)
+            self._bytes -= sum(map(_in_memory, objects))
             for _ in outcomes:
                 self._outcomes.popleft()
             self._done += len(objects) + len(outcomes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -14,7 +15,7 @@ from spool.making import assert_whole, files, make, receive, rows
 
 from shadowhound_data_logger import worker
 from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
 from shadowhound_data_logger.spool import writer as writer_module
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES
@@ -158,21 +159,37 @@ def test_a_failing_disk_loses_nothing(opened: Callable[..., SpoolWriter], spool:
     assert assert_whole(root)['topics']['/camera']['stored'] == 5
 
 
+DiskOf = Callable[[int], Path]
+
+
+@pytest.fixture
+def disk_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DiskOf:
+    """Makes the spool's disk one of so many bytes; beside the spool it has a folder for files that are to be taken in."""
+    beside, write_part = tmp_path / 'beside', Tree.write_part
+    beside.mkdir()
+
+    def of(size: int) -> Path:
+        def free(tree: Tree) -> int:
+            found = [*(tree.root / name for name in files(tree.root)), *beside.iterdir()]
+            return size - sum({status.st_ino: status.st_size for status in map(Path.stat, found)}.values())
+
+        def writes_if_it_fits(tree: Tree, number: int, content: bytes, said: Mapping[str, Any]) -> None:
+            if len(content) > free(tree):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            write_part(tree, number, content, said)
+
+        monkeypatch.setattr(Tree, 'free_bytes', free)
+        monkeypatch.setattr(Tree, 'write_part', writes_if_it_fits)
+        return beside
+
+    return of
+
+
 def test_what_was_delivered_leaves_a_full_disk_first(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
-                                                     monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+                                                     disk_of: DiskOf) -> None:  # fmt: skip
     """A disk that is full of what was delivered has room for as much again: the spool does not wait for it for ever."""
-    body, write_part = bytes(200_000), Tree.write_part
-
-    def free(tree: Tree) -> int:
-        return 5 * (len(body) + OVERHEAD_BYTES) - sum(map(len, files(tree.root).values()))
-
-    def writes_if_it_fits(tree: Tree, number: int, content: bytes, said: Mapping[str, Any]) -> None:
-        if len(content) > free(tree):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        write_part(tree, number, content, said)
-
-    monkeypatch.setattr(Tree, 'free_bytes', free)
-    monkeypatch.setattr(Tree, 'write_part', writes_if_it_fits)
+    body = bytes(200_000)
+    disk_of(5 * (len(body) + OVERHEAD_BYTES))
     writing = opened(60.0)
     for number in range(5):
         receive(spool)
@@ -186,6 +203,30 @@ def test_what_was_delivered_leaves_a_full_disk_first(opened: Callable[..., Spool
     found = assert_whole(root)['objects']
     assert (found['delivered'], found['pending'], found['evicted']) == (5, 4, 0)
     assert not writing.worker.failures
+
+
+def test_files_of_a_full_disk_make_room_for_the_rest(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
+                                                     disk_of: DiskOf) -> None:  # fmt: skip
+    """Slices that wait for the same commit are given up, or taken as they lie, before anything is written in their place."""
+    body = bytes(200_000)
+    disk = disk_of(7 * (len(body) + OVERHEAD_BYTES))
+    writing = opened(60.0)
+    writing.put(make('first', topic=None))
+    assert writing.flush(10)
+    for number in range(6):
+        path = disk / f'slice{number}'
+        path.write_bytes(body)
+        sha256 = hashlib.sha256(body).hexdigest()
+        writing.put(make(f'slice{number}', FileBody(path, len(body), sha256), topic=None, priority=8), wait=False)
+    for number in range(4):
+        receive(spool)
+        writing.put(make(f'new{number}', body))
+    assert writing.flush(10)
+    assert not writing.worker.failures
+    states = {row['key']: row['state'] for row in rows(root)}
+    assert [states[f'new{number}'] for number in range(4)] == ['pending'] * 4
+    assert not list(disk.iterdir())
+    assert assert_whole(root)['objects']['evicted'] == 3
 
 
 def test_encoders_wait_while_too_much_waits(opened: Callable[..., SpoolWriter], spool: Spool,
