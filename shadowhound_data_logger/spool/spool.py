@@ -7,7 +7,9 @@ is the only commit point, so objects and ledger cannot disagree; a rename that d
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 import sqlite3
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -25,7 +27,7 @@ from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.adding import Adding, remove_sources, staged
 from shadowhound_data_logger.spool.adoption import Recovery
-from shadowhound_data_logger.spool.ballast import Ballast
+from shadowhound_data_logger.spool.ballast import Ballast, says_full
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index, spooled
@@ -130,7 +132,8 @@ class Spool:
 
     def unwritable(self, error: OSError | sqlite3.Error) -> SpoolError:
         """What a failed commit means to an operator."""
-        reason = getattr(error, 'strerror', None) or error
+        full = os.strerror(errno.ENOSPC)  # in one word, whoever found it: it is told once
+        reason = full if says_full(error, self.root) else getattr(error, 'strerror', None) or error
         return SpoolError(f'the spool {self.root} cannot be written: {reason}', remedy='is its disk full, read-only or broken?')
 
     def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,

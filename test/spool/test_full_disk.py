@@ -179,6 +179,13 @@ def test_a_payload_that_cannot_be_written(spool: Spool, root: Path, monkeypatch:
     assert_whole(root)
 
 
+def test_a_full_disk_has_one_name(spool: Spool) -> None:
+    """Whether the index or a file found it: a log that tells each new error once tells one."""
+    errors = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), sqlite3.OperationalError('database or disk is full')
+    (told,) = {str(spool.unwritable(error)) for error in errors}
+    assert 'No space left on device' in told
+
+
 def test_a_part_that_cannot_be_removed(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch,
                                        caplog: pytest.LogCaptureFixture) -> None:  # fmt: skip
     """A disk that is read-only from the middle of a part on says so each time, and nothing else; later it goes on."""
