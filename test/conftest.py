@@ -62,11 +62,11 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(optionalhook=True)  # pytest-xdist's, which need not be there
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Two more than there are cores, because most tests wait; none for files by name, which are there sooner without."""
+    """Three for each core, because most tests wait; none for files by name, which are there sooner without."""
     names = [Path(argument.partition('::')[0]) for argument in config.args]
     if config.args_source is pytest.Config.ArgsSource.ARGS and all(name.is_file() for name in names):
         return 0
-    return min(len(os.sched_getaffinity(0)) + 2, MOST_WORKERS)
+    return min(3 * len(os.sched_getaffinity(0)), MOST_WORKERS)
 
 
 @pytest.hookimpl(optionalhook=True)
