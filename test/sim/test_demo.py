@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 from rich.console import Console
+from ship.fakes import until
 from spool.making import FakeClock, make, new_spool, settle
 
 from shadowhound_data_logger.catalogue.parts import encode
@@ -317,7 +318,7 @@ def test_a_node_that_logged_an_error_is_told(tmp_path: Path, line: str) -> None:
     """However well the ledger balances: each line counts, and lines that only speak of errors do not."""
     log = tmp_path / 'node.log'
     with demo_processes.Child('platform', [], os.environ, log) as child:
-        child.stop(30.0)
+        until(lambda: not child.is_running)
         assert child.errors() == []
         log.write_text(f'[WARN] [1760788800.0] [sensor_logger]: an ERROR was avoided\n{line}\n', encoding='utf-8')
         assert child.errors() == [line]
