@@ -21,6 +21,8 @@ from shadowhound_data_logger.spool.accounts import PAUSED, Accounts, TopicAccoun
 
 QUEUE_FULL: Final = 'queue_full'
 """Why samples are dropped that the encoders' queue has no room for."""
+SAMPLER_FAILED: Final = 'sampler_failed'
+"""Why messages are dropped of which a defect kept the sampler from choosing."""
 STEP_BACK_NS: Final = 10 * SECOND
 """Stamps further back than this are a clock that was set or a bag that was started again, not jitter."""
 STAMP_END: Final = 12
@@ -175,14 +177,11 @@ class Sampler(Consumer):
     def choose(self, drained: Drained, account: TopicAccount) -> None:
         messages = drained.messages
         sampled = self._sampled[drained.topic]
-        sampled.follow(self._sensors[drained.sensor])
-        kept: list[Sample] = []
-        if not (drained.paused or self.idle):
-            keep, has_header, clock = sampled.rule.keep, sampled.has_header, self._clock
-            for cdr, source_ns, _, _, _ in messages:
-                stamp_ns = stamp_of(header_stamp_ns(cdr) if has_header else 0, source_ns, clock)
-                if keep(stamp_ns, cdr):
-                    kept.append(Sample(stamp_ns, cdr))
+        try:
+            kept = self._kept(sampled, drained)
+        except Exception:
+            account.drop(SAMPLER_FAILED, len(messages), messages[0].source_ns, messages[-1].source_ns)
+            raise
         sampled.chosen = kept
         if kept:
             sampled.kept_ns = kept[-1].stamp_ns
@@ -191,6 +190,17 @@ class Sampler(Consumer):
             account.drop(PAUSED, len(messages), account.gaps.heard_ns or messages[0].source_ns, messages[-1].source_ns)
         else:
             account.skipped += len(messages) - len(kept)
+
+    def _kept(self, sampled: _Sampled, drained: Drained) -> list[Sample]:
+        sampled.follow(self._sensors[drained.sensor])
+        kept: list[Sample] = []
+        if not (drained.paused or self.idle):
+            keep, has_header, clock = sampled.rule.keep, sampled.has_header, self._clock
+            for cdr, source_ns, _, _, _ in drained.messages:
+                stamp_ns = stamp_of(header_stamp_ns(cdr) if has_header else 0, source_ns, clock)
+                if keep(stamp_ns, cdr):
+                    kept.append(Sample(stamp_ns, cdr))
+        return kept
 
     def take(self, drained: Drained) -> None:
         sampled = self._sampled[drained.topic]

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from shadowhound_data_logger.capture import sampling
 from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.capture.encode_pool import BatchQueue
 from shadowhound_data_logger.capture.sampling import Sampler
@@ -319,6 +320,20 @@ def test_a_consumer_that_raises_keeps_no_other_from_its_messages(where: str, sai
     assert (talk.sampler.failures, last.failures) == (0, 0)
     (record,) = caplog.records
     assert 'Broken fails to take messages of /talk (1 times so far)' in record.message
+
+
+def test_what_a_sampler_fails_to_choose_is_dropped_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its messages are not open until the node ends, with the journal complete beyond them."""
+    talk, last = Talk(), Drains()
+    talk.listen(talk.sampler, last)
+    talk.add(talk.messages(2))
+    with monkeypatch.context() as patched:
+        patched.setattr(sampling, 'stamp_of', lambda *_: 1 // 0)
+        talk.add(talk.messages(3))
+    talk.add(talk.messages(1))
+    assert talk.kept() == [1, 2, 6]
+    assert (talk.account.dropped, talk.account.open) == ({'sampler_failed': 3}, 3)
+    assert (last.sizes, talk.sampler.failures) == ([2, 3, 1], 1)
 
 
 def test_a_topic_of_no_sensor_goes_to_the_others_too() -> None:
