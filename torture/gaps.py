@@ -25,7 +25,7 @@ from typing import Any, Final, NamedTuple
 
 from domains import free_domain
 from e2e.numbered import told
-from e2e.processes import Node, Processes, Publisher, until
+from e2e.processes import Node, Processes, Publisher
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import SpoolError
@@ -35,6 +35,7 @@ from shadowhound_data_logger.spool.control import connect
 from shadowhound_data_logger.spool.gaps import Gap
 from shadowhound_data_logger.spool.index import Index
 from torture._command import Bar, parser, progress, verdict, workshop
+from torture.losses import quiet
 
 DISTURBANCES: Final = 200
 SHORT_DISTURBANCES: Final = 8
@@ -313,7 +314,7 @@ def campaign(folder: Path, disturbances: int, rng: random.Random) -> Found:
             time.sleep(max(STEADY_S, EVICTED_S - (time.time_ns() - began_ns) / SECOND))
             for stream in STREAMS:
                 publisher.halt_numbered(stream.topic)
-            _quiet((scene.node, small))
+            quiet((scene.node, small))
             for each in (scene.node, small):
                 each.stop()
             for reader in readers:
@@ -329,18 +330,6 @@ def campaign(folder: Path, disturbances: int, rng: random.Random) -> Found:
     for cause in ('transport', 'restart', 'paused', 'no_room'):
         found.say(f'messages were lost by {cause}', f'{found.lost}', holds=found.lost[cause] > 0)
     return found
-
-
-def _quiet(nodes: Sequence[Node]) -> None:
-    """Returns once nothing comes any more."""
-    seen: list[int] = []
-
-    def quiet() -> bool:
-        seen.append(sum(row['received'] for node in nodes for row in node.ledger()['topics'].values()))
-        time.sleep(0.5)
-        return len(seen) > 2 and seen[-1] == seen[-3]
-
-    until(quiet, 'nothing is on its way any more')
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -18,7 +18,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -337,20 +337,20 @@ def _disturb(nodes: Nodes, robot: Robot, rounds: int, rng: random.Random, learn_
     time.sleep(STEADY_S)
     for who in PUBLISHERS:
         robot.halt(who)
-    _quiet(nodes)
+    quiet(nodes.running.values())
     return done
 
 
-def _quiet(nodes: Nodes) -> None:
-    """Returns once nothing comes any more."""
+def quiet(nodes: Collection[Node]) -> None:
+    """Returns once nothing comes to them any more."""
     seen: list[int] = []
 
-    def quiet() -> bool:
-        seen.append(sum(row['received'] for node in nodes.running.values() for row in node.ledger()['topics'].values()))
+    def is_quiet() -> bool:
+        seen.append(sum(row['received'] for node in nodes for row in node.ledger()['topics'].values()))
         time.sleep(0.5)
         return len(seen) > 2 and seen[-1] == seen[-3]
 
-    until(quiet, 'nothing is on its way any more')
+    until(is_quiet, 'nothing is on its way any more')
 
 
 def main(argv: Sequence[str] | None = None) -> int:
