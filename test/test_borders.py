@@ -117,6 +117,18 @@ def test_one_file_of_the_stores_knows_obstore() -> None:
     assert [path.name for path in ours if any(name.startswith('obstore') for name in imports(path))] == ['s3_obstore.py']
 
 
+def test_one_module_owns_the_sql_of_the_spools_index() -> None:
+    """What sends SQL elsewhere has a database of its own: notes of an audit, what was fetched, a bag."""
+    index = {'spool/index.py', 'spool/gap_table.py', 'spool/schema.py'}
+    own = {'spool/deliveries.py', 'lake/fetched.py', 'bags/contents.py', 'bags/verify.py'}
+    senders = {
+        path.relative_to(ROOT).as_posix() for path in MODULES for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        if isinstance(node, ast.Attribute) and node.attr in {'execute', 'executemany', 'executescript'}
+    }  # fmt: skip
+    assert senders == index | own
+    assert [name for name in own if 'FROM objects' in (ROOT / name).read_text(encoding='utf-8')] == []
+
+
 def test_one_file_of_the_doctor_knows_ros() -> None:
     """It is loaded in a process of its own, which may crash; the rest of the doctor works on machines without ROS."""
     ours = [path for path in MODULES if folder(path) == 'doctor']

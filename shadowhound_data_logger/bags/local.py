@@ -14,6 +14,7 @@ from typing import Final
 from shadowhound_data_logger.bags.naming import BUCKET, FOLDER, prefix_of
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.mcap.writer import OPEN
+from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.index import Index
 
 RECORDS: Final = 'records'
@@ -55,7 +56,7 @@ def local_files(home: Path, robot: str) -> dict[tuple[str, str], UnsentFile]:
 def given_up(home: Path, robot: str) -> Counter[str]:
     """Bag -> files that the full spool gave up, as far as it remembers; some manifests know of them. Raises SpoolError."""
     try:
-        return Counter(bag for bag, _, _ in _rows(home / 'spool', robot, "'evicted'"))
+        return Counter(bag for bag, _, _ in _rows(home / 'spool', robot, State.EVICTED))
     except sqlite3.Error as error:
         raise _unreadable(home, error) from error
 
@@ -70,14 +71,14 @@ def _recording(folder: Path) -> Iterator[UnsentFile]:
 
 
 def _spooled(spool: Path, robot: str) -> Iterator[UnsentFile]:
-    for bag, name, row in _rows(spool, robot, "'pending', 'held', 'quarantined'"):
+    for bag, name, row in _rows(spool, robot, State.PENDING, State.HELD, State.QUARANTINED):
         is_refused = row['state'] == 'quarantined'
         path = None if is_refused else spool / 'ready' / BUCKET / row['key']
         where = QUARANTINE if is_refused else SPOOL
         yield UnsentFile(bag, name, where, row['bytes'], json.loads(row['metadata']), path)
 
 
-def _rows(spool: Path, robot: str, states: str) -> Iterator[tuple[str, str, sqlite3.Row]]:
+def _rows(spool: Path, robot: str, *states: State) -> Iterator[tuple[str, str, sqlite3.Row]]:
     """Bag, file and row of each object of a bag in these states."""
     if not (spool / 'index.db').exists():
         return
@@ -85,8 +86,7 @@ def _rows(spool: Path, robot: str, states: str) -> Iterator[tuple[str, str, sqli
     index = Index(spool / 'index.db', read_only=True)
     index.open()
     with closing(index):
-        condition = f'bucket = ? AND key >= ? AND key < ? AND state IN ({states}) ORDER BY id'
-        rows = index.rows(condition, (BUCKET, prefix, prefix[:-1] + chr(ord('/') + 1)))
+        rows = index.with_prefix(BUCKET, prefix, states)
     for row in rows:
         bag, _, name = row['key'][len(prefix) :].partition('/')
         yield bag, name or bag, row

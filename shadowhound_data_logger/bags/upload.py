@@ -176,7 +176,7 @@ def _rows(spool: Spool, sent: Parcel) -> dict[str, sqlite3.Row]:
     index = Index(spool.root / 'index.db', read_only=True)
     index.open()
     with closing(index):
-        return {row['key']: row for file in sent.files for row in index.rows('bucket = ? AND key = ?', (BUCKET, file.key))}
+        return {file.key: row for file in sent.files if (row := index.row(BUCKET, file.key)) is not None}
 
 
 def _check_names(spool: Spool, sent: Parcel) -> None:

@@ -24,8 +24,9 @@ from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.model import DataObject
-from shadowhound_data_logger.spool import clock_record, gaps, uncatalogued
-from shadowhound_data_logger.spool.index import MISSING, Index
+from shadowhound_data_logger.spool import clock_record
+from shadowhound_data_logger.spool.gaps import Gap, Watermark
+from shadowhound_data_logger.spool.index import Index
 
 MOST_ROWS: Final = 5000
 """At a time: a tenth of a second of CPU. While there are more, the next ones come with the next look."""
@@ -73,9 +74,13 @@ class CatalogueWriter:
         Raises SpoolError or sqlite3.Error.
         """
         if not self._settings.enabled:
-            uncatalogued.clear(self._spool)
+            with closing(Index(self._spool / 'index.db')) as index:
+                index.open()
+                index.clear_uncatalogued()
             return []
-        listed = uncatalogued.waiting(self._spool, MOST_ROWS)
+        with closing(Index(self._spool / 'index.db', read_only=True)) as index:
+            index.open()
+            listed = index.uncatalogued(MOST_ROWS)
         there = {item.id for item in listed}
         # A part takes all its rows at once: where one has gone without the others, another process's part has it, not ours.
         self._handed = {number: rows for number, rows in self._handed.items() if rows <= there}
@@ -118,7 +123,7 @@ class _GapParts:
         self._clock = clock
         self._version: int | None = None
         self._boots: frozenset[str] = frozenset()
-        self._marks: dict[tuple[str, str, int], gaps.Watermark] = {}
+        self._marks: dict[tuple[str, str, int], Watermark] = {}
         self._missing: frozenset[int] = frozenset()
         self.has_more = False
         """Whether there are further rows already."""
@@ -128,18 +133,22 @@ class _GapParts:
         offsets = clock_record.read(self._spool, self._robot)['offsets']
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
             index.open()
-            index.db.execute('BEGIN')
-            if self._version is None:
-                self._version = _told(index, self._robot)
-            newest, began_ns, others = gaps.extent(index.db, self._robot)
-            is_dated_now = not self._boots.issuperset(offsets) and gaps.has_undated(index.db)
-            self._boots = frozenset(offsets)
-            before, self._missing = self._missing, _missing(index, self._robot)
-            if is_dated_now or self._version > newest or not self._missing <= before:  # an index that was made anew begins anew
-                self._version = 0
-            found = gaps.changed(index.db, self._version, MOST_ROWS, offsets)
-            self.has_more = bool(found) and found[-1].version < newest and len(found) >= MOST_ROWS
-            marks = [] if self.has_more or _is_waiting(index, self._robot) else gaps.watermarks(index.db)
+            with index.snapshot():
+                if self._version is None:
+                    self._version = _told(index, self._robot)
+                newest, began_ns, others = index.gaps.extent(self._robot)
+                is_dated_now = not self._boots.issuperset(offsets) and index.gaps.has_undated()
+                self._boots = frozenset(offsets)
+                before = self._missing
+                self._missing = index.missing(BUCKET, GAPS.prefix(self._robot), sensor=SENSOR)
+                # An index that was made anew begins anew.
+                if is_dated_now or self._version > newest or not self._missing <= before:
+                    self._version = 0
+                found = index.gaps.changed(self._version, MOST_ROWS, offsets)
+                self.has_more = bool(found) and found[-1].version < newest and len(found) >= MOST_ROWS
+                # A watermark must not be in the store before a part with gaps that is told before it.
+                is_waiting = index.has_waiting(BUCKET, GAPS.prefix(self._robot), sensor=SENSOR, priority=PRIORITY)
+                marks = [] if self.has_more or is_waiting else index.gaps.watermarks()
         if found:
             self._version = found[-1].version
         rows = [
@@ -160,7 +169,7 @@ class _GapParts:
                     rows.append(said)
         return self._made(rows, self._version)
 
-    def _row(self, gap: gaps.Gap, began_ns: int) -> Statement:
+    def _row(self, gap: Gap, began_ns: int) -> Statement:
         """Revisions go on where an index was damaged, and versions begin anew: the new one began later."""
         is_dated = gap.boot_id is None or gap.from_ns is not None
         clock = None if gap.boot_id is None else words.SET_LATER if is_dated else words.UNSET
@@ -193,32 +202,10 @@ class _GapParts:
         return made
 
 
-_OF_GAPS: Final = 'bucket = ? AND sensor = ? AND key >= ? AND key < ?'
-
-
-def _is_waiting(index: Index, robot: str) -> bool:
-    """Whether a part with gaps is not in the store yet: a watermark must not be there before it."""
-    place = BUCKET, SENSOR, GAPS.prefix(robot), GAPS.prefix(robot) + '\uffff'
-    return any(
-        index.rows(f'{condition} AND {_OF_GAPS} LIMIT 1', (*values, *place))
-        for condition, values in (("state = 'pending' AND priority = ?", (PRIORITY,)),
-                                  ("state = 'quarantined' AND reason <> ?", (MISSING,)))
-    )  # fmt: skip
-
-
-def _missing(index: Index, robot: str) -> frozenset[int]:
-    """Parts with gaps whose files are gone: what they told has to be told again."""
-    values = MISSING, BUCKET, SENSOR, GAPS.prefix(robot), GAPS.prefix(robot) + '\uffff'
-    return frozenset(row['id'] for row in index.rows(f"state = 'quarantined' AND reason = ? AND {_OF_GAPS}", values))
-
-
 def _told(index: Index, robot: str) -> int:
     """Up to which version of the journal parts were written by whoever was here before; 0 where nobody knows."""
-    said = index.db.execute(
-        'SELECT metadata FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND metadata LIKE ? ORDER BY +id DESC LIMIT 1',
-        (BUCKET, GAPS.prefix(robot), GAPS.prefix(robot) + '\uffff', f'%"{words.GAP_VERSION}"%'),
-    ).fetchone()  # fmt: skip
+    said = index.newest_metadata(BUCKET, GAPS.prefix(robot), words.GAP_VERSION)
     try:
-        return max(0, int(json.loads(said[0])[words.GAP_VERSION])) if said else 0
+        return max(0, int(json.loads(said)[words.GAP_VERSION])) if said else 0
     except (ValueError, TypeError, KeyError):
         return 0

@@ -16,7 +16,6 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.spool import ledger, status
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.piles import Piles, look
-from shadowhound_data_logger.spool.schema import SCHEMA_VERSION
 
 NAME: Final = 'spool'
 OLD_S: Final = 600.0
@@ -64,11 +63,9 @@ def _index(path: Path) -> tuple[Piles, dict[str, int]]:
     index = Index(path, read_only=True)
     try:
         index.open()
-        if index.db.execute('PRAGMA user_version').fetchone()[0] == SCHEMA_VERSION:
+        if index.is_current:
             index.check()  # an older one is brought up to date by the next start, and has other tables
-        query = "SELECT reason, count(*) FROM objects WHERE state = 'quarantined' GROUP BY reason"
-        reasons = {str(reason): count for reason, count in index.db.execute(query)}
-        return look(index, path.parent, time.time_ns()), reasons
+        return look(index, path.parent, time.time_ns()), index.quarantine_reasons()
     finally:
         index.close()
 

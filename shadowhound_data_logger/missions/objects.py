@@ -25,7 +25,7 @@ from shadowhound_data_logger.model import Binding, DataObject
 from shadowhound_data_logger.ship.uploader import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.spool import LAST, Spool
+from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import limits
 
 FRAME_PRIORITY: Final = 6
@@ -199,7 +199,6 @@ def _has(index: Index, item: DataObject) -> bool:
     folder, slash, name = item.key.rpartition('/')
     stem, dot, extension = name.partition('.')
     first = f'{folder}{slash}{stem}'
-    values = (item.bucket, first, f'{first}{LAST}', content_sha256(item.body))
-    found = index.rows('bucket = ? AND key >= ? AND key < ? AND sha256 = ?', values)
+    found = index.with_content(item.bucket, first, content_sha256(item.body))
     numbered = re.compile(rf'{re.escape(first)}(_[1-9][0-9]*)?{re.escape(dot + extension)}')
     return any(numbered.fullmatch(row['key']) for row in found)

@@ -81,7 +81,7 @@ def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectSt
     index = Index(spool / 'index.db', read_only=True)
     index.open()
     try:
-        rows = index.rows('1 ORDER BY id')
+        rows = index.rows()
         publishers = index.publishers()
     finally:
         index.close()

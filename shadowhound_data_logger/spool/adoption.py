@@ -73,10 +73,8 @@ class Adoption:
             if not _can_be_named(bucket, key):
                 self._foreign(path)
                 continue
-            row = self._index.db.execute(
-                'SELECT id, state, reason, sha256 FROM objects WHERE bucket = ? AND key = ?', (bucket, key)
-            ).fetchone()
-            if row is not None and row[1] in _IN_SPOOL and row[2] != MISSING:
+            row = self._index.row(bucket, key)
+            if row is not None and row['state'] in _IN_SPOOL and row['reason'] != MISSING:
                 continue
             try:
                 size, sha256 = fingerprint(path)
@@ -100,21 +98,16 @@ class Adoption:
         """Keys of objects in the spool that begin so. A query a file would make a start with 100,000 of them take seconds."""
         if not _can_be_named(bucket, f'{prefix}x'):
             return frozenset()
-        end = f'{prefix[:-1]}0' if prefix else '\U0010ffff'  # "0" comes after "/"
-        rows = self._index.db.execute(
-            "SELECT key FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND state IN ('pending', 'held', 'quarantined')"
-            ' AND reason IS NOT ?', (bucket, prefix, end, MISSING),
-        )  # fmt: skip
-        return frozenset(key for (key,) in rows)
+        return self._index.keys_in_spool(bucket, prefix)
 
     def _known(self, row: sqlite3.Row, sha256: str, path: Path, ready: Path) -> None:
         """A file whose object is missing or has left the spool."""
-        if row[3] != sha256:
+        if row['sha256'] != sha256:
             self._foreign(path)
-        elif row[1] in _IN_SPOOL:
+        elif row['state'] in _IN_SPOOL:
             if path == ready or self._tree.place(path, ready):
                 with self._index.transaction():
-                    self._index.set_found(row[0])
+                    self._index.set_found(row['id'])
                 self._report.counts['missing files back'] += 1
         else:
             self._tree.remove(path)  # delivered, but the process died before it removed the file

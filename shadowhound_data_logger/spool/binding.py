@@ -8,7 +8,6 @@ committed, and gives its final name to what was.
 from __future__ import annotations
 
 import json
-import sqlite3
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -17,22 +16,12 @@ from typing import Any
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.keys import check_key, unique
-from shadowhound_data_logger.model import Binding, HeldObject, SpooledObject, State
+from shadowhound_data_logger.model import Binding, SpooledObject, State
 from shadowhound_data_logger.spool.files import Tree, describe
 from shadowhound_data_logger.spool.index import MISSING, Index, spooled
 
 Row = Mapping[str, Any]
-"""Of an object in the index, with ``counts``: messages by account, where it holds those of several."""
-
-
-def held(index: Index, reason: str, limit: int) -> list[HeldObject]:
-    """What is held for this reason, the oldest first."""
-    rows = index.db.execute(
-        "SELECT id, bucket, key, metadata, t_start_ns, t_end_ns, created_ns FROM objects WHERE state = 'held' AND reason = ?"
-        ' ORDER BY id LIMIT ?', (reason, limit),
-    )  # fmt: skip
-    return [HeldObject(number, bucket, key, json.loads(metadata), start_ns, end_ns, created_ns)
-            for number, bucket, key, metadata, start_ns, end_ns, created_ns in rows]  # fmt: skip
+"""As of ``Index.full_row``."""
 
 
 def bind(index: Index, tree: Tree, bindings: Sequence[Binding], now_ns: int) -> list[SpooledObject]:
@@ -46,20 +35,20 @@ def bind(index: Index, tree: Tree, bindings: Sequence[Binding], now_ns: int) -> 
     before: list[Row] = []
     with index.transaction(undo=lambda: _put_back(tree, before)):
         for binding in bindings:
-            row = _row(index, binding.id)
+            row = index.full_row(binding.id)
             if row is not None and row['state'] == State.HELD.value and _to_part(tree, row):
                 before.append(row)
                 _change(index, row, binding, now_ns)
                 renew(index, row['id'], tree.part(row['id']))
         if before:
             tree.sync_incoming()
-    bound = [row for old in before if (row := _row(index, old['id'])) is not None]
+    bound = [row for old in before if (row := index.full_row(old['id'])) is not None]
     return [spooled(row, tree.waiting(row['id'], row['bucket'], row['key'])) for row in bound]
 
 
 def renew(index: Index, number: int, path: Path) -> None:
     """Have a file say what its row says now. A file that is gone says nothing; raises OSError when the disk fails."""
-    row = _row(index, number)
+    row = index.full_row(number)
     if row is not None:
         _describe(path, row)
 
@@ -87,21 +76,11 @@ def free_key(index: Index, bucket: str, wanted: str, own: str | None = None) -> 
 def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:
     """Whether this content was given the wanted key, or one of its ``_1``, ``_2``, ..., and its file is not missing."""
     attempt = 0
-    while rows := index.rows('bucket = ? AND key = ?', (bucket, unique(wanted, attempt))):
-        if rows[0]['sha256'] == sha256 and rows[0]['reason'] != MISSING:
+    while (row := index.row(bucket, unique(wanted, attempt))) is not None:
+        if row['sha256'] == sha256 and row['reason'] != MISSING:
             return True
         attempt += 1
     return False
-
-
-def _row(index: Index, number: int) -> Row | None:
-    cursor = index.db.execute('SELECT * FROM objects WHERE id = ?', (number,))
-    cursor.row_factory = sqlite3.Row
-    row: sqlite3.Row | None = cursor.fetchone()
-    if row is None:
-        return None
-    counts = dict(index.db.execute('SELECT topic, samples FROM contents WHERE id = ?', (number,)).fetchall())
-    return {**dict(row), 'counts': counts}
 
 
 def _to_part(tree: Tree, row: Row) -> bool:
@@ -120,10 +99,7 @@ def _change(index: Index, row: Row, binding: Binding, now_ns: int) -> None:
     created_ns = row['created_ns']
     if created_ns < EARLIEST_SANE_NS <= now_ns:  # spooled before the clock was set: for how long it waits is told from this
         created_ns = binding.t_end_ns if EARLIEST_SANE_NS <= binding.t_end_ns <= now_ns else now_ns
-    index.db.execute(
-        "UPDATE objects SET state = 'pending', reason = NULL, key = ?, metadata = ?, t_start_ns = ?, t_end_ns = ?, created_ns = ?"
-        ' WHERE id = ?', (key, json.dumps(metadata), binding.t_start_ns, binding.t_end_ns, created_ns, row['id']),
-    )  # fmt: skip
+    index.set_bound(key, binding, metadata, created_ns)
 
 
 def _put_back(tree: Tree, before: Sequence[Row]) -> None:

@@ -3,33 +3,58 @@
 Written by one connection under one lock, in transactions that are durable when they return (WAL, synchronous=FULL);
 read by any number of others. Its transaction is the one commit point of the spool: an object exists once its row does.
 Totals are kept by triggers, so that rows of delivered objects may be forgotten without a total changing.
+
+Every statement that the index is asked or changed with is here, but for those of its gap journal (gap_table.py); its tables,
+triggers and migrations are in schema.py. What to do is decided elsewhere.
 """
 
 from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from heapq import merge
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import DataObject, SpooledObject, State
-from shadowhound_data_logger.spool import gaps
+from shadowhound_data_logger.model import Binding, DataObject, HeldObject, ObjectInfo, SpooledObject, State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
-from shadowhound_data_logger.spool.schema import definitions, expected, prepare
+from shadowhound_data_logger.spool.gap_table import GapTable
+from shadowhound_data_logger.spool.schema import CATALOGUE, IMPLAUSIBLE, SCHEMA_VERSION, definitions, expected, prepare
 
 FORGET_STEP: Final = 10_000
 """Rows that one commit forgets at most: some 50 ms."""
 BUSY_TIMEOUT_S: Final = 10.0
 MISSING: Final = 'missing'
 """Reason of a quarantined object whose file is gone."""
+_IN_SPOOL: Final = "state IN ('pending', 'held', 'quarantined')"
+_IN_SPOOL_COUNTED: Final = f"""
+SELECT ifnull(topic, '') AS name, state, count(*), sum(bytes), sum(samples) FROM objects WHERE {_IN_SPOOL} GROUP BY name, state
+UNION ALL SELECT contents.topic, state, 0, 0, sum(contents.samples) FROM contents JOIN objects USING (id)
+WHERE {_IN_SPOOL} GROUP BY contents.topic, state HAVING sum(contents.samples)"""  # noqa: S608 - own constants only
+_IN_SPOOL_TALLY: Final = f"""
+SELECT topic, state, objects, bytes, samples FROM tally
+WHERE {_IN_SPOOL} AND (objects OR bytes OR samples)"""  # noqa: S608 - own constants only
+_DELIVERED: Final = f"FROM objects WHERE state = 'delivered' AND sensor <> '{CATALOGUE}'"
+_OF_SENSOR: Final = 'bucket = ? AND sensor = ? AND key >= ? AND key < ?'
 _OBJECT: Final = 'id, bucket, key, bytes, sha256, content_type, metadata, priority, created_ns, state, reason'
+
+
+class UncataloguedObject(NamedTuple):
+    """An object as the store holds it; of a repeat its own times, and the key that holds its content."""
+
+    id: int
+    bucket: str
+    key: str
+    size: int
+    content_type: str
+    metadata: Mapping[str, str]
 
 
 class Index:
@@ -64,45 +89,154 @@ class Index:
             self._connection = None
 
     @property
-    def db(self) -> sqlite3.Connection:
+    def _db(self) -> sqlite3.Connection:
         if self._connection is None:
             raise SpoolError('the spool index is not open')
         return self._connection
+
+    @property
+    def gaps(self) -> GapTable:
+        """The gap journal in it."""
+        return GapTable(self._db)
+
+    @property
+    def is_current(self) -> bool:
+        """Whether its tables are of this version: a start of the node brings older ones up to date."""
+        return bool(self._db.execute('PRAGMA user_version').fetchone()[0] == SCHEMA_VERSION)
 
     def check(self) -> None:
         """Raises sqlite3.DatabaseError when the file is damaged: 3 us a row, 6 us after a stop that was none.
 
         The longer check compares tables with their indexes as well, without which damage shows in a commit only.
         """
-        if not definitions(self.db) >= expected():
+        if not definitions(self._db) >= expected():
             raise sqlite3.DatabaseError('its tables are not those of this version')
         pragma = 'integrity_check' if self.sessions(ended=False) else 'quick_check'
-        answer = self.db.execute(f'PRAGMA {pragma}(1)').fetchone()[0]
+        answer = self._db.execute(f'PRAGMA {pragma}(1)').fetchone()[0]
         if answer != 'ok':
             raise sqlite3.DatabaseError(str(answer))
 
+    def check_values(self) -> None:
+        """Raises sqlite3.DatabaseError for a value that cannot be ours: asked at each start, before one is used."""
+        for table, query in IMPLAUSIBLE.items():
+            found = self._db.execute(query).fetchone()
+            if found is not None:
+                raise sqlite3.DatabaseError(f'a value of {table} {found[0]!r} cannot be')
+
+    def miscounted(self) -> Iterator[str]:
+        """A sentence for each total that is not that of the objects in the spool."""
+        with self.snapshot():  # other processes commit meanwhile
+            counted = {row[:2]: row[2:] for row in self._db.execute(_IN_SPOOL_COUNTED)}
+            said = {row[:2]: row[2:] for row in self._db.execute(_IN_SPOOL_TALLY)}
+        for what in sorted(counted.keys() | said.keys()):
+            if counted.get(what) != said.get(what):
+                yield f'{what[0] or "bookkeeping"}: {what[1]} {said.get(what)}, but in the spool {counted.get(what)}'
+
     @contextmanager
-    def transaction(self, undo: Callable[[], None] = lambda: None) -> Iterator[sqlite3.Connection]:
-        """All or nothing, durable on leaving; ``undo`` runs before it is rolled back, with other writers still shut out."""
-        self.db.execute('BEGIN IMMEDIATE')
+    def snapshot(self) -> Iterator[None]:
+        """All that is read inside is of one instant."""
+        self._db.execute('BEGIN')
         try:
-            yield self.db
-            self.db.execute('COMMIT')
+            yield
+        finally:
+            self._db.execute('COMMIT')
+
+    @contextmanager
+    def transaction(self, undo: Callable[[], None] = lambda: None) -> Iterator[None]:
+        """All or nothing, durable on leaving; ``undo`` runs before it is rolled back, with other writers still shut out."""
+        self._db.execute('BEGIN IMMEDIATE')
+        try:
+            yield
+            self._db.execute('COMMIT')
         except BaseException:
-            if self.db.in_transaction:  # SQLite itself ends it on some errors: a full disk, a failing one
+            if self._db.in_transaction:  # SQLite itself ends it on some errors: a full disk, a failing one
                 undo()
-                self.db.execute('ROLLBACK')
+                self._db.execute('ROLLBACK')
             raise
 
     # -- objects ---------------------------------------------------------------------------------------------------
 
     def has(self, bucket: str, key: str) -> bool:
-        return self.db.execute('SELECT 1 FROM objects WHERE bucket = ? AND key = ?', (bucket, key)).fetchone() is not None
+        return self._db.execute('SELECT 1 FROM objects WHERE bucket = ? AND key = ?', (bucket, key)).fetchone() is not None
+
+    def row(self, bucket: str, key: str) -> sqlite3.Row | None:
+        """The row of a key."""
+        return next(iter(self._rows('bucket = ? AND key = ?', (bucket, key))), None)
+
+    def rows(self) -> list[sqlite3.Row]:
+        """Of all objects, as they were spooled."""
+        return self._rows('1 ORDER BY id')
+
+    def with_prefix(self, bucket: str, prefix: str, states: Collection[State] = tuple(State)) -> list[sqlite3.Row]:
+        """Rows in these states whose keys begin so, as they were spooled."""
+        values = (bucket, prefix, _after(prefix), *(state.value for state in states))
+        return self._rows(f'bucket = ? AND key >= ? AND key < ? AND state IN ({_marks(len(values) - 3)}) ORDER BY id', values)
+
+    def with_content(self, bucket: str, prefix: str, sha256: str) -> list[sqlite3.Row]:
+        """Rows of this content whose keys begin so."""
+        return self._rows('bucket = ? AND key >= ? AND key < ? AND sha256 = ?', (bucket, prefix, _after(prefix), sha256))
+
+    def in_spool(self) -> list[sqlite3.Row]:
+        """Rows of what is pending, held or quarantined, as it was spooled."""
+        return self._rows(f'{_IN_SPOOL} ORDER BY id')
+
+    def is_in_spool(self, number: int) -> bool:
+        """Whether an object is pending, held or quarantined."""
+        return bool(self._rows(f'id = ? AND {_IN_SPOOL}', (number,)))
+
+    def is_quarantined(self, number: int) -> bool:
+        return bool(self._rows("id = ? AND state = 'quarantined'", (number,)))
+
+    def quarantined(self, reason: str | None = None) -> list[sqlite3.Row]:
+        """Rows of what is quarantined, for this reason or any, but that its file is gone."""
+        return self._rows("state = 'quarantined' AND reason = ifnull(?, reason) AND reason <> ? ORDER BY id", (reason, MISSING))
+
+    def keys_in_spool(self, bucket: str, prefix: str) -> frozenset[str]:
+        """Keys that begin so, of what is pending, held or quarantined and whose file is not known to be gone."""
+        rows = self._db.execute(
+            f'SELECT key FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND {_IN_SPOOL} AND reason IS NOT ?',  # noqa: S608
+            (bucket, prefix, _after(prefix), MISSING),
+        )
+        return frozenset(key for (key,) in rows)
+
+    def full_row(self, number: int) -> Mapping[str, Any] | None:
+        """All columns of an object, with ``counts``: messages by account, where it holds those of several."""
+        cursor = self._db.execute('SELECT * FROM objects WHERE id = ?', (number,))
+        cursor.row_factory = sqlite3.Row
+        row: sqlite3.Row | None = cursor.fetchone()
+        if row is None:
+            return None
+        counts = dict(self._db.execute('SELECT topic, samples FROM contents WHERE id = ?', (number,)).fetchall())
+        return {**dict(row), 'counts': counts}
+
+    def listed(self, state: State | None, sensor: str | None, prefix: str) -> Iterator[tuple[Any, ...]]:
+        """(bucket, key, sensor, state, reason, bytes, created_ns) of what is pending, held or quarantined, as it was spooled.
+
+        ``prefix`` is how ``bucket/key`` begins.
+        """
+        return self._db.execute(
+            f'SELECT bucket, key, sensor, state, reason, bytes, created_ns FROM objects WHERE {_IN_SPOOL}'  # noqa: S608
+            ' AND state = ifnull(?, state) AND sensor = ifnull(?, sensor)'
+            " AND substr(bucket || '/' || key, 1, length(?)) = ? ORDER BY id",
+            (state and state.value, sensor, prefix, prefix),
+        )
+
+    def heaps(self) -> list[tuple[Any, ...]]:
+        """(sensor, state, reason, objects, bytes, oldest created_ns) of the same, the most important first."""
+        return self._db.execute(
+            f'SELECT sensor, state, reason, count(*), sum(bytes), min(created_ns) FROM objects WHERE {_IN_SPOOL}'  # noqa: S608
+            ' GROUP BY sensor, state, reason ORDER BY min(priority), sensor, state, reason'
+        ).fetchall()
+
+    def quarantine_reasons(self) -> dict[str, int]:
+        """Reason -> quarantined objects."""
+        query = "SELECT reason, count(*) FROM objects WHERE state = 'quarantined' GROUP BY reason"
+        return {str(reason): count for reason, count in self._db.execute(query)}
 
     def insert(self, item: DataObject, key: str, sha256: str, state: State, reason: str | None,
                metadata: Mapping[str, str], now_ns: int) -> int:  # fmt: skip
         """Add a row under the final key; returns its id."""
-        cursor = self.db.execute(
+        cursor = self._db.execute(
             'INSERT INTO objects (bucket, key, state, reason, priority, protected, sensor, topic, type, samples, bytes, sha256,'
             ' content_type, metadata, t_start_ns, t_end_ns, created_ns) VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
             (item.bucket, key, state.value, reason, item.priority, item.protected, item.sensor, item.topic, item.type,
@@ -112,7 +246,7 @@ class Index:
         number = int(cursor.lastrowid or 0)
         if item.counts:
             rows = ((number, account, count) for account, count in item.counts.items())
-            self.db.executemany('INSERT INTO contents VALUES (?,?,?)', rows)
+            self._db.executemany('INSERT INTO contents VALUES (?,?,?)', rows)
         return number
 
     def move(self, ids: Iterable[int], state: State, reason: str | None, now_ns: int) -> None:
@@ -122,9 +256,26 @@ class Index:
         that the store confirmed all the same, is delivered.
         """
         movable = (State.PENDING, State.HELD, State.EVICTED if state is State.DELIVERED else State.HELD)
-        self.db.executemany(
+        self._db.executemany(
             'UPDATE objects SET state = ?, reason = ?, settled_ns = ? WHERE id = ? AND state IN (?, ?, ?)',
             ((state.value, reason, now_ns, number, *(each.value for each in movable)) for number in ids),
+        )
+
+    def held(self, reason: str, limit: int) -> list[HeldObject]:
+        """What has no final name yet for this reason, the oldest first."""
+        rows = self._db.execute(
+            "SELECT id, bucket, key, metadata, t_start_ns, t_end_ns, created_ns FROM objects WHERE state = 'held' AND reason = ?"
+            ' ORDER BY id LIMIT ?', (reason, limit),
+        )  # fmt: skip
+        return [HeldObject(number, bucket, key, json.loads(metadata), start_ns, end_ns, created_ns)
+                for number, bucket, key, metadata, start_ns, end_ns, created_ns in rows]  # fmt: skip
+
+    def set_bound(self, key: str, binding: Binding, metadata: Mapping[str, str], created_ns: int) -> None:
+        """A held object waits for delivery under its final key."""
+        self._db.execute(
+            "UPDATE objects SET state = 'pending', reason = NULL, key = ?, metadata = ?, t_start_ns = ?, t_end_ns = ?,"
+            ' created_ns = ? WHERE id = ?',
+            (key, json.dumps(dict(metadata)), binding.t_start_ns, binding.t_end_ns, created_ns, binding.id),
         )
 
     def pending(self, limit: int, *, oldest: bool, without: Sequence[str] = ()) -> list[sqlite3.Row]:
@@ -134,46 +285,45 @@ class Index:
         """
         order = ('id',) if oldest else ('priority', 'id')
         condition = f"state = 'pending' AND bucket = ? ORDER BY {', '.join(order)} LIMIT ?"
-        found = [self.rows(condition, (bucket, limit)) for bucket in self._waited_for() if bucket not in without]
+        found = [self._rows(condition, (bucket, limit)) for bucket in self._waited_for() if bucket not in without]
         return list(islice(merge(*found, key=itemgetter(*order)), limit))
 
     def _waited_for(self) -> Iterator[str]:
         """The buckets of all pending objects: one step in the index for each."""
         query = "SELECT bucket FROM objects WHERE state = 'pending' AND bucket > ? ORDER BY bucket LIMIT 1"
         bucket = ''
-        while row := self.db.execute(query, (bucket,)).fetchone():
+        while row := self._db.execute(query, (bucket,)).fetchone():
             bucket = row[0]
             yield bucket
 
     def held_count(self, reason: str) -> int:
         """How many objects have no final name yet for this reason."""
         query = "SELECT count(*) FROM objects WHERE state = 'held' AND reason = ?"
-        return int(self.db.execute(query, (reason,)).fetchone()[0])
+        return int(self._db.execute(query, (reason,)).fetchone()[0])
 
-    def rows(self, where: str, values: Sequence[object] = ()) -> list[sqlite3.Row]:
-        """Object rows by a condition of this package's own (never of a user's)."""
-        cursor = self.db.execute(f'SELECT {_OBJECT} FROM objects WHERE {where}', tuple(values))  # noqa: S608 - own constants only
+    def _rows(self, where: str, values: Sequence[object] = ()) -> list[sqlite3.Row]:
+        cursor = self._db.execute(f'SELECT {_OBJECT} FROM objects WHERE {where}', tuple(values))  # noqa: S608 - own constants only
         cursor.row_factory = sqlite3.Row
         return cursor.fetchall()
 
     def protect(self, bucket: str, key: str) -> None:
         """Never evict this object from now on."""
-        self.db.execute('UPDATE objects SET protected = 1 WHERE bucket = ? AND key = ?', (bucket, key))
+        self._db.execute('UPDATE objects SET protected = 1 WHERE bucket = ? AND key = ?', (bucket, key))
 
     def evictable(self, limit: int) -> list[sqlite3.Row]:
         """What a full disk costs first: lowest priority, then oldest; never a protected object."""
-        return self.rows("state IN ('pending', 'held') AND NOT protected ORDER BY priority DESC, id LIMIT ?", (limit,))
+        return self._rows("state IN ('pending', 'held') AND NOT protected ORDER BY priority DESC, id LIMIT ?", (limit,))
 
     def evictable_bytes(self) -> dict[int, int]:
         """What evicting everything that may be evicted would free, by priority."""
         where = "state IN ('pending', 'held') AND NOT protected"
-        return dict(self.db.execute(f'SELECT priority, sum(bytes) FROM objects WHERE {where} GROUP BY priority'))  # noqa: S608
+        return dict(self._db.execute(f'SELECT priority, sum(bytes) FROM objects WHERE {where} GROUP BY priority'))  # noqa: S608
 
     def payload_bytes(self) -> int:
         """Bytes of all payload that lies in the spool: files that went missing take no room."""
         present = "SELECT ifnull(sum(bytes), 0) FROM tally WHERE state IN ('pending', 'held', 'quarantined')"
         missing = "SELECT ifnull(sum(bytes), 0) FROM objects WHERE state = 'quarantined' AND reason = 'missing'"
-        return int(self.db.execute(f'SELECT ({present}) - ({missing})').fetchone()[0])
+        return int(self._db.execute(f'SELECT ({present}) - ({missing})').fetchone()[0])
 
     def oldest_pending_ns(self) -> int | None:
         """When the object that has waited for delivery for the longest was spooled; None when none waits."""
@@ -181,7 +331,7 @@ class Index:
 
     def set_missing(self, ids: Iterable[int], now_ns: int) -> int:
         """The files of these objects are gone, whoever took them; returns for how many that is new."""
-        cursor = self.db.executemany(
+        cursor = self._db.executemany(
             "UPDATE objects SET state = 'quarantined', reason = 'missing', settled_ns = ? WHERE id = ?"
             " AND state IN ('pending', 'held', 'quarantined')", ((now_ns, number) for number in ids),
         )  # fmt: skip
@@ -189,7 +339,7 @@ class Index:
 
     def set_found(self, number: int) -> None:
         """The file of a quarantined object is back where it waits for delivery."""
-        self.db.execute(
+        self._db.execute(
             "UPDATE objects SET state = 'pending', reason = NULL, settled_ns = NULL WHERE id = ?"
             " AND state = 'quarantined'", (number,),
         )  # fmt: skip
@@ -201,57 +351,159 @@ class Index:
 
         Rows of a time before the clock was set stay: the next boot may begin at that time again, and their keys are taken.
         """
-        cursor = self.db.execute(
+        cursor = self._db.execute(
             "DELETE FROM objects WHERE id IN (SELECT id FROM objects WHERE state IN ('delivered', 'deduplicated', 'evicted')"
             ' AND settled_ns BETWEEN ? AND ? AND id NOT IN (SELECT id FROM uncatalogued) LIMIT ?)',
             (EARLIEST_SANE_NS, before_ns, FORGET_STEP),
         )  # fmt: skip
-        return gaps.forget(self.db, before_ns, FORGET_STEP) and cursor.rowcount < FORGET_STEP
+        return self.gaps.forget(before_ns, FORGET_STEP) and cursor.rowcount < FORGET_STEP
+
+    # -- what the catalogue lacks ------------------------------------------------------------------------------------
+
+    def uncatalogued(self, limit: int) -> list[UncataloguedObject]:
+        """Delivered objects that no part of the catalogue has a row of yet, the oldest first: triggers keep the list."""
+        rows = self._db.execute(
+            'SELECT id, bucket, key, bytes, content_type, metadata FROM uncatalogued JOIN objects USING (id)'
+            ' ORDER BY id LIMIT ?', (limit,),
+        )  # fmt: skip
+        said = [(*row, json.loads(metadata)) for *row, metadata in rows]
+        return [UncataloguedObject(number, bucket, metadata.get(words.CONTENT_KEY, key), size, content_type, metadata)
+                for number, bucket, key, size, content_type, metadata in said]  # fmt: skip
+
+    def take_uncatalogued(self, ids: Collection[int]) -> bool:
+        """Take these off the list, in the transaction that spools their part, so that a death leaves both or neither.
+
+        False, and nothing is changed, where one was taken already.
+        """
+        if not ids:
+            return True
+        listed = {number for (number,) in self._db.execute('SELECT id FROM uncatalogued')}
+        if not listed.issuperset(ids):
+            return False
+        self._db.executemany('DELETE FROM uncatalogued WHERE id = ?', ((number,) for number in ids))
+        return True
+
+    def clear_uncatalogued(self) -> None:
+        """No part will have what is delivered by now."""
+        with self.transaction():
+            self._db.execute('DELETE FROM uncatalogued')
+
+    def has_waiting(self, bucket: str, prefix: str, *, sensor: str, priority: int) -> bool:
+        """Whether one of a sensor's objects whose keys begin so is pending with this priority, or quarantined with its file."""
+        place = bucket, sensor, prefix, _after(prefix)
+        return bool(
+            self._rows(f"state = 'pending' AND priority = ? AND {_OF_SENSOR} LIMIT 1", (priority, *place))
+            or self._rows(f"state = 'quarantined' AND reason <> ? AND {_OF_SENSOR} LIMIT 1", (MISSING, *place))
+        )
+
+    def missing(self, bucket: str, prefix: str, *, sensor: str) -> frozenset[int]:
+        """Of a sensor's objects whose keys begin so, those whose files are gone."""
+        values = MISSING, bucket, sensor, prefix, _after(prefix)
+        return frozenset(row['id'] for row in self._rows(f"state = 'quarantined' AND reason = ? AND {_OF_SENSOR}", values))
+
+    def newest_metadata(self, bucket: str, prefix: str, word: str) -> str | None:
+        """The metadata, as JSON, of the newest object whose key begins so and whose metadata has this word."""
+        said = self._db.execute(
+            'SELECT metadata FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND metadata LIKE ?'
+            ' ORDER BY +id DESC LIMIT 1',
+            (bucket, prefix, _after(prefix), f'%"{word}"%'),
+        ).fetchone()
+        return said[0] if said else None
+
+    # -- what was delivered ------------------------------------------------------------------------------------------
+
+    def delivered(self, after: int, limit: int) -> list[tuple[int, ObjectInfo]]:
+        """Delivered objects with greater numbers, by number and as the store has to describe them.
+
+        Without the catalogue's parts: others stand for them in time, and they go; they can be made again.
+        """
+        query = f'SELECT id, bucket, key, bytes, sha256 {_DELIVERED} AND id > ? ORDER BY id LIMIT ?'
+        return [(number, ObjectInfo(*of_store)) for number, *of_store in self._db.execute(query, (after, limit))]
+
+    def delivered_count(self) -> int:
+        """Of those, how many are remembered."""
+        return int(self._db.execute(f'SELECT count(*) {_DELIVERED}').fetchone()[0])
+
+    def delivered_since_ns(self) -> int | None:
+        """When the first of them was delivered; None without any."""
+        found = self._db.execute(f'SELECT min(settled_ns) {_DELIVERED}').fetchone()[0]
+        return None if found is None else int(found)
+
+    def forgotten_count(self) -> int:
+        """Delivered objects that are counted and not remembered, the catalogue's parts among them."""
+        ever = self._db.execute("SELECT ifnull(sum(objects), 0) FROM tally WHERE state = 'delivered'").fetchone()[0]
+        return int(ever) - int(self._db.execute("SELECT count(*) FROM objects WHERE state = 'delivered'").fetchone()[0])
 
     # -- accounts --------------------------------------------------------------------------------------------------
 
     def begin_session(self, robot: str, boot_id: str, pid: int, now_ns: int) -> int:
         query = 'INSERT INTO sessions (robot, boot_id, pid, started_ns) VALUES (?,?,?,?)'
-        cursor = self.db.execute(query, (robot, boot_id, pid, now_ns))
+        cursor = self._db.execute(query, (robot, boot_id, pid, now_ns))
         return int(cursor.lastrowid or 0)
 
     def end_session(self, session: int, now_ns: int) -> None:
-        self.db.execute('UPDATE sessions SET ended_ns = ? WHERE id = ?', (now_ns, session))
+        self._db.execute('UPDATE sessions SET ended_ns = ? WHERE id = ?', (now_ns, session))
+
+    def first_session(self) -> tuple[int, str] | None:
+        """(started_ns, boot_id): tells one index from another."""
+        found = self._db.execute('SELECT started_ns, boot_id FROM sessions ORDER BY id LIMIT 1').fetchone()
+        return found and tuple(found)
+
+    def last_session(self, robot: str, pid: int) -> tuple[int, int | None] | None:
+        """(started_ns, ended_ns) of a robot's last session, of this process where it has one."""
+        query = 'SELECT started_ns, ended_ns FROM sessions WHERE robot = ? ORDER BY pid = ? DESC, id DESC LIMIT 1'
+        found = self._db.execute(query, (robot, pid)).fetchone()
+        return found and tuple(found)
+
+    def sessions_with_open(self, robot: str, sink: str) -> list[int]:
+        """A robot's ended sessions that left messages of a sink open."""
+        columns = 'SELECT session, received - skipped - stored, rejected, dropped FROM accounts JOIN sessions ON id = session'
+        rows = self._db.execute(f'{columns} WHERE robot = ? AND ended_ns IS NOT NULL AND topic GLOB ?', (robot, f'{sink}*'))
+        return sorted({
+            number for number, rest, *lost in rows if rest > sum(sum(json.loads(each).values()) for each in lost)
+        })  # fmt: skip
+
+    def take_over(self, session: int, topic: str, received: int, estimated: int, unknown: int) -> None:
+        """These messages of an ended session are another one's to account for; so many of them estimated, or unknown."""
+        query = 'UPDATE accounts SET received = received - ? WHERE session = ? AND topic = ?'
+        self._db.execute(query, (received, session, topic))
+        query = 'UPDATE estimates SET estimated = estimated - ?, unknown = unknown - ? WHERE session = ? AND topic = ?'
+        self._db.execute(query, (estimated, unknown, session, topic))
 
     def write(self, session: int, snapshot: AccountSnapshot) -> None:
         """Replace the session's accounts by a newer snapshot."""
-        self.db.executemany(
+        self._db.executemany(
             'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
               json.dumps(row.rejected), json.dumps(row.dropped), row.last_kept_ns, row.first_ns,
               row.heard_ns, row.complete_ns) for row in snapshot.topics),
         )  # fmt: skip
-        self.db.executemany(
+        self._db.executemany(
             'DELETE FROM publishers WHERE session = ? AND topic = ? AND publisher = ?', ((session, *row) for row in snapshot.gone)
         )
-        self.db.executemany(
+        self._db.executemany(
             'INSERT OR REPLACE INTO publishers VALUES (?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.publisher, row.first, row.last, row.published, row.received, json.dumps(row.missed),
               row.heard_ns) for row in snapshot.publishers),
         )  # fmt: skip
-        self.db.executemany(
+        self._db.executemany(
             'INSERT OR REPLACE INTO estimates VALUES (?,?,?,?,?)',
             ((session, row.topic, row.estimated, row.unknown, json.dumps(row.missed))
              for row in snapshot.topics if row.estimated or row.unknown or row.missed),
         )  # fmt: skip
-        self.db.executemany(
+        self._db.executemany(
             'INSERT OR REPLACE INTO rhythms VALUES (?,?,?,?,?)',
             ((row.topic, row.publisher, row.of, row.period, row.last) for row in snapshot.rhythms),
         )
-        self.db.executemany(
+        self._db.executemany(
             'INSERT OR REPLACE INTO other_types VALUES (?,?,?,?,?)',
             ((session, row.topic, row.type, json.dumps(row.publishers), row.messages) for row in snapshot.other_types),
         )  # fmt: skip
-        gaps.write(self.db, session, snapshot.gaps, snapshot.taken_back)
+        self.gaps.write(session, snapshot.gaps, snapshot.taken_back)
 
     def sessions(self, *, ended: bool) -> list[int]:
         condition = 'NOT NULL' if ended else 'NULL'
-        return [row[0] for row in self.db.execute(f'SELECT id FROM sessions WHERE ended_ns IS {condition} ORDER BY id')]  # noqa: S608
+        return [row[0] for row in self._db.execute(f'SELECT id FROM sessions WHERE ended_ns IS {condition} ORDER BY id')]  # noqa: S608
 
     def topics(self, session: int | None = None) -> list[TopicRow]:
         """Accounts of one session, or of all in the order of the sessions."""
@@ -263,13 +515,13 @@ class Index:
             TopicRow(topic, kind, accounting, received, skipped, stored, json.loads(rejected), json.loads(dropped), last_ns,
                      estimated, unknown, json.loads(missed), first_ns, heard_ns, complete_ns)
             for topic, kind, accounting, received, skipped, stored, last_ns, rejected, dropped, estimated, unknown, missed,
-            first_ns, heard_ns, complete_ns in self.db.execute(query, values)
+            first_ns, heard_ns, complete_ns in self._db.execute(query, values)
         ]  # fmt: skip
 
     def publishers(self) -> list[PublisherRow]:
         """All spans in the order of the sessions: the last row of a publisher says where its numbers stand."""
         columns = 'topic, publisher, first, last, published, received, missed, heard_ns'
-        rows = self.db.execute(f'SELECT {columns} FROM publishers ORDER BY session')  # noqa: S608
+        rows = self._db.execute(f'SELECT {columns} FROM publishers ORDER BY session')  # noqa: S608
         return [
             PublisherRow(topic, publisher, first, last, published, received, json.loads(missed), heard_ns)
             for topic, publisher, first, last, published, received, missed, heard_ns in rows
@@ -279,24 +531,33 @@ class Index:
         """Of all sessions, in their order."""
         if self._read_only and not self._has('other_types'):
             return []
-        rows = self.db.execute('SELECT topic, type, publishers, messages FROM other_types ORDER BY session')
+        rows = self._db.execute('SELECT topic, type, publishers, messages FROM other_types ORDER BY session')
         return [OtherTypeRow(topic, kind, tuple(json.loads(nodes)), count) for topic, kind, nodes, count in rows]
 
     def gap_sums(self) -> dict[tuple[str, str, str, str], int] | None:
-        """What the gap journal adds up to (``gaps.sums``); None for an older index, which has none."""
-        return None if self._read_only and not self._has('gaps') else gaps.sums(self.db)
+        """What the gap journal adds up to (``GapTable.sums``); None for an older index, which has none."""
+        return None if self._read_only and not self._has('gaps') else self.gaps.sums()
 
     def _has(self, table: str) -> bool:
         """An older index is read as it is: only the node brings it up to date."""
-        return self.db.execute('SELECT 1 FROM sqlite_master WHERE name = ?', (table,)).fetchone() is not None
+        return self._db.execute('SELECT 1 FROM sqlite_master WHERE name = ?', (table,)).fetchone() is not None
 
     def rhythms(self) -> list[RhythmRow]:
         """What is known of topics without numbers, one row each."""
-        return [RhythmRow(*row) for row in self.db.execute('SELECT topic, publisher, of, period, last FROM rhythms')]
+        return [RhythmRow(*row) for row in self._db.execute('SELECT topic, publisher, of, period, last FROM rhythms')]
 
     def tally(self) -> list[tuple[str, str, int, int, int]]:
         """(topic or '', state or 'spooled', objects, bytes, samples)."""
-        return self.db.execute('SELECT topic, state, objects, bytes, samples FROM tally').fetchall()
+        return self._db.execute('SELECT topic, state, objects, bytes, samples FROM tally').fetchall()
+
+
+def _after(prefix: str) -> str:
+    """The first text after all those that begin so."""
+    return f'{prefix[:-1]}{chr(ord(prefix[-1]) + 1)}' if prefix else '\U0010ffff'
+
+
+def _marks(count: int) -> str:
+    return ', '.join('?' * count)
 
 
 def spooled(row: sqlite3.Row | Mapping[str, Any], path: Path) -> SpooledObject:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool import clock_record, gaps
+from shadowhound_data_logger.spool import clock_record
 from shadowhound_data_logger.spool.account_rows import OtherTypeRow
 from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED, Gap
@@ -40,7 +40,7 @@ def journal(spool: Path, robot: str) -> list[Gap]:
         if index.gap_sums() is None:
             raise SpoolError(f'the spool {spool} is of an older version, which kept no times of losses',
                              remedy='start the node once: it brings the spool up to date')  # fmt: skip
-        return gaps.known(index.db, clock_record.read(spool, robot)['offsets'])
+        return index.gaps.known(clock_record.read(spool, robot)['offsets'])
 
 
 @contextmanager
@@ -61,12 +61,9 @@ def _reading(spool: Path) -> Iterator[Index]:
 
 def of_index(index: Index, robot: str) -> dict[str, Any]:
     """The ledger of an open index, all of one instant."""
-    index.db.execute('BEGIN')
-    try:
+    with index.snapshot():
         topics, publishers, tally, others = index.topics(), index.publishers(), index.tally(), index.other_types()
         journal = index.gap_sums()
-    finally:
-        index.db.execute('COMMIT')
     names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
     accounts = {topic: _topic(topic, topics, publishers, tally, others) for topic in sorted(names)}
     for topic, row in accounts.items():

@@ -12,7 +12,7 @@ from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.files import Tree
-from shadowhound_data_logger.spool.index import MISSING, Index
+from shadowhound_data_logger.spool.index import Index
 
 HERE: Final = (State.PENDING, State.HELD, State.QUARANTINED)
 """States of objects whose bytes lie in the spool."""
@@ -58,25 +58,14 @@ class Retried:
 
 def heaps(index: Index) -> list[Heap]:
     """Of an open index, the most important first. Raises sqlite3.Error."""
-    rows = index.db.execute(
-        'SELECT sensor, state, reason, count(*), sum(bytes), min(created_ns) FROM objects'
-        " WHERE state IN ('pending', 'held', 'quarantined')"
-        ' GROUP BY sensor, state, reason ORDER BY min(priority), sensor, state, reason'
-    )
-    return [Heap(*row) for row in rows]
+    return [Heap(*row) for row in index.heaps()]
 
 
 def objects(index: Index, root: Path, *, state: State | None = None, sensor: str | None = None,
             prefix: str = '') -> Iterator[Listed]:  # fmt: skip
     """Of an open index, as they were spooled; ``prefix`` is how ``bucket/key`` begins. Raises sqlite3.Error."""
     tree = Tree(root)
-    rows = index.db.execute(
-        'SELECT bucket, key, sensor, state, reason, bytes, created_ns FROM objects'
-        " WHERE state IN ('pending', 'held', 'quarantined') AND state = ifnull(?, state) AND sensor = ifnull(?, sensor)"
-        " AND substr(bucket || '/' || key, 1, length(?)) = ? ORDER BY id",
-        (state and state.value, sensor, prefix, prefix),
-    )
-    for bucket, key, of, now, reason, size, created_ns in rows:
+    for bucket, key, of, now, reason, size, created_ns in index.listed(state, sensor, prefix):
         path = tree.path(State(now), reason, bucket, key).relative_to(root)
         yield Listed(bucket, key, of, now, reason, size, created_ns, str(path))
 
@@ -93,10 +82,7 @@ def retry(root: Path, *, reason: str | None = None, names: Collection[str] = ())
     with flock(root / 'recovery.lock'):
         index.open()
         try:
-            rows = index.rows(
-                "state = 'quarantined' AND reason = ifnull(?, reason) AND reason <> ? ORDER BY id", (reason, MISSING)
-            )
-            wanted = [row for row in rows if not names or f'{row["bucket"]}/{row["key"]}' in names]
+            wanted = [row for row in index.quarantined(reason) if not names or f'{row["bucket"]}/{row["key"]}' in names]
             moved = [row for row in wanted if _moved(tree, row['reason'], row['bucket'], row['key'])]
             with index.transaction():
                 for row in moved:

@@ -24,7 +24,6 @@ from typing import Final
 
 from shadowhound_data_logger.disk import lock
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool import plausible
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import SINKS
 from shadowhound_data_logger.spool.adoption import Adoption, Recovery, place_said
@@ -40,7 +39,6 @@ log = logging.getLogger(__name__)
 DAMAGED: Final = 'damaged'
 REBUILT: Final = 'damaged index rebuilt'
 _DAMAGED: Final = ('malformed', 'disk I/O', 'already exists', 'no such', 'decode', 'unsupported file format')
-_IN_SPOOL: Final = "state IN ('pending', 'held', 'quarantined')"
 
 
 def open_recovered(tree: Tree, now_ns: int, report: Recovery) -> Index:
@@ -57,7 +55,7 @@ def open_recovered(tree: Tree, now_ns: int, report: Recovery) -> Index:
         try:
             index.open()
             index.check()
-            plausible.check(index.db)
+            index.check_values()
             _recover(tree, index, now_ns, report, has_log=has_log)
         except (sqlite3.Error, ValueError, TypeError, AttributeError, OverflowError) as error:
             index.close()
@@ -111,7 +109,7 @@ def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery, *, has_log
         if _is_dead(tree, session):
             tree.remove(body)
             report.counts['files not committed'] += 1
-    for sentence in imbalances(of_index(index, '')) or plausible.uncounted(index.db):
+    for sentence in imbalances(of_index(index, '')) or index.miscounted():
         log.error('the ledger of %s does not close, its index was damaged: %s', tree.root, sentence)
         report.counts['sums of the ledger that do not close'] += 1
     tree.prune()
@@ -121,7 +119,7 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
     """Every row's file to where the row says it is. Other processes may deliver meanwhile."""
     missing: list[int] = []
     damaged: list[tuple[sqlite3.Row, Path]] = []
-    for row in index.rows(f'{_IN_SPOOL} ORDER BY id'):
+    for row in index.in_spool():
         state = State(row['state'])
         if state is State.QUARANTINED and row['reason'] == MISSING:
             continue
@@ -169,7 +167,7 @@ def _settle_parts(tree: Tree, index: Index, report: Recovery, *, adopt: bool) ->
     # Inside a transaction: another process that is about to commit a part of its own holds the write lock.
     with index.transaction():
         for number, part in tree.parts():
-            if index.rows(f'id = ? AND {_IN_SPOOL}', (number,)):
+            if index.is_in_spool(number):
                 continue
             place = place_said(tree, part) if adopt else None
             if place is None or not tree.place(part, place):

@@ -65,13 +65,13 @@ class Repeats:
         distance = 0 if last.sha256 == sha256 else _distance(last.likeness, item.likeness)
         if distance is None:
             return None
-        rows = index.rows('bucket = ? AND key = ?', (item.bucket, last.key))
-        if not rows or rows[0]['state'] not in _HOLDS or rows[0]['sha256'] != last.sha256:
+        row = index.row(item.bucket, last.key)
+        if row is None or row['state'] not in _HOLDS or row['sha256'] != last.sha256:
             return None  # evicted, say
         index.protect(item.bucket, last.key)  # else an outage that fills the disk would cost all its repeats as well
         self._next[_source(item)] = replace(last, repeats=last.repeats + 1, until_ns=item.t_end_ns)
         said = {words.CONTENT_KEY: last.key} | ({} if last.sha256 == sha256 else {words.CONTENT_DISTANCE: str(distance)})
-        return Holder(FileBody(Path(last.key), rows[0]['bytes'], last.sha256), said)
+        return Holder(FileBody(Path(last.key), row['bytes'], last.sha256), said)
 
     def stored(self, item: DataObject, key: str, sha256: str) -> Mapping[str, str]:
         """The sensor stored this; returns what is to be said of the repeats before it."""

@@ -1,4 +1,4 @@
-"""The tables of the spool's index: objects, their totals (kept by triggers), sessions and accounts; and that they are there."""
+"""The tables of the spool's index: objects, their totals (kept by triggers), sessions and accounts; what can be in them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool.gaps import FORGOTTEN, MERGE, NEXT_VERSION, UNTIMED
+from shadowhound_data_logger.spool.gaps import FORGOTTEN, UNTIMED
 
 SCHEMA_VERSION: Final = 6
 CATALOGUE: Final = '_catalog'
@@ -20,6 +20,12 @@ JOURNALED: Final = 6
 """The version from which on losses have times."""
 VERSION_LIMIT: Final = 1000
 """A version from here on is damage, not a future."""
+NEXT_VERSION: Final = '(SELECT ifnull(max(version), 0) + 1 FROM gaps)'
+MERGE: Final = """
+  ON CONFLICT DO UPDATE SET version = excluded.version, count = count + excluded.count, merged = merged + excluded.merged,
+    from_ns = CASE WHEN count > 0 THEN min(from_ns, excluded.from_ns) ELSE excluded.from_ns END,
+    to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END"""
+"""What an INSERT does where the row is there."""
 _STATES: Final = ', '.join(f"'{state.value}'" for state in State)
 _BY_BUCKET: Final = """
 CREATE INDEX pending ON objects (bucket, priority, id) WHERE state = 'pending';
@@ -41,7 +47,7 @@ CREATE TRIGGER forgotten AFTER DELETE ON objects BEGIN
   DELETE FROM uncatalogued WHERE id = OLD.id;
 END;
 """  # noqa: S608 - own constants only
-"""What the store holds and no part of the catalogue has a row of (uncatalogued.py)."""
+"""What the store holds and no part of the catalogue has a row of (``Index.uncatalogued``)."""
 _CONTENTS: Final = """
 CREATE TABLE contents (
   id INTEGER NOT NULL, topic TEXT NOT NULL, samples INTEGER NOT NULL, PRIMARY KEY (id, topic)) WITHOUT ROWID;
@@ -293,3 +299,66 @@ def expected() -> set[tuple[str, str]]:
     with closing(sqlite3.connect(':memory:')) as db:
         db.executescript(SCHEMA)
         return definitions(db)
+
+
+_NUMBERS: Final = {
+    'objects': ('id', 'priority', 'protected', 'samples', 'bytes', 't_start_ns', 't_end_ns', 'created_ns', 'settled_ns'),
+    'sessions': ('id', 'pid', 'started_ns', 'ended_ns'),
+    'accounts': ('session', 'received', 'skipped', 'stored', 'last_kept_ns', 'first_ns', 'heard_ns', 'complete_ns'),
+    'publishers': ('session', 'first', 'last', 'published', 'received', 'heard_ns'),
+    'other_types': ('session', 'messages'),
+    'estimates': ('session', 'estimated', 'unknown'),
+    'rhythms': ('last',),
+    'tally': ('objects', 'bytes', 'samples'),
+    'contents': ('id', 'samples'),
+    'gaps': ('session', 'begin_ns', 'from_ns', 'to_ns', 'count', 'merged', 'version'),
+    'sqlite_sequence': ('seq',),
+}
+_COUNTS: Final = frozenset({'id', 'samples', 'bytes', 'received', 'skipped', 'stored', 'published', 'objects', 'seq', 'session',
+                            'messages', 'estimated', 'unknown', 'count', 'merged', 'version'})  # fmt: skip
+"""Never below 0, and no more than can be counted. Times and the numbers of messages are whatever a publisher says."""
+_MOST: Final = 1 << 53
+_TEXTS: Final = {
+    'objects': ('bucket', 'key', 'state', 'reason', 'sensor', 'topic', 'type', 'sha256', 'content_type', 'metadata'),
+    'sessions': ('robot', 'boot_id'),
+    'accounts': ('topic', 'type', 'accounting', 'rejected', 'dropped'),
+    'publishers': ('topic', 'publisher', 'missed'),
+    'other_types': ('topic', 'type', 'publishers'),
+    'estimates': ('topic', 'missed'),
+    'rhythms': ('topic', 'publisher', 'of'),
+    'tally': ('topic', 'state'),
+    'contents': ('topic',),
+    'gaps': ('topic', 'kind', 'cause', 'grade', 'publisher', 'mission'),
+    'sqlite_sequence': ('name',),
+}
+_JSON: Final = {
+    'accounts': ('rejected', 'dropped'), 'publishers': ('missed',), 'estimates': ('missed',), 'objects': ('metadata',),
+}  # fmt: skip
+_UNSAFE: Final = (
+    "length(key) > 1024 OR length(bucket) > 64 OR bucket GLOB '*[^A-Za-z0-9_.-]*' OR bucket IN ('', '.', '..')"
+    " OR '/' || key || '/' GLOB '*/../*' OR '/' || key || '/' GLOB '*/./*' OR '/' || key || '/' GLOB '*//*'"
+    " OR length(reason) > 200 OR reason GLOB '*/*' OR reason IN ('.', '..')"
+)
+
+
+def _implausible(table: str) -> str:
+    """NULL is judged by the table's own constraints."""
+    conditions = [f"typeof({column}) NOT IN ('text', 'null')" for column in _TEXTS[table]]
+    for column in _NUMBERS[table]:
+        conditions.append(f"typeof({column}) NOT IN ('integer', 'null')")
+        if column in _COUNTS:
+            conditions.append(f'{column} NOT BETWEEN 0 AND {_MOST}')
+    if table == 'rhythms':
+        conditions.append(f"typeof(period) <> 'real' OR period NOT BETWEEN 0 AND {_MOST}")
+    conditions += [f"{column} NOT GLOB '{{*}}'" for column in _JSON.get(table, ())]
+    name = 'rowid' if table in {'objects', 'sessions', 'sqlite_sequence'} else 'topic'  # the others have no rowid
+    where = ' OR '.join((*conditions, *([_UNSAFE] if table == 'objects' else [])))
+    return f'SELECT {name} FROM {table} WHERE {where} LIMIT 1'  # noqa: S608 - own constants only
+
+
+IMPLAUSIBLE: Final = {table: _implausible(table) for table in _NUMBERS}
+"""Table -> the question for a row with a value that cannot be ours.
+
+A flipped bit gives a record any value, and SQLite sees nothing wrong with it: a text among numbers would end every start, a key
+with ``..`` in it lead out of the spool. Asking takes 4 us a row.
+"""

@@ -6,7 +6,6 @@ is spooled, or known to be lost. The two rows change in one transaction, so that
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import replace
 
@@ -49,7 +48,7 @@ class Session:
 def carry(index: Index, session: int, robot: str, sink: str) -> list[TopicRow]:
     """Move what a robot's ended sessions left open to this one; its new rows. In a transaction, before it has any of the sink."""
     moved: dict[str, TopicRow] = {}
-    for number in _ended(index, robot, sink):
+    for number in index.sessions_with_open(robot, sink):
         for row in index.topics(number):
             if row.topic.startswith(sink) and row.open > 0:
                 before = moved.get(row.topic) or TopicRow(row.topic, '', '', 0, 0, 0, {}, {}, 0)
@@ -60,21 +59,6 @@ def carry(index: Index, session: int, robot: str, sink: str) -> list[TopicRow]:
                     estimated=before.estimated + estimated, unknown=before.unknown + unknown,
                     last_kept_ns=max(before.last_kept_ns, row.last_kept_ns), heard_ns=max(before.heard_ns, row.heard_ns),
                 )  # fmt: skip
-                place = number, row.topic
-                query = 'UPDATE accounts SET received = received - ? WHERE session = ? AND topic = ?'
-                index.db.execute(query, (row.open, *place))
-                index.db.execute(
-                    'UPDATE estimates SET estimated = estimated - ?, unknown = unknown - ? WHERE session = ? AND topic = ?',
-                    (estimated, unknown, *place),
-                )
+                index.take_over(number, row.topic, row.open, estimated, unknown)
     index.write(session, AccountSnapshot(tuple(moved.values()), ()))
     return list(moved.values())
-
-
-def _ended(index: Index, robot: str, sink: str) -> list[int]:
-    """Sessions that may have left something open."""
-    columns = 'SELECT session, received - skipped - stored, rejected, dropped FROM accounts JOIN sessions ON id = session'
-    rows = index.db.execute(f'{columns} WHERE robot = ? AND ended_ns IS NOT NULL AND topic GLOB ?', (robot, f'{sink}*'))
-    return sorted({
-        number for number, rest, *lost in rows if rest > sum(sum(json.loads(each).values()) for each in lost)
-    })  # fmt: skip

@@ -22,7 +22,7 @@ from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, SpooledObject, State
-from shadowhound_data_logger.spool import binding, gaps
+from shadowhound_data_logger.spool import binding
 from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.adding import Adding, remove_sources, staged
@@ -36,7 +36,6 @@ from shadowhound_data_logger.spool.recovery import open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, fits, make_room
 from shadowhound_data_logger.spool.session import Session, carry
-from shadowhound_data_logger.spool.uncatalogued import take
 
 log = logging.getLogger(__name__)
 
@@ -160,8 +159,7 @@ class Spool:
 
     def states(self, bucket: str, prefix: str) -> dict[str, State]:
         """What became of every object whose key begins so, by key. Waits for no commit; raises sqlite3.Error."""
-        rows = self._view.rows('bucket = ? AND key >= ? AND key < ?', (bucket, prefix, prefix + LAST))
-        return {row['key']: State(row['state']) for row in rows}
+        return {row['key']: State(row['state']) for row in self._view.with_prefix(bucket, prefix)}
 
     def gaps_after(self, version: int, limit: int, offsets: Mapping[str, int]) -> tuple[list[Gap], list[Watermark]]:
         """What changed in the gap journal since this version, and up to when that is complete, both of one instant.
@@ -171,8 +169,8 @@ class Spool:
         """
         with closing(Index(self.root / 'index.db', read_only=True)) as index:
             index.open()
-            index.db.execute('BEGIN')
-            return gaps.changed(index.db, version, limit, offsets), gaps.watermarks(index.db)
+            with index.snapshot():
+                return index.gaps.changed(version, limit, offsets), index.gaps.watermarks()
 
     def free_bytes(self) -> int:
         """What this user may still write to the spool's file system. Raises OSError."""
@@ -192,7 +190,7 @@ class Spool:
 
     def held(self, reason: str, limit: int = 256) -> list[HeldObject]:
         """What has no final name yet for this reason, the oldest first; waits for no commit. Raises sqlite3.Error."""
-        return binding.held(self._view, reason, limit)
+        return self._view.held(reason, limit)
 
     def bind(self, bindings: Sequence[Binding]) -> list[SpooledObject]:
         """Give held objects their final (made unique) keys, all or none; returns those that may be shipped now.
@@ -259,7 +257,7 @@ class Spool:
         try:
             with self._index.transaction(undo=adding.discard):
                 for place, item in enumerate(objects):
-                    if take(self._index, item.catalogues):
+                    if self._index.take_uncatalogued(item.catalogues):
                         adding.add(item, fits=place not in room.given_up)
                 adding.sync()
                 for outcome in outcomes:
@@ -289,7 +287,7 @@ class Spool:
         """
         try:
             with flock(self.root / 'recovery.lock', wait=False) as mine, self._lock:
-                if mine and self._index.rows("id = ? AND state = 'quarantined'", (item.id,)):
+                if mine and self._index.is_quarantined(item.id):
                     source = self._tree.waiting(item.id, item.bucket, item.key)
                     self._tree.place(source, self._tree.path(State.QUARANTINED, reason, item.bucket, item.key))
         except (OSError, sqlite3.Error) as error:

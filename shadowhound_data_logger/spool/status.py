@@ -162,8 +162,7 @@ def _session(index: Index, robot: str, pid: int) -> dict[str, Any] | None:
 
     Who sends missions or bags has sessions as well: the node's is that of the process that wrote the status, where one did.
     """
-    query = 'SELECT started_ns, ended_ns FROM sessions WHERE robot = ? ORDER BY pid = ? DESC, id DESC LIMIT 1'
-    row = index.db.execute(query, (robot, pid)).fetchone()
+    row = index.last_session(robot, pid)
     return {'started': iso(row[0]), 'ended': iso(row[1]) if row[1] is not None else None} if row else None
 
 

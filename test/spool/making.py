@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.index import Index, UncataloguedObject
 from shadowhound_data_logger.spool.spool import Outcome, Spool
 
 NOON_NS = 1_760_788_800 * SECOND
@@ -79,6 +81,25 @@ def put(spool: Spool, *objects: DataObject) -> list[SpooledObject]:
 def settle(spool: Spool, item: SpooledObject, state: State, reason: str | None = None) -> None:
     """Commit one outcome."""
     spool.commit(outcomes=[Outcome(item, state, reason)])
+
+
+@contextmanager
+def index_of(root: Path) -> Iterator[Index]:
+    """The index as somebody else opens it."""
+    with closing(Index(root / 'index.db')) as index:
+        index.open()
+        yield index
+
+
+def uncatalogued(root: Path, limit: int = 99) -> list[UncataloguedObject]:
+    """The oldest of what no part of the catalogue has a row of yet."""
+    with index_of(root) as index:
+        return index.uncatalogued(limit)
+
+
+def clear_uncatalogued(root: Path) -> None:
+    with index_of(root) as index:
+        index.clear_uncatalogued()
 
 
 def rows(root: Path) -> list[dict[str, Any]]:

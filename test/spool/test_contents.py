@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 from spool.conftest import Open
-from spool.making import FakeClock, make, new_spool, receive, settle
+from spool.making import FakeClock, clear_uncatalogued, index_of, make, new_spool, receive, settle
 
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import DataObject, State
-from shadowhound_data_logger.spool import ledger, plausible, uncatalogued
+from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.spool import Spool
 
@@ -30,8 +30,8 @@ def bags(root: Path) -> dict[str, tuple[int, int, dict[str, int], int]]:
     """Topic -> (received, stored, dropped, open), of a ledger that balances and agrees with the files."""
     found = ledger.read(root, 'thor')
     assert ledger.imbalances(found) == []
-    with sqlite3.connect(root / 'index.db') as db:
-        assert list(plausible.uncounted(db)) == []
+    with index_of(root) as index:
+        assert list(index.miscounted()) == []
     return {topic: (row['received'], row['stored'], row['dropped'], row['open']) for topic, row in found['bags'].items()}
 
 
@@ -88,7 +88,7 @@ def test_totals_stay_when_slices_are_forgotten(opened: Open, root: Path, clock: 
     receive(spool, 3, IMU)
     (item,) = spool.commit([a_slice(0, imu=3)])
     settle(spool, item, State.DELIVERED)
-    uncatalogued.clear(root)
+    clear_uncatalogued(root)
     clock.now_ns += 3 * 24 * 3600 * 10**9
     spool.commit()
     with sqlite3.connect(root / 'index.db') as db:

@@ -74,7 +74,7 @@ def test_a_lost_write_ahead_log(opened: Open, root: Path) -> None:
     """When the index goes back in time, the files written since are adopted again."""
     spool = opened()
     put(spool, make('old'))
-    spool._index.db.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+    spool._index._db.execute('PRAGMA wal_checkpoint(TRUNCATE)')
     put(spool, make('new', b'new'))
     before = (root / 'index.db').read_bytes()
     assert (root / 'index.db-wal').stat().st_size > 0

@@ -231,13 +231,13 @@ def test_no_space_for_the_index(spool: Spool, root: Path, monkeypatch: pytest.Mo
 def test_an_index_that_may_not_grow(spool: Spool, root: Path) -> None:
     """When SQLite itself finds the disk full, the spool goes on once there is space."""
     index = spool._index
-    pages = index.db.execute('PRAGMA page_count').fetchone()[0]
-    index.db.execute(f'PRAGMA max_page_count = {pages}')
+    pages = index._db.execute('PRAGMA page_count').fetchone()[0]
+    index._db.execute(f'PRAGMA max_page_count = {pages}')
     objects = [make(f'{number}', metadata={'padding': 'x' * 1500}) for number in range(40)]
     with pytest.raises(sqlite3.OperationalError, match='full'):
         put(spool, *objects)
     assert rows(root) == []
-    index.db.execute('PRAGMA max_page_count = 1000000')
+    index._db.execute('PRAGMA max_page_count = 1000000')
     assert len(spool.commit(objects)) == 40
     assert_whole(root)
 

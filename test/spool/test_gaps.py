@@ -16,6 +16,7 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.model import Outcome, SpooledObject, State
 from shadowhound_data_logger.spool import gaps, ledger
 from shadowhound_data_logger.spool.accounts import BAG
+from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.gaps import Gap, TopicGaps
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -27,7 +28,7 @@ CAMERA = '/camera'
 def journal(root: Path) -> list[Gap]:
     """All of it, read by somebody else."""
     with closing(sqlite3.connect(root / 'index.db')) as db:
-        return gaps.known(db, {})
+        return GapTable(db).known({})
 
 
 def short(root: Path) -> list[tuple[str, str, int | None, float | None, float | None]]:
@@ -247,7 +248,7 @@ def test_a_commit_that_is_tried_again_claims_nothing_for_what_came_meanwhile(
     items = spool.commit([make('a')])
     hear(spool, 2)
     with monkeypatch.context() as patch:
-        patch.setattr(gaps, 'write', _full)
+        patch.setattr(GapTable, 'write', _full)
         with pytest.raises(sqlite3.OperationalError):
             spool.commit()
     deliver(spool, *items)
@@ -416,7 +417,7 @@ def test_a_commit_that_fails_loses_no_time(spool: Spool, root: Path, monkeypatch
     spool.commit()
     hear(spool, 6)
     with monkeypatch.context() as patch:
-        patch.setattr(gaps, 'write', _full)
+        patch.setattr(GapTable, 'write', _full)
         for _ in range(2):
             with pytest.raises(sqlite3.OperationalError):
                 spool.commit()
@@ -483,7 +484,7 @@ def _count(spool: Spool, clock: FakeClock, what: str, number: int) -> None:
     if what == 'fail':
         accounts.reject(CAMERA, {'nothing': 0})
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(gaps, 'write', _full)
+            patch.setattr(GapTable, 'write', _full)
             with pytest.raises(sqlite3.OperationalError):
                 spool.commit()
     elif what == 'rebase':

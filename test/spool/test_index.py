@@ -54,9 +54,9 @@ def work(index: Index, *, oldest: bool, without: tuple[str, ...]) -> int:
         steps += STEP
         return 0
 
-    index.db.set_progress_handler(count, STEP)
+    index._db.set_progress_handler(count, STEP)
     found = index.pending(40, oldest=oldest, without=without)
-    index.db.set_progress_handler(None, STEP)
+    index._db.set_progress_handler(None, STEP)
     assert len(found) == (20 if without else 40)
     return steps
 

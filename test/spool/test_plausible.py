@@ -12,10 +12,9 @@ import pytest
 from profiles import examples
 from spool import editing, rotting
 from spool.conftest import Open
-from spool.making import make, put, settle
+from spool.making import index_of, make, put, settle
 
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool import plausible
 
 ROUNDS = examples(40)
 
@@ -34,9 +33,9 @@ def index(opened: Open, root: Path) -> Path:
 
 def test_what_is_ours_is_not_doubted(index: Path) -> None:
     """No value that the spool itself wrote is called impossible, and its totals are those of its objects."""
-    with closing(sqlite3.connect(index)) as db:
-        plausible.check(db)
-        assert list(plausible.uncounted(db)) == []
+    with index_of(index.parent) as whole:
+        whole.check_values()
+        assert list(whole.miscounted()) == []
 
 
 @pytest.mark.parametrize(
@@ -54,8 +53,8 @@ def test_what_cannot_be_ours_is_found(index: Path, opened: Open, change: str) ->
     with closing(sqlite3.connect(index)) as db:
         db.execute(f'UPDATE {change}')
         db.commit()
-        with pytest.raises(sqlite3.DatabaseError, match='cannot be'):
-            plausible.check(db)
+    with index_of(index.parent) as damaged, pytest.raises(sqlite3.DatabaseError, match='cannot be'):
+        damaged.check_values()
     assert opened().recovery.counts['damaged index rebuilt'] == 1
 
 
@@ -64,7 +63,8 @@ def test_totals_of_other_objects_are_told(index: Path, opened: Open, caplog: pyt
     with closing(sqlite3.connect(index)) as db:
         db.execute("UPDATE objects SET topic = '/other' WHERE key = 'thor/3'")
         db.commit()
-        assert len(list(plausible.uncounted(db))) == 2
+    with index_of(index.parent) as wrong:
+        assert len(list(wrong.miscounted())) == 2
     assert opened().recovery.counts['sums of the ledger that do not close'] == 2
     assert '/other: pending None, but in the spool (1, 7, 1)' in caplog.text
 

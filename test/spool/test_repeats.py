@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 from spool.conftest import Open
-from spool.making import BUCKET, NOON_NS, assert_whole, files, make, put, receive, rows, settle
+from spool.making import BUCKET, NOON_NS, assert_whole, files, make, put, receive, rows, settle, uncatalogued
 
 from shadowhound_data_logger.metadata_words import CONTENT_DISTANCE, CONTENT_KEY
 from shadowhound_data_logger.model import DataObject, Likeness, State
-from shadowhound_data_logger.spool import uncatalogued
 from shadowhound_data_logger.spool.spool import Spool
 
 
@@ -118,7 +117,7 @@ def test_the_catalogue_has_a_row_for_each_repeat(spool: Spool, root: Path) -> No
     (item,) = put(spool, picture(0))
     put(spool, picture(1))
     settle(spool, item, State.DELIVERED)
-    found = uncatalogued.waiting(root, 9)
+    found = uncatalogued(root, 9)
     assert [each.key for each in found] == [item.key, item.key]
     assert [each.metadata['t_start_ns'] for each in found] == [str(picture(0).t_start_ns), str(picture(1).t_start_ns)]
 

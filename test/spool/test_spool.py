@@ -8,13 +8,26 @@ from pathlib import Path
 import pytest
 from spool.child import started
 from spool.conftest import Open
-from spool.making import BUCKET, KEY, NOON_NS, FakeClock, assert_whole, files, make, new_spool, put, receive, rows, settle
+from spool.making import (
+    BUCKET,
+    KEY,
+    NOON_NS,
+    FakeClock,
+    assert_whole,
+    clear_uncatalogued,
+    files,
+    make,
+    new_spool,
+    put,
+    receive,
+    rows,
+    settle,
+)
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.keys import MAX_SEGMENT_BYTES
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool import uncatalogued
 from shadowhound_data_logger.spool.spool import Outcome, Spool
 
 DAY_NS = 24 * 3600 * SECOND
@@ -112,7 +125,7 @@ def test_quarantine_moves_the_file(spool: Spool, root: Path, reason: str | None,
 def test_quarantine_moves_the_file_while_somebody_reads(spool: Spool, root: Path) -> None:
     """A question to the index that is half answered meanwhile, as a status is on a busy machine, does not hide the outcome."""
     (item,) = put(spool, make())
-    half = spool._view.db.execute('SELECT * FROM tally')
+    half = spool._view._db.execute('SELECT * FROM tally')
     assert half.fetchone()
     settle(spool, item, State.QUARANTINED, 'foreign')
     assert half.fetchone(), 'it was not at its end'
@@ -160,7 +173,7 @@ def test_old_deliveries_are_forgotten_and_totals_stay(spool: Spool, root: Path, 
     clock.now_ns += 31 * DAY_NS
     spool.commit()
     assert len(rows(root)) == 2, 'the catalogue has no row of it yet'
-    uncatalogued.clear(root)
+    clear_uncatalogued(root)
     clock.now_ns += DAY_NS
     spool.commit()
     assert [row['id'] for row in rows(root)] == [kept.id]
@@ -172,7 +185,7 @@ def test_forgetting_keeps_up(spool: Spool, root: Path, clock: FakeClock, monkeyp
     monkeypatch.setattr('shadowhound_data_logger.spool.index.FORGET_STEP', 2)
     items = put(spool, *(make(str(number)) for number in range(5)))
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
-    uncatalogued.clear(root)
+    clear_uncatalogued(root)
     clock.now_ns += 31 * DAY_NS
     left = []
     for _ in range(3):

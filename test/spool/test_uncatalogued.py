@@ -9,10 +9,21 @@ from pathlib import Path
 
 import pytest
 from spool.conftest import Moments, Open
-from spool.making import WITHOUT_GAPS, FakeClock, abandon, assert_whole, make, new_spool, put, rows, settle
+from spool.making import (
+    WITHOUT_GAPS,
+    FakeClock,
+    abandon,
+    assert_whole,
+    clear_uncatalogued,
+    make,
+    new_spool,
+    put,
+    rows,
+    settle,
+    uncatalogued,
+)
 
 from shadowhound_data_logger.model import DataObject, Outcome, State
-from shadowhound_data_logger.spool import uncatalogued
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.spool import Spool
 
@@ -20,12 +31,12 @@ ALL = 1000
 
 
 def listed(root: Path) -> list[str]:
-    return [item.key for item in uncatalogued.waiting(root, ALL)]
+    return [item.key for item in uncatalogued(root, ALL)]
 
 
 def part(root: Path, name: str, *keys: str) -> DataObject:
     """A part with rows of all that is listed, or of these."""
-    ids = tuple(item.id for item in uncatalogued.waiting(root, ALL) if not keys or item.key in keys)
+    ids = tuple(item.id for item in uncatalogued(root, ALL) if not keys or item.key in keys)
     return make(f'thor/_catalog/{name}.parquet', name.encode(), sensor='_catalog', topic=None, protected=True, catalogues=ids)
 
 
@@ -42,11 +53,11 @@ def test_what_the_store_holds_is_listed(spool: Spool, root: Path) -> None:
     settle(spool, items[3], State.DELIVERED)
     settle(spool, items[0], State.DELIVERED)
     assert listed(root) == ['a', 'd']
-    (first, _) = uncatalogued.waiting(root, ALL)
+    (first, _) = uncatalogued(root, ALL)
     assert first == (items[0].id, 'sensor-data', 'a', 1, 'image/jpeg', items[0].metadata)
     settle(spool, items[2], State.DELIVERED)  # it was on its way when it was evicted
     assert listed(root) == ['a', 'c', 'd']
-    assert [item.key for item in uncatalogued.waiting(root, 2)] == ['a', 'c']
+    assert [item.key for item in uncatalogued(root, 2)] == ['a', 'c']
 
 
 def test_a_part_takes_its_rows_off(spool: Spool, root: Path) -> None:
@@ -123,7 +134,7 @@ def test_what_is_listed_is_not_forgotten(opened: Open, root: Path, clock: FakeCl
     clock.now_ns += 10**18
     spool.commit()
     assert [row['key'] for row in rows(root)] == listed(root) == ['a']
-    uncatalogued.clear(root)
+    clear_uncatalogued(root)
     assert listed(root) == []
     clock.now_ns += 10**14
     spool.commit()

@@ -1,0 +1,204 @@
+"""The table of the gap journal (gaps.py): every statement that reads or writes it, but for the triggers in schema.py."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final
+
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.spool.gaps import FORGOTTEN, LATELY_NS, OBJECTS, Gap, GapRow, TakenBack, Watermark, split
+from shadowhound_data_logger.spool.schema import MERGE, NEXT_VERSION
+
+MOST_WAITING: Final = 5_000
+"""Objects of a bucket that are looked at for the first stamp of each account: some 20 ms."""
+_SESSIONS: Final = """
+SELECT session, robot, started_ns, received = skipped + stored
+    + ifnull((SELECT sum(value) FROM json_each(rejected)), 0) + ifnull((SELECT sum(value) FROM json_each(dropped)), 0)
+    AND ifnull(json_extract(dropped, '$.restart'), 0) = 0,
+  topic, accounting, received, skipped, first_ns, heard_ns, complete_ns, ended_ns IS NOT NULL
+FROM accounts JOIN sessions ON id = session
+WHERE session > (SELECT max(id) FROM sessions) - 20 AND first_ns >= ? AND accounting IN ('exact', 'estimated')
+ORDER BY robot, topic, session"""
+_NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
+
+
+class GapTable:
+    """Part of an open index, on its connection. Methods that write belong into one of its transactions."""
+
+    def __init__(self, db: sqlite3.Connection) -> None:
+        self._db = db
+
+    def write(self, session: int, rows: Iterable[GapRow], taken_back: Iterable[TakenBack]) -> None:
+        """Change the journal, in the transaction that writes the accounts."""
+        less: list[TakenBack] = []
+        for row in rows:
+            key = row.key
+            if row.messages <= 0:
+                changed = self._db.execute(
+                    f'UPDATE gaps SET version = {NEXT_VERSION}, count = count + ?, merged = max(0, merged + ?) WHERE {_NAMED}'  # noqa: S608
+                    ' AND publisher = ? AND mission = ? AND begin_ns = ? AND count + ? >= 0',
+                    (row.messages, row.merged, session, row.topic, *key, row.messages),
+                ).rowcount  # fmt: skip
+                if not changed and row.messages:
+                    less.append(TakenBack(row.topic, *key[:3], -row.messages))
+                continue
+            self._db.execute(
+                f'INSERT INTO gaps VALUES (?,?,?,?,?,?,?,?,?,?,?,?,{NEXT_VERSION}) {MERGE}',  # noqa: S608 - own constants only
+                (session, row.topic, *key, row.from_ns, row.to_ns, row.messages, row.merged),
+            )
+        for each in (*less, *taken_back):
+            self._take_back(session, each)
+
+    def _take_back(self, session: int, given: TakenBack) -> None:
+        named = (session, given.topic, given.kind, given.cause, given.grade)
+        rest = given.messages
+        newest = (
+            f'SELECT publisher, mission, begin_ns, count FROM gaps WHERE {_NAMED} AND count > 0 ORDER BY begin_ns DESC LIMIT 1'  # noqa: S608
+        )
+        while rest and (row := self._db.execute(newest, named).fetchone()) is not None:
+            publisher, mission, begin_ns, count = row
+            part = min(rest, count)
+            self._db.execute(
+                f'UPDATE gaps SET version = {NEXT_VERSION}, count = count - ?1,'  # noqa: S608
+                ' merged = CASE WHEN count > ?1 THEN merged ELSE 0 END'
+                ' WHERE session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ? AND publisher = ? AND mission = ?'
+                ' AND begin_ns = ?',
+                (part, *named, publisher, mission, begin_ns),
+            )
+            rest -= part
+
+    def forget(self, before_ns: int, limit: int) -> bool:
+        """Drop rows of before then, their sums stay; False when there may be more of them. In a transaction."""
+        old = self._db.execute(
+            'SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged FROM gaps'
+            " WHERE begin_ns BETWEEN ? AND ? AND kind <> 'quarantined' LIMIT ?", (EARLIEST_SANE_NS, before_ns, limit),
+        ).fetchall()  # fmt: skip
+        sums = Counter[tuple[Any, ...]]()
+        merged = Counter[tuple[Any, ...]]()
+        for row in old:
+            sums[row[:5]] += row[8]
+            merged[row[:5]] += row[9]
+        self._db.executemany(
+            f"INSERT INTO gaps VALUES (?,?,?,?,?,'','',{FORGOTTEN},NULL,NULL,?,?,{NEXT_VERSION}) {MERGE}",  # noqa: S608
+            ((*what, count, merged[what]) for what, count in sums.items()),
+        )
+        self._db.executemany(
+            f'DELETE FROM gaps WHERE {_NAMED} AND publisher = ? AND mission = ? AND begin_ns = ?',  # noqa: S608
+            (row[:8] for row in old),
+        )
+        return len(old) < limit
+
+    def changed(self, after: int, limit: int, offsets: Mapping[str, int]) -> list[Gap]:
+        """The rows whose versions are greater, by version: about ``limit``, and all of the last version.
+
+        ``offsets`` are UTC less boot clock by boot (``ClockRecord.offsets``). Sums of what was forgotten are left out.
+        """
+        query = 'SELECT version FROM gaps WHERE version > ? ORDER BY version LIMIT 1 OFFSET ?'
+        last = self._db.execute(query, (after, limit - 1)).fetchone()
+        upto = (1 << 62) if last is None else last[0]
+        return list(
+            self._gaps('version > ? AND version <= ? AND begin_ns <> ? ORDER BY version', (after, upto, FORGOTTEN), offsets)
+        )
+
+    def extent(self, robot: str) -> tuple[int, int, set[str]]:
+        """The newest version; when the journal began; and topics that other robots of this spool have, and this one has not."""
+        newest = self._db.execute('SELECT ifnull(max(version), 0) FROM gaps').fetchone()[0]
+        began_ns = self._db.execute('SELECT ifnull(min(started_ns), 0) FROM sessions').fetchone()[0]
+        topics: dict[bool, set[str]] = {True: set(), False: set()}
+        for account, is_own in self._db.execute(
+            'SELECT DISTINCT topic, robot = ? FROM accounts JOIN sessions ON id = session', (robot,)
+        ):
+            topics[bool(is_own)].add(split(account)[1])
+        return newest, began_ns, topics[False] - topics[True]
+
+    def has_undated(self) -> bool:
+        """Whether there are rows of a time before the clock was set."""
+        return (
+            self._db.execute('SELECT 1 FROM gaps WHERE begin_ns BETWEEN 0 AND ? LIMIT 1', (EARLIEST_SANE_NS,)).fetchone()
+            is not None
+        )
+
+    def known(self, offsets: Mapping[str, int]) -> list[Gap]:
+        """All that is lost, in the order of time; what has no time comes first."""
+        return list(self._gaps('count > 0 ORDER BY begin_ns, topic', (), offsets))
+
+    def watermarks(self) -> list[Watermark]:
+        """Of each sink and topic of the newest sessions that has one.
+
+        Before the first message that still waits for delivery, since that may yet be evicted; and before the last message of each
+        publisher that was heard lately, since what it sent after that may be found to be missed.
+        """
+        waiting = self._waiting()
+        silent = {
+            (session, account): stamp
+            for session, account, stamp in self._db.execute(
+                'SELECT session, topic, min(publishers.heard_ns) FROM publishers JOIN accounts USING (session, topic)'
+                ' JOIN sessions ON id = session WHERE ended_ns IS NULL AND publishers.heard_ns > accounts.heard_ns - ?'
+                ' GROUP BY session, topic', (LATELY_NS,),
+            )
+        }  # fmt: skip
+        found = []
+        for (session, robot, started_ns, is_over, account, grade, received, skipped, first_ns, heard_ns, complete_ns,
+             has_ended) in self._db.execute(_SESSIONS, (EARLIEST_SANE_NS,)):  # fmt: skip
+            sink, topic = split(account)
+            if has_ended and sink == OBJECTS and is_over:
+                complete_ns = heard_ns  # noqa: PLW2901 - nothing was lost on its way after all
+            end_ns = min(complete_ns, silent.get((session, account), complete_ns), waiting.get(account, complete_ns))
+            since_ns = max(first_ns, started_ns)
+            if since_ns <= end_ns:
+                found.append(Watermark(robot, sink, topic, session, since_ns, end_ns, grade, received, skipped))
+        return found
+
+    def _waiting(self) -> dict[str, int]:
+        """Account -> the first stamp of what waits for delivery or a name; 0 where so much waits that nobody looks for it."""
+        waiting: dict[str, int] = {}
+        is_all = True
+        for state, column, order in (('pending', 'bucket', 'waiting'), ('held', 'reason', 'held')):
+            for value in self._values(state, column):
+                rows = self._db.execute(
+                    'SELECT ifnull(contents.topic, one.topic), min(t_start_ns), count(*) FROM (SELECT id, topic, t_start_ns'  # noqa: S608
+                    f" FROM objects INDEXED BY {order} WHERE state = '{state}' AND {column} = ? ORDER BY id LIMIT {MOST_WAITING})"
+                    ' AS one LEFT JOIN contents USING (id) GROUP BY 1', (value,),
+                ).fetchall()  # fmt: skip
+                is_all &= sum(count for _, _, count in rows) < MOST_WAITING
+                for account, stamp, _ in rows:
+                    waiting[account] = min(stamp, waiting.get(account, stamp))
+        if not is_all:
+            query = "SELECT topic FROM tally WHERE state IN ('pending', 'held') AND samples > 0"
+            for (account,) in self._db.execute(query):
+                waiting.setdefault(account, 0)
+        return waiting
+
+    def _values(self, state: str, column: str) -> Iterator[str]:
+        """Those that a column of objects in a state has, by one step in the index for each."""
+        query = f"SELECT {column} FROM objects WHERE state = '{state}' AND {column} > ? ORDER BY {column} LIMIT 1"  # noqa: S608
+        value = ''
+        while row := self._db.execute(query, (value,)).fetchone():
+            value = row[0]
+            yield value
+
+    def sums(self) -> dict[tuple[str, str, str, str], int]:
+        """(account, kind, cause, grade) -> messages, over all rows."""
+        query = 'SELECT topic, kind, cause, grade, sum(count) FROM gaps GROUP BY topic, kind, cause, grade HAVING sum(count) <> 0'
+        return {(*what,): count for *what, count in self._db.execute(query)}
+
+    def _gaps(self, where: str, values: tuple[object, ...], offsets: Mapping[str, int]) -> Iterator[Gap]:
+        columns = ('session, topic, kind, cause, grade, publisher, mission, begin_ns, from_ns, to_ns, count, merged, version,'
+                   ' robot, boot_id, started_ns')  # fmt: skip
+        query = f'SELECT {columns} FROM gaps LEFT JOIN sessions ON sessions.id = session WHERE {where}'  # noqa: S608 - own conditions
+        for (session, account, kind, cause, grade, publisher, mission, begin_ns, from_ns, to_ns, count, merged, version,
+             robot, boot_id, started_ns) in self._db.execute(query, values):  # fmt: skip
+            sink, topic = split(account)
+            is_boot = from_ns is not None and from_ns < EARLIEST_SANE_NS
+            offset_ns = offsets.get(boot_id) if is_boot else 0
+            yield Gap(
+                sink, topic, publisher or None, session or None, kind, cause, _plus(from_ns, offset_ns), _plus(to_ns, offset_ns),
+                count, merged, grade, mission or None, robot, boot_id if is_boot else None, from_ns if is_boot else None,
+                to_ns if is_boot else None, started_ns, begin_ns, version,
+            )  # fmt: skip
+
+
+def _plus(stamp_ns: int | None, offset_ns: int | None) -> int | None:
+    return None if stamp_ns is None or offset_ns is None else stamp_ns + offset_ns
