@@ -13,10 +13,9 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-import rclpy
+from capture.participants import Participant
 from capture.test_stream import Batches
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import Float64, Int32, String
@@ -44,38 +43,7 @@ NUMBERED: Final = get_rmw_implementation_identifier() in FAST_DDS
 NOTHING: Final = Totals('', None, 0, 0, 0, 0, 0, 0, None, None, 0)
 
 
-class Publishing:
-    """A program of its own, as the graph sees it: a participant, because one has one type for a topic."""
-
-    def __init__(self, name: str, domain: int) -> None:
-        self.name = f'/{name}'
-        self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context, domain_id=domain)
-        self.node = Node(name, context=self._context, start_parameter_services=False, enable_rosout=False)
-        self._publisher: Any = None
-
-    def create(self, message_class: type, topic: str, *, reliable: bool = True, latched: bool = False) -> None:
-        profile = QoSProfile(depth=1000)
-        profile.reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        profile.durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-        self._publisher = self.node.create_publisher(message_class, topic, profile)
-
-    def matched(self) -> bool:
-        return bool(self._publisher.get_subscription_count())
-
-    def publish(self, *messages: Any) -> None:
-        for message in messages:
-            self._publisher.publish(message)
-
-    def leave(self) -> None:
-        self.node.destroy_publisher(self._publisher)
-
-    def end(self) -> None:
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
-
-
-class Listening(Publishing):
+class Listening(Participant):
     """A sensor's subscriber as the intake has it, polled by the test."""
 
     def __init__(self, domain: int) -> None:
@@ -111,7 +79,7 @@ class Listening(Publishing):
             self.turn()
             time.sleep(0.02)
 
-    def refused(self, topic: str, squatter: Publishing, *messages: Any) -> int:
+    def refused(self, topic: str, squatter: Participant, *messages: Any) -> int:
         """How many messages of another type are counted, once all of these are: they begin when one got through."""
         while not self.totals(topic).rejected:
             squatter.publish(messages[0])
@@ -141,11 +109,11 @@ class Listening(Publishing):
 
 
 @pytest.fixture
-def make(domain: int) -> Iterator[Callable[[str], Publishing]]:
+def make(domain: int) -> Iterator[Callable[[str], Participant]]:
     with ExitStack() as stack:
 
-        def make_one(name: str) -> Publishing:
-            one = Listening(domain) if name == 'logger' else Publishing(name, domain)
+        def make_one(name: str) -> Participant:
+            one = Listening(domain) if name == 'logger' else Participant(name, domain)
             stack.callback(one.end)
             return one
 
