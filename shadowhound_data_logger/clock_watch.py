@@ -43,6 +43,7 @@ class ClockWatch:
 
     def __init__(self, clock: Clock, hold_s: float, steps: int = 0) -> None:
         self._clock = clock
+        self.hold_s = hold_s
         self._hold_ns = round(hold_s * SECOND)
         self._lock = threading.Lock()
         self._offset_ns = clock.wall_ns() - clock.boot_ns()
@@ -62,6 +63,12 @@ class ClockWatch:
 
     def boot_ns(self) -> int:
         return self._clock.boot_ns()
+
+    @property
+    def unset_since_ns(self) -> int:
+        """By the boot clock: since when it is not set, as far as this process knows. It says nothing while it is set."""
+        with self._lock:
+            return self._unset_since_ns
 
     @property
     def is_set(self) -> bool:

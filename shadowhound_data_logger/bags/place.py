@@ -19,7 +19,7 @@ from shadowhound_data_logger.bags.naming import BUCKET, UNSYNCED, bag_name, key_
 from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock
-from shadowhound_data_logger.missions.dating import Dating
+from shadowhound_data_logger.dating import Dating
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 _LATEST: Final = 1 << 63
@@ -32,7 +32,7 @@ class BagPlace:
                  offsets: Callable[[], Mapping[str, int]] = dict) -> None:  # fmt: skip
         """``root`` is the robot's folder of bags; bags go through ``writer`` into its spool, under names that none has there.
 
-        ``hold_s`` and ``offsets`` as in ``missions.dating``: how long a bag waits for its date, and what is known of other boots.
+        ``hold_s`` and ``offsets`` as in ``Dating``: how long a bag waits for its date, and what is known of other boots.
         """
         self.root = root
         self.robot = robot

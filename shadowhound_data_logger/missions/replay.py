@@ -23,9 +23,10 @@ from typing import Final
 
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.dating import Dating
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import DataLoggerError, TrackingRefused, TrackingUnavailable
-from shadowhound_data_logger.missions.dating import Dating
+from shadowhound_data_logger.missions.dating import give_date
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.drawing import Drawing
 from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missions, write_json
@@ -289,7 +290,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings, clock = Settings.load({}, {**os.environ, 'SHADOWHOUND_HOME': str(options.home)}), SystemClock.of_this_machine()
         tracking = open_tracking(options.home, options.experiment)
         dating = Dating(clock, settings.clock.hold_s, lambda: clock_record.read(settings.spool_path, settings.robot)['offsets'])
-        replay = Replay(options.home, tracking, Shelf(settings, clock), Drawing(), settle=dating.settle)
+        replay = Replay(
+            options.home, tracking, Shelf(settings, clock), Drawing(), settle=lambda folder: give_date(folder, dating)
+        )
         opened.callback(replay.close)
         run(replay, parent, lambda: bool(asked))
     return 0

@@ -54,10 +54,6 @@ class ClockRecord:
         """UTC less boot clock by boot id, of the boots whose clock was set; the others are missing."""
         return dict(self._offsets)
 
-    def offset_ns(self, boot_id: str) -> int | None:
-        """UTC less boot clock of a boot whose clock was set."""
-        return self._offsets.get(boot_id)
-
     def knows(self, boot_id: str, offset_ns: int | None) -> bool:
         """Whether there is nothing new in this offset."""
         if offset_ns is None:

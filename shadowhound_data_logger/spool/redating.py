@@ -3,8 +3,8 @@
 A time before 2024 is that of the boot clock (``clock.stamp_of`` sees to that). An object that begins at such a time is held
 under ``<robot>/_unsynced/<boot_id>/<sensor>/<seconds since boot>``, with all that its final name is made of in its metadata,
 where it survives a restart and a lost index. Once the clock is set the offset between the clocks is known, and key, times and
-metadata are those of UTC; content stays as it is. Where the clock is not set for too long, or the boot ended before it was,
-objects ship under the names that they have.
+metadata are those of UTC; content stays as it is. Which offset that is, and how long an object waits for it, is decided in
+``dating.py``; those that go without a date ship under the names that they have.
 
 Every object says when it was by both clocks: ``boot_id``, ``boot_start_ns``, ``boot_end_ns``, and as ``clock`` how its date is
 known: ``set`` (this machine's clock was right), ``publisher`` (it was not, but that of the publisher's machine),
@@ -21,6 +21,7 @@ from typing import Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.clock_watch import ClockWatch
+from shadowhound_data_logger.dating import Dating
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import dated, unsynced
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, SpooledObject
@@ -42,27 +43,29 @@ class Redating:
     def __init__(self, spool: Spool, watch: ClockWatch, record: ClockRecord, robot: str) -> None:
         self._spool = spool
         self._watch = watch
+        self._dating = Dating(watch, watch.hold_s, record.offsets)
         self._record = record
         self._robot = robot
 
     def date(self, item: DataObject) -> DataObject:
         """The object with what is known of its time; held, or under another key, where that is not UTC."""
-        offset_ns, boot_id = self._watch.offset_ns(), self._watch.boot_id
+        boot_id = self._watch.boot_id
+        offset_ns = self._offset_of(boot_id)
         start_ns, end_ns = item.t_start_ns, item.t_end_ns
         if start_ns >= EARLIEST_SANE_NS:
-            away_ns = offset_ns if offset_ns is not None else end_ns - self._watch.boot_ns()
-            clock = words.SET if offset_ns is not None else words.PUBLISHER
+            away_ns = offset_ns or end_ns - self._watch.boot_ns()
+            clock = words.SET if offset_ns else words.PUBLISHER
             return replace(
                 item, metadata={**item.metadata, **_boot(boot_id, start_ns - away_ns, end_ns - away_ns), words.CLOCK: clock}
             )
         known = {name: value for name, value in item.metadata.items() if name not in _TIMES}
         metadata = {**known, **_boot(boot_id, start_ns, end_ns), words.CLOCK: words.UNSET}
         metadata[words.KEY_PATTERN] = item.key_pattern or item.key
-        if offset_ns is not None:
+        if offset_ns:
             key, metadata = _final(metadata, start_ns, end_ns, offset_ns)
             return replace(item, key=key, metadata=metadata, t_start_ns=start_ns + offset_ns, t_end_ns=end_ns + offset_ns)
         key = unsynced(self._robot, boot_id, item.sensor, start_ns, item.key)
-        return replace(item, key=key, metadata=metadata, held=None if self._watch.state().gave_up else CLOCK)
+        return replace(item, key=key, metadata=metadata, held=CLOCK if offset_ns is None else None)
 
     def step(self) -> list[SpooledObject]:
         """Look at the clock and name what can be named now; returns what may be shipped. Raises OSError or sqlite3.Error."""
@@ -79,18 +82,19 @@ class Redating:
     def _binding(self, item: HeldObject) -> Binding | None:
         """What becomes of a held object now; None where it has to wait."""
         offset_ns = self._offset_of(item.metadata.get(words.BOOT_ID, ''))
-        if offset_ns is not None and item.t_start_ns < EARLIEST_SANE_NS:
+        if offset_ns is None:
+            return None
+        if offset_ns and item.t_start_ns < EARLIEST_SANE_NS:
             try:
                 key, metadata = _final(item.metadata, item.t_start_ns, item.t_end_ns, offset_ns)
                 return Binding(item.id, key, metadata, item.t_start_ns + offset_ns, item.t_end_ns + offset_ns)
             except (NameRefused, LookupError, ValueError) as error:
                 log.warning('%s cannot be dated: %s', item.key, error)
-        elif offset_ns is None and item.metadata.get(words.BOOT_ID) == self._watch.boot_id and not self._watch.state().gave_up:
-            return None
         return Binding(item.id, item.key, item.metadata, item.t_start_ns, item.t_end_ns)
 
     def _offset_of(self, boot_id: str) -> int | None:
-        return self._watch.offset_ns() if boot_id == self._watch.boot_id else self._record.offset_ns(boot_id)
+        """As of ``Dating``. Objects wait since the clock is known not to be set: once that is too long, none waits any more."""
+        return self._dating.offset_ns(boot_id, self._watch.unset_since_ns)
 
 
 def _boot(boot_id: str, start_ns: int, end_ns: int) -> dict[str, str]:

@@ -10,8 +10,9 @@ from clocks import NOON_NS, Clocks
 from missions.fakes import FakeDrawing, FakeShelf, FakeTracking, journalling
 
 from shadowhound_data_logger.clock import SECOND, SystemClock
+from shadowhound_data_logger.dating import Dating
 from shadowhound_data_logger.missions.active import Active, Lookout, ended
-from shadowhound_data_logger.missions.dating import WAITS, Dating
+from shadowhound_data_logger.missions.dating import WAITS, give_date
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
 from shadowhound_data_logger.missions.node_log import NodeLog
 from shadowhound_data_logger.missions.odometer import Pose
@@ -49,7 +50,7 @@ def fly(home: Path, clocks: Clocks, *, is_set_meanwhile: bool = False) -> Missio
 
 def sender(home: Path, clocks: Clocks, tracking: FakeTracking, shelf: FakeShelf, **offsets: int) -> Replay:
     dating = Dating(clocks, 600.0, lambda: {name.replace('_', '-'): offset for name, offset in offsets.items()})
-    return Replay(home, tracking, shelf, FakeDrawing(), settle=dating.settle, rng=random.Random(1))  # type: ignore[arg-type]
+    return Replay(home, tracking, shelf, FakeDrawing(), settle=lambda folder: give_date(folder, dating), rng=random.Random(1))  # type: ignore[arg-type]
 
 
 def check(tracking: FakeTracking, shelf: FakeShelf, folder: MissionFolder) -> None:

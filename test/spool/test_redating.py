@@ -263,8 +263,8 @@ def test_a_record_keeps_few_boots(root: Path, clocks: Clocks) -> None:
         clocks.boot_id = f'boot-{number}'
         record.note(ClockWatch(clocks, 600.0))
     again = ClockRecord(root, 'thor')
-    assert again.offset_ns('boot-2') is None
-    assert again.offset_ns(f'boot-{BOOTS + 2}') == clocks.offset_ns
+    assert 'boot-2' not in again.offsets()
+    assert again.offsets()[f'boot-{BOOTS + 2}'] == clocks.offset_ns
 
 
 def test_a_held_object_that_has_a_date(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
