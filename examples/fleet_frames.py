@@ -23,7 +23,7 @@ import numpy as np
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.lake import decode, query
-from shadowhound_data_logger.lake.bodies import Bodies, Place
+from shadowhound_data_logger.lake.prefetch import Place, Prefetch
 from shadowhound_data_logger.lake.track import Object
 
 import daft  # isort: skip - after query, which turns its telemetry off
@@ -47,11 +47,11 @@ class Judge:
         columns = (each.to_pylist() for each in (bucket, key, size, sha256))
         objects = [Object(one, two, three, four or '') for one, two, three, four in zip(*columns, strict=True)]
         found = []
-        with Bodies(self._place.read, 1, THREADS) as bodies:
-            bodies.ahead(objects)
+        with Prefetch(self._place.read, 1, THREADS) as prefetch:
+            prefetch.ahead(objects)
             for each in objects:
                 try:
-                    found.append(judged(decode.image(bodies.get(each))))
+                    found.append(judged(decode.image(prefetch.get(each))))
                 except DataLoggerError:
                     found.append({'sharpness': None, 'brightness': None})
         return found

@@ -54,12 +54,12 @@ class SystemClock:
 
 
 def is_sane(stamp_ns: int, reference_ns: int) -> bool:
-    """Whether a header stamp can be believed, given the publisher's own time of sending (D3)."""
+    """Whether a header stamp can be believed, given the publisher's own time of sending."""
     return EARLIEST_SANE_NS <= stamp_ns <= max(reference_ns, EARLIEST_SANE_NS) + FUTURE_SLACK_NS
 
 
 def stamp_of(header_ns: int, source_ns: int, clock: Clock) -> int:
-    """The time of a message that was just taken (D3): UTC where any clock knows it, else that of the boot clock.
+    """The time of a message that was just taken: UTC where any clock knows it, else that of the boot clock.
 
     Either is in ns, and which of them it is shows: a time before 2024 is one since boot. Who may be believed, in this order:
 

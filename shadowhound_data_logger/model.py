@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class Sample(NamedTuple):
-    """One message as it was taken: its time (D3) and its serialized form (CDR with the 4-byte encapsulation header)."""
+    """One message as it was taken: its time and its serialized form (CDR with the 4-byte encapsulation header)."""
 
     stamp_ns: int
     cdr: bytes
@@ -85,7 +85,7 @@ class DataObject:
     priority: int = 5
     """0 ... 9; 0 is shipped first and evicted last."""
     protected: bool = False
-    """Never evicted (D9)."""
+    """Never evicted."""
     held: str | None = None
     """Why it has no final name yet; None when it may be shipped."""
     metadata: Mapping[str, str] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Supervised threads: a loop that fails is seen, counted and started again; it never ends silently (D14).
+"""Supervised threads: a loop that fails is seen, counted and started again; it never ends silently.
 
 Whatever a round raises, SystemExit included, costs that round and a pause. Should the thread itself end all the same (no
 memory for its own bookkeeping, say), whoever supervises it finds out in ``look`` and starts another one.
@@ -137,7 +137,7 @@ class Worker:
             self._round_s = time.monotonic()
             try:
                 self._step()
-            except BaseException as error:  # noqa: BLE001 - the one supervised catch-all (D14); the step accounts for what it holds
+            except BaseException as error:  # noqa: BLE001 - the one supervised catch-all; the step accounts for what it holds
                 self._fail(error, 'failed')
                 self._stopping.wait(self._longer_pause())
             else:

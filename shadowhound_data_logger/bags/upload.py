@@ -17,7 +17,7 @@ from typing import Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.fetch import Told, on_disk
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
-from shadowhound_data_logger.bags.parcel import Outgoing, Parcel, archive_of, finished, parcel_of
+from shadowhound_data_logger.bags.upload_plan import Outgoing, UploadPlan, archive_of, finished, plan_of
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.disk import flock
@@ -61,7 +61,7 @@ class Uploaded:
 
 
 @contextmanager
-def parcel(folder: Path, robot: str, bag: str, home: Path, *, is_archive: bool) -> Iterator[Parcel]:
+def planned(folder: Path, robot: str, bag: str, home: Path, *, is_archive: bool) -> Iterator[UploadPlan]:
     """The bag as objects; what had to be made for it is gone afterwards. Raises BagError, BagDamaged, NameRefused."""
     finished(folder)  # before a folder is made for it
     with on_disk(home):
@@ -70,43 +70,43 @@ def parcel(folder: Path, robot: str, bag: str, home: Path, *, is_archive: bool) 
         try:
             with flock(work / 'lock'):
                 _sweep(home / SENDING)
-                yield (archive_of if is_archive else parcel_of)(folder, robot, bag, work)
+                yield (archive_of if is_archive else plan_of)(folder, robot, bag, work)
         finally:
             shutil.rmtree(work, ignore_errors=True)
 
 
-def upload_now(store: ObjectStore, sent: Parcel, *, deadline_s: float, told: Told | None = None) -> Uploaded:
+def upload_now(store: ObjectStore, plan: UploadPlan, *, deadline_s: float, told: Told | None = None) -> Uploaded:
     """Without the spool: returns when the store confirmed all of it. Raises BagError, StoreError."""
     told = told or Told()
-    told.begin(sent.size)
+    told.begin(plan.size)
     end_s = time.monotonic() + deadline_s
 
     def put(place: int) -> None:
-        file = sent.files[place]
+        file = plan.files[place]
         item = SpooledObject(place, BUCKET, file.key, file.path, file.size, file.sha256, file.content_type,
                              {**file.metadata, words.SHA256: file.sha256}, PRIORITY, 0)  # fmt: skip
         try:
             steadily(lambda: store.put(item), tries=float('inf'), until_s=end_s, cap_s=CAP_S)
         except ForeignObject as error:
-            raise _taken(sent.bag, str(error.data.get('key'))) from error
+            raise _taken(plan.bag, str(error.data.get('key'))) from error
         told.have(file.size)
 
     with ThreadPoolExecutor(THREADS, 'bag-upload') as pool:
-        list(pool.map(put, range(len(sent.files) - 1)))
-    put(len(sent.files) - 1)  # the manifest says that all the others are there
-    return Uploaded(sent.robot, sent.bag, len(sent.files), sent.size, len(sent.files), '')
+        list(pool.map(put, range(len(plan.files) - 1)))
+    put(len(plan.files) - 1)  # the manifest says that all the others are there
+    return Uploaded(plan.robot, plan.bag, len(plan.files), plan.size, len(plan.files), '')
 
 
-def spool_parcel(sent: Parcel, spool: Spool) -> None:
+def spool_upload(plan: UploadPlan, spool: Spool) -> None:
     """Make it durable in the spool; what is or was there already is left out. The bag's own files stay.
 
     Raises BagError where there is no room or another bag has the name, SpoolError.
     """
     objects = []
-    with tempfile.TemporaryDirectory(dir=sent.files[-1].path.parent) as work:
+    with tempfile.TemporaryDirectory(dir=plan.files[-1].path.parent) as work:
         try:
-            _check_names(spool, sent)
-            for place, file in enumerate(sent.files):
+            _check_names(spool, plan)
+            for place, file in enumerate(plan.files):
                 if spool.knows(BUCKET, file.key, file.sha256):
                     continue
                 link = Path(work) / str(place)
@@ -117,7 +117,7 @@ def spool_parcel(sent: Parcel, spool: Spool) -> None:
             raise spool.unwritable(error) from error
     if len(placed) < len(objects):
         remedy = 'raise spool.max_bytes, or send it with --now, past the spool'
-        raise BagError(f'the spool {spool.root} has no room for {sent.bag}: {sent.size} bytes', remedy=remedy)
+        raise BagError(f'the spool {spool.root} has no room for {plan.bag}: {plan.size} bytes', remedy=remedy)
 
 
 @contextmanager
@@ -129,12 +129,12 @@ def opened_spool(settings: Settings, clock: Clock) -> Iterator[Spool]:
         yield spool
 
 
-def deliver(settings: Settings, spool: Spool, sent: Parcel, *, deadline_s: float, told: Told | None = None) -> Uploaded:
+def deliver(settings: Settings, spool: Spool, plan: UploadPlan, *, deadline_s: float, told: Told | None = None) -> Uploaded:
     """Wait until the store has it, delivering where no node does. Raises BagError for what the store refuses, SettingError."""
     told = told or Told()
-    told.begin(sent.size)
+    told.begin(plan.size)
     with delivering(spool, settings, CLOSE_S) as (uploader, _):
-        return _wait(spool, sent, uploader, time.monotonic() + deadline_s, told)
+        return _wait(spool, plan, uploader, time.monotonic() + deadline_s, told)
 
 
 def is_confirmed(store: ObjectStore, files: Sequence[tuple[str, int, str]]) -> bool:
@@ -146,16 +146,16 @@ def is_confirmed(store: ObjectStore, files: Sequence[tuple[str, int, str]]) -> b
     return True
 
 
-def _wait(spool: Spool, sent: Parcel, uploader: Uploader, end_s: float, told: Told) -> Uploaded:
+def _wait(spool: Spool, plan: UploadPlan, uploader: Uploader, end_s: float, told: Told) -> Uploaded:
     done: set[str] = set()
     while True:
-        rows = _rows(spool, sent)
-        for file in sent.files:
-            if file.key not in done and _is_done(rows.get(file.key), sent.bag):
+        rows = _rows(spool, plan)
+        for file in plan.files:
+            if file.key not in done and _is_done(rows.get(file.key), plan.bag):
                 done.add(file.key)
                 told.have(file.size)
-        if len(done) == len(sent.files) or time.monotonic() >= end_s:
-            return Uploaded(sent.robot, sent.bag, len(sent.files), sent.size, len(done), uploader.status().last_error)
+        if len(done) == len(plan.files) or time.monotonic() >= end_s:
+            return Uploaded(plan.robot, plan.bag, len(plan.files), plan.size, len(done), uploader.status().last_error)
         time.sleep(POLL_S)
 
 
@@ -171,19 +171,19 @@ def _is_done(row: sqlite3.Row | None, bag: str) -> bool:
     return False
 
 
-def _rows(spool: Spool, sent: Parcel) -> dict[str, sqlite3.Row]:
+def _rows(spool: Spool, plan: UploadPlan) -> dict[str, sqlite3.Row]:
     """What the spool's index says of its keys."""
     index = Index(spool.root / 'index.db', read_only=True)
     index.open()
     with closing(index):
-        return {file.key: row for file in sent.files if (row := index.row(BUCKET, file.key)) is not None}
+        return {file.key: row for file in plan.files if (row := index.row(BUCKET, file.key)) is not None}
 
 
-def _check_names(spool: Spool, sent: Parcel) -> None:
-    rows = _rows(spool, sent)
-    for file in sent.files:
+def _check_names(spool: Spool, plan: UploadPlan) -> None:
+    rows = _rows(spool, plan)
+    for file in plan.files:
         if file.key in rows and rows[file.key]['sha256'] != file.sha256:
-            raise _taken(sent.bag, file.key)
+            raise _taken(plan.bag, file.key)
 
 
 def _object(file: Outgoing, path: Path) -> DataObject:

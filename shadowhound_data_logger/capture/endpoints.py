@@ -1,4 +1,4 @@
-"""How to listen to a topic, decided from its publishers in the graph (D4). Plain Python: rclpy's types end in ``Endpoint``."""
+"""How to listen to a topic, decided from its publishers in the graph. Plain Python: rclpy's types end in ``Endpoint``."""
 
 from __future__ import annotations
 

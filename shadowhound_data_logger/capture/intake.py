@@ -1,4 +1,4 @@
-"""The intake thread: it alone creates, drains and destroys subscriptions, on its own clock (D1, D2).
+"""The intake thread: it alone creates, drains and destroys subscriptions, on its own clock (docs/decisions/0010).
 
 What it takes of a topic goes to its consumers (``consumers.Consumer``), in order; it knows none of them. Nothing here
 touches disk or network or parses a message.

@@ -20,7 +20,7 @@ from shadowhound_data_logger.capture.mission_observer import MissionObserver
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.missions.active import THIS_MACHINE, Active, Lookout, ended
+from shadowhound_data_logger.missions.active import THIS_MACHINE, Active, MissionFinder, ended
 from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import safe_type
 from shadowhound_data_logger.missions.node_log import NodeLog
@@ -53,7 +53,7 @@ class MissionWatch:
         self._queue = queue
         self._observer = observer
         self._tell = tell
-        self._lookout = Lookout(settings.home, settings.robot)
+        self._finder = MissionFinder(settings.home, settings.robot)
         self._mission: Active | None = None
         self._marks: Mapping[str, str] = {}
         self._last: tuple[Active, Mapping[str, str]] | None = None
@@ -109,7 +109,7 @@ class MissionWatch:
     # -- the thread ------------------------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        found, before = self._lookout.look(), self._mission
+        found, before = self._finder.look(), self._mission
         if (found and found.id) != (before and before.id):
             if before is not None:
                 self._leave(before)

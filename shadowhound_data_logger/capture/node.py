@@ -172,7 +172,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
     except DataLoggerError as error:
         node.get_logger().fatal(str(error))
         return 1
-    except BaseException as error:  # the one supervised catch-all of the main loop (D14); systemd starts the node again
+    except BaseException as error:  # the one supervised catch-all of the main loop; systemd starts the node again
         logging.getLogger(__name__).critical('the node ends: %s: %s', type(error).__name__, error, exc_info=error)
         return 1
     finally:

@@ -212,7 +212,7 @@ class Pipeline:
         """Called several times a second: starts threads again that died, and once a second tells what goes on.
 
         A failure of a thread is told at once. At the turn of each UTC day the ledger is shipped. Raises SpoolError when the
-        spool cannot be mended while it is in use.
+        spool cannot be repaired while it is in use.
         """
         if self.writer.damaged:
             text = f'the index of the spool {self.spool.root} is damaged'

@@ -1,4 +1,4 @@
-"""One subscription, drained instead of called back (D1). The seam to what rclpy of each distribution offers.
+"""One subscription, drained instead of called back. The seam to what rclpy of each distribution offers.
 
 Where rclpy tells less of a message than its RMW knows (Humble: neither number nor publisher; Jazzy: not the publisher), messages
 are taken through librcl, if that proves right for messages of the node's own.

@@ -106,7 +106,7 @@ class Status:
         """The status of now; None where the spool cannot be read, which is said once."""
         now_s = self._monotonic()
         try:
-            piles = self._stages.spool.piles()
+            usage = self._stages.spool.usage()
         except (OSError, sqlite3.Error) as error:
             self._complain(f'the status cannot be told: {error}')
             return None
@@ -119,7 +119,7 @@ class Status:
             'paused': self._stages.intake.paused, 'ended': ended, 'middleware': self._middleware(),
             'mission': self._stages.mission.status(), 'bag': self._bag(), 'events': self._events(), 'topics': self._topics(now_s),
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
-            'spool': {'path': str(self._stages.spool.root), **asdict(piles), **asdict(self._settings.spool)},
+            'spool': {'path': str(self._stages.spool.root), **asdict(usage), **asdict(self._settings.spool)},
             'store': self._store(upload, now_s), 'clock': asdict(self._clock.state()),
             'consumers': {name: {'failures': count, 'last_error': text}
                           for name, (count, text) in self._stages.intake.consumer_failures().items()},

@@ -54,7 +54,7 @@ class Watchdog:
 
     def __init__(self, request_s: float) -> None:
         self._delivery_s = DELIVERY_S + request_s
-        self._rhythms: dict[str, Rhythm] = {}
+        self._detectors: dict[str, SilenceDetector] = {}
         self._encoding, self._delivering = _Progress(), _Progress()
         self._told: Stalls = {}
 
@@ -80,7 +80,7 @@ class Watchdog:
     def _topics(self, status: Mapping[str, Any], now_s: float, *, takes: bool) -> dict[str, str]:
         found = {}
         for topic, row in status['topics'].items():
-            text = self._rhythms.setdefault(topic, Rhythm(topic)).look(row, now_s)
+            text = self._detectors.setdefault(topic, SilenceDetector(topic)).look(row, now_s)
             if text and takes:  # else all of them seem to be silent
                 found[topic] = text
         return found
@@ -141,8 +141,8 @@ def _why_undelivered(status: Mapping[str, Any]) -> str:
     return 'nothing is under way, which is a defect of this program; start the node again'
 
 
-class Rhythm:
-    """New for each topic; ``look`` at each status."""
+class SilenceDetector:
+    """Notices that a topic has fallen silent although its publisher is there. One for each topic; ``look`` at each status."""
 
     def __init__(self, topic: str) -> None:
         self._topic = topic
@@ -152,12 +152,12 @@ class Rhythm:
         self._received = 0
 
     def look(self, row: Mapping[str, Any], now_s: float) -> str:
-        """Why it is to be missed, in words; empty where it is not."""
+        """Return what is wrong with the topic; empty where nothing is."""
         if not row['enabled'] or not row['publishers']:
             self._since_s = None
             return ''
         received = row['received'] - row['wrong_type']
-        if self._since_s is None:  # whoever publishes it from now on has a rhythm of its own
+        if self._since_s is None:  # a new publisher has a period of its own
             self._since_s, self._heard_s, self._received = now_s, None, received
             self._pauses.clear()
         if received > self._received:

@@ -21,7 +21,7 @@ from shadowhound_data_logger.bags.manifest import ClockOf, Missing
 from shadowhound_data_logger.bags.overview import BagRow, overview
 from shadowhound_data_logger.bags.record import DEADLINE_S, record
 from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
-from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, parcel, spool_parcel, upload_now
+from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, planned, spool_upload, upload_now
 from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, verify_remote
 from shadowhound_data_logger.bags.watch import Step, Watch
 from shadowhound_data_logger.cli.common import as_json, robot_name, the_home, the_store
@@ -241,13 +241,16 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
     """
     folder = folder.absolute()
     settings, clock = Settings.load({'robot': robot}, os.environ), SystemClock.of_this_machine()
-    with parcel(folder, robot, name or folder.name, the_home(), is_archive=tar_gz) as sent, progress('sent', of='bytes') as bar:
+    with (
+        planned(folder, robot, name or folder.name, the_home(), is_archive=tar_gz) as sent,
+        progress('sent', of='bytes') as bar,
+    ):
         if now:
             with the_store(STORE_THREADS) as store:
                 found = upload_now(store, sent, deadline_s=deadline, told=bar)
         else:
             with opened_spool(settings, clock) as spool:
-                spool_parcel(sent, spool)
+                spool_upload(sent, spool)
                 found = deliver(settings, spool, sent, deadline_s=deadline, told=bar)
     if as_json:
         print_json({**asdict(found), 'is_delivered': found.is_delivered})

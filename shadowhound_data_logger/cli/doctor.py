@@ -20,7 +20,7 @@ from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make
 from shadowhound_data_logger.doctor.model import Check, Context, Result, Role, Severity
 from shadowhound_data_logger.doctor.run import TIMEOUT_S, Examination
-from shadowhound_data_logger.doctor.run import fix as mend
+from shadowhound_data_logger.doctor.run import fix as fix_results
 from shadowhound_data_logger.ros_arguments import ParametersUnreadable
 
 STYLES: Final = {
@@ -88,13 +88,13 @@ def doctor(  # noqa: PLR0913 - one for each option
         raise click.BadParameter(str(error), param_hint='--params-file') from error
     began_s = time.monotonic()
     results = _examine([check for check in checks if context.role in check.roles], context, timeout)
-    mended = list(mend(results, context)) if fix else []
+    fixed = list(fix_results(results, context)) if fix else []
     took_s = time.monotonic() - began_s
-    left = [result for result in results if result.is_finding and not _is_mended(result, mended)]
+    left = [result for result in results if result.is_finding and not _is_fixed(result, fixed)]
     if as_json:
-        print_json(_said(results, mended, context, took_s, ok=not left))
+        print_json(_said(results, fixed, context, took_s, ok=not left))
     else:
-        for part in report(results, mended, context, took_s, verbose=verbose):
+        for part in report(results, fixed, context, took_s, verbose=verbose):
             console().print(part)
     return 1 if left else 0
 
@@ -119,30 +119,30 @@ def _examine(checks: Sequence[Check], context: Context, timeout_s: float) -> lis
         return Examination(checks, context, timeout_s=timeout_s, tell=tell).run()
 
 
-def _is_mended(result: Result, mended: Sequence[tuple[Result, str]]) -> bool:
-    return bool(result.fix) and any(one.fix == result.fix and not what.startswith('not') for one, what in mended)
+def _is_fixed(result: Result, fixed: Sequence[tuple[Result, str]]) -> bool:
+    return bool(result.fix) and any(one.fix == result.fix and not what.startswith('not') for one, what in fixed)
 
 
-def _said(results: Sequence[Result], mended: Sequence[tuple[Result, str]], context: Context, took_s: float,
+def _said(results: Sequence[Result], fixed: Sequence[tuple[Result, str]], context: Context, took_s: float,
           *, ok: bool) -> dict[str, Any]:  # fmt: skip
     return {
         'role': context.role.value, 'robot': context.settings.robot, 'ok': ok, 'took_s': round(took_s, 3),
         'findings': sum(result.is_finding for result in results), 'results': [result.as_dict() for result in results],
-        'fixed': [{'check': result.check, 'what': what} for result, what in mended],
+        'fixed': [{'check': result.check, 'what': what} for result, what in fixed],
     }  # fmt: skip
 
 
-def report(results: Sequence[Result], mended: Sequence[tuple[Result, str]], context: Context, took_s: float,
+def report(results: Sequence[Result], fixed: Sequence[tuple[Result, str]], context: Context, took_s: float,
          *, verbose: bool) -> list[RenderableType]:  # fmt: skip
     """The verdict, each finding with cause and remedy, what was done, what is good to know, and what is fine."""
     findings = sorted(
         (result for result in results if result.is_finding), key=lambda result: result.severity is not Severity.ERROR
     )
     parts: list[RenderableType] = [_verdict(findings, context, took_s), *(part for each in findings for part in _finding(each))]
-    if mended:
+    if fixed:
         parts += [
             '',
-            *(plain(f'--fix: {what}  ({result.check})', 'red' if what.startswith('not') else 'green') for result, what in mended),
+            *(plain(f'--fix: {what}  ({result.check})', 'red' if what.startswith('not') else 'green') for result, what in fixed),
         ]
     told = [each for each in results if each.severity in {Severity.INFO, Severity.SKIPPED}]
     if told:

@@ -32,7 +32,7 @@ UNLISTED: Final = 'unlisted'
 DAY_NS: Final = 24 * 3600 * SECOND
 MOST_COVERED_NS: Final = 400 * DAY_NS
 WORDS: Final = {**KINDS, UNLISTED: "not in the store's own catalogue; `lake reindex` adds those that are there"}
-COLUMNS: Final = ('robot', 'days', 'first', 'last', 'files', 'size', 'compacted', 'to compact', 'stood for')
+COLUMNS: Final = ('robot', 'days', 'first', 'last', 'files', 'size', 'compacted', 'to compact', 'superseded')
 _robot = click.option('--robot', metavar='NAME', help='Of this robot alone.')
 
 
@@ -47,8 +47,8 @@ def lake() -> None:
 def lake_status(*, robot: str | None, as_json: bool) -> int:
     """How many files the catalogue has, of which days, and what compacting would do."""
     with asking():
+        from shadowhound_data_logger.lake.live_files import state  # noqa: PLC0415
         from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
-        from shadowhound_data_logger.lake.standing import state  # noqa: PLC0415
 
     source = default_source(the_store_settings())
     left_out = quietly()
@@ -71,7 +71,7 @@ def lake_status(*, robot: str | None, as_json: bool) -> int:
 @click.option('--before', metavar='DATE', help='Days earlier than this  [default: today, UTC]')
 @click.option('--keep', is_flag=True, help='Delete nothing.')
 @click.option('--grace', type=click.FloatRange(0.0), default=60.0, show_default=True, metavar='MIN',
-              help='How long files stay that a compacted one stands for: somebody may be reading them.')  # fmt: skip
+              help='How long superseded files stay: somebody may be reading them.')  # fmt: skip
 @as_json
 def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: float, as_json: bool) -> int:
     """Make one file of the many of each day that is over, and delete those that an earlier run made one of.
@@ -99,7 +99,7 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
     if deleted:
         click.echo(f'{number(deleted)} that were merged earlier are deleted.')
     if kept:
-        click.echo(f'{number(kept)} that are stood for are still there: a later run deletes them.')
+        click.echo(f'{number(kept)} superseded files are still there: a later run deletes them.')
     if any(day.denied for day in found):
         click.echo('These credentials may not delete: that costs room, and nothing else.')
     return tell_left_out(left_out)

@@ -248,12 +248,12 @@ def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalogue: Cata
 
 
 def _drained(folder: Path, spool: Spool, status: UploadStatus) -> dict[str, Any]:
-    piles = spool.piles()
+    usage = spool.usage()
     why = OTHER if status.state == 'not_draining' else status.last_error
     return {
-        'spool': str(folder), 'delivered': status.delivered, 'pending': piles.pending, 'held': piles.held,
-        'quarantined': piles.quarantined, 'newly_quarantined': status.quarantined,
-        'last_error': why if piles.pending or status.quarantined else '', 'ok': not piles.pending and not status.quarantined,
+        'spool': str(folder), 'delivered': status.delivered, 'pending': usage.pending, 'held': usage.held,
+        'quarantined': usage.quarantined, 'newly_quarantined': status.quarantined,
+        'last_error': why if usage.pending or status.quarantined else '', 'ok': not usage.pending and not status.quarantined,
     }  # fmt: skip
 
 

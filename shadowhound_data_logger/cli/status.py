@@ -212,8 +212,8 @@ def _disk(spool: Mapping[str, Any]) -> str:
 def _piles(spool: Mapping[str, Any]) -> str:
     """``3 objects wait (oldest 0.4 s), 1 quarantined``."""
     oldest = '' if spool['oldest_age_s'] is None else f' (oldest {duration(spool["oldest_age_s"])})'
-    piles = ''.join(f', {spool[name]:,} {name}' for name in ('held', 'quarantined') if spool[name])
-    return f'{spool["pending"]:,} objects wait{oldest}{piles}'
+    usage = ''.join(f', {spool[name]:,} {name}' for name in ('held', 'quarantined') if spool[name])
+    return f'{spool["pending"]:,} objects wait{oldest}{usage}'
 
 
 def _add_store(grid: Table, found: Mapping[str, Any]) -> None:

@@ -180,7 +180,7 @@ def in_child(running: Running, context: Context) -> Iterator[Result]:
 
 
 def fix(results: Sequence[Result], context: Context) -> Iterator[tuple[Result, str]]:
-    """Each result that could be mended with what was done; where it failed, the words begin with ``not``."""
+    """Yield each result that can be fixed, with what was done; where that failed, the text begins with ``not``."""
     done: set[tuple[str, ...]] = set()
     for result in results:
         if result.fix and result.fix not in done:

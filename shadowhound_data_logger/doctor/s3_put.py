@@ -53,7 +53,7 @@ def buckets(settings: Settings) -> tuple[str, ...]:
 
 
 def missing_bucket(name: str, endpoint: str) -> Result:
-    """The finding, which ``--fix`` can mend where the keys allow it."""
+    """The finding; ``--fix`` can repair it where the keys allow that."""
     return error(
         's3.bucket',
         f'there is no bucket {name}',

@@ -15,7 +15,7 @@ from shadowhound_data_logger.doctor.model import Context, Result, error, info, o
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.spool import ledger, status
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.piles import Piles, look
+from shadowhound_data_logger.spool.usage import SpoolUsage, usage_of
 
 NAME: Final = 'spool'
 OLD_S: Final = 600.0
@@ -41,7 +41,7 @@ def check(context: Context) -> Iterator[Result]:
         )
         return
     try:
-        piles, quarantined = _index(path)
+        usage, quarantined = _index(path)
         accounts = ledger.read(folder, robot)
     except (OSError, sqlite3.Error, SpoolError) as problem:
         yield error(
@@ -53,19 +53,19 @@ def check(context: Context) -> Iterator[Result]:
         return
     yield ok('spool.index', 'the index is whole')
     yield _ledger(accounts, path)
-    yield _backlog(piles, context, runs=found['running'])
+    yield _backlog(usage, context, runs=found['running'])
     yield from _quarantine(quarantined)
     yield from _lock(folder, found, context.root)
 
 
-def _index(path: Path) -> tuple[Piles, dict[str, int]]:
+def _index(path: Path) -> tuple[SpoolUsage, dict[str, int]]:
     """What lies there, and objects in quarantine by reason; raises sqlite3.Error for a damaged file."""
     index = Index(path, read_only=True)
     try:
         index.open()
         if index.is_current:
             index.check()  # an older one is brought up to date by the next start, and has other tables
-        return look(index, path.parent, time.time_ns()), index.quarantine_reasons()
+        return usage_of(index, path.parent, time.time_ns()), index.quarantine_reasons()
     finally:
         index.close()
 
@@ -161,9 +161,9 @@ def _ledger(accounts: Mapping[str, Any], index: Path) -> Result:
     )
 
 
-def _backlog(piles: Piles, context: Context, *, runs: bool) -> Result:
+def _backlog(usage: SpoolUsage, context: Context, *, runs: bool) -> Result:
     """How much waits, and how long it takes at the rate that the check of the store has measured."""
-    count, size, oldest_s = piles.pending, piles.bytes, piles.oldest_age_s
+    count, size, oldest_s = usage.pending, usage.bytes, usage.oldest_age_s
     if not count:
         return ok('spool.backlog', 'nothing waits for delivery', pending=0)
     figures: dict[str, Any] = {'pending': count, 'bytes': size, 'oldest_age_s': oldest_s}

@@ -1,9 +1,9 @@
-"""``lake compact``: the many parts of a day that is over become one, in the order in which a question looks for rows.
+"""``lake compact``: merges the parts of each day that is over into one, sorted in the order in which queries look for rows.
 
-Of the gap journal, only the newest statement about each gap is left; withdrawals stay, since a part with the gap may come later.
+Of the gap journal, only the newest statement about each gap is kept; withdrawals stay, since a part with the gap may come later.
 
-It only ever adds an object, under a name made of what it is made of. What that covers is deleted later, when nobody reads a list
-from before it any more; so it may die, or run twice at a time, at any moment (docs/decisions/0014).
+Compaction only adds an object, whose name is derived from its sources. A later run deletes the sources, when nobody reads from an
+older listing any more. It may therefore be killed at any moment, and two may run at once (docs/decisions/0014).
 """
 
 from __future__ import annotations
@@ -28,51 +28,51 @@ from shadowhound_data_logger.errors import AccessDenied
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import folded
-from shadowhound_data_logger.lake.reading import arrow_schema, whole
-from shadowhound_data_logger.lake.scan import unrepeated
-from shadowhound_data_logger.lake.standing import (
-    LEAVES,
+from shadowhound_data_logger.lake.live_files import (
+    SOURCES,
     Day,
     compacted_key,
     dates_of,
     days,
-    encode_leaves,
+    encode_sources,
     folder_of,
     is_compacted,
     name_of,
     robots,
 )
+from shadowhound_data_logger.lake.reading import arrow_schema, whole
+from shadowhound_data_logger.lake.scan import unrepeated
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 
 GRACE: Final = timedelta(hours=1)
-"""How long parts stay that a compacted one stands for: who listed them before that may still read them."""
+"""How long superseded parts stay: a reader who listed them before may still read them."""
 MOST_S: Final = 1800.0
-"""From the list of a day's parts to its compacted part; half of the grace."""
+"""From the listing of a day's parts to the put of its compacted part; half of the grace."""
 MOST_DAY_BYTES: Final = 1 << 30
-"""Of a day's rows in memory: of a robot that stores everything all day they take 400 MB."""
+"""A day's rows in memory: those of a robot that stores everything all day take 400 MB."""
 GROUP_ROWS: Final = 4096
 CELL_M: Final = 4.0
-"""Rows are ordered by sensor, by squares of this side along a Z-order curve, then by time: what lies together is read at once."""
+"""Rows are sorted by sensor, by squares of this side along a Z-order curve, then by time: rows of one place are read together."""
 _CELLS: Final = 1 << 15
 _BY_TOPIC: Final = [(name, 'ascending') for name in ('sink', 'topic', 'what', 'from_ns', 'id')]
 
 
 @dataclass(frozen=True, slots=True)
 class Compacted:
-    """What became of a day."""
+    """What compaction did to a day."""
 
     robot: str
     date: str
     merged: int = 0
-    """Parts that one now stands for; 0 where there was nothing to merge."""
+    """Parts that became one; 0 where there was nothing to merge."""
     rows: int = 0
     size: int = 0
     deleted: int = 0
     kept: int = 0
-    """Parts that are stood for and not deleted yet."""
+    """Superseded parts that have not been deleted yet."""
     denied: bool = False
-    """The credentials may not delete: that costs room and nothing else."""
+    """The credentials may not delete: superseded parts take space, with no other effect."""
 
 
 def compact(  # noqa: PLR0913 - what is handed in
@@ -80,10 +80,10 @@ def compact(  # noqa: PLR0913 - what is handed in
     findings: Findings | None = None,
     now: Callable[[], datetime] = lambda: datetime.now(timezone.utc), monotonic: Callable[[], float] = time.monotonic,
 ) -> Iterator[Compacted]:  # fmt: skip
-    """Merge every day earlier than ``before`` (default: today, UTC), and delete what was merged ``grace`` ago (None: nothing).
+    """Merge every day before ``before`` (default: today, UTC), and delete parts superseded ``grace`` ago (None: none).
 
-    Yields each day that it had to do with. A part of which something is left out stays as it is; the others are merged.
-    Raises StoreError; what was done until then is whole.
+    Yields each day that it changed. A part that cannot be read in full stays as it is; the others are merged.
+    Raises StoreError; the days that were done before are complete.
     """
     findings = Findings() if findings is None else findings
     end = before or f'{now():%Y-%m-%d}'
@@ -107,10 +107,10 @@ def _merge(source: Bucket, store: ObjectStore, day: Day, of: TableSchema, findin
         merged, rows = _rows(source, day, of, findings)
         if len(merged) < 2:
             return nothing
-        leaves = frozenset().union(*(day.leaves.get(entry.key, {name_of(entry.key)}) for entry in merged))
-        key = compacted_key(day.robot, day.date, leaves, is_mended=day.is_mended, of=of)
+        sources = frozenset().union(*(day.sources.get(entry.key, {name_of(entry.key)}) for entry in merged))
+        key = compacted_key(day.robot, day.date, sources, is_backfilled=day.is_backfilled, of=of)
         rows = in_order(unrepeated(rows)) if of is OBJECTS else folded(rows).sort_by(_BY_TOPIC)
-        body = _encoded(rows, of, leaves)
+        body = _encoded(rows, of, sources)
     except MemoryError:
         findings.add(folder_of(day.robot, day.date, of), 'there is not enough memory to compact it')
         return nothing
@@ -121,7 +121,7 @@ def _merge(source: Bucket, store: ObjectStore, day: Day, of: TableSchema, findin
 
 
 def _rows(source: Bucket, day: Day, of: TableSchema, findings: Findings) -> tuple[list[ObjectInfo], pa.Table]:
-    """The parts that can be merged, and what is in them. Raises MemoryError for more than ``MOST_DAY_BYTES``."""
+    """The parts that can be merged, and their rows. Raises MemoryError for more than ``MOST_DAY_BYTES``."""
     merged: list[ObjectInfo] = []
     found: list[pa.Table] = [arrow_schema(of).empty_table()]
     size = 0
@@ -134,25 +134,25 @@ def _rows(source: Bucket, day: Day, of: TableSchema, findings: Findings) -> tupl
     return merged, pa.concat_tables(found).combine_chunks()
 
 
-def _encoded(rows: pa.Table, of: TableSchema, leaves: frozenset[str]) -> bytes:
+def _encoded(rows: pa.Table, of: TableSchema, sources: frozenset[str]) -> bytes:
     body = pa.BufferOutputStream()
     with pq.ParquetWriter(body, arrow_schema(of), compression='zstd', store_schema=False) as file:
         file.write_table(rows.cast(arrow_schema(of)), row_group_size=GROUP_ROWS)
-        file.add_key_value_metadata({**of.about, LEAVES: encode_leaves(leaves)})
+        file.add_key_value_metadata({**of.about, SOURCES: encode_sources(sources)})
     return bytes(body.getvalue().to_pybytes())
 
 
 def _tidy(source: Bucket, day: Day, done: Compacted, grace: timedelta | None, now: datetime) -> Compacted:
-    """Delete what is stood for since long enough; of a day that was merged just now, that is for a later run."""
+    """Delete parts that have been superseded for long enough; a day that was merged just now is left to a later run."""
     compacted = [entry.modified for entry in day.entries if is_compacted(entry.key)]
     fresh = [modified for modified in compacted if grace is None or modified is None or now - modified < grace]
-    if done.merged or fresh or not day.covered:
-        return replace(done, kept=len(day.covered) + done.merged)
+    if done.merged or fresh or not day.superseded:
+        return replace(done, kept=len(day.superseded) + done.merged)
     deleted = 0
     with ThreadPoolExecutor(THREADS) as pool:
-        for gone in pool.map(lambda entry: _delete(source, entry), day.covered):
+        for gone in pool.map(lambda entry: _delete(source, entry), day.superseded):
             deleted += gone
-    return replace(done, deleted=deleted, kept=len(day.covered) - deleted, denied=deleted < len(day.covered))
+    return replace(done, deleted=deleted, kept=len(day.superseded) - deleted, denied=deleted < len(day.superseded))
 
 
 def _delete(source: Bucket, entry: ObjectInfo) -> bool:
@@ -164,7 +164,7 @@ def _delete(source: Bucket, entry: ObjectInfo) -> bool:
 
 
 def in_order(rows: pa.Table) -> pa.Table:
-    """Sorted by sensor, place and time; rows without a place come last among their sensor's."""
+    """Sort by sensor, place and time; rows without a place come last within their sensor."""
     cells = pa.array(_curve(rows['x']) | _curve(rows['y']) << 1, pa.int64(), mask=~np.asarray(pc.is_valid(rows['x'])))
     keys = [
         ('sensor', 'ascending'),
@@ -178,7 +178,7 @@ def in_order(rows: pa.Table) -> pa.Table:
 
 
 def _curve(column: pa.ChunkedArray) -> NDArray[np.int64]:
-    """The cell's number along an axis with a zero bit between its bits (Morton order)."""
+    """The cell numbers along an axis, with a zero bit between any two bits (Morton order)."""
     metres = np.nan_to_num(np.asarray(column.fill_null(0.0).to_numpy()))
     spread = (np.clip(np.floor(metres / CELL_M), -_CELLS, _CELLS - 1) + _CELLS).astype(np.int64)
     for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):

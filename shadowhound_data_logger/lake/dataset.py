@@ -17,8 +17,8 @@ import numpy as np
 
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.lake import shards
-from shadowhound_data_logger.lake.bodies import Bodies
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.prefetch import Prefetch
 from shadowhound_data_logger.lake.samples import POSE_GAP_NS, Near, Sample, Samples, Window, is_complete
 from shadowhound_data_logger.lake.track import Object, Track
 
@@ -70,7 +70,7 @@ class MissionDataset:
         self._chosen = [self._complete(track) for track in self._selection.anchors]
         counts = [track.count[chosen] for track, chosen in zip(self._selection.anchors, self._chosen, strict=True)]
         self._ends = np.cumsum(np.concatenate([np.empty(0, np.int64), *counts]))
-        self._reading: tuple[int, Bodies, Samples] | None = None
+        self._reading: tuple[int, Prefetch, Samples] | None = None
 
     def __len__(self) -> int:
         return int(self._ends[-1]) if len(self._ends) else 0
@@ -84,12 +84,12 @@ class MissionDataset:
         objects = [each for track, number, _ in wanted for each in self._selection.needed(track, number)]
         samples = self._samples()
         assert self._reading is not None
-        bodies = self._reading[1]
-        bodies.ahead(objects)
+        prefetch = self._reading[1]
+        prefetch.ahead(objects)
         try:
             return [samples.sample(*each) for each in wanted]
         finally:
-            bodies.settle(objects)
+            prefetch.settle(objects)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, '_reading': None}
@@ -129,24 +129,24 @@ class MissionDataset:
     def streamed(self, share: tuple[int, int], seed: int | None, epoch: int) -> Iterator[Sample]:
         """One share of (share, shares) of one epoch of a stream."""
         references = shards.order(self._selection.anchors, self._chosen, share=share, seed=seed, epoch=epoch)
-        with Bodies(self._place.read, KEEP_BYTES, THREADS) as bodies:
-            samples = Samples(self._selection, bodies)
+        with Prefetch(self._place.read, KEEP_BYTES, THREADS) as prefetch:
+            samples = Samples(self._selection, prefetch)
             waiting: deque[tuple[shards.Reference, tuple[Object, ...]]] = deque()
             while True:
-                self._go_ahead(references, waiting, bodies)
+                self._go_ahead(references, waiting, prefetch)
                 if not waiting:
                     return
                 reference, objects = waiting.popleft()
                 sample = samples.sample(*self._at(reference))
                 if not waiting or waiting[0][0][:2] != reference[:2]:
-                    bodies.settle(objects)
+                    prefetch.settle(objects)
                 if not self._drop_incomplete or is_complete(sample, self.aligned):
                     yield sample
 
     def _go_ahead(self, references: Iterator[shards.Reference], waiting: deque[tuple[shards.Reference, tuple[Object, ...]]],
-                  bodies: Bodies) -> None:  # fmt: skip
+                  prefetch: Prefetch) -> None:  # fmt: skip
         """At least one reference waits afterwards, if there are any."""
-        while not waiting or (len(waiting) < AHEAD and bodies.waiting_bytes < AHEAD_BYTES):
+        while not waiting or (len(waiting) < AHEAD and prefetch.waiting_bytes < AHEAD_BYTES):
             reference = next(references, None)
             if reference is None:
                 return
@@ -154,7 +154,7 @@ class MissionDataset:
                 objects = waiting[-1][1]
             else:
                 objects = tuple(self._selection.needed(*self._at(reference)[:2]))
-            bodies.ahead(objects)
+            prefetch.ahead(objects)
             waiting.append((reference, objects))
 
     def close(self) -> None:
@@ -187,8 +187,8 @@ class MissionDataset:
     def _samples(self) -> Samples:
         """Of this process: what a parent had is useless in its child."""
         if self._reading is None or self._reading[0] != os.getpid():
-            bodies = Bodies(self._place.read, KEEP_BYTES, THREADS)
-            self._reading = os.getpid(), bodies, Samples(self._selection, bodies)
+            prefetch = Prefetch(self._place.read, KEEP_BYTES, THREADS)
+            self._reading = os.getpid(), prefetch, Samples(self._selection, prefetch)
         return self._reading[2]
 
 

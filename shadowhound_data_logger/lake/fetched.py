@@ -29,7 +29,7 @@ from shadowhound_data_logger.catalogue import parts
 from shadowhound_data_logger.catalogue.schema import COLUMNS
 from shadowhound_data_logger.disk import replacing
 from shadowhound_data_logger.keys import is_name
-from shadowhound_data_logger.lake.standing import mended_key
+from shadowhound_data_logger.lake.live_files import backfilled_key
 
 FOLDER: Final = '.fetch'
 PARTS: Final = f'{FOLDER}/parts'
@@ -148,7 +148,7 @@ class Fetched:
 def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """One part for each robot and date among rows as Daft gives them. Raises LakeError where it cannot be written.
 
-    Rows that two fetches brought are shown once, since they count as mended parts.
+    Rows that two fetches brought are shown once, because these files count as backfilled parts.
 
     A row whose robot is no name is left out: anybody may have written it, and the name becomes a folder's.
     """
@@ -159,7 +159,7 @@ def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         if robot is None or not is_name(robot):
             continue
         ours = [row for _, row in found]
-        path = folder / mended_key(robot, date, [f'{row["bucket"]}/{row["key"]} {row["t_start_ns"]}' for row in ours])
+        path = folder / backfilled_key(robot, date, [f'{row["bucket"]}/{row["key"]} {row["t_start_ns"]}' for row in ours])
         if path.is_file():
             continue
         try:

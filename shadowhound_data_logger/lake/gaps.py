@@ -28,8 +28,8 @@ from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.live_files import days, robots
 from shadowhound_data_logger.lake.reading import arrow_schema, tables
-from shadowhound_data_logger.lake.standing import days, robots
 from shadowhound_data_logger.times import moment
 
 OBJECTS, BAGS, EVENTS = 'objects', 'bags', 'events'

@@ -17,10 +17,10 @@ from shadowhound_data_logger.catalogue.schema import BUCKET, Row, is_row, row_of
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.live_files import backfilled_key
 from shadowhound_data_logger.lake.reading import tables
 from shadowhound_data_logger.lake.scan import KEY, folders
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.lake.standing import mended_key
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -62,7 +62,7 @@ def reindex(
             rows = list(_rows(place, new))
             for _, date, numbered in parts.by_folder(enumerate(rows)):
                 part = [row for _, row in numbered]
-                key = mended_key(robot, date, (f'{row["bucket"]}/{row["key"]}' for row in part))
+                key = backfilled_key(robot, date, (f'{row["bucket"]}/{row["key"]}' for row in part))
                 put_part(store, key, robot, parts.encode(part), len(part))
                 found.parts += 1
             found.added += len(rows)

@@ -13,8 +13,8 @@ import numpy as np
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
-from shadowhound_data_logger.lake.bodies import Bodies
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, ArchiveMember, Table, table
+from shadowhound_data_logger.lake.prefetch import Prefetch
 from shadowhound_data_logger.lake.track import Object, Track
 
 if TYPE_CHECKING:
@@ -108,9 +108,9 @@ class Selection:
 class Samples:
     """Makes them, on one thread; keeps what it decoded, because neighbours need it again."""
 
-    def __init__(self, selection: Selection, bodies: Bodies) -> None:
+    def __init__(self, selection: Selection, prefetch: Prefetch) -> None:
         self._selection = selection
-        self._bodies = bodies
+        self._prefetch = prefetch
         self._decoded: OrderedDict[tuple[str, str, str], tuple[Any, int]] = OrderedDict()
         self._decoded_bytes = 0
 
@@ -131,7 +131,7 @@ class Samples:
     def _anchor(self, track: Track, number: int, member: int, wanted: Object) -> tuple[str, NDArray[Any], int]:
         extension = decode.extension_of(wanted.key)
         if extension not in ARCHIVES:
-            return (*self._picture(wanted, self._bodies.get(wanted), extension), int(track.start_ns[number]))
+            return (*self._picture(wanted, self._prefetch.get(wanted), extension), int(track.start_ns[number]))
         found = self._members(wanted)
         if member >= len(found):
             raise LakeError(f'{wanted.key} has {len(found)} messages, the catalogue says {track.count[number]}', key=wanted.key)
@@ -144,7 +144,7 @@ class Samples:
 
     def _members(self, wanted: Object) -> list[ArchiveMember]:
         def read() -> list[ArchiveMember]:
-            return decode.members(self._bodies.get(wanted), decode.extension_of(wanted.key))
+            return decode.members(self._prefetch.get(wanted), decode.extension_of(wanted.key))
 
         found: list[ArchiveMember] = self._once(('members', wanted.bucket, wanted.key), wanted, read)
         return found
@@ -197,7 +197,7 @@ class Samples:
             return np.empty((0, 4), np.float32), None
         away, wanted, one = best
         with _naming(wanted):
-            return decode.cloud(self._bodies.get(wanted) if one is None else one.body), away
+            return decode.cloud(self._prefetch.get(wanted) if one is None else one.body), away
 
     def _window(self, how: Window, side: Track | None, width: int,
                 stamp_ns: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
@@ -222,7 +222,7 @@ class Samples:
         wanted = side.object(number)
 
         def read() -> Table:
-            found = decode.records(self._bodies.get(wanted))
+            found = decode.records(self._prefetch.get(wanted))
             return table(found, side.kind, fields, int(side.offset_ns[number]))
 
         made: Table = self._once((side.sensor, wanted.bucket, wanted.key), wanted, read)

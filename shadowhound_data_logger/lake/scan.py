@@ -19,9 +19,9 @@ import pyarrow as pa
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.live_files import Day, days, robots
 from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, arrow_schema
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.lake.standing import Day, days, robots
 from shadowhound_data_logger.model import ObjectInfo
 
 os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # else it tells its makers of each run, over the network
@@ -59,9 +59,9 @@ class Catalogue(DataSource):
         columns = _columns(pushdowns)
         found = await _apart(lambda: folders(self._source, self._wanted, self._findings))
         for day in found:
-            if day.is_mended:
+            if day.is_backfilled:
                 yield self._parts(day.entries, columns, once=True)
-        for _, whole in groupby((day for day in found if not day.is_mended), lambda day: day.robot):
+        for _, whole in groupby((day for day in found if not day.is_backfilled), lambda day: day.robot):
             plain = [entry for day in whole for entry in day.entries]
             small = [entry for entry in plain if entry.size <= SMALL_BYTES]
             for start in range(0, len(small), PARTS_AT_A_TIME):

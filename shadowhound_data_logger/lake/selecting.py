@@ -10,10 +10,10 @@ from shadowhound_data_logger.catalogue.schema import SENSOR
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import query  # first: it turns Daft's telemetry off
-from shadowhound_data_logger.lake.bodies import Place
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES, extension_of
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.options import StoreSettings

@@ -1,12 +1,12 @@
-"""Makes whole slices of those that were not closed, and tells what a whole one holds.
+"""Repairs slices that were not closed, and tells what a whole slice holds.
 
 A slice whose writer was killed, or whose disk lost power, ends where it was last synced or somewhere after: with a torn
-chunk, zeros, anything. What is kept is every chunk whose CRC-32 holds, up to the last of them; the file is mended where it
-lies, so a large slice takes neither memory nor a second copy. Every step can be cut short and done again. Whatever the file
-claims, it takes the memory of a chunk packed and unpacked, each at most ``MOST_CHUNK_BYTES``, and of what goes into the
-summary, at most ``MOST_SUMMARY_BYTES`` before Python's overhead.
+chunk, zeros, anything. Every chunk with a valid CRC-32 is kept, up to the last one; the file is repaired in place, so that a
+large slice takes neither memory nor a second copy. Every step can be interrupted and repeated. Whatever the file claims,
+recovery takes the memory of one chunk, packed and unpacked, each at most ``MOST_CHUNK_BYTES``, and of the summary's content, at
+most ``MOST_SUMMARY_BYTES`` before Python's overhead.
 
-This repairs the bytes of a slice; ``bags/salvage.py`` decides about a bag, ``spool/recovery.py`` mends a spool.
+This repairs the bytes of a slice; ``bags/salvage.py`` decides about a bag, ``spool/recovery.py`` repairs a spool.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _INDEX_ENTRY: Final = 16
 
 
 @dataclass(slots=True)
-class Survey:
+class SliceScan:
     """What is whole in a file, and how it becomes a slice: write the repairs, cut it off at ``end``, append the ending."""
 
     contents: Contents = field(default_factory=Contents)
@@ -80,18 +80,18 @@ class _Damaged(Exception):
     """A record is not what its writer wrote."""
 
 
-def survey(file: int) -> Survey:
-    """Of an open file. Raises OSError alone."""
-    return _Surveyor(file).run()
+def scan(file: int) -> SliceScan:
+    """Scan an open file. Raises only OSError."""
+    return _Scanner(file).run()
 
 
-class _Surveyor:
+class _Scanner:
     """One pass over one file. What is damaged is a suspect until something whole follows it; at the end it is the torn tail."""
 
     def __init__(self, file: int) -> None:
         self._file = file
         self._size = os.fstat(file).st_size
-        self._found = Survey()
+        self._found = SliceScan()
         self._tracks = self._found.contents.tracks
         self._schemas = Schemas()
         self._held_bytes = 0
@@ -99,7 +99,7 @@ class _Surveyor:
         """(offset, opcode) of records since the last whole one."""
         self._suspect_messages = 0
 
-    def run(self) -> Survey:
+    def run(self) -> SliceScan:
         at = self._found.end = self._header()
         while at < self._size:
             start = os.pread(self._file, RECORD.size, at)
@@ -259,7 +259,7 @@ def recover(path: Path, *, ros_distro: str = '') -> SliceInfo:
         raise FileExistsError(f'{final} is there already, beside {path}')
     file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     try:
-        found = survey(file)
+        found = scan(file)
         for at, content in found.repairs:
             _write(file, at, content)
         os.ftruncate(file, found.end)

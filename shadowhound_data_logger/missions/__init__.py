@@ -1,1 +1,1 @@
-"""Missions: what the agent logs goes to a journal, and from there to MLflow and the spool by a process of its own (D11)."""
+"""Missions: what the agent logs goes to a journal, and from there to MLflow and the spool by a process of its own."""

@@ -49,7 +49,7 @@ class Active:
         return stamp_ns - self.start_ns
 
 
-class Lookout:
+class MissionFinder:
     """Finds a robot's active mission, of several the one that began last. Not thread-safe."""
 
     def __init__(self, home: Path, robot: str) -> None:
@@ -62,7 +62,7 @@ class Lookout:
         self._told = ''
 
     def look(self) -> Active | None:
-        """What is active now; a folder that cannot be read has none, which is said once."""
+        """The mission that is active now; None where the folder cannot be read, which is logged once."""
         try:
             self._find()
             found = [active for folder in tuple(self._open.values()) if (active := self._judge(folder))]

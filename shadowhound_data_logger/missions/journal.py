@@ -1,4 +1,4 @@
-"""The journal of one mission: an append-only file that has what was logged when the call returns (D11).
+"""The journal of one mission: an append-only file that has what was logged when the call returns.
 
 A line a record: eight hex digits, the CRC-32 of what follows the space, then JSON in ASCII. A line break cannot occur in such
 JSON, so that a torn or rotten line costs itself alone. The file is locked (flock) for as long as its writer lives.

@@ -1,4 +1,4 @@
-"""MissionDataLogger: what the mission agent uses. No call waits for Tower, and none raises because of it (D11).
+"""MissionDataLogger: what the mission agent uses. No call waits for Tower, and none raises because of it.
 
 logger = MissionDataLogger()
 with logger.mission('patrol', 'go round the house') as mission:

@@ -134,7 +134,7 @@ class Replay:
         except TrackingRefused as error:
             log.error('mission %s is not sent on: %s', mission_id, error)  # noqa: TRY400 - no defect
             said = str(error)
-        except Exception as error:  # the supervised catch-all (D14): one rotten journal must not stop the others
+        except Exception as error:  # the supervised catch-all: one rotten journal must not stop the others
             log.error('mission %s cannot be sent', mission_id, exc_info=error)  # noqa: TRY400
             said = f'{type(error).__name__}: {error}'
         with suppress(OSError):  # the log has it as well
@@ -299,7 +299,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def open_tracking(home: Path, experiment: str) -> MlflowTracking:
-    """The tracking server that the environment names, else a SQLite file in the home (D13)."""
+    """The tracking server that the environment names, else a SQLite file in the home."""
     uri = os.environ.get('MLFLOW_TRACKING_URI') or _private_store(home)
     root = home / 'mlartifacts' if uri.startswith('sqlite:') else None
     if root is not None:

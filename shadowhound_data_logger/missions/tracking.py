@@ -1,4 +1,4 @@
-"""MLflow as missions need it: the one file that imports it. Explicit run ids, never the fluent API (D11).
+"""MLflow as missions need it: the one file that imports it. Explicit run ids, never the fluent API.
 
 Every method blocks for as long as a request may take (``ENVIRONMENT``) and raises TrackingUnavailable or TrackingRefused; each
 may be repeated: a run is looked up by its mission's id before it is made, and points, params and artifacts that are

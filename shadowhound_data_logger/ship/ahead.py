@@ -24,7 +24,7 @@ LIVE: Final = 64
 OLDEST_OF_BACKLOG: Final = 4
 """Of so many turns of the backlog one is that of the oldest."""
 LOOK_EVERY_S: Final = 1.0
-"""Other processes spool too (D6) and wake nobody here: an idle drain looks this often."""
+"""Other processes spool too, without waking this one: an idle drain looks this often."""
 
 
 class Ahead:

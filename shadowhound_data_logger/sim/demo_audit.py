@@ -27,7 +27,7 @@ BOOKKEEPING: Final = '_ledger'
 
 
 @dataclass(slots=True)
-class Pile:
+class SensorTotals:
     """The objects of one sensor."""
 
     objects: int = 0
@@ -62,7 +62,7 @@ class DemoAudit:
 
     ledger: Mapping[str, Any]
     messages: Mapping[str, Messages]
-    piles: Mapping[str, Pile]
+    totals: Mapping[str, SensorTotals]
     read_back: int
     """Objects read from the server."""
     samples: int
@@ -98,7 +98,7 @@ def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectSt
     catalogue = _catalogued(bodies)
     problems += [*_uncounted(found, samples), *_uncatalogued(catalogue, bodies)]
     return DemoAudit(
-        found, messages, _piles(rows), len(bodies), sum(samples.values()), bodies, catalogue.total(), tuple(problems)
+        found, messages, _totals(rows), len(bodies), sum(samples.values()), bodies, catalogue.total(), tuple(problems)
     )
 
 
@@ -107,15 +107,15 @@ def _messages(published: int, before: int, account: Mapping[str, Any] | None) ->
     return Messages(published, before if known else None, account)
 
 
-def _piles(rows: list[Any]) -> dict[str, Pile]:
-    piles: dict[str, Pile] = {}
+def _totals(rows: list[Any]) -> dict[str, SensorTotals]:
+    totals: dict[str, SensorTotals] = {}
     for row in rows:
-        pile = piles.setdefault(json.loads(row['metadata']).get('sensor', BOOKKEEPING), Pile())
-        pile.objects += 1
-        pile.delivered += row['state'] == State.DELIVERED.value
-        pile.bytes += row['bytes']
-        pile.latest = row['key'] if is_row(BUCKET, row['key']) else f'{row["key"].rpartition("/")[0]}/'
-    return piles
+        total = totals.setdefault(json.loads(row['metadata']).get('sensor', BOOKKEEPING), SensorTotals())
+        total.objects += 1
+        total.delivered += row['state'] == State.DELIVERED.value
+        total.bytes += row['bytes']
+        total.latest = row['key'] if is_row(BUCKET, row['key']) else f'{row["key"].rpartition("/")[0]}/'
+    return totals
 
 
 def _count(rows: list[Any], bodies: Mapping[str, bytes]) -> Counter[str]:

@@ -129,10 +129,10 @@ def objects_table(audit: DemoAudit) -> Table:
     """A row a sensor: the objects that lie in the S3 server, and what they are called."""
     columns = ('objects', 'delivered', 'size', 'the latest one')
     table = plain_table('What lies in the S3 server', columns, left=columns[-1:])
-    for _, pile in sorted(audit.piles.items(), key=lambda item: item[1].latest):
-        table.add_row(number(pile.objects), number(pile.delivered), volume(pile.bytes), pile.latest)
-    piles = audit.piles.values()
-    total = (sum(pile.objects for pile in piles), sum(pile.delivered for pile in piles), sum(pile.bytes for pile in piles))
+    for _, each in sorted(audit.totals.items(), key=lambda item: item[1].latest):
+        table.add_row(number(each.objects), number(each.delivered), volume(each.bytes), each.latest)
+    totals = audit.totals.values()
+    total = (sum(each.objects for each in totals), sum(each.delivered for each in totals), sum(each.bytes for each in totals))
     table.add_row(number(total[0]), number(total[1]), volume(total[2]), 'all', style='bold')
     return table
 

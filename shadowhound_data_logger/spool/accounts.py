@@ -1,4 +1,4 @@
-"""What became of every message, counted in memory: the live half of the ledger (D10).
+"""What became of every message, counted in memory: the live half of the ledger.
 
 One lock guards all of it. Every message is received once, and then skipped, rejected, dropped or stored once; whatever
 has no outcome yet is open. ``snapshot`` is taken by the spool inside a group commit, so that what is durable balances too.

@@ -1,4 +1,4 @@
-"""Binding: what is held gets its final name, and may be shipped from then on (D5).
+"""Binding: what is held gets its final name, and may be shipped from then on.
 
 All of it is one step in the index. Before its transaction ends the files lie as ``incoming/<id>.part`` and describe themselves as
 what they become, so that a death leaves them where recovery looks for the file of any row: it puts back what was not
@@ -54,7 +54,7 @@ def renew(index: Index, number: int, path: Path) -> None:
 
 
 def free_key(index: Index, bucket: str, wanted: str, own: str | None = None) -> str:
-    """The wanted key or the first of its ``_1``, ``_2``, ... that was never given out (D7), or is the object's ``own``.
+    """The wanted key or the first of its ``_1``, ``_2``, ... that was never given out, or is the object's ``own``.
 
     They are given out in turn, so few are asked for: an agent whose frames all have one number must not hold up other writers.
     """

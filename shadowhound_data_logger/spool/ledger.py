@@ -1,4 +1,4 @@
-"""The ledger: what became of every message and every object, read from the spool's index, and whether it closes (D10)."""
+"""The ledger: what became of every message and every object, read from the spool's index, and whether it closes."""
 
 from __future__ import annotations
 

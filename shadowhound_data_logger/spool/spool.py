@@ -1,4 +1,4 @@
-"""The durable spool: what ``commit`` returned has survived the death of the process and of the power (D5, D6, D9).
+"""The durable spool: what ``commit`` returned has survived the death of the process and of the power (docs/decisions/0001).
 
 A group commit writes and syncs the payloads as ``incoming/<id>.part``, then commits one index transaction that holds
 the new objects, the outcomes of deliveries and the accounts, then renames the parts to their final names. The transaction
@@ -31,11 +31,11 @@ from shadowhound_data_logger.spool.ballast import Ballast, says_full
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index, spooled
-from shadowhound_data_logger.spool.piles import Piles, look
 from shadowhound_data_logger.spool.recovery import open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, fits, make_room
 from shadowhound_data_logger.spool.session import Session, carry
+from shadowhound_data_logger.spool.usage import SpoolUsage, usage_of
 
 log = logging.getLogger(__name__)
 
@@ -107,7 +107,7 @@ class Spool:
 
         ``durable`` gets them as well, before the files of delivered objects are removed: that may take as long as the commit.
         Raises OSError or sqlite3.OperationalError when nothing of it became durable; the caller tries again. Objects
-        for which there is no room at all are recorded as evicted (D9), those whose file is gone as quarantined.
+        for which there is no room at all are recorded as evicted, those whose file is gone as quarantined.
         """
         with staged(self._tree, self._session.number if self._session else 0, objects) as ready:
             with self._lock:
@@ -205,13 +205,13 @@ class Spool:
         """Waits for no commit."""
         return sum(row[2] for row in self._view.tally() if row[1] == State.PENDING.value)
 
-    def piles(self) -> Piles:
+    def usage(self) -> SpoolUsage:
         """What lies here now; waits for no commit. Raises OSError or sqlite3.Error."""
-        return look(self._view, self.root, self._clock.wall_ns())
+        return usage_of(self._view, self.root, self._clock.wall_ns())
 
     @contextmanager
     def drain_lock(self) -> Iterator[bool]:
-        """Held by the one process that ships (D6); yields False when another one has it."""
+        """Held by the one process that ships; yields False when another one has it."""
         with flock(self.root / 'drain.lock', wait=False) as mine:
             yield mine
 

@@ -19,7 +19,7 @@ from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.piles import look
+from shadowhound_data_logger.spool.usage import usage_of
 
 FRESH_NS: Final = 5 * SECOND
 """A node writes once a second: one that is silent for longer hangs, or is no more."""
@@ -149,8 +149,8 @@ def _of_index(spool: Path, robot: str, now_ns: int, written: Mapping[str, Any] |
     try:
         index.open()
         limit = written['spool']['max_bytes'] if written else None
-        piles = {'path': str(spool), **asdict(look(index, spool, now_ns)), 'max_bytes': limit}
-        return {'spool': piles, 'session': _session(index, robot, written['pid'] if written else 0)}
+        usage = {'path': str(spool), **asdict(usage_of(index, spool, now_ns)), 'max_bytes': limit}
+        return {'spool': usage, 'session': _session(index, robot, written['pid'] if written else 0)}
     except (OSError, sqlite3.Error, SpoolError) as error:
         return {'spool': None, 'session': None, 'problem': f'the spool index {path} cannot be read: {error}'}
     finally:

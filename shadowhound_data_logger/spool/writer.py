@@ -50,7 +50,7 @@ class SpoolWriter:
         """Whether outcomes wait for no object to be committed with: somebody waits for them, at a stop say."""
         self._last_commit = -HEARTBEAT_S
         self.damaged = False
-        """Whether the index was found damaged: only the recovery of a new start can mend that."""
+        """Whether the index was found damaged: only the recovery at the next start can repair it."""
         self.worker = Worker('spool-writer', self._step, patience_s=HEARTBEAT_S + commit_s + HANGING_S)
 
     def on_commit(self, *, spooled: Callable[[Sequence[SpooledObject]], None] | None = None,

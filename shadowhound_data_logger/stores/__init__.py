@@ -18,7 +18,7 @@ __all__ = ['open_reader', 'open_store']
 
 
 def open_store(settings: StoreSettings, upload: UploadSettings) -> ObjectStore:
-    """The store that the settings name, opened: S3 with an endpoint, else a folder (D13). Close it once.
+    """The store that the settings name, opened: S3 with an endpoint, else a folder. Close it once.
 
     Raises SettingError for an endpoint that no request can be sent to.
     """

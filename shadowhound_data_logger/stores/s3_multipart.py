@@ -27,7 +27,7 @@ from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 MULTIPART_BYTES: Final = 16 << 20
 """Larger objects are sent in parts: what is smaller is sent again as a whole after a broken connection."""
 _LOST: Final = frozenset({'InvalidPart', 'InvalidPartOrder', 'EntityTooSmall'})
-"""The server says that it has not what it said that it has: only a new upload can mend that."""
+"""The server denies having parts that it confirmed: only a new upload helps."""
 
 _log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.remote import find_bag, find_bags
-from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, parcel, spool_parcel, upload_now
+from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, planned, spool_upload, upload_now
 from shadowhound_data_logger.bags.verify import verify_remote
 from shadowhound_data_logger.bags.watch import Watch
 from shadowhound_data_logger.clock import SystemClock
@@ -48,10 +48,10 @@ def store(settings: Settings) -> DirectoryStore:
 def send(settings: Settings, folder: Path, *, is_archive: bool = False, deadline_s: float = DEADLINE_S) -> Uploaded:
     """Through the spool."""
     with (
-        parcel(folder, 'thor', folder.name, settings.home, is_archive=is_archive) as sent,
+        planned(folder, 'thor', folder.name, settings.home, is_archive=is_archive) as sent,
         opened_spool(settings, CLOCK) as spool,
     ):
-        spool_parcel(sent, spool)
+        spool_upload(sent, spool)
         return deliver(settings, spool, sent, deadline_s=deadline_s)
 
 
@@ -93,7 +93,7 @@ def test_another_bag_of_that_name_is_refused(settings: Settings, store: Director
     write_ours(tmp_path / 'other' / NAME, slices=1, each=10)
     if is_now:
         with (
-            parcel(tmp_path / 'other' / NAME, 'thor', NAME, settings.home, is_archive=False) as sent,
+            planned(tmp_path / 'other' / NAME, 'thor', NAME, settings.home, is_archive=False) as sent,
             pytest.raises(BagError, match='--name'),
         ):
             upload_now(store, sent, deadline_s=DEADLINE_S)
@@ -124,7 +124,7 @@ def test_an_away_tower_is_no_failure(tmp_path: Path, seaweed: Tower) -> None:
     assert '127.0.0.1:9' in found.last_error
     back = Settings.load({'robot': 'thor', 'spool.min_free_bytes': 0},
                          {'SHADOWHOUND_HOME': str(tmp_path / 'home'), **seaweed.environment()})  # fmt: skip
-    with parcel(tmp_path / NAME, 'thor', NAME, back.home, is_archive=False) as sent, opened_spool(back, CLOCK) as spool:
+    with planned(tmp_path / NAME, 'thor', NAME, back.home, is_archive=False) as sent, opened_spool(back, CLOCK) as spool:
         shutil.rmtree(tmp_path / NAME)
         assert deliver(back, spool, sent, deadline_s=DEADLINE_S).is_delivered
     with closing(open_store(back.store, back.upload)) as store:
@@ -164,8 +164,11 @@ def test_a_bag_that_is_changed_after_it_was_spooled(settings: Settings, store: D
     """What small files were is sent; a slice that is not what it was is refused, and never sent under its name."""
     write_ours(tmp_path / NAME, slices=2, each=1500)
     before = contents(tmp_path / NAME)
-    with parcel(tmp_path / NAME, 'thor', NAME, settings.home, is_archive=False) as sent, opened_spool(settings, CLOCK) as spool:
-        spool_parcel(sent, spool)
+    with (
+        planned(tmp_path / NAME, 'thor', NAME, settings.home, is_archive=False) as sent,
+        opened_spool(settings, CLOCK) as spool,
+    ):
+        spool_upload(sent, spool)
         for name in ('metadata.yaml', f'{NAME}_0.mcap'):
             with (tmp_path / NAME / name).open('ab') as file:
                 file.write(b'# more')

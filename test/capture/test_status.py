@@ -220,7 +220,7 @@ def test_a_disk_that_refuses_is_said_once(setting: Setting, caplog: pytest.LogCa
 
 def test_a_spool_that_cannot_be_read_is_said_once(setting: Setting, caplog: pytest.LogCaptureFixture) -> None:
     """Then there is no status, and what was written before stays, growing old."""
-    setting.spool.piles = broken  # type: ignore[method-assign]
+    setting.spool.usage = broken  # type: ignore[method-assign]
     with caplog.at_level(logging.WARNING):
         assert setting.status.look() is None
         assert setting.status.look() is None

@@ -35,7 +35,7 @@ def test_status_compact_status(home: Path) -> None:
     assert 'thor' in run(home, 'status').output
     merged = run(home, 'compact', '--before', '2026-10-30').output
     assert '24 files are 2 now, one a day' in merged
-    assert '24 that are stood for' in merged
+    assert '24 superseded files' in merged
     assert 'There is nothing to merge' in run(home, 'compact', '--before', '2026-10-30', '--keep').output
     assert [row['covered'] for row in json.loads(run(home, 'status', '--json').output)] == [24]
     assert '24 that were merged earlier are deleted' in run(home, 'compact', '--before', '2026-10-30', '--grace', '0').output

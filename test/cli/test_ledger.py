@@ -35,9 +35,9 @@ def a_topic(**figures: Any) -> dict[str, Any]:
 
 
 def a_ledger(balanced: bool = True, **topics: dict[str, Any]) -> dict[str, Any]:
-    piles = {'spooled': 60, 'pending': 0, 'held': 0, 'delivered': 60, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0}
+    counts = {'spooled': 60, 'pending': 0, 'held': 0, 'delivered': 60, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0}
     named = {f'/{name}'.replace('__', '/'): row for name, row in topics.items()}
-    return {'robot': 'thor', 'balanced': balanced, 'topics': named, 'objects': piles, 'bytes': piles}
+    return {'robot': 'thor', 'balanced': balanced, 'topics': named, 'objects': counts, 'bytes': counts}
 
 
 def shown(found: dict[str, Any], width: int = 80, *, terminal: bool = False) -> str:

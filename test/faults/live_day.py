@@ -134,7 +134,7 @@ class Day:
         self._report.objects, self._report.foreign = len(self._bodies), len(self._theirs)
 
     def _put_back(self) -> int:
-        """What somebody has to do about objects that were denied twice while others were taken (D8)."""
+        """What somebody has to do about objects that were denied twice while others were taken."""
         denied = [row['key'] for row in rows(self._root) if row['reason'] == 'access_denied']
         for key in denied:
             assert self._front.denied[f'/{BUCKET}/{key}'] > 1

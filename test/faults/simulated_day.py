@@ -203,7 +203,7 @@ class Day:
         return self._process.spool.pending_count() == 0
 
     def _put_back(self) -> None:
-        """What somebody has to do about objects that were denied twice while others were taken (D8)."""
+        """What somebody has to do about objects that were denied twice while others were taken."""
         denied = [row for row in rows(self._root) if row['reason'] == 'access_denied']
         if not denied:
             return

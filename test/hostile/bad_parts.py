@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from shadowhound_data_logger.catalogue import parquet, parts, schema
 from shadowhound_data_logger.lake import reading
-from shadowhound_data_logger.lake.standing import LEAVES, compacted_key
+from shadowhound_data_logger.lake.live_files import SOURCES, compacted_key
 from shadowhound_data_logger.options import StoreSettings
 
 DATE: Final = '2026-10-28'
@@ -86,8 +86,8 @@ def lying_page(rows: Sequence[schema.Row], claim: int = (1 << 31) - 1) -> bytes:
     return body[: place + 3] + said + body[end + 1 :]  # the columns after it lie elsewhere now, which is a lie as well
 
 
-def leaf_bomb(rows: Sequence[schema.Row]) -> tuple[str, bytes]:
-    """The name and content of a compacted part whose list of leaves is a gigabyte of JSON in a megabyte."""
+def source_list_bomb(rows: Sequence[schema.Row]) -> tuple[str, bytes]:
+    """The name and content of a compacted part whose list of sources is a gigabyte of JSON in a megabyte."""
     piece, pieces = b'a' * (1 << 20), 1024
     parts_ = (b'["', piece, b'"]')
     packers = [zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS) for _ in parts_]
@@ -100,12 +100,12 @@ def leaf_bomb(rows: Sequence[schema.Row]) -> tuple[str, bytes]:
     return compacted(rows, base64.b64encode(squeezed).decode())
 
 
-def compacted(rows: Sequence[schema.Row], leaves: str | Sequence[str]) -> tuple[str, bytes]:
-    """A compacted part that says so of its leaves."""
-    said = leaves if isinstance(leaves, str) else base64.b64encode(zlib.compress(json.dumps(list(leaves)).encode())).decode()
-    key = compacted_key('thor', DATE, [said], is_mended=False)
+def compacted(rows: Sequence[schema.Row], sources: str | Sequence[str]) -> tuple[str, bytes]:
+    """A compacted part that says so of its sources."""
+    said = sources if isinstance(sources, str) else base64.b64encode(zlib.compress(json.dumps(list(sources)).encode())).decode()
+    key = compacted_key('thor', DATE, [said], is_backfilled=False)
     table = pa.Table.from_pylist(list(rows), schema=reading.arrow_schema())
-    return Path(key).stem, written(table, {LEAVES: said})
+    return Path(key).stem, written(table, {SOURCES: said})
 
 
 def footer_of(body: bytes) -> tuple[int, int]:

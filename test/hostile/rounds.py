@@ -47,8 +47,8 @@ from shadowhound_data_logger.lake.decode import table
 from shadowhound_data_logger.lake.fetch import Wish
 from shadowhound_data_logger.lake.fetch import fetch as fetch_objects
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.live_files import sources_of
 from shadowhound_data_logger.lake.samples import Near, Samples, Selection, Window
-from shadowhound_data_logger.lake.standing import leaves_of
 from shadowhound_data_logger.lake.track import Track
 from shadowhound_data_logger.mcap.format import CHUNK, RECORD, record, text
 from shadowhound_data_logger.mcap.index import records
@@ -317,11 +317,11 @@ def _row(given: schema.Row, rng: random.Random) -> schema.Row:
     return made
 
 
-def leaf_lists(shop: Shop) -> Round:
+def source_lists(shop: Shop) -> Round:
     """What compacted parts say that they were made of."""
     rows = [row('camera', NOON_NS)]
     made = bad_parts.compacted(rows, [f'part{number}' for number in range(200)])[1]
-    bombs = [bad_parts.leaf_bomb(rows)[1]]
+    bombs = [bad_parts.source_list_bomb(rows)[1]]
 
     def one(rng: random.Random) -> str:
         body = rng.choice(bombs) if rng.random() < 0.05 else made
@@ -332,7 +332,7 @@ def leaf_lists(shop: Shop) -> Round:
             body = packed if rng.random() < 0.5 else bad_parts.mutated(packed, rng)
         source: Any = _Bodies({'thor/_catalog/x.parquet': body})
         with shop.reading():
-            return said(lambda: leaves_of(source, source.entries()[0]))
+            return said(lambda: sources_of(source, source.entries()[0]))
 
     return one
 
@@ -503,7 +503,7 @@ def samples(shop: Shop) -> Round:
     def one(rng: random.Random) -> str:
         contents = [as_json(BATCH, rng) if rng.random() < 0.5 else json.dumps(BATCH).encode() for _ in range(3)]
 
-        class Bodies:
+        class Prefetch:
             def get(self, wanted: Any) -> bytes:
                 return file.getvalue() if wanted.key.endswith('jpg') else contents[int(wanted.key[-6]) % 3]
 
@@ -521,7 +521,7 @@ def samples(shop: Shop) -> Round:
 
         frames, imu = track('camera', 'sensor_msgs/msg/CompressedImage', 'jpg', 3), track('imu', 'sensor_msgs/msg/Imu', 'json', 3)
         aligned = {'imu': rng.choice((Near(0.5), Window(0.5, 4), Near(0.5, ('list',)), Window(1e9, 2)))}
-        made = Samples(Selection((frames,), aligned, {('thor', 'imu'): imu}, None), Bodies())  # type: ignore[arg-type]
+        made = Samples(Selection((frames,), aligned, {('thor', 'imu'): imu}, None), Prefetch())  # type: ignore[arg-type]
         with np.errstate(all='ignore'), shop.reading():
             return said(lambda: [made.sample(frames, number) for number in range(3)])
 
@@ -686,7 +686,7 @@ def packed_bags(shop: Shop) -> Round:
 
 
 KINDS: Final[Mapping[str, Callable[[Shop], Round]]] = {
-    'parts': catalogue_parts, 'leaf lists': leaf_lists, 'summaries': summaries, 'fetched objects': fetched_objects,
+    'parts': catalogue_parts, 'source lists': source_lists, 'summaries': summaries, 'fetched objects': fetched_objects,
     'images': images,
     'clouds': clouds, 'records': records_, 'archives': archives, 'samples': samples, 'slices': slices, 'metadata': metadata,
     'manifests': manifests, 'packed bags': packed_bags,

@@ -24,9 +24,9 @@ from PIL import Image
 from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
-from shadowhound_data_logger.lake.bodies import Bodies
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import table
+from shadowhound_data_logger.lake.prefetch import Prefetch
 from shadowhound_data_logger.lake.query import _summary
 from shadowhound_data_logger.lake.track import Object
 from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet
@@ -212,7 +212,7 @@ def test_no_more_of_an_object_is_read_than_its_row_says() -> None:
         asked.append(most)
         return b'content'
 
-    with Bodies(read, 1000, 1) as bodies:
+    with Prefetch(read, 1000, 1) as bodies:
         assert bodies.get(Object('b', 'k', 7, '')) == b'content'
         for size in (MOST_OBJECT_BYTES + 1, 0, -1, 1 << 62):
             with pytest.raises(LakeError, match='are not decoded'):

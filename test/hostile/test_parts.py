@@ -161,12 +161,12 @@ def test_a_data_set_says_what_it_leaves_out(home: Path) -> None:
     assert not len(pickle.loads(pickle.dumps(frames)).left_out)  # noqa: S301 - our own
 
 
-def test_a_compacted_part_that_lies_about_its_leaves_costs_itself_alone(home: Path) -> None:
+def test_a_compacted_part_that_lies_about_its_sources_costs_itself_alone(home: Path) -> None:
     """A list that is none, one that unpacks to a gigabyte, and two that contradict each other."""
     before = good(home)
     settings = folder_store(home)
     made = [
-        bad_parts.leaf_bomb(ROWS), bad_parts.compacted(ROWS, 'no base64'), bad_parts.compacted(ROWS, ''),
+        bad_parts.source_list_bomb(ROWS), bad_parts.compacted(ROWS, 'no base64'), bad_parts.compacted(ROWS, ''),
         bad_parts.compacted(ROWS, ['gone', 'a']), bad_parts.compacted(ROWS, ['gone', 'b', 'c']),
     ]  # fmt: skip
     told = [bad_parts.put(settings, body, name) for name, body in made]
@@ -199,7 +199,7 @@ def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None
 def test_a_bomb_is_left_out_in_2_gb(home: Path) -> None:
     """With no more memory than that, ``query`` and ``lake compact`` end by themselves and say of each bomb that it is one."""
     bombs = {'thor_bad': bad_parts.dictionary_bomb(ROWS[0]), 'thor_zeros': bad_parts.zeros_bomb(ROWS),
-             'thor_liar': bad_parts.lying_page(ROWS), **dict([bad_parts.leaf_bomb(ROWS)])}  # fmt: skip
+             'thor_liar': bad_parts.lying_page(ROWS), **dict([bad_parts.source_list_bomb(ROWS)])}  # fmt: skip
     keys = [bad_parts.put(folder_store(home), body, name) for name, body in bombs.items()]
     for arguments in (('query', '--format', 'keys'), ('lake', 'compact', '--before', '2026-10-29')):
         ran = in_2_gb(home, *arguments)

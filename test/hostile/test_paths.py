@@ -19,8 +19,8 @@ from shadowhound_data_logger.bags.verify import verify_folder
 from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import BagDamaged, LakeError, NameRefused, ObjectRefused, StoreError
-from shadowhound_data_logger.lake.bodies import Place
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.memory import MemoryStore

@@ -19,7 +19,7 @@ from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import AccessDenied, StoreUnavailable
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import Compacted, compact
-from shadowhound_data_logger.lake.standing import is_compacted
+from shadowhound_data_logger.lake.live_files import is_compacted
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
@@ -131,7 +131,7 @@ def test_it_may_die_anywhere(tmp_path: Path) -> None:
             except Dead:
                 found = [path for path in files(settings) if not is_compacted(path)]
                 assert len(found) + sum(map(is_compacted, files(settings))) >= 1
-            if number % 4 == 0:  # Daft takes its time; all states are in test_standing
+            if number % 4 == 0:  # Daft takes its time; all states are in test_live_files
                 assert answer(settings) == keys(rows)
     else:
         pytest.fail('it never came to its end')

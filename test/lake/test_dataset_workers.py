@@ -19,7 +19,7 @@ from lake.making import folder_store
 from lake.training import FRAMES_HZ, Drive, in_a_child
 
 from shadowhound_data_logger.catalogue.schema import BUCKET
-from shadowhound_data_logger.lake import MissionDataset, bodies, dataset, shards
+from shadowhound_data_logger.lake import MissionDataset, dataset, prefetch, shards
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.options import StoreSettings
 
@@ -202,9 +202,9 @@ def test_the_threads_of_a_process_open_one_store(tmp_path: Path, monkeypatch: py
 
     def ask(_: int) -> object:
         begin.wait()
-        return bodies._of_this_process(StoreSettings(directory=tmp_path))
+        return prefetch._of_this_process(StoreSettings(directory=tmp_path))
 
-    monkeypatch.setattr(bodies, 'open_store', open_slowly)
+    monkeypatch.setattr(prefetch, 'open_store', open_slowly)
     with ThreadPoolExecutor(8) as pool:
         found = set(pool.map(ask, range(8)))
     assert [*found] == opened

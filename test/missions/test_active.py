@@ -10,23 +10,23 @@ from missions.fakes import journalling
 from missions.server import until
 
 from shadowhound_data_logger.missions import journal
-from shadowhound_data_logger.missions.active import Lookout, ended
+from shadowhound_data_logger.missions.active import MissionFinder, ended
 from shadowhound_data_logger.missions.folder import new_folder
 
 
 def test_a_mission_is_active_from_start_to_end(tmp_path: Path) -> None:
     """It is found by its journal's lock; its end's time is the one that the agent recorded."""
-    lookout = Lookout(tmp_path, 'thor')
-    assert lookout.look() is None
+    finder = MissionFinder(tmp_path, 'thor')
+    assert finder.look() is None
     with journalling(tmp_path) as logger:
         mission_id = logger.start_mission('patrol', 'go')
-        found = lookout.look()
+        found = finder.look()
         assert found is not None
         assert (found.id, found.mission_type, found.has(found.start_ns), found.has(found.start_ns - 1)) == (
             mission_id, 'patrol', True, False,
         )  # fmt: skip
         logger.end_mission(True, 1.0, 1.0)
-        until(lambda: lookout.look() is None, 'the end of the mission')  # the journal is let go of by another thread
+        until(lambda: finder.look() is None, 'the end of the mission')  # the journal is let go of by another thread
     over = ended(found)
     assert over.end_ns == (journal.last(found.folder.journal))['t']
     assert over.has(over.end_ns or 0)
@@ -37,36 +37,36 @@ def test_only_its_own_robot_is_looked_for(tmp_path: Path) -> None:
     """Several robots may share a home."""
     with journalling(tmp_path, robot='tachi') as logger:
         logger.start_mission('patrol', 'go')
-        assert Lookout(tmp_path, 'thor').look() is None
-        assert Lookout(tmp_path, 'tachi').look() is not None
+        assert MissionFinder(tmp_path, 'thor').look() is None
+        assert MissionFinder(tmp_path, 'tachi').look() is not None
 
 
 def test_the_newest_of_several_is_active(tmp_path: Path) -> None:
     """When it ends, the one before it is again."""
-    lookout = Lookout(tmp_path, 'thor')
+    finder = MissionFinder(tmp_path, 'thor')
     with journalling(tmp_path) as first:
         older = first.start_mission('z', '')
         with journalling(tmp_path) as second:
             newer = second.start_mission('a', '')
-            found = lookout.look()
+            found = finder.look()
             assert (found and found.id) == newer
-        found = lookout.look()
+        found = finder.look()
         assert (found and found.id) == older
 
 
 def test_a_mission_that_is_being_made_is_not_over(tmp_path: Path) -> None:
     """Between the folder, the journal, the lock and the first record it is looked at again."""
-    lookout = Lookout(tmp_path, 'thor')
+    finder = MissionFinder(tmp_path, 'thor')
     folder = new_folder(tmp_path, 'patrol', 1)
-    assert lookout.look() is None
+    assert finder.look() is None
     writer = journal.Journal(folder.journal)
     writer.create()
-    assert lookout.look() is None
+    assert finder.look() is None
     writer.append({'k': 'start', 't': 1, 'type': 'patrol', 'command': '', 'robot': 'thor'})
-    found = lookout.look()
+    found = finder.look()
     assert (found and found.id) == folder.mission_id
     writer.close()
-    assert lookout.look() is None
+    assert finder.look() is None
 
 
 def test_what_is_over_costs_one_stat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,9 +74,9 @@ def test_what_is_over_costs_one_stat(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for _ in range(3):
         with journalling(tmp_path) as logger:
             logger.start_mission('patrol', '')
-    lookout = Lookout(tmp_path, 'thor')
-    lookout.look()
-    lookout.look()
+    finder = MissionFinder(tmp_path, 'thor')
+    finder.look()
+    finder.look()
     monkeypatch.setattr(os, 'open', lambda *_: pytest.fail('a file was opened'))
     monkeypatch.setattr(os, 'scandir', lambda *_: pytest.fail('the folder was listed'))
-    assert lookout.look() is None
+    assert finder.look() is None

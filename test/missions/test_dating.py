@@ -11,7 +11,7 @@ from missions.fakes import FakeDrawing, FakeShelf, FakeTracking, journalling
 
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.dating import Dating
-from shadowhound_data_logger.missions.active import Active, Lookout, ended
+from shadowhound_data_logger.missions.active import Active, MissionFinder, ended
 from shadowhound_data_logger.missions.dating import WAITS, give_date
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
 from shadowhound_data_logger.missions.node_log import NodeLog
@@ -141,7 +141,7 @@ def test_the_node_s_part_is_dated_as_well(tmp_path: Path, clocks: Clocks) -> Non
     """Poses of before and after the clock was set are one path, and steps are seconds since the start all the way."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
-        found = Lookout(tmp_path, 'thor').look()
+        found = MissionFinder(tmp_path, 'thor').look()
         assert found
         mission = Active(found.folder, found.mission_type, found.start_ns, clock=clocks)
         node_log = NodeLog(mission, SECOND, 5.0)

@@ -11,7 +11,7 @@ from missions.fakes import FakeShelf, FakeTracking, journalling
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.errors import TrackingError
 from shadowhound_data_logger.missions import node_delivery
-from shadowhound_data_logger.missions.active import Active, Lookout, ended
+from shadowhound_data_logger.missions.active import Active, MissionFinder, ended
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.node_log import Frame, NodeLog, Reading
@@ -23,7 +23,7 @@ JPEG = b'\xff\xd8 of the node \xff\xd9'
 
 def join(home: Path, *, seconds: int = 5, step_ns: int = 1000) -> NodeLog:
     """A node that has seen a robot for a while."""
-    mission = Lookout(home, 'thor').look()
+    mission = MissionFinder(home, 'thor').look()
     assert mission
     node_log = NodeLog(mission, step_ns, 5e9)
     node_log.open()

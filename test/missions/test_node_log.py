@@ -12,7 +12,7 @@ import pytest
 from missions.fakes import journalling
 
 from shadowhound_data_logger.missions import copies, journal
-from shadowhound_data_logger.missions.active import Active, Lookout
+from shadowhound_data_logger.missions.active import Active, MissionFinder
 from shadowhound_data_logger.missions.node_log import FIRST_FRAME, MOST_FLOOR_POINTS, Cloud, Floor, Frame, NodeLog, Reading
 from shadowhound_data_logger.missions.odometer import Pose
 
@@ -25,7 +25,7 @@ def mission(tmp_path: Path) -> Iterator[Active]:
     """An active one."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
-        found = Lookout(tmp_path, 'thor').look()
+        found = MissionFinder(tmp_path, 'thor').look()
         assert found
         yield found
 

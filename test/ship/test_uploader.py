@@ -290,7 +290,7 @@ def test_close_before_open_and_twice_is_fine(spool: FakeSpool) -> None:
 
 
 def test_into_a_folder(spool: FakeSpool, start: Start, tmp_path: Path) -> None:
-    """With the store that is the default (D13): every object is there with its content."""
+    """With the store that is the default: every object is there with its content."""
     items = spool.add(40, content=b'\xff\xd8 a picture')
     store = open_store(StoreSettings(directory=tmp_path / 'store'), SETTINGS)
     uploader = start(store)

@@ -99,7 +99,7 @@ def test_an_audit_of_what_is_well_has_no_problems(good: Scene) -> None:
     assert found.messages[CAMERA].before_match == 10
     assert found.messages[IMU].before_match == 0
     assert found.messages[RAW].account is None
-    assert (found.piles['camera'].objects, found.piles['camera'].delivered, found.piles['imu'].latest) == (2, 2, IMU_KEY)
+    assert (found.totals['camera'].objects, found.totals['camera'].delivered, found.totals['imu'].latest) == (2, 2, IMU_KEY)
 
 
 def test_an_object_that_changed_is_found(good: Scene) -> None:

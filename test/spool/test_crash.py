@@ -1,4 +1,4 @@
-"""D5 and D10 under ``kill -9``: what commit returned stays, nothing is half there, and the ledger closes."""
+"""The spool and the ledger under ``kill -9``: what commit returned stays, nothing is half there, and the ledger closes."""
 
 from __future__ import annotations
 

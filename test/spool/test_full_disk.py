@@ -1,4 +1,4 @@
-"""D9: a full disk is a decision, not a crash."""
+"""A full disk is a decision, not a crash."""
 
 from __future__ import annotations
 

@@ -223,9 +223,9 @@ def test_an_age_that_nobody_knows(tmp_path: Path) -> None:
     spool.open()
     put(spool, make())
     clock.now_ns += 9 * SECOND
-    assert spool.piles().oldest_age_s == 9.0
+    assert spool.usage().oldest_age_s == 9.0
     clock.now_ns = NOON_NS
-    assert spool.piles().oldest_age_s is None
+    assert spool.usage().oldest_age_s is None
     spool.close()
 
 

@@ -1,7 +1,7 @@
-"""Which parts of a day count: a compacted part stands for the parts that it was made of, whether those are gone already or not.
+"""Which parts of a day are live: a compacted part supersedes its sources, whether or not they have been deleted yet.
 
-A folder is the rows of one robot and one date. What a compacted part was made of stands in its footer, down to the parts that a
-robot wrote, so whoever lists a folder at whatever moment of a compaction sees each row once (docs/decisions/0014).
+A folder has the rows of one robot and one date. The footer of a compacted part names its sources, down to the parts that a robot
+wrote, so a reader who lists the folder at any moment of a compaction sees each row once (docs/decisions/0014).
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.untrusted import from_json
 
-LEAVES: Final = 'shadowhound.leaves'
-"""Of a compacted part's Parquet metadata: the names of the parts that it was made of, as JSON, zlib, base64."""
-MOST_LEAVES_BYTES: Final = 8 << 20
-"""Of such a list, as JSON: 100,000 parts."""
-UNLISTED: Final = 'it cannot be listed, since a name in it is none'
+SOURCES: Final = 'shadowhound.leaves'
+"""The key in a compacted part's Parquet metadata; its value: the names of its sources, as JSON, zlib, base64."""
+MOST_SOURCES_BYTES: Final = 8 << 20
+"""The longest such list, as JSON: 100,000 parts."""
+UNLISTED: Final = 'it cannot be listed: it contains an invalid name'
 _FOLDER: Final = re.compile(r'date=\d{4}-\d\d-\d\d', re.ASCII)
 _COMPACTED: Final = re.compile(r'_compacted_[0-9a-f]{16}(_mended)?\.parquet$')
-_MENDED: Final = re.compile(r'_mended(_[0-9a-f]{16})?\.parquet$')
+_BACKFILLED: Final = re.compile(r'_mended(_[0-9a-f]{16})?\.parquet$')
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,57 +43,57 @@ class Day:
     robot: str
     date: str
     entries: tuple[ObjectInfo, ...]
-    """What is to be read: each row stands in one of them."""
-    covered: tuple[ObjectInfo, ...]
-    """What those stand for and is still there."""
-    leaves: Mapping[str, frozenset[str]]
-    """Key of a compacted part among ``entries`` -> the names of the robot's parts that it holds; not of one that is alone."""
+    """The live files: each row is in one of them."""
+    superseded: tuple[ObjectInfo, ...]
+    """Sources of live files that have not been deleted yet."""
+    sources: Mapping[str, frozenset[str]]
+    """Key of a compacted part among ``entries`` -> the names of the robot's parts that it holds. Omits a part that is alone."""
 
     @property
-    def is_mended(self) -> bool:
-        """Whether ``reindex`` wrote in it: a row may then stand in two parts, as the robot's own part can come later."""
-        return any(_MENDED.search(entry.key) for entry in self.entries)
+    def is_backfilled(self) -> bool:
+        """Whether ``reindex`` added a part: a row may then be in two parts, because the robot's own part can come later."""
+        return any(_BACKFILLED.search(entry.key) for entry in self.entries)
 
 
 def folder_of(robot: str, date: str, of: TableSchema = OBJECTS) -> str:
-    """What the keys of a robot's parts of a date begin with."""
+    """The prefix of the keys of a robot's parts of a date."""
     return f'{of.prefix(robot)}date={date}/'
 
 
 def name_of(key: str) -> str:
-    """What tells a part from the others of its folder."""
+    """The name of a part in its folder."""
     return key.rpartition('/')[2]
 
 
-def compacted_key(robot: str, date: str, leaves: Iterable[str], *, is_mended: bool, of: TableSchema = OBJECTS) -> str:
-    """The key of the part that is made of these: the same for all who compact the same."""
-    digest = hashlib.sha256('\n'.join(sorted(leaves)).encode()).hexdigest()[:16]
-    return of.part_key(robot, date, f'{date.replace("-", "")}_compacted_{digest}{"_mended" * is_mended}')
+def compacted_key(robot: str, date: str, sources: Iterable[str], *, is_backfilled: bool, of: TableSchema = OBJECTS) -> str:
+    """The key of the part that is made from these sources: the same whoever makes it."""
+    digest = hashlib.sha256('\n'.join(sorted(sources)).encode()).hexdigest()[:16]
+    return of.part_key(robot, date, f'{date.replace("-", "")}_compacted_{digest}{"_mended" * is_backfilled}')
 
 
-def mended_key(robot: str, date: str, keys: Iterable[str]) -> str:
-    """The key of a part with rows that ``reindex`` found missing."""
+def backfilled_key(robot: str, date: str, keys: Iterable[str]) -> str:
+    """The key of a part with rows that were missing (``reindex``); ``_mended`` in it is part of the format."""
     digest = hashlib.sha256('\n'.join(sorted(keys)).encode()).hexdigest()[:16]
     return OBJECTS.part_key(robot, date, f'{date.replace("-", "")}_mended_{digest}')
 
 
 def is_compacted(key: str) -> bool:
-    """Whether it is a part made of parts."""
+    """Whether this is the key of a compacted part."""
     return _COMPACTED.search(key) is not None
 
 
-def encode_leaves(names: Iterable[str]) -> str:
-    """As ``LEAVES`` has them."""
+def encode_sources(names: Iterable[str]) -> str:
+    """The value of ``SOURCES`` for these names."""
     return base64.b64encode(zlib.compress(json.dumps(sorted(names)).encode())).decode('ascii')
 
 
 def robots(source: Bucket) -> list[str]:
-    """Those that have a folder. Raises StoreError."""
+    """Robots that have a folder. Raises StoreError."""
     return [name for name in source.folders('') if is_name(name)]
 
 
 def dates_of(source: Bucket, robot: str, findings: Findings, of: TableSchema = OBJECTS) -> list[str]:
-    """The dates of which a robot has rows. Raises StoreError."""
+    """The dates for which a robot has rows. Raises StoreError."""
     try:
         return [name[5:] for name in source.folders(of.prefix(robot)) if _FOLDER.fullmatch(name)]
     except ObjectRefused as error:
@@ -103,9 +103,9 @@ def dates_of(source: Bucket, robot: str, findings: Findings, of: TableSchema = O
 
 def days(source: Bucket, named: Sequence[str], dates: Sequence[str] | None, pool: Executor, findings: Findings,
          has: Callable[[str], bool] = lambda _: True, of: TableSchema = OBJECTS) -> list[Day]:  # fmt: skip
-    """The folders of these robots and dates (None: of all that there are, those it ``has``) that hold something, oldest first.
+    """The folders of these robots and dates that are not empty, oldest first. ``dates`` None: all for which ``has`` is true.
 
-    No other folder is listed, and a footer is read only of compacted parts that do not stand alone. Raises StoreError.
+    Lists no other folder, and reads footers only of compacted parts that share their folder. Raises StoreError.
     """
     pairs = [(robot, date) for robot in named
              for date in (filter(has, dates_of(source, robot, findings, of)) if dates is None else dates)]  # fmt: skip
@@ -114,69 +114,69 @@ def days(source: Bucket, named: Sequence[str], dates: Sequence[str] | None, pool
 
 
 def _day(source: Bucket, robot: str, date: str, findings: Findings, of: TableSchema) -> Day:
-    """What a part says that is no good, or contradicts others, is left out: neither read nor stood for."""
+    """A part whose list of sources is invalid or contradicts another is left out: neither live nor superseded."""
     try:
         entries = [entry for entry in source.list(folder_of(robot, date, of)) if entry.key.endswith('.parquet')]
     except ObjectRefused as error:
         findings.add(folder_of(robot, date, of), f'{UNLISTED}: {error}')
         entries = []
-    leaves: dict[str, frozenset[str]] = {}
+    sources: dict[str, frozenset[str]] = {}
     for entry in [entry for entry in entries if is_compacted(entry.key)] if len(entries) > 1 else []:
         try:
-            leaves[entry.key] = leaves_of(source, entry)
+            sources[entry.key] = sources_of(source, entry)
         except LakeError as error:
             findings.add(entry.key, str(error))
             entries.remove(entry)
     while True:
         try:
-            return standing(robot, date, entries, leaves)
+            return live_files(robot, date, entries, sources)
         except LakeError as error:
             findings.add(error.data['key'], str(error))
             entries = [entry for entry in entries if entry.key != error.data['key']]
 
 
-def standing(robot: str, date: str, entries: Sequence[ObjectInfo], leaves: dict[str, frozenset[str]]) -> Day:
-    """Of parts and compacted parts: the fullest first, then others that share nothing with it, then parts that none holds.
+def live_files(robot: str, date: str, entries: Sequence[ObjectInfo], sources: dict[str, frozenset[str]]) -> Day:
+    """Choose the live files: the compacted part with the most sources, others that share none with it, then parts in neither.
 
     Raises LakeError where a part is gone and the compacted part that held it contradicts a fuller one.
     """
     held: set[str] = set()
-    stand: list[ObjectInfo] = []
+    live: list[ObjectInfo] = []
     names = {name_of(entry.key) for entry in entries}
-    for entry in sorted(entries, key=lambda entry: (-len(leaves.get(entry.key, ())), entry.key)):
-        inside = leaves.get(entry.key, frozenset({name_of(entry.key)}))
+    for entry in sorted(entries, key=lambda entry: (-len(sources.get(entry.key, ())), entry.key)):
+        inside = sources.get(entry.key, frozenset({name_of(entry.key)}))
         if not inside & held:
-            stand.append(entry)
+            live.append(entry)
             held |= inside
         elif not inside <= held | names:
             raise LakeError(
                 f'it contradicts another compacted part of {robot} {date}, and parts that they were made of are gone',
                 remedy=f'move {entry.key} away and run `shadowhound-data lake reindex`', robot=robot, date=date, key=entry.key,
             )  # fmt: skip
-    chosen = {entry.key for entry in stand}
-    covered = tuple(entry for entry in entries if entry.key not in chosen)
-    made = {entry.key: leaves[entry.key] for entry in stand if entry.key in leaves}
-    return Day(robot, date, tuple(sorted(stand, key=lambda entry: entry.key)), covered, made)
+    chosen = {entry.key for entry in live}
+    superseded = tuple(entry for entry in entries if entry.key not in chosen)
+    made = {entry.key: sources[entry.key] for entry in live if entry.key in sources}
+    return Day(robot, date, tuple(sorted(live, key=lambda entry: entry.key)), superseded, made)
 
 
-def leaves_of(source: Bucket, entry: ObjectInfo) -> frozenset[str]:
-    """What a compacted part says that it was made of. Raises LakeError for a file that does not say it."""
+def sources_of(source: Bucket, entry: ObjectInfo) -> frozenset[str]:
+    """The sources that a compacted part names. Raises LakeError for a file without a valid list."""
     from shadowhound_data_logger.lake import reading  # noqa: PLC0415 - pyarrow, only for days that are between two states
 
     try:
-        packed = base64.b64decode(reading.footer(source, entry)[LEAVES.encode()], validate=True)
-        names = from_json(zlib.decompressobj().decompress(packed, MOST_LEAVES_BYTES + 1), MOST_LEAVES_BYTES)
+        packed = base64.b64decode(reading.footer(source, entry)[SOURCES.encode()], validate=True)
+        names = from_json(zlib.decompressobj().decompress(packed, MOST_SOURCES_BYTES + 1), MOST_SOURCES_BYTES)
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise ValueError('that is no list of names')
+            raise ValueError('not a list of names')
     except (*reading.UNREADABLE, zlib.error) as error:
-        text = f'it does not say what it was made of: {error or type(error).__name__}'
-        raise LakeError(text, remedy='is it one of ours?', key=entry.key) from error
+        text = f'its list of sources is invalid: {error or type(error).__name__}'
+        raise LakeError(text, remedy='was it written by `lake compact`?', key=entry.key) from error
     return frozenset(names)
 
 
 @dataclass(frozen=True, slots=True)
 class CatalogueState:
-    """Of one robot's catalogue."""
+    """What one robot's catalogue consists of."""
 
     robot: str
     days: int
@@ -185,17 +185,17 @@ class CatalogueState:
     last: str
     files: int
     size: int
-    """Bytes of all of them."""
+    """Bytes of all files."""
     compacted: int
-    """Days that are one file."""
+    """Days with one file."""
     open_days: int
-    """Days that are over and have several."""
+    """Days that are over and have several files."""
     covered: int
-    """Files that others stand for: they only take room."""
+    """Superseded files that have not been deleted yet."""
 
 
 def state(source: Bucket, robot: str | None = None, findings: Findings | None = None) -> list[CatalogueState]:
-    """Of all robots that have a catalogue. Raises StoreError."""
+    """The state of one robot's catalogue, or of all. Raises StoreError."""
     findings = Findings() if findings is None else findings
     today = f'{utc(time.time_ns()):%Y-%m-%d}'
     with ThreadPoolExecutor(THREADS) as pool:
@@ -205,10 +205,10 @@ def state(source: Bucket, robot: str | None = None, findings: Findings | None = 
 
 def _state(robot: str, found: Iterable[Day], today: str) -> CatalogueState:
     each = list(found)
-    entries = [entry for day in each for entry in (*day.entries, *day.covered)]
+    entries = [entry for day in each for entry in (*day.entries, *day.superseded)]
     return CatalogueState(
         robot=robot, days=len(each), first=each[0].date, last=each[-1].date, files=len(entries),
-        size=sum(entry.size for entry in entries), covered=sum(len(day.covered) for day in each),
+        size=sum(entry.size for entry in entries), covered=sum(len(day.superseded) for day in each),
         compacted=sum(len(day.entries) == 1 and is_compacted(day.entries[0].key) for day in each),
         open_days=sum(len(day.entries) > 1 and day.date < today for day in each),
     )  # fmt: skip

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shadowhound_data_logger.errors import LakeError
-from shadowhound_data_logger.lake.standing import Day, compacted_key, folder_of, is_compacted, name_of, standing
+from shadowhound_data_logger.lake.live_files import Day, compacted_key, folder_of, is_compacted, live_files, name_of
 from shadowhound_data_logger.model import ObjectInfo
 
 NOW = datetime(2026, 10, 28, tzinfo=timezone.utc)
@@ -24,18 +24,18 @@ class Folder:
 
     def __init__(self) -> None:
         self.files: dict[str, datetime] = {}
-        self.leaves: dict[str, frozenset[str]] = {}
+        self.sources: dict[str, frozenset[str]] = {}
         self.written = 0
         self.now = NOW
         self.under_way: list[tuple[datetime, frozenset[str]]] = []
 
     def look(self) -> list[str]:
         """What a reader reads, as names of parts that robots wrote."""
-        day = self.standing()
-        return sorted(leaf for entry in day.entries for leaf in self.leaves.get(entry.key, {name_of(entry.key)}))
+        day = self.live_files()
+        return sorted(source for entry in day.entries for source in self.sources.get(entry.key, {name_of(entry.key)}))
 
-    def standing(self) -> Day:
-        return standing(ROBOT, DATE, self.entries(), {key: self.leaves[key] for key in self.files if is_compacted(key)})
+    def live_files(self) -> Day:
+        return live_files(ROBOT, DATE, self.entries(), {key: self.sources[key] for key in self.files if is_compacted(key)})
 
     def entries(self) -> list[ObjectInfo]:
         return [ObjectInfo('sensor-data', key, 1, None, modified=modified) for key, modified in self.files.items()]
@@ -45,31 +45,31 @@ class Folder:
         self.written += 1
 
     def begin(self) -> None:
-        day = self.standing()
-        leaves = frozenset(leaf for entry in day.entries for leaf in self.leaves.get(entry.key, {name_of(entry.key)}))
-        self.under_way.append((self.now, leaves))
+        day = self.live_files()
+        sources = frozenset(source for entry in day.entries for source in self.sources.get(entry.key, {name_of(entry.key)}))
+        self.under_way.append((self.now, sources))
 
     def end(self, number: int) -> None:
         """The put of a compaction; it gives up after half the grace."""
         if number < len(self.under_way):
-            begun, leaves = self.under_way.pop(number)
-            if leaves and self.now - begun < timedelta(minutes=30):
-                key = compacted_key(ROBOT, DATE, leaves, is_mended=False)
+            begun, sources = self.under_way.pop(number)
+            if sources and self.now - begun < timedelta(minutes=30):
+                key = compacted_key(ROBOT, DATE, sources, is_backfilled=False)
                 self.files.setdefault(key, self.now)
-                self.leaves[key] = leaves
+                self.sources[key] = sources
 
     def delete(self, most: int) -> None:
-        """Some of what is stood for, in any order, then death."""
-        day = self.standing()
+        """Delete some of the superseded files, in any order, then die."""
+        day = self.live_files()
         if all(self.now - entry.modified >= timedelta(hours=1) for entry in day.entries if is_compacted(entry.key)):
-            for entry in day.covered[:most]:
+            for entry in day.superseded[:most]:
                 del self.files[entry.key]
 
 
 @settings(deadline=None)
 @given(STEPS)
 def test_each_row_is_read_once_at_every_moment(steps: list[str | int]) -> None:
-    """Parts come, compactions begin, end, die and overlap, what is stood for is deleted: a reader sees all rows once."""
+    """Parts come, compactions begin, end, die and overlap, superseded files are deleted: a reader sees all rows once."""
     folder = Folder()
     for step in steps:
         if step == 'part':
@@ -102,16 +102,20 @@ def test_a_part_that_comes_again_after_its_deletion_is_not_read_again() -> None:
 
 def test_what_cannot_be_is_said_instead_of_losing_rows() -> None:
     """Two that overlap, and what only one of them has is gone: an error names the file and what to do."""
-    keys = [compacted_key(ROBOT, DATE, names, is_mended=False) for names in ('abc', 'bcde')]
+    keys = [compacted_key(ROBOT, DATE, names, is_backfilled=False) for names in ('abc', 'bcde')]
     entries = [ObjectInfo('sensor-data', key, 1, None, modified=NOW) for key in keys]
-    leaves = {keys[0]: frozenset('abc'), keys[1]: frozenset('bcde')}
+    sources = {keys[0]: frozenset('abc'), keys[1]: frozenset('bcde')}
     with pytest.raises(LakeError, match='contradict') as caught:
-        standing(ROBOT, DATE, entries, leaves)
+        live_files(ROBOT, DATE, entries, sources)
     assert caught.value.data['key'] == keys[0]
     assert 'reindex' in caught.value.remedy
 
 
 def test_the_same_parts_make_the_same_name() -> None:
     """Two who compact the same write one object; others do not collide."""
-    assert compacted_key(ROBOT, DATE, ['a', 'b'], is_mended=False) == compacted_key(ROBOT, DATE, ['b', 'a'], is_mended=False)
-    assert compacted_key(ROBOT, DATE, ['a', 'b'], is_mended=False) != compacted_key(ROBOT, DATE, ['a', 'c'], is_mended=False)
+    assert compacted_key(ROBOT, DATE, ['a', 'b'], is_backfilled=False) == compacted_key(
+        ROBOT, DATE, ['b', 'a'], is_backfilled=False
+    )
+    assert compacted_key(ROBOT, DATE, ['a', 'b'], is_backfilled=False) != compacted_key(
+        ROBOT, DATE, ['a', 'c'], is_backfilled=False
+    )

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from bags.real_bags import NAME, write_ours
 
-from shadowhound_data_logger.bags.parcel import finished
+from shadowhound_data_logger.bags.upload_plan import finished
 from shadowhound_data_logger.errors import BagDamaged
 
 BOMB = b'a: &a [x, x]\n' + b''.join(

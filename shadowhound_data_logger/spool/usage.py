@@ -12,7 +12,7 @@ from shadowhound_data_logger.spool.index import Index
 
 
 @dataclass(frozen=True, slots=True)
-class Piles:
+class SpoolUsage:
     """What lies in a spool at one instant."""
 
     pending: int
@@ -26,12 +26,12 @@ class Piles:
     """How long the oldest pending object has waited; None when none waits, or it was spooled before the clock was set."""
 
 
-def look(index: Index, folder: Path, now_ns: int) -> Piles:
+def usage_of(index: Index, folder: Path, now_ns: int) -> SpoolUsage:
     """Read it from an open index. Raises OSError or sqlite3.Error."""
     tally, oldest_ns = index.tally(), index.oldest_pending_ns()
     count = {state: sum(row[2] for row in tally if row[1] == state.value) for state in State}
     unknown = oldest_ns is not None and oldest_ns < EARLIEST_SANE_NS <= now_ns  # spooled before the clock was set
     age_s = None if oldest_ns is None or unknown else max(0.0, round((now_ns - oldest_ns) / SECOND, 1))
     disk = os.statvfs(folder)
-    return Piles(count[State.PENDING], count[State.HELD], count[State.QUARANTINED], index.payload_bytes(),
+    return SpoolUsage(count[State.PENDING], count[State.HELD], count[State.QUARANTINED], index.payload_bytes(),
                  disk.f_bavail * disk.f_frsize, age_s)  # fmt: skip

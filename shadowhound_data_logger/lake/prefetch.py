@@ -1,4 +1,4 @@
-"""The contents of objects for one process that reads a data set: fetched ahead by a few threads, verified, in bounded memory."""
+"""The contents of objects for one process that reads a data set: prefetched by a few threads, verified, in bounded memory."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 _PATIENT: Final = UploadSettings(threads=32, connect_timeout_s=10.0, read_timeout_s=60.0)
-"""As patient as whatever else reads (stores/s3_obstore.py), and connections for several data sets in one process."""
+"""The timeouts of all other readers (stores/s3_obstore.py), and connections for several data sets in one process."""
 _locks: Final[dict[int, threading.Lock]] = {}
-"""By process."""
+"""Process id -> its lock."""
 Read = Callable[[str, str, int], bytes]
-"""From bucket, key and size to content."""
+"""Bucket, key and size -> content."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where contents come from, as a value that another process can be given."""
+    """Where contents come from: a store, or a folder of fetched objects. Can be sent to another process."""
 
     settings: StoreSettings
     folder: Path | None = None
-    """Of fetched objects (``DIR/KEY``); they count alone."""
+    """Fetched objects, as ``DIR/KEY``; with a folder nothing is read from the store."""
 
     def read(self, bucket: str, key: str, most: int) -> bytes:
-        """Raises StoreError; ObjectRefused where it is larger than it should be, of which nothing is read then."""
+        """Return an object's content. Raises StoreError; ObjectRefused, with nothing read, for more than ``most`` bytes."""
         if self.folder is None:
             store = _of_this_process(self.settings)
             return steadily(lambda: store.get(bucket, key, most))
@@ -62,10 +62,11 @@ class Place:
         return body
 
 
-class Bodies:
-    """New; ``ahead`` and ``get`` on one thread; close. What was got is kept while it fits into ``keep_bytes``.
+class Prefetch:
+    """Fetches contents ahead of their use, in a few threads, and keeps what it returned while that fits into ``keep_bytes``.
 
-    The threads begin with the first ``ahead``; all but reading is the caller's, so nothing needs a lock.
+    Life: new; ``ahead`` and ``get`` on one thread; close. The threads start with the first ``ahead`` and only read: everything
+    else happens on the caller's thread, so nothing needs a lock.
     """
 
     def __init__(self, read: Read, keep_bytes: int, threads: int) -> None:
@@ -77,7 +78,7 @@ class Bodies:
         self._kept: OrderedDict[tuple[str, str], bytes] = OrderedDict()
         self._held_bytes = 0
         self.waiting_bytes = 0
-        """Of objects that were asked for ahead and not got yet."""
+        """Bytes of objects that were prefetched and not returned yet."""
         self._over = threading.Event()
 
     def __enter__(self) -> Self:
@@ -87,7 +88,7 @@ class Bodies:
         self.close()
 
     def close(self) -> None:
-        """Waits for the requests under way; idempotent."""
+        """Wait for the requests under way; idempotent."""
         self._over.set()
         pool, self._pool = self._pool, None
         if pool is not None:
@@ -95,7 +96,7 @@ class Bodies:
         self._waiting.clear()
 
     def ahead(self, objects: Iterable[Object]) -> None:
-        """These may be asked for; ``settle`` them once it is over."""
+        """Start to fetch these; ``settle`` them when they are not needed any more."""
         for each in objects:
             name = (each.bucket, each.key)
             if name not in self._kept and name not in self._waiting:
@@ -105,7 +106,7 @@ class Bodies:
                 self.waiting_bytes += each.size
 
     def get(self, wanted: Object) -> bytes:
-        """The content. Raises StoreError, LakeError for one that is not what was stored."""
+        """Return the content. Raises StoreError, and LakeError for content that is not what was stored."""
         name = (wanted.bucket, wanted.key)
         if (body := self._kept.get(name)) is not None:
             self._kept.move_to_end(name)
@@ -115,7 +116,7 @@ class Bodies:
         return body
 
     def settle(self, objects: Iterable[Object]) -> None:
-        """What of these nobody asked for is forgotten."""
+        """Forget those of these that nobody asked for."""
         for each in objects:
             waiting = self._waiting.pop((each.bucket, each.key), None)
             if waiting is not None:
@@ -154,7 +155,7 @@ class Bodies:
 
 
 def _of_this_process(settings: StoreSettings) -> ObjectStore:
-    """A forked process makes one of its own: no thread, no connection and no lock is taken over from the parent."""
+    """A forked process opens its own store: it inherits no thread, connection or lock from the parent."""
     process = os.getpid()
     with _locks.setdefault(process, threading.Lock()):  # else each thread would open one, of half a second and megabytes
         return _opened(settings, process)

@@ -49,7 +49,7 @@ class Outgoing:
 
 
 @dataclass(frozen=True, slots=True)
-class Parcel:
+class UploadPlan:
     """A bag on its way; the manifest is the last of its files."""
 
     robot: str
@@ -87,7 +87,7 @@ def finished(folder: Path) -> Description:
     return described
 
 
-def parcel_of(folder: Path, robot: str, bag: str, work: Path) -> Parcel:
+def plan_of(folder: Path, robot: str, bag: str, work: Path) -> UploadPlan:
     """Its files as they are; the manifest is made in the folder ``work``. Raises BagError, BagDamaged, NameRefused, OSError."""
     described = finished(folder)
     check_name(bag, 'the bag', MAX_BAG_BYTES)
@@ -99,10 +99,10 @@ def parcel_of(folder: Path, robot: str, bag: str, work: Path) -> Parcel:
     made = work / MANIFEST
     made.write_bytes(manifest.to_json())
     files.append(replace(_outgoing(made, MANIFEST, robot, bag), t_start_ns=described.t_start_ns, t_end_ns=described.t_end_ns))
-    return Parcel(robot, bag, folder, tuple(files))
+    return UploadPlan(robot, bag, folder, tuple(files))
 
 
-def archive_of(folder: Path, robot: str, bag: str, work: Path) -> Parcel:
+def archive_of(folder: Path, robot: str, bag: str, work: Path) -> UploadPlan:
     """One ``<bag>.tar.gz`` with the bag's folder in it, made in ``work``; the same bag gives the same bytes."""
     described = finished(folder)
     name = f'{check_name(bag, "the bag", MAX_BAG_BYTES)}{ARCHIVE}'
@@ -117,7 +117,7 @@ def archive_of(folder: Path, robot: str, bag: str, work: Path) -> Parcel:
     key = check_key(f'{prefix_of(robot)}{name}')
     metadata = {words.ROBOT: robot, words.BAG: bag, words.MESSAGES: str(described.messages)}
     item = Outgoing(name, key, path, *fingerprint(path), metadata, described.t_start_ns, described.t_end_ns)
-    return Parcel(robot, bag, folder, (item,))
+    return UploadPlan(robot, bag, folder, (item,))
 
 
 def _nobodys(member: tarfile.TarInfo) -> tarfile.TarInfo:
