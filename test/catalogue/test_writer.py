@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -162,6 +163,17 @@ def test_rows_on_their_way_are_not_handed_out_again(spool: Spool, root: Path, ca
         'thor/_catalog/date=2025-10-18/thor_20251018T120000_01234567.parquet',
         'thor/_catalog/date=2025-10-18/thor_20251018T120000_01234567_1.parquet',
     ]
+
+
+def test_what_is_remembered_of_parts_on_their_way_is_small(spool: Spool, catalogue: CatalogueWriter) -> None:
+    """After an outage they have thousands of rows: memory grows with the rows, not with their square."""
+    delivered(spool, *map(str, range(600)))
+    tracemalloc.start()
+    made = catalogue.parts()
+    kept = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert [len(part.catalogues) for part in made] == [600]
+    assert kept < 1_000_000
 
 
 def test_two_that_catalogue_one_spool(spool: Spool, root: Path, clock: FakeClock) -> None:
