@@ -1,33 +1,42 @@
 """What one mission still owes to its receivers: MLflow's run, its artifacts, and the objects of the store.
 
-Each receiver has its own place in the journal, so that artifacts that cannot be stored hold up no metric. A place moves
-on after what lies before it has arrived; whatever is sent again after a crash changes nothing.
+Two journals tell of it, the agent's and the node's, each on its way by itself (journal_delivery.py); the agent's makes the run
+and ends it. What the agent logs itself wins: points of a metric that it has logged are not sent for the node. Frames of both are
+kept: those of the node have numbers of their own (node_log.FIRST_FRAME).
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import logging
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.disk import replacing
 from shadowhound_data_logger.errors import TrackingRefused
 from shadowhound_data_logger.missions import journal
-from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of, prepared
-from shadowhound_data_logger.missions.batch import MOST_POINTS, Batches, send
+from shadowhound_data_logger.missions.artifacts import Artifact, prepared
+from shadowhound_data_logger.missions.batch import send
 from shadowhound_data_logger.missions.drawing import Pictures, nothing
-from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped, write_json
-from shadowhound_data_logger.missions.node_delivery import NodeDelivery
-from shadowhound_data_logger.missions.objects import Item, Shelf, objects_of
-from shadowhound_data_logger.missions.story import KILLED, Point, Story, summary_of
+from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, Run, stamped, write_json
+from shadowhound_data_logger.missions.journal_delivery import JournalDelivery
+from shadowhound_data_logger.missions.objects import Shelf
+from shadowhound_data_logger.missions.story import FRAMES, KILLED, Point, Story, summary_of
 from shadowhound_data_logger.missions.tracking import Tracking
+from shadowhound_data_logger.missions.values import MAX_TAG
 
 log = logging.getLogger(__name__)
 
 ARTIFACTS_A_STEP: Final = 4
 OBJECTS_A_STEP: Final = 64
 BYTES_A_STEP: Final = 8 << 20
+NODE_S: Final = 30.0
+"""How long the end of a mission waits for a node that does not let go of its journal: it takes a second, unless it hangs."""
 
 
 class Delivery:
@@ -36,35 +45,42 @@ class Delivery:
     The three do a bounded piece of work and say whether there was any. They raise TrackingError, SpoolError or OSError.
     """
 
-    def __init__(self, folder: MissionFolder, tracking: Tracking, shelf: Shelf, pictures: Pictures = nothing) -> None:
+    def __init__(self, folder: MissionFolder, tracking: Tracking, shelf: Shelf, pictures: Pictures = nothing,
+                 monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
         self.folder = folder
-        self.sent = folder.sent()
         self.run: Run | None = folder.run()
-        self.story = Story()
-        self.node = NodeDelivery(folder, self.story, MOST_POINTS)
-        self.story.node = self.node.story
+        self._agent = JournalDelivery(folder, folder, folder.lines)
+        self._node = JournalDelivery(folder, folder.node, folder.node_lines, self._is_agents)
+        self._story = self._agent.story
+        self._story.node = self._node.story
         self._tracking = tracking
         self._shelf = shelf
         self._pictures = pictures
-        self._batches = Batches(folder, self.story)
+        self._monotonic = monotonic
+        self._asked_s: float | None = None
+
+    @property
+    def sent(self) -> MissionSent:
+        """How far the agent's part is sent, and the mission as a whole."""
+        return self._agent.sent
 
     def track(self) -> bool:
         """Send the next batch of metrics; make the run first, end it after the last."""
         self._recall()
         if self.sent.ended:
-            return self.node.track(self.run, self._send)
-        batch = self._batches.next(self.sent.metrics, self.node.is_over)
+            return self._track_node()
+        batch = self._agent.points(self._is_node_over)
         if batch is None:
-            return self.node.track(self.run, self._send) or self._end_abandoned()
-        run = self._run_of()
-        self._send(run, batch.points, batch.params, batch.tags)
-        if batch.is_last:
-            self._tracking.finish(
-                run.run_id, self.folder.mission_id, self.story.end['status'], int(self.story.end['t']) // 1_000_000
-            )
-        self._move(metrics=batch.end, ended=batch.is_last)
+            return self._track_node() or self._end_abandoned()
+        run, is_last = self._run_of(), batch.last == 'end'
+        params = self._story.params() if batch.last == 'start' else self._story.final_params() if is_last else {}
+        self._send(run, batch.points, params, _last_words(self._story) if is_last else {})
+        if is_last:
+            end = self._story.end
+            self._tracking.finish(run.run_id, self.folder.mission_id, end['status'], int(end['t']) // 1_000_000)
+        self._agent.move(metrics=batch.end, ended=is_last)
         if batch.is_all:  # the agent's first: what it logs itself is not sent for the node
-            self.node.track(run, self._send)
+            self._track_node()
         return True
 
     def attach(self) -> bool:
@@ -72,83 +88,109 @@ class Delivery:
         self._recall()
         if self.run is None:
             return False
-        done, end = 0, self.sent.artifacts
-        for line in self._lines(self.sent.artifacts):
-            for artifact in artifacts_of(line.record or {}, self.folder, self.story):
-                self._attach(self.run, artifact)
-                done += 1
-            end = line.end
-            if done >= ARTIFACTS_A_STEP:
-                break
-        moved = self._moved(artifacts=end)
-        return self.node.attach(self.run, self._attach, ARTIFACTS_A_STEP - done) or moved
+        before = self._agent.sent, self._node.sent
+        send = partial(self._attach, self.run)
+        done = self._agent.attach(self._lines(self.sent.artifacts), send, ARTIFACTS_A_STEP)
+        rest = self._node.lines(self._node.sent.artifacts, self._node.sent.metrics)
+        self._node.attach(rest, send, ARTIFACTS_A_STEP - done)
+        return (self._agent.sent, self._node.sent) != before
 
     def shelve(self, *, hold: bool = False) -> bool:
         """Hand the next frames, trajectories and the summary to the spool; without a run only with ``hold``, to be held there."""
         self._recall()
         if self.run is not None and self.sent.held:
             if not self._shelf.bind(self.folder.mission_id, self.run.run_id):
-                self._move(held=False)
+                self._agent.move(held=False)
             return True
-        if self.run is None and not (hold and self.story.start):
+        if self.run is None and not (hold and self._story.start):
             return False
-        items: list[Item] = []
-        size, end, missing = 0, self.sent.objects, 0
-        for line in self._lines(self.sent.objects) if self.run else self._lines_before_a_run():
-            found = list(objects_of(line.record or {}, self.story.start, self.folder, self.run))
-            items += found
-            missing += not found and (line.record or {}).get('k') in {'frame', 'trajectory'}
-            size += sum(len(item.content.body) for item in found)
-            end = line.end
-            if len(items) >= OBJECTS_A_STEP or size >= BYTES_A_STEP:
-                break
-        if self.run is None and items and not self.sent.held:
-            self._move(held=True)
-        more, node_end = self.node.shelve(self.run, OBJECTS_A_STEP - len(items))
-        self._shelf.add([item.content for item in (*items, *more)])
-        moved = self.node.shelved(node_end)
-        moved = self._moved(objects=end, missing=self.sent.missing + missing) or moved
-        for item in items:
+        before = self._agent.sent, self._node.sent
+        lines = self._lines(self.sent.objects) if self.run else self._lines_before_a_run()
+        own = self._agent.objects(lines, self._story.start, self.run, OBJECTS_A_STEP, BYTES_A_STEP)
+        if self.run is None and own.items:
+            self._agent.move(held=True)
+        rest = self._node.lines(self._node.sent.objects, self._node.sent.metrics if self.run else 0)
+        left = OBJECTS_A_STEP - len(own.items), BYTES_A_STEP - own.bytes
+        nodes = self._node.objects(rest, self._story.start, self.run, *left)
+        self._shelf.add([item.content for item in (*own.items, *nodes.items)])
+        for part, batch in ((self._node, nodes), (self._agent, own)):
+            part.move(objects=batch.end, missing=part.sent.missing + batch.missing)
+        for item in own.items:
             if item.is_done_with:
                 item.path.unlink(missing_ok=True)
-        return moved
+        return (self._agent.sent, self._node.sent) != before
 
     def complete(self) -> bool:
         """Whether everything has arrived; what was kept for sending goes then."""
+        sent, nodes = self._agent.sent, self._node.sent
         if (
-            self.sent.ended
-            and not self.sent.held
-            and not self.sent.complete
-            and self.sent.artifacts == self.sent.objects == self.sent.metrics
-            and self.node.is_sent()
+            sent.ended
+            and not sent.held
+            and not sent.complete
+            and sent.artifacts == sent.objects == sent.metrics
+            and self._node.is_closed()
+            and nodes.artifacts == nodes.objects == nodes.metrics == self._node.whole()
         ):
-            self._move(complete=True)
+            self._agent.move(complete=True)
             for folder in (self.folder, self.folder.node):
                 shutil.rmtree(folder.files, ignore_errors=True)
         return self.sent.complete
 
     def give_up(self, error: str) -> None:
         """Say why nothing more of it can be sent; the next start tries again."""
-        self._move(error=error)
+        self._agent.move(error=error)
+
+    # -- the node's part -------------------------------------------------------------------------------------------
+
+    def _track_node(self) -> bool:
+        """Send its next points."""
+        batch = self._node.points() if self.run else None
+        if self.run is None or batch is None:
+            return False
+        self._send(self.run, batch.points, {}, {})
+        self._node.move(metrics=batch.end)
+        return True
+
+    def _is_agents(self, point: Point) -> bool:
+        """Whether the agent logs this metric itself: then the node's points are not sent. Frames of both are kept."""
+        return point.key in self._story.first or (point.key == FRAMES and bool(self._story.counts['frame']))
+
+    def _is_node_over(self) -> bool:
+        """Whether the run has all its points, or it has taken too long to let go of its journal: the mission may end."""
+        if self._node.is_closed():
+            return self._node.sent.metrics == self._node.whole()
+        self._asked_s = self._monotonic() if self._asked_s is None else self._asked_s
+        return self._monotonic() - self._asked_s > NODE_S
+
+    def _write_trajectory(self) -> None:
+        """Once: trajectory.csv of all poses, in seconds since 1970, metres and radians."""
+        if not self._node.story.counts['poses'] or self.folder.trajectory.exists():
+            return
+        with replacing(self.folder.trajectory) as binary, io.TextIOWrapper(binary, 'ascii', newline='') as file:
+            rows = csv.writer(file, lineterminator='\n')
+            rows.writerow(('timestamp', 'x', 'y', 'yaw', 'z'))
+            for line in self._node.lines(0):
+                if line.record and line.record.get('k') == 'poses':
+                    rows.writerows((f'{ns // SECOND}.{ns % SECOND:09d}', *pose) for ns, *pose in line.record['p'])
 
     # -- the journal -----------------------------------------------------------------------------------------------
 
     def _recall(self) -> None:
-        """After a restart: tell the story what was sent before."""
-        self.node.recall()
-        self._batches.recall(self.sent.metrics)
+        """After a restart: tell the stories what was sent before."""
+        self._node.recall()
+        self._agent.recall()
 
     def _end_abandoned(self) -> bool:
         """Where the agent died in the middle, say so in its place; whether that was so."""
-        if not self.story.start or self.story.end or not self.node.is_over():
+        if not self._story.start or self._story.end or not self._is_node_over():
             return False
         with journal.abandoned(self.folder.journal) as descriptor:
-            if descriptor is None or any(True for _ in self.folder.lines(self._batches.told)):
+            if descriptor is None or any(True for _ in self.folder.lines(self._agent.told)):
                 return descriptor is not None
             error = 'the agent ended without ending its mission'
-            last_ns = max(self.story.last_ns, self.node.story.last_ns)
+            last_ns = max(self._story.last_ns, self._node.story.last_ns)
             record = {'k': 'end', 't': last_ns, 'status': KILLED, 'success': False, 'by': 'replayer', 'error': error}
-            torn = journal.finish(self.folder.journal, descriptor, self._batches.told, record)
+            torn = journal.finish(self.folder.journal, descriptor, self._agent.told, record)
         cut = f', {torn} bytes of a record that was being written are cut off' if torn else ''
         log.warning('mission %s: %s; it is closed as %s%s', self.folder.mission_id, error, KILLED, cut)
         return True
@@ -174,7 +216,7 @@ class Delivery:
 
     def _run_of(self) -> Run:
         if self.run is None:
-            start = self.story.start
+            start = self._story.start
             tags = {'mlflow.user': start['robot'], 'mlflow.source.name': 'shadowhound_data_logger'}
             name = stamped(start['type'], int(start['t']))
             run = self._tracking.run_of(self.folder.mission_id, name, int(start['t']) // 1_000_000, tags)
@@ -187,7 +229,7 @@ class Delivery:
 
     def _refuse(self, error: Exception, count: str = 'refused') -> None:
         log.error('mission %s: %s', self.folder.mission_id, error)
-        self._move(**{count: getattr(self.sent, count) + 1, 'error': str(error)})
+        self._agent.move(**{count: getattr(self.sent, count) + 1, 'error': str(error)})
 
     # -- artifacts -------------------------------------------------------------------------------------------------
 
@@ -206,26 +248,17 @@ class Delivery:
     def _summarize(self) -> bool:
         """Once: artifact and object must be the same. False while the pictures are being made."""
         assert self.run is not None
-        if not self.story.counts['trajectory']:
-            self.node.write_trajectory()
+        if not self._story.counts['trajectory']:
+            self._write_trajectory()
         if not self.folder.summary.exists():
-            made = self._pictures(self.folder, stamped(self.story.start['type'], int(self.story.start['t'])))
+            made = self._pictures(self.folder, stamped(self._story.start['type'], int(self._story.start['t'])))
             if made is None:
                 return False
-            content = summary_of(self.story, self.folder.mission_id, self.run, self.sent, made)
+            content = summary_of(self._story, self.folder.mission_id, self.run, self.sent, made)
             write_json(self.folder.summary, content, durable=True)
         return True
 
-    # -- places ----------------------------------------------------------------------------------------------------
 
-    def _moved(self, **offset: int) -> bool:
-        """Move one place; False where it was there."""
-        if all(getattr(self.sent, name) == value for name, value in offset.items()):
-            return False
-        self._move(**offset)
-        return True
-
-    def _move(self, **changes: Any) -> None:
-        self.sent = replace(self.sent, **changes)
-        durable = not changes.keys().isdisjoint({'objects', 'held', 'complete'})  # after these, files go
-        self.folder.set_sent(self.sent, durable=durable)
+def _last_words(story: Story) -> dict[str, str]:
+    error: Any = story.end.get('error')
+    return {'shadowhound.error': str(error)[:MAX_TAG]} if error else {}

@@ -52,22 +52,24 @@ def held_reason(mission_id: str) -> str:
     return f'mission-{mission_id}'
 
 
-def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: MissionFolder, run: Run | None) -> Iterator[Item]:
+def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: MissionFolder, run: Run | None,
+               files: Path | None = None) -> Iterator[Item]:  # fmt: skip
     """What a record of the journal gives to the store; a file that is gone gives nothing. Raises OSError.
 
-    Without a run it is held under the mission's id, which ``Shelf.bind`` replaces.
+    ``files`` is where those of the journal lie, if not in the mission's own ``files/``. Without a run it is held under the
+    mission's id, which ``Shelf.bind`` replaces.
     """
-    kind, robot = record.get('k'), start['robot']
+    kind, robot, files = record.get('k'), start['robot'], files or folder.files
     home = f'{robot}/missions/{run.run_id if run else folder.mission_id}'
     metadata = {words.ROBOT: robot, words.MISSION_ID: folder.mission_id, words.MISSION_TYPE: safe_type(start['type'])}
     metadata |= {words.RUN_ID: run.run_id} if run else {}
     time_ns = int(record.get('t', 0))
     if kind == 'frame':
-        number, path = int(record['id']), folder.files / record['file']
+        number, path = int(record['id']), files / record['file']
         key, more = f'{home}/camera/frame_{number:06d}.jpg', {**record.get('marks', {}), **metadata, words.FRAME_ID: str(number)}
         yield from _item(path, BUCKET, key, time_ns, more, is_done_with=not record.get('artifact'))
     elif kind == 'trajectory':
-        yield from _trajectory(folder.files / record['file'], home, start, time_ns, metadata)
+        yield from _trajectory(files / record['file'], home, start, time_ns, metadata)
     elif kind == 'end':
         yield from _trajectory(folder.trajectory, home, start, time_ns, metadata)
         yield from _item(folder.summary, BUCKET, f'{home}/summary.json', time_ns, metadata)

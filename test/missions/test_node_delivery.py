@@ -10,9 +10,8 @@ from missions.fakes import FakeShelf, FakeTracking, journalling
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.errors import TrackingError
-from shadowhound_data_logger.missions import node_delivery
 from shadowhound_data_logger.missions.active import Active, MissionFinder, ended
-from shadowhound_data_logger.missions.delivery import Delivery
+from shadowhound_data_logger.missions.delivery import NODE_S, Delivery
 from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.node_log import Frame, NodeLog, Reading
 from shadowhound_data_logger.missions.odometer import Pose
@@ -117,10 +116,9 @@ def test_a_node_that_hangs_does_not_hold_the_end(tmp_path: Path) -> None:
         node_log = join(tmp_path)
         logger.end_mission(True, 0.0, 0.0)
     tracking = FakeTracking()
-    delivery = Delivery(node_log.mission.folder, tracking, FakeShelf())  # type: ignore[arg-type]
-    delivery.node._monotonic = lambda: now[0]
+    delivery = Delivery(node_log.mission.folder, tracking, FakeShelf(), monotonic=lambda: now[0])  # type: ignore[arg-type]
     assert not any(work(delivery) for _ in range(20))
-    now[0] = node_delivery.NODE_S + 1
+    now[0] = NODE_S + 1
     assert not any(work(delivery) for _ in range(20))
     assert len(tracking.finished) == 1
     node_log.add(Reading(node_log.mission.start_ns + 1, 'late', 1.0))
