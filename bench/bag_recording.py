@@ -25,9 +25,8 @@ SMALL_HZ = 10_000
 TOPIC = '/imu'
 SMALL: dict[str, Any] = {
     'sensors': ['imu'], 'imu.topics': [TOPIC], 'imu.types': ['sensor_msgs/msg/Imu'], 'imu.rate_hz': 0.0001, 'imu.batch_s': 0.0,
-    'intake.max_rate_hz': 2.0 * SMALL_HZ, 'intake.history_bytes': 256 << 20, 'bag.record': 'always', 'bag.compression': 'none',
+    'bag.record': 'always', 'bag.compression': 'none',
 }  # fmt: skip
-"""A subscription's history is counted at 4 KiB a message: 32 MiB of it would be 0.8 s at this rate."""
 WARM_S = 3.0
 SETTLE_S = 20.0
 BAR = 1.6

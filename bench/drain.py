@@ -78,7 +78,7 @@ def drain(folder: Path, settings: StoreSettings, threads: int, objects: Sequence
     for start in range(0, len(objects), GROUP):
         spool.commit(objects[start : start + GROUP])
     with closing(open_store(settings, upload)) as store:
-        writer = SpoolWriter(spool, SpoolSettings().commit_s)
+        writer = SpoolWriter(spool)
         uploader = Uploader(spool, store, upload, writer.settle)
         writer.on_commit(settled=uploader.settled)
         writer.prompt = True

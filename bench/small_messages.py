@@ -32,7 +32,7 @@ def run(folder: Path, rate_hz: int, seconds: float) -> dict[str, Any]:
     """One rate: what was published, what the ledger says of it, and what it took."""
     with World(folder) as world:
         # The history of a subscription is sized for 2,000 messages a second unless the node is told of more.
-        node = world.node({**PARAMETERS, 'intake.max_rate_hz': float(2 * rate_hz)})
+        node = world.node(PARAMETERS)
         publisher = world.program('imu_publisher', 'imu_publisher.py', '--topic', TOPIC)
         publisher.ask(subscribers=1)
         time.sleep(1.0)

@@ -13,21 +13,20 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.conditions import conditions
-from shadowhound_data_logger.errors import NameRefused, SettingError
+from shadowhound_data_logger.errors import NameRefused, SettingError, SettingGone
 from shadowhound_data_logger.keys import KeyTemplate, check_name
 from shadowhound_data_logger.options import (
     ARCHIVES,
     BATCHED,
     DEFAULT_SENSORS,
     FORMATS,
+    GONE,
     GROUPS,
     BagSettings,
     CaptureSettings,
     CatalogueSettings,
     ClockSettings,
-    EncodeSettings,
     EventSettings,
-    IntakeSettings,
     MissionSettings,
     QueueSettings,
     SensorSettings,
@@ -39,9 +38,9 @@ from shadowhound_data_logger.options import (
 
 __all__ = [
     'DEFAULT_SENSORS', 'FOREIGN', 'FORMATS', 'BagSettings',
-    'CaptureSettings', 'CatalogueSettings', 'ClockSettings', 'EncodeSettings', 'EventSettings', 'IntakeSettings',
+    'CaptureSettings', 'CatalogueSettings', 'ClockSettings', 'EventSettings',
     'MissionSettings', 'QueueSettings', 'SensorSettings', 'Settings', 'ShutdownSettings', 'SpoolSettings', 'StoreSettings',
-    'UploadSettings', 'default_parameters', 'home', 'store_settings',
+    'UploadSettings', 'default_parameters', 'gone', 'home', 'store_settings',
 ]  # fmt: skip
 
 MIN_RATE_HZ: Final = 1e-4
@@ -65,9 +64,7 @@ class Settings:
     sensors: tuple[SensorSettings, ...]
     store: StoreSettings
     capture: CaptureSettings
-    intake: IntakeSettings
     queue: QueueSettings
-    encode: EncodeSettings
     spool: SpoolSettings
     upload: UploadSettings
     shutdown: ShutdownSettings
@@ -85,6 +82,7 @@ class Settings:
     def load(cls, parameters: Mapping[str, Any], environ: Mapping[str, str], namespace: str = '/') -> Settings:
         """Raises SettingError (unknown or wrong parameter or variable) naming it, its value and what is allowed."""
         given = {name: value for name, value in parameters.items() if name.split('.')[0] not in FOREIGN}
+        _check_gone(given)
         robot = _robot(given.pop('robot', ''), environ, namespace)
         sensors = _sensors(given, robot)
         groups = {name: _fill(kind, name, given) for name, kind in GROUPS.items()}
@@ -127,15 +125,19 @@ def store_settings(environ: Mapping[str, str], folder: Path) -> StoreSettings:
     )
 
 
+def gone(name: str) -> str:
+    """What does the job now of a parameter of an earlier version; empty for any other name."""
+    group, _, last = name.partition('.')
+    return GONE.get(name) or ('' if group in GROUPS else GONE.get(f'SENSOR.{last}', '').replace('SENSOR', group))
+
+
 def default_parameters() -> dict[str, Any]:
     """Every parameter with its default, as flat ROS names; sequences as lists."""
     flat: dict[str, Any] = {'robot': '', 'sensors': list(DEFAULT_SENSORS)}
     for name, kind in GROUPS.items():
-        flat |= {f'{name}.{spec.name}': _listed(spec.default) for spec in fields(kind)}
+        flat |= {f'{name}.{spec.name}': _listed(spec.default) for spec in fields(kind) if spec.metadata}
     for sensor in _sensors({}, 'thor'):
-        for spec in fields(sensor)[1:]:
-            value = getattr(sensor, spec.name)
-            flat[f'{sensor.name}.{spec.name}'] = _listed(value)
+        flat |= {f'{sensor.name}.{spec.name}': _listed(getattr(sensor, spec.name)) for spec in fields(sensor) if spec.metadata}
     return flat
 
 
@@ -174,6 +176,13 @@ def _sensors(given: dict[str, Any], robot: str) -> tuple[SensorSettings, ...]:
     return sensors
 
 
+def _check_gone(given: Mapping[str, Any]) -> None:
+    """Raises SettingError for a parameter of an earlier version: what does its job now."""
+    for name, value in given.items():
+        if instead := gone(name):
+            raise SettingGone(name, value, instead)
+
+
 def _sensor(name: str, given: dict[str, Any], robot: str) -> SensorSettings:
     if name in {'robot', 'sensors', *GROUPS, *FOREIGN}:
         raise SettingError('sensors', name, 'names that are not those of other parameters')
@@ -203,10 +212,8 @@ def _check_batches(sensor: SensorSettings) -> None:
     text = f'0 with format {sensor.format!r}: only {", ".join(BATCHED)} objects hold several messages'
     if sensor.batch_s and sensor.format not in BATCHED:
         raise SettingError(f'{sensor.name}.batch_s', sensor.batch_s, text)
-    if sensor.batch_count and sensor.format not in BATCHED:
-        raise SettingError(f'{sensor.name}.batch_count', sensor.batch_count, text)
-    if sensor.format in ARCHIVES and not sensor.batched:
-        text = f'more than 0 with format {sensor.format!r}, or a batch_count: an archive holds several messages'
+    if sensor.format in ARCHIVES and not sensor.batch_s:
+        text = f'more than 0 with format {sensor.format!r}: an archive holds several messages'
         raise SettingError(f'{sensor.name}.batch_s', sensor.batch_s, text)
 
 
@@ -243,7 +250,7 @@ def _fill(kind: type, prefix: str, given: dict[str, Any], defaults: Mapping[str,
     values = dict(defaults or {})
     for spec in fields(kind):
         name = f'{prefix}.{spec.name}'
-        if spec.name != 'name' and name in given:
+        if spec.metadata and name in given:
             default = spec.default if spec.default is not MISSING else ()
             values[spec.name] = _check(name, given.pop(name), default, spec.metadata)
     return kind(**values)
@@ -277,4 +284,4 @@ def _near(name: str, sensors: Sequence[SensorSettings], known: list[str]) -> str
     kind = GROUPS.get(prefix) or (SensorSettings if prefix in {sensor.name for sensor in sensors} else None)
     if kind is None:
         return ', '.join(known)
-    return ', '.join(f'{prefix}.{spec.name}' for spec in fields(kind) if spec.name != 'name')
+    return ', '.join(f'{prefix}.{spec.name}' for spec in fields(kind) if spec.metadata)

@@ -28,6 +28,14 @@ class SettingError(DataLoggerError):
         super().__init__(f'{name} = {value!r} is refused; allowed is {allowed}', name=name, value=value, allowed=allowed)
 
 
+class SettingGone(SettingError):
+    """A parameter of an earlier version; ``data['allowed']`` is what does its job now."""
+
+    def __init__(self, name: str, value: object, instead: str) -> None:
+        DataLoggerError.__init__(self, f'{name} = {value!r}: there is no such parameter any more', remedy=f'remove it: {instead}',
+                                 name=name, value=value, allowed=instead)  # fmt: skip
+
+
 class NameRefused(DataLoggerError):
     """A name that would become part of an object key is not safe there."""
 

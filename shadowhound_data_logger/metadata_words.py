@@ -42,8 +42,6 @@ KEY_PATTERN: Final = 'key_pattern'
 # Repeats of the content before it.
 CONTENT_KEY: Final = 'content_key'
 """Of a repeat, in the index alone: the key of the object that holds its content, in the same bucket."""
-CONTENT_DISTANCE: Final = 'content_distance'
-"""Of a repeat that only looks like that object, in the index alone: how many of 64 bits differ (``encode.image``)."""
 REPEATS: Final = 'repeats'
 REPEATS_OF: Final = 'repeats_of'
 REPEATS_UNTIL_NS: Final = 'repeats_until_ns'

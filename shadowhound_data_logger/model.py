@@ -57,15 +57,6 @@ class FileBody:
         return self.size
 
 
-class Likeness(NamedTuple):
-    """How a picture looks, and what looks the same."""
-
-    hash: int
-    """64 bits (``encode.image``)."""
-    within: int
-    """So many of them may differ."""
-
-
 @dataclass(frozen=True, slots=True)
 class DataObject:
     """A finished object on its way into the spool: where it wants to go, its bytes, and what it is."""
@@ -94,8 +85,6 @@ class DataObject:
     """Messages by account (``spool.accounts``) of an object that holds those of several; ``topic`` is None then."""
     dedup: bool = False
     """Not stored where its content is that of the object which its sensor stored before it (``spool.repeats``)."""
-    likeness: Likeness | None = None
-    """With ``dedup``: what looks like that object is not stored either."""
     key_pattern: str | None = None
     """The wanted key with its time left open (``keys.dated``), should that not be known yet."""
     catalogues: tuple[int, ...] = ()

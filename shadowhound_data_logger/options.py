@@ -47,32 +47,20 @@ class SensorSettings:
     )
     on_change: bool = _setting(False, 'Keep a message only when its content, but for its stamp, is not that of the last one.')
     batch_s: float = _setting(0.0, 'Seconds of messages an object; 0 makes one object of each message.', low=0.0, high=3600.0)
-    batch_count: int = _setting(0, 'Most messages an object, whichever comes first; 0 is no limit.', low=0, high=10_000)
     format: str = _setting('json', 'What an object is encoded as.', choices=FORMATS)
     quality: int = _setting(85, 'JPEG quality where an image has to be encoded.', low=1, high=100, live=True)
     bucket: str = _setting('sensor-data', 'Bucket of its objects.')
     key: str = _setting('{robot}/{sensor}/{date}/{time}_{sensor}.{ext}', 'Key of an object; {date} and {time} are UTC.')
     dedup: bool = _setting(False, 'Store content that follows itself byte for byte once; the repeats stay listed.')
-    dedup_distance: int = _setting(
-        0, 'With dedup: JPEGs that look alike are repeats too, where at most so many of 64 bits differ.', low=0, high=32
-    )
     priority: int = _setting(5, '0 ships first and is dropped or evicted last, 9 the other way round.', low=0, high=9, live=True)
     expected_hz: float = _setting(
         0.0, 'How often it is published, to estimate what is lost where messages have no numbers; 0 learns it.', low=0.0, high=1e5
     )
     counter: str = _setting('', 'The same: a field that counts messages or milliseconds, such as tick; used instead of stamps.')
-    counter_step: float = _setting(0.0, 'By how much it grows from one message to the next; 0 learns it.', low=0.0, high=1e12)
-
-    @property
-    def batched(self) -> bool:
-        """Whether an object holds several messages."""
-        return bool(self.batch_s or self.batch_count)
 
     @property
     def period_ns(self) -> int:
         """The time between two objects as far as their names go, ns; 0 where they can follow each other at any distance."""
-        if self.batch_count:
-            return 0
         if self.batch_s:
             return round(self.batch_s * 1e9)
         if self.on_change:
@@ -92,34 +80,16 @@ class CaptureSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IntakeSettings:
-    """The polled reader (D1)."""
-
-    poll_s: float = _setting(0.2, 'Seconds between two drains of the subscriptions.', low=0.005, high=1.0)
-    history_bytes: int = _setting(32 * MEBI, 'Most bytes one subscription may hold between two drains.', low=MEBI)
-    max_rate_hz: float = _setting(2000.0, 'Rate for which the history of small messages is sized.', low=1.0, high=1e5)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class QueueSettings:
     """The bounded queue between intake and the encode pool."""
 
     max_bytes: int = _setting(64 * MEBI, 'Most bytes waiting for an encoder; beyond it the lowest priority is dropped.', low=MEBI)
-    max_messages: int = _setting(50_000, 'Most messages waiting for an encoder.', low=1)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EncodeSettings:
-    """The encode pool."""
-
-    threads: int = _setting(2, 'Encoder threads.', low=1, high=32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpoolSettings:
     """The durable spool (D5, D9)."""
 
-    commit_s: float = _setting(0.1, 'Longest time between an encoded object and its group commit.', low=0.01, high=10.0)
     max_bytes: int = _setting(20 * GIBI, 'Most payload bytes in the spool; beyond it the least important is evicted.', low=MEBI)
     min_free_bytes: int = _setting(2 * GIBI, 'Free space of the file system that is never used.', low=0)
     remember_days: float = _setting(3.0, 'Days for which delivered keys are remembered.', low=1.0, high=3650.0)
@@ -130,7 +100,8 @@ class UploadSettings:
     """Delivery (D7, D8)."""
 
     threads: int = _setting(4, 'Upload threads.', low=1, high=64)
-    connect_timeout_s: float = _setting(5.0, 'Seconds to wait for a connection.', low=0.1, high=60.0)
+    connect_timeout_s: float = 5.0
+    """Not a parameter: of the doctor and of tests."""
     read_timeout_s: float = _setting(30.0, 'Seconds to wait for an answer.', low=0.1, high=600.0)
     backoff_s: float = _setting(60.0, 'Longest pause between two tries while the store is away.', low=0.1, high=3600.0)
     max_mbps: float = _setting(
@@ -164,7 +135,6 @@ class MissionSettings:
     battery: str = _setting('lowstate:bms_state.soc', 'Topic and field of battery_pct; empty for none.')
     temperature: str = _setting('imu:temperature', 'Topic and field of temperature_c; empty for none.')
     odometry: str = _setting('odom', 'Topic (nav_msgs/Odometry) of pose, trajectory and distance; empty for none.')
-    max_speed_mps: float = _setting(5.0, 'A step of the odometry that is faster is a jump and no way.', low=0.01, high=1000.0)
     frames: str = _setting('camera', 'Sensor whose pictures become frames of the run; empty for none.')
     frame_every_s: float = _setting(5.0, 'Seconds between two of these frames.', low=0.0, high=1e6)
 
@@ -190,8 +160,6 @@ class BagSettings:
     slice_s: float = _setting(60.0, 'Seconds a slice: each is uploaded while the next one records.', low=1.0, high=86_400.0)
     slice_bytes: int = _setting(256 * MEBI, 'Most bytes a slice.', low=MEBI)
     compression: str = _setting('zstd', 'Of the chunks in a slice.', choices=COMPRESSIONS)
-    chunk_bytes: int = _setting(MEBI, 'Bytes that are compressed, and read back, at once.', low=4096, high=64 * MEBI)
-    queue_bytes: int = _setting(64 * MEBI, 'Most bytes that wait for the disk; what comes beyond it is dropped.', low=MEBI)
     priority: int = _setting(8, 'Of slices: 0 ships first and is evicted last, 9 the other way round.', low=0, high=9)
 
 
@@ -239,9 +207,7 @@ class StoreSettings:
 
 GROUPS: Final[dict[str, type]] = {
     'capture': CaptureSettings,
-    'intake': IntakeSettings,
     'queue': QueueSettings,
-    'encode': EncodeSettings,
     'spool': SpoolSettings,
     'upload': UploadSettings,
     'shutdown': ShutdownSettings,
@@ -278,3 +244,19 @@ DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
         'format': 'cdr', 'priority': 8,
     },
 }  # fmt: skip
+GONE: Final[dict[str, str]] = {
+    'SENSOR.batch_count': 'SENSOR.batch_s limits an object in time: 10 frames at 1 Hz are batch_s: 10.0',
+    'SENSOR.dedup_distance': 'SENSOR.dedup stores equal content once, and a lower SENSOR.rate_hz stores fewer pictures',
+    'SENSOR.counter_step': 'the step of SENSOR.counter is learned from the messages',
+    'intake.poll_s': 'topics are drained five times a second, and the history of each grows with what is heard on it',
+    'intake.history_bytes': 'the history of each topic is sized from what is heard on it',
+    'intake.max_rate_hz': 'the history of each topic is sized from what is heard on it',
+    'queue.max_messages': 'queue.max_bytes limits the queue',
+    'encode.threads': 'there are as many as half the cores, two to four',
+    'spool.commit_s': 'objects are committed after a tenth of a second at most',
+    'upload.connect_timeout_s': 'a connection is given up after 5 s; upload.read_timeout_s is how long an answer may take',
+    'mission.max_speed_mps': 'a step of the odometry that is faster than 5 m/s is a jump',
+    'bag.chunk_bytes': 'chunks have 1 MiB',
+    'bag.queue_bytes': '64 MiB may wait for the disk',
+}
+"""Parameters of earlier versions, and what does their job now. SENSOR stands for the name of any sensor."""

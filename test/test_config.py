@@ -1,13 +1,14 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from shadowhound_data_logger.config import Settings, default_parameters
-from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.options import GIBI
+from shadowhound_data_logger.errors import SettingError, SettingGone
+from shadowhound_data_logger.options import GIBI, GONE
 
 
 def load(environ: dict[str, str] | None = None, namespace: str = '/', **parameters: Any) -> Settings:
@@ -69,12 +70,11 @@ def test_a_robot_name_of_the_shell_is_told_as_that() -> None:
     ('camera.topics', 'a', 'a list of strings'),
     ('camera.topics', [], 'at least one topic'), ('camera.topics', [''], 'at least one topic'), ('camera.topics', [5], 'a list'),
     ('imu.types', ['a', 'b'], 'at most one type'), ('camera.batch_s', 1.0, '0 with format'),
-    ('camera.batch_count', 10, '0 with format'), ('imu.batch_count', 10_001, '0 to 10000'), ('imu.batch_count', 2.0, 'a whole'),
     ('voxel_map.batch_s', 1.0, '0 with format'),
     ('camera.bucket', '../x', 'letters'),
     ('camera.key', '{robot}/front.jpg', '{date} and {time}'), ('camera.priority', 10, '0 to 9'),
     ('spool.max_bytes', 5, 'at least'),
-    ('spool.max_bytes', 1e10, 'a whole number'), ('intake.poll_s', 0.0, '0.005 to 1'), ('upload.threads', 0, '1 to 64'),
+    ('spool.max_bytes', 1e10, 'a whole number'), ('upload.backoff_s', 0.0, '0.1 to 3600'), ('upload.threads', 0, '1 to 64'),
     ('shutdown.drain_s', float('inf'), '0 to 600'), ('sensors', 'camera', 'a list of names'),
     ('sensors', ['a', 'a'], 'each once'),
 ])  # fmt: skip
@@ -99,6 +99,25 @@ def test_an_unknown_parameter_stops_the_start(name: str, near: str) -> None:
     assert near in error.data['allowed']
 
 
+@pytest.mark.parametrize('name', sorted(GONE))
+def test_a_parameter_that_is_gone_stops_the_start(name: str) -> None:
+    """The error names it, its value, and what does its job now, be it one of the Go2's sensors or of one's own."""
+    for sensor in ('camera', 'thermal') if name.startswith('SENSOR') else ('',):
+        given = name.replace('SENSOR', sensor)
+        error = refused(**{'sensors': ['camera', 'thermal'], 'thermal.topics': ['thermal'], given: 4711})
+        assert isinstance(error, SettingGone)
+        assert (error.data['name'], error.data['allowed']) == (given, GONE[name].replace('SENSOR', sensor))
+        assert str(error) == f'{given} = 4711: there is no such parameter any more (remove it: {error.data["allowed"]})'
+
+
+def test_what_is_gone_is_no_parameter() -> None:
+    """Neither of its names nor those that its sentence gives as doing the job are wrong."""
+    known = set(default_parameters())
+    assert not known & {name.replace('SENSOR', 'camera') for name in GONE}
+    named = {word for text in GONE.values() for word in re.findall(r'(?:SENSOR|[a-z]+)\.[a-z_]+', text)}
+    assert {name.replace('SENSOR', 'camera') for name in named} <= known
+
+
 @pytest.mark.parametrize('name', ['robot', 'spool', 'a/b', '', 'use_sim_time'])
 def test_a_sensor_needs_a_name_of_its_own(name: str) -> None:
     """A sensor that would be mistaken for another parameter or a folder is refused."""
@@ -119,19 +138,16 @@ def test_a_sensor_of_ones_own() -> None:
 
 
 def test_an_archive_is_of_several_messages() -> None:
-    """A zip or tar without a limit in time or number is refused; either limit, or both, will do."""
+    """A zip or tar of single messages is refused."""
     error = refused(camera__format='zip')
     assert (error.data['name'], error.data['value']) == ('camera.batch_s', 0.0)
-    assert 'batch_count' in error.data['allowed']
-    for limits in ({'batch_s': 1.0}, {'batch_count': 10}, {'batch_s': 1.0, 'batch_count': 10}):
-        assert load(camera__format='tar', **{f'camera__{name}': value for name, value in limits.items()}).sensors[0].batched
+    assert load(camera__format='tar', camera__batch_s=1.0).sensors[0].batch_s == 1.0
 
 
 def test_the_least_time_between_two_objects() -> None:
-    """Names go by the batch, else by the rate; a number of messages can be reached at any time."""
+    """Names go by the batch, else by the rate."""
     imu = {'imu__rate_hz': 0.0, 'imu__batch_s': 10.0}
     assert load(**imu).sensors[3].period_ns == 10_000_000_000
-    assert load(**imu, imu__batch_count=5).sensors[3].period_ns == 0
     assert load(imu__rate_hz=4.0, imu__batch_s=0.0).sensors[3].period_ns == 250_000_000
     assert load(imu__rate_hz=0.0, imu__batch_s=0.0).sensors[3].period_ns == 0
 

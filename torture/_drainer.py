@@ -73,7 +73,7 @@ def main(home: str, log_path: str) -> None:
     backlog = spool.pending_count()
     stop = threading.Event()
     with Path(log_path).open('w', encoding='utf-8') as log:
-        writer = SpoolWriter(spool, SpoolSettings().commit_s)
+        writer = SpoolWriter(spool)
         uploader = Uploader(spool, Noting(store, log), upload, writer.settle)
         writer.on_commit(spooled=uploader.wake, settled=uploader.settled)
         live = threading.Thread(target=go_on, args=(spool, writer, stop))

@@ -30,7 +30,7 @@ SETTLE_S: Final = 6.0
 LEFT_S: Final = 100.0
 """Subscriptions go after 30 s without a publisher, and the heap is given back once a minute."""
 PARAMETERS: Final[dict[str, Any]] = {
-    'bag.record': 'always', 'bag.regex': '.*', 'events.regex': '.*', 'mission.join': False, 'spool.commit_s': 0.1,
+    'bag.record': 'always', 'bag.regex': '.*', 'events.regex': '.*', 'mission.join': False,
 }  # fmt: skip
 PROGRAM: Final = Path(__file__).parents[1] / 'test/e2e/crowd.py'
 

@@ -277,7 +277,7 @@ class Scene:
 def start(processes: Processes, home: str = '', tower: dict[str, str] | None = None, **more: Any) -> Node:
     """A node that stores every message of each topic."""
     given: dict[str, Any] = {'sensors': [stream.topic.strip('/') for stream in STREAMS], 'robot': ROBOT,
-                             'intake.history_bytes': 256 << 20, 'queue.max_bytes': 256 << 20, **more}  # fmt: skip
+                             'queue.max_bytes': 256 << 20, **more}  # fmt: skip
     for stream in STREAMS:
         name = stream.topic.strip('/')
         given |= {f'{name}.topics': [name], f'{name}.types': [STRING], f'{name}.rate_hz': 0.0, f'{name}.batch_s': BATCH_S}

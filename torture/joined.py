@@ -49,7 +49,7 @@ NOTICED_NS: Final = 2 * SECOND
 """So late may a node on a machine that is loaded notice that a mission began or ended."""
 PARAMETERS: Final[dict[str, Any]] = {
     'mission.frame_every_s': 1.0, 'lowstate.batch_s': 1.0,
-    'upload.connect_timeout_s': 1.0, 'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
+    'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
 }  # fmt: skip
 
 

@@ -43,7 +43,7 @@ DELIVER_S: Final = 300.0
 PARAMETERS: Final[dict[str, Any]] = {
     **{f'{name}.rate_hz': 0.0 for name in ('camera', 'lidar', 'odom', 'lowstate')},
     'odom.batch_s': 1.0, 'lowstate.batch_s': 1.0,
-    'upload.connect_timeout_s': 1.0, 'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
+    'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
 }  # fmt: skip
 """Every message is stored; and a store that is back is noticed within the life of a node."""
 READY: Final = re.compile(r'\[(\d+\.\d+)\].*: logging ')

@@ -269,7 +269,7 @@ def audit(found: Found, who: str, ledger: Mapping[str, Any], truths: Mapping[str
 def parameters() -> dict[str, Any]:
     """Every message of each topic is stored."""
     given: dict[str, Any] = {'sensors': [stream.topic.strip('/') for stream in STREAMS], 'robot': ROBOT,
-                             'intake.history_bytes': 256 << 20, 'queue.max_bytes': 256 << 20}  # fmt: skip
+                             'queue.max_bytes': 256 << 20}  # fmt: skip
     for stream in STREAMS:
         name = stream.topic.strip('/')
         given |= {f'{name}.topics': [name], f'{name}.types': [STRING], f'{name}.rate_hz': 0.0, f'{name}.batch_s': BATCH_S}

@@ -12,6 +12,8 @@ from shadowhound_data_logger.model import Taken
 
 QUEUE_FULL: Final = 'queue_full'
 """Why messages are dropped that do not fit."""
+MAX_BYTES: Final = 64 << 20
+"""Of messages that wait for the disk; what comes beyond it is dropped."""
 WAKE_BYTES: Final = 1 << 20
 """So much is worth a wake before the writer's time has come: about a chunk."""
 
@@ -33,7 +35,7 @@ Mark = Callable[[], None]
 class BagQueue:
     """Thread-safe. ``put`` and ``mark`` from any thread, ``wait`` and ``next`` by the writer."""
 
-    def __init__(self, max_bytes: int) -> None:
+    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
         self._max_bytes = max_bytes
         self._changed = threading.Condition()
         self._items: deque[tuple[Lot | Mark, int]] = deque()

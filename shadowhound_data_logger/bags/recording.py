@@ -180,9 +180,7 @@ class Recording:
         path = self.notes.folder / slice_file(self.notes.folder.name, self.number + 1)
         try:
             path.with_name(path.name + OPEN).unlink(missing_ok=True)  # what a try that failed has left
-            self._writer = SliceWriter(
-                path, compression=self._settings.compression, chunk_bytes=self._settings.chunk_bytes, ros_distro=ros_distro()
-            )
+            self._writer = SliceWriter(path, compression=self._settings.compression, ros_distro=ros_distro())
         except OSError as error:
             self._refuse(_reason(error), str(error))
             return False

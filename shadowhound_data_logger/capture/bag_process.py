@@ -58,8 +58,8 @@ CLOSE_S: Final = 5.0
 class ManifestWriter(SpoolWriter):
     """The spool's writer, which remembers the manifests of the bags that ended: not only ours, older ones are made whole too."""
 
-    def __init__(self, spool: Spool, commit_s: float) -> None:
-        super().__init__(spool, commit_s)
+    def __init__(self, spool: Spool) -> None:
+        super().__init__(spool)
         self._manifests: list[Manifest] = []
 
     def put(self, item: DataObject, *, wait: bool = True) -> None:
@@ -119,7 +119,7 @@ def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[st
         spool = Spool(settings.spool_path, settings.spool, SystemClock.of_this_machine(), owner)
         spool.open()
         opened.callback(spool.close)
-        writer = ManifestWriter(spool, settings.spool.commit_s)
+        writer = ManifestWriter(spool)
         uploader = Uploader(spool, store, settings.upload, writer.settle)
         writer.on_commit(spooled=uploader.wake, settled=uploader.settled)
         recorder = _open_recorder(opened, node, settings, writer)
@@ -138,9 +138,9 @@ def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[st
 def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: SpoolWriter) -> Recorder:
     """Writer, intake and recorder, opened; they are closed in the opposite order."""
     clock, accounts = SystemClock.of_this_machine(), writer.spool.accounts
-    queue = BagQueue(settings.bag.queue_bytes)
+    queue = BagQueue()
     bags = BagConsumer(node, settings.bag, accounts, queue)
-    intake = Intake(node, {}, settings.intake, accounts, MessageTypes(), [bags])
+    intake = Intake(node, {}, accounts, MessageTypes(), [bags])
     place = BagPlace(settings.home / RECORDS / settings.robot, settings.robot, clock, writer)
     salvage = Salvage(place, settings.bag.priority)
     recorder = Recorder(settings.bag, place, queue, salvage, partial(intake.listen, bags))

@@ -7,6 +7,7 @@ comes out as stored or as rejected with a reason, also when an encoder has a fau
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections import deque
@@ -14,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from shadowhound_data_logger.config import QueueSettings, SensorSettings, Settings
+from shadowhound_data_logger.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.encode.registry import encode
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, DataObject
@@ -24,6 +25,10 @@ from shadowhound_data_logger.worker import Worker
 log = logging.getLogger(__name__)
 
 WAIT_S: Final = 0.5
+THREADS: Final = min(max(2, len(os.sched_getaffinity(0)) // 2), 4)
+"""Encoder threads: half the cores that this process may use, at least two, at most four."""
+MAX_MESSAGES: Final = 50_000
+"""Messages that wait for an encoder at most, however small they are."""
 ENCODER_FAILED: Final = 'encoder_failed'
 """Why samples are rejected whose encoder has a fault."""
 PATIENCE_S: Final = 60.0
@@ -42,6 +47,7 @@ class QueueStatus:
     bytes: int
     finished: int = 0
     """Batches that were taken from it and are done."""
+    max_messages: int = MAX_MESSAGES
 
 
 class BatchQueue:
@@ -50,8 +56,8 @@ class BatchQueue:
     Whoever takes a batch says ``done`` when it has left for good, so that one can wait for those before a moment.
     """
 
-    def __init__(self, settings: QueueSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: QueueSettings, max_messages: int = MAX_MESSAGES) -> None:
+        self._max_bytes, self._max_messages = settings.max_bytes, max_messages
         self._lock = threading.Lock()
         self._ready = threading.Condition(self._lock)
         self._left = threading.Condition(self._lock)
@@ -75,7 +81,7 @@ class BatchQueue:
             self._unfinished[id(batch)] = self._put, batch
             self._messages += len(batch.samples)
             self._bytes += batch.size
-            while self._messages > self._settings.max_messages or self._bytes > self._settings.max_bytes:
+            while self._messages > self._max_messages or self._bytes > self._max_bytes:
                 dropped.append(self._remove(next(lane for lane in reversed(self._lanes.values()) if lane)))
                 self._finish(dropped[-1])
             self._ready.notify()
@@ -125,7 +131,8 @@ class BatchQueue:
 
     def status(self) -> QueueStatus:
         with self._lock:
-            return QueueStatus(sum(len(lane) for lane in self._lanes.values()), self._messages, self._bytes, self._finished)
+            batches = sum(len(lane) for lane in self._lanes.values())
+            return QueueStatus(batches, self._messages, self._bytes, self._finished, self._max_messages)
 
     def _first(self) -> int:
         """The number of the oldest batch that is not done, or of the next one."""
@@ -145,24 +152,22 @@ class BatchQueue:
 class EncodePool:
     """New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake."""
 
-    def __init__(self, settings: Settings, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,
-                 writer: SpoolWriter, marks: Sequence[Mark], observe: Observe) -> None:  # fmt: skip
+    def __init__(self, robot: str, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,  # noqa: PLR0913 - each is a neighbour
+                 writer: SpoolWriter, marks: Sequence[Mark], observe: Observe, *, threads: int = THREADS) -> None:  # fmt: skip
         """``sensors`` are the settings in force. An object goes through the ``marks`` one after the other, then to ``writer``.
 
         ``observe`` is shown each batch and its object, if there is one, once that is on its way; what it raises loses nothing.
         """
         self._queue = queue
         self._sensors = sensors
-        self._robot = settings.robot
+        self._robot = robot
         self._types = types
         self._writer = writer
         self._accounts = writer.spool.accounts
         self._marks = marks
         self._observe = observe
         self._told: set[tuple[str, str]] = set()
-        self.workers = [
-            Worker(f'encode-{number}', self._step, patience_s=PATIENCE_S) for number in range(settings.encode.threads)
-        ]
+        self.workers = [Worker(f'encode-{number}', self._step, patience_s=PATIENCE_S) for number in range(threads)]
 
     def open(self) -> None:
         for worker in self.workers:

@@ -20,6 +20,7 @@ from shadowhound_data_logger.bags.ring import Claims, Held, Ring
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.capture.bags import profiles_offered
 from shadowhound_data_logger.capture.consumers import Consumer, Drained, TopicChoice
+from shadowhound_data_logger.capture.endpoints import POLL_S
 from shadowhound_data_logger.capture.triggers import EventWatch, Inbox
 from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.config import Settings
@@ -90,7 +91,7 @@ class EventBuffer:
                  types: MessageTypes) -> None:  # fmt: skip
         options, home = settings.events, settings.home
         ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
-        self.events = Events(options, settings.bag, place, ring, salvage, settings.intake.poll_s)
+        self.events = Events(options, settings.bag, place, ring, salvage, POLL_S)
         self.consumer = EventConsumer(node, options, ring, self.events.claims) if options.enabled else None
         self._watch = self._make_watch(options, home, place, types)
 

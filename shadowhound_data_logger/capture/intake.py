@@ -17,10 +17,11 @@ from typing import Final
 from rclpy.node import Node
 
 from shadowhound_data_logger.capture.consumers import Consumer
+from shadowhound_data_logger.capture.endpoints import POLL_S
 from shadowhound_data_logger.capture.extra_topics import ExtraTopics
 from shadowhound_data_logger.capture.reader import PolledGroup
 from shadowhound_data_logger.capture.subscriber import OtherTypes, Subscriber, SubscriberStatus, Surroundings
-from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.worker import Worker
@@ -37,16 +38,15 @@ class Intake:
     ``sensors`` are the settings in force, shared with consumers and encoders; while it runs, this thread alone replaces entries.
     """
 
-    def __init__(self, node: Node, sensors: dict[str, SensorSettings], settings: IntakeSettings, accounts: Accounts,
-                 types: MessageTypes, consumers: Sequence[Consumer], first: Collection[str] = ()) -> None:  # fmt: skip
+    def __init__(self, node: Node, sensors: dict[str, SensorSettings], accounts: Accounts, types: MessageTypes,
+                 consumers: Sequence[Consumer], first: Collection[str] = ()) -> None:  # fmt: skip
         """``consumers`` get what is taken; one that wants topics besides those of the sensors shares what those before it have.
 
         ``first`` are topics to be drained before all others.
         """
         self._sensors = sensors
-        self._settings = settings
         self._consumers = consumers
-        around = Surroundings(node, settings, PolledGroup(), accounts, types)
+        around = Surroundings(node, PolledGroup(), accounts, types)
         self._others = OtherTypes(node, accounts)
         self._subscribers = tuple(Subscriber(around, sensor, consumers, self._others) for sensor in sensors.values())
         self._by_turn = sorted(self._subscribers, key=lambda subscriber: subscriber.topic not in first)
@@ -133,7 +133,7 @@ class Intake:
         self._wake.wait(max(0.0, self._next_poll_s - time.monotonic()))
         self._wake.clear()
         now_s = time.monotonic()
-        self._next_poll_s = now_s + self._settings.poll_s
+        self._next_poll_s = now_s + POLL_S
         todo: list[Callable[[], None]] = []
         if refreshes := now_s >= self._next_refresh_s:
             self._next_refresh_s = now_s + REFRESH_S

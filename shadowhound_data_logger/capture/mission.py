@@ -127,7 +127,7 @@ class MissionWatch:
         self._marks = {words.MISSION_ID: mission.id, words.MISSION_TYPE: safe_type(mission.mission_type)}
         self._find_run(mission)
         if self._settings.join:
-            node_log = NodeLog(mission, max(1, round(self._settings.period_s * SECOND)), self._settings.max_speed_mps)
+            node_log = NodeLog(mission, max(1, round(self._settings.period_s * SECOND)))
             try:
                 node_log.open()
             except OSError as error:

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from shadowhound_data_logger.conditions import conditions
-from shadowhound_data_logger.config import FOREIGN, Settings
+from shadowhound_data_logger.config import FOREIGN, Settings, gone
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
 from shadowhound_data_logger.options import GROUPS
 
@@ -83,6 +83,8 @@ class Parameters:
         return [{**each, 'value': plain(self._node.get_parameter(each['name']).value)} for each in self._described]
 
     def _check_known(self, name: str) -> None:
+        if instead := gone(name):
+            raise DataLoggerError(f'there is no parameter {name!r} any more', remedy=instead)
         if not self._node.has_parameter(name):
             known = [each for each in self._node.get_parameters_by_prefix('') if each.partition('.')[0] not in FOREIGN]
             near = [each for each in known if each.partition('.')[0] == name.partition('.')[0]]

@@ -117,7 +117,7 @@ class Pipeline:
     def _make_stages(self) -> None:
         """Each with what it hands its work to; none runs yet."""
         settings = self._settings
-        self.writer = SpoolWriter(self.spool, settings.spool.commit_s)
+        self.writer = SpoolWriter(self.spool)
         self.uploader = Uploader(self.spool, self._store, settings.upload, self.writer.settle)
         self.writer.on_commit(spooled=self.uploader.wake, settled=self.uploader.settled)
         accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
@@ -126,19 +126,19 @@ class Pipeline:
         salvage = Salvage(place, settings.bag.priority)
         self.event_buffer = EventBuffer(node, settings, place, salvage, types)
         # Who listens to the robot; what is wanted besides the sensors' topics is shared with those further down.
-        queue, bag_queue = BatchQueue(settings.queue), BagQueue(settings.bag.queue_bytes)
+        queue, bag_queue = BatchQueue(settings.queue), BagQueue()
         sensors = {sensor.name: sensor for sensor in settings.sensors}
         track = RobotTrack(settings.mission, types, self._clock, node.resolve_topic_name)
-        sampler = Sampler(sensors, settings.intake, accounts, types, self._clock, queue)
+        sampler = Sampler(sensors, accounts, types, self._clock, queue)
         accounts.oldest_open = sampler.oldest_open
         bags = BagConsumer(node, settings.bag, accounts, bag_queue)
         consumers = (track, sampler, *self.event_buffer.consumers, bags)
-        self.intake = Intake(node, sensors, settings.intake, accounts, types, consumers, first=[track.odometry])
+        self.intake = Intake(node, sensors, accounts, types, consumers, first=[track.odometry])
         self.recorder = Recorder(settings.bag, place, bag_queue, salvage, partial(self.intake.listen, bags))
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
         self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)
         marks = self.mission.mark, track.mark, self._redating.date
-        self.pool = EncodePool(settings, queue, sensors, types, self.writer, marks, self.mission.observe)
+        self.pool = EncodePool(settings.robot, queue, sensors, types, self.writer, marks, self.mission.observe)
         self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
                                        self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,

@@ -156,6 +156,8 @@ class Reader:
     def __init__(self, node: Node, plan: Plan, group: PolledGroup) -> None:
         """Raises TypeUnavailable when the message package is missing, SubscriptionRefused when the middleware does not do it."""
         self.plan = plan
+        self.drained_s: float | None = None
+        """When its owner drained it last, by the monotonic clock."""
         self._node = node
         self._group = group
         self._class = message_class(plan.type)

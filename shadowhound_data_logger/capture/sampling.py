@@ -12,8 +12,9 @@ from zlib import crc32
 
 from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.capture.encode_pool import BatchQueue
+from shadowhound_data_logger.capture.endpoints import POLL_S
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock, stamp_of
-from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.model import Batch, Sample
 from shadowhound_data_logger.options import ARCHIVES
@@ -35,8 +36,8 @@ MAX_ARCHIVE_BYTES: Final = 16 << 20
 27 MB. One such batch may be open, as much again be in the making in each encoder, and the queue holds four."""
 MAX_BATCH_MESSAGES: Final = 10_000
 """The same for messages so small that their bytes say little; the queue holds five such batches."""
-MAX_BATCH_S: Final = 60.0
-"""How long a batch that is only limited in number stays open: what is in memory alone can be lost."""
+GRACE_S: Final = 2 * POLL_S
+"""How late the last message of a window may come."""
 
 
 class KeepRule(Protocol):
@@ -96,7 +97,7 @@ def rule_for(sensor: SensorSettings, *, has_header: bool, last_kept_ns: int) -> 
 
 
 class Batcher:
-    """The open batch of one topic: one message each, or whole windows of ``batch_s`` in UTC, at most ``batch_count`` messages.
+    """The open batch of one topic: one message each, or whole windows of ``batch_s`` in UTC.
 
     A late sample (of a second publisher with another clock, say) joins the open batch; a clock that was set begins a new one.
     """
@@ -106,8 +107,8 @@ class Batcher:
         self._topic = topic
         self._type = type_name
         self._window_ns = round(sensor.batch_s * 1e9)
-        self._longest_s = sensor.batch_s or MAX_BATCH_S
-        self._most = (sensor.batch_count or MAX_BATCH_MESSAGES) if sensor.batched else 1
+        self._longest_s = sensor.batch_s
+        self._most = MAX_BATCH_MESSAGES if sensor.batch_s else 1
         self._most_bytes = MAX_ARCHIVE_BYTES if sensor.format in ARCHIVES else MAX_BATCH_BYTES
         self._samples: list[Sample] = []
         self._size = 0
@@ -152,11 +153,10 @@ class Batcher:
 class Sampler(Consumer):
     """What is logged of the sensors' topics. New; ``take`` what the intake drained."""
 
-    def __init__(self, sensors: Mapping[str, SensorSettings], settings: IntakeSettings, accounts: Accounts, types: MessageTypes,
-                 clock: Clock, queue: BatchQueue) -> None:  # fmt: skip
+    def __init__(self, sensors: Mapping[str, SensorSettings], accounts: Accounts, types: MessageTypes, clock: Clock,
+                 queue: BatchQueue) -> None:  # fmt: skip
         """``sensors`` are the settings in force, by name; ``queue`` gets the batches."""
         self._sensors = sensors
-        self._grace_s = 2 * settings.poll_s
         self._accounts = accounts
         self._types = types
         self._clock = clock
@@ -220,7 +220,7 @@ class Sampler(Consumer):
     def tick(self, now_s: float) -> None:
         """Close the batches whose time is over, though no message of the next one came."""
         for sampled in self._sampled.values():
-            if sampled.batcher.is_due(now_s, self._grace_s):
+            if sampled.batcher.is_due(now_s, GRACE_S):
                 self._close(sampled)
 
     def flush(self) -> None:

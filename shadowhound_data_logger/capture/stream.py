@@ -186,7 +186,7 @@ class SensorStream:
         if sensor.counter:
             try:
                 self._counter = types.counter(self._type, sensor.counter)
-                return Expectation(f'counter:{sensor.counter}', sensor.counter_step, self._counter.wrap)
+                return Expectation(f'counter:{sensor.counter}', wrap=self._counter.wrap)
             except Rejected as error:
                 log.warning('%s.counter is not used, stamps are instead: %s', sensor.name, error)
         return Expectation(period=SECOND / sensor.expected_hz if sensor.expected_hz else 0.0)
@@ -221,8 +221,8 @@ class SensorStream:
                 account.gaps.heard_ns = newest_ns
         if is_refuted and not self._is_refuted:
             self._is_refuted = True
-            text = '%s: messages come more often than %s says: how often they are published is learned instead'
-            log.warning(text, self._topic, 'counter_step' if counter else 'expected_hz')
+            text = '%s: messages come more often than expected_hz says: how often they are published is learned instead'
+            log.warning(text, self._topic)
         for consumer, defect in failed.items():
             count_failure(consumer, self._topic, defect)
         if fresh:

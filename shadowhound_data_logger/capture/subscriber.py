@@ -17,10 +17,10 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from shadowhound_data_logger.capture.consumers import Consumer
-from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, logged_type, plans
+from shadowhound_data_logger.capture.endpoints import POLL_S, Endpoint, HistoryDepth, Plan, logged_type, plans
 from shadowhound_data_logger.capture.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, unavailable
 from shadowhound_data_logger.capture.stream import Senders, SensorStream, TopicStream
-from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.accounts import MAX_NODES, MAX_OTHER_TYPES, SINKS, Accounts
 
@@ -136,7 +136,6 @@ class Surroundings(NamedTuple):
     """What all subscribers of an intake work with."""
 
     node: Node
-    settings: IntakeSettings
     group: PolledGroup
     accounts: Accounts
     types: MessageTypes
@@ -154,7 +153,7 @@ class Subscriber:
         """
         self.sensor = sensor
         self._others = others
-        self._node, self._settings, self._group, self._accounts, self._message_types = around
+        self._node, self._group, self._accounts, self._message_types = around
         self._consumers = consumers
         node = self._node
         self._topics: list[str] = [node.resolve_topic_name(topic) for topic in sensor.topics]
@@ -167,6 +166,7 @@ class Subscriber:
         self.has_latched = False
         """Whether one of them does."""
         self._type = ''
+        self._history = HistoryDepth('')
         self._readers: list[Reader] = []
         self._retiring: dict[Reader, float] = {}
         self._heard: set[Plan] = set()
@@ -213,7 +213,7 @@ class Subscriber:
             return
         if type_name != self._type:
             self._retype(type_name, now_s)
-        wanted = plans(self._chosen, type_name, publishers, self._settings)
+        wanted = plans(self._chosen, type_name, publishers, self._history.depth)
         present = {reader.plan for reader in self._readers}
         for plan in wanted:
             if plan not in present and not self._subscribe(plan):
@@ -338,6 +338,7 @@ class Subscriber:
                 self.sensor, self._chosen, type_name, self._accounts, self._message_types, self._consumers
             )
         self._type = type_name
+        self._history = HistoryDepth(type_name)
 
     def _retire(self, wanted: set[Plan], now_s: float) -> None:
         """Close the subscriptions that are not wanted any more, once their successors are matched; none is missed so."""
@@ -379,8 +380,10 @@ class Subscriber:
 
     def _take(self, reader: Reader, now_s: float) -> None:
         taken = reader.drain()
+        before_s, reader.drained_s = reader.drained_s, now_s
         if not taken or self._stream is None:
             return
+        self._history.hear([len(message.cdr) for message in taken], POLL_S if before_s is None else now_s - before_s)
         last_s, self._last_received_s = self._last_received_s, now_s
         is_unnamed = taken[0].publisher is None or taken[0].number is None
         if is_unnamed and (not self._senders.gids or last_s is None or now_s - last_s > PAUSE_S):

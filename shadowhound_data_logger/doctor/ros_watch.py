@@ -15,9 +15,8 @@ import rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 
-from shadowhound_data_logger.capture.endpoints import Endpoint, logged_type, plans
+from shadowhound_data_logger.capture.endpoints import Endpoint, HistoryDepth, logged_type, plans
 from shadowhound_data_logger.capture.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
-from shadowhound_data_logger.options import IntakeSettings
 
 NODE: Final = 'shadowhound_doctor'
 DISCOVER_S: Final = 3.0
@@ -116,7 +115,7 @@ def _readers(of: Node, one: Heard) -> list[Reader]:
     if not publishers:
         return []
     try:
-        wanted = plans(one.topic, one.type, publishers, IntakeSettings())
+        wanted = plans(one.topic, one.type, publishers, HistoryDepth(one.type).depth)
         return [Reader(of, wanted[-1], PolledGroup())]
     except (TypeUnavailable, SubscriptionRefused) as error:
         one.unavailable = str(error)

@@ -136,7 +136,7 @@ def _front(found: Mapping[str, Any]) -> Iterator[Result]:
 def _status_remedy(text: str) -> str:
     remedies = {
         'missed': 'shadowhound-data ledger  # by restart: no node ran; by transport: doctor --only sockets --only ros',
-        'dropped': 'top -H -p $(pgrep -f sensor_logger_node)  # the encoders do not follow: log less, or set encode.threads',
+        'dropped': 'top -H -p $(pgrep -f sensor_logger_node)  # the encoders cannot keep up: set a lower rate_hz',
         'the node is paused': 'ros2 service call /sensor_logger_node/pause std_srvs/srv/SetBool "{data: false}"',
         'bucket': 'shadowhound-data doctor --only s3',
         'the clock': 'timedatectl  # docs/thor.md, Wrong clock',

@@ -48,7 +48,7 @@ _BYTES: Final = frozenset({'uint8', 'byte', 'char', 'octet'})
 
 def encode_records(job: Job, rejections: Rejections) -> Payload | None:
     """The JSON of a batch; messages that cannot be decoded are rejected as ``malformed`` or ``unknown_type``."""
-    batched = job.sensor.batched or len(job.batch.samples) > 1
+    batched = bool(job.sensor.batch_s) or len(job.batch.samples) > 1
     kept: list[Sample] = []
     records = _records(job, _of_batch if batched else _alone, kept, rejections)
     parts: list[bytes] = []

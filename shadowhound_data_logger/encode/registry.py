@@ -9,14 +9,14 @@ from typing import Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.archive import archive, pack_tar, pack_zip
-from shadowhound_data_logger.encode.image import difference_hash, encode_jpeg, encode_png
+from shadowhound_data_logger.encode.image import encode_jpeg, encode_png
 from shadowhound_data_logger.encode.payload import Encoder, Fact, Job, Payload, Rejections, encode_cdr, one_message
 from shadowhound_data_logger.encode.pointcloud import encode_cloud
 from shadowhound_data_logger.encode.records import encode_records
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import NameRefused, Rejected
 from shadowhound_data_logger.keys import KeyTemplate, dated
-from shadowhound_data_logger.model import Batch, DataObject, Likeness
+from shadowhound_data_logger.model import Batch, DataObject
 
 ENCODERS: Final[Mapping[str, Encoder]] = {
     'jpeg': one_message(encode_jpeg),
@@ -87,17 +87,9 @@ def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, 
         t_end_ns=end_ns,
         priority=sensor.priority,
         dedup=sensor.dedup,
-        likeness=_likeness(sensor, payload),
         metadata={**{name: _text(fact) for name, fact in payload.facts.items()}, **metadata},
         key_pattern=pattern,
     )
-
-
-def _likeness(sensor: SensorSettings, payload: Payload) -> Likeness | None:
-    if not (sensor.dedup and sensor.dedup_distance and payload.ext == 'jpg'):
-        return None
-    found = difference_hash(payload.body)
-    return None if found is None else Likeness(found, sensor.dedup_distance)
 
 
 def _text(fact: Fact) -> str:

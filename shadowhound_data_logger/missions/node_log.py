@@ -18,7 +18,7 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.disk import replacing
 from shadowhound_data_logger.missions import copies, journal
 from shadowhound_data_logger.missions.active import Active
-from shadowhound_data_logger.missions.odometer import Odometer, Pose
+from shadowhound_data_logger.missions.odometer import MAX_SPEED_MPS, Odometer, Pose
 from shadowhound_data_logger.missions.recorder import MOST_FRAME_ARTIFACTS
 from shadowhound_data_logger.missions.story import DISTANCE, Story
 
@@ -110,7 +110,7 @@ class Floor:
 class NodeLog:
     """Life: New; open once; ``add`` from any thread, ``write`` from one; close once. ``_lock`` guards what waits."""
 
-    def __init__(self, mission: Active, period_ns: int, max_speed_mps: float) -> None:
+    def __init__(self, mission: Active, period_ns: int, max_speed_mps: float = MAX_SPEED_MPS) -> None:
         """Of the poses, one every ``period_ns`` becomes points of the metrics pose_x, pose_y, pose_yaw and the distance."""
         self.mission = mission
         self._folder = mission.folder.node

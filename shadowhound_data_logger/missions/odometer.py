@@ -7,6 +7,8 @@ from typing import Final, NamedTuple
 
 from shadowhound_data_logger.clock import SECOND
 
+MAX_SPEED_MPS: Final = 5.0
+"""No Go2 walks faster."""
 REST_M: Final = 0.02
 """Movements that stay within this are the noise of a robot that stands: at 50 Hz a millimetre each would be 3 m a minute."""
 
@@ -29,7 +31,7 @@ class Pose(NamedTuple):
 class Odometer:
     """Adds up the way over the ground. New, with what was gone before; ``add`` poses as they come."""
 
-    def __init__(self, max_speed_mps: float, distance_m: float = 0.0) -> None:
+    def __init__(self, max_speed_mps: float = MAX_SPEED_MPS, distance_m: float = 0.0) -> None:
         """A step that implies more than ``max_speed_mps`` is a jump of the estimate and no way."""
         self.distance_m = distance_m
         self.jumps = 0

@@ -257,7 +257,7 @@ def delivering(spool: Spool, settings: Settings, close_s: float) -> Iterator[tup
     with ExitStack() as opened:
         store = open_store(settings.store, settings.upload)
         opened.callback(store.close)
-        writer = SpoolWriter(spool, settings.spool.commit_s)
+        writer = SpoolWriter(spool)
         uploader = Uploader(spool, store, settings.upload, writer.settle)
         writer.on_commit(settled=uploader.settled)
         writer.open()

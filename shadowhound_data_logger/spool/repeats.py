@@ -1,7 +1,6 @@
 """Content that follows itself is kept once: a camera that shows the same picture for minutes.
 
-Equal are the same bytes or, where a sensor asks for it, pictures that look alike; each is compared with the one that was
-stored, not with its neighbour, so that what changes slowly is stored again. A repeat is a row of the index in state
+Equal are the same bytes. A repeat is a row of the index in state
 deduplicated, with its own time, and ``content_key`` in its metadata names the object that holds the content; so does its
 row in the catalogue. No file of it is written and nothing of it is sent. What was sent cannot be changed, so the first
 object with another content tells, as metadata, how many repeats there were before it. What has repeats is never evicted.
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.model import DataObject, FileBody, Likeness, State
+from shadowhound_data_logger.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.index import Index
 
 _HOLDS: Final = frozenset({State.PENDING.value, State.DELIVERED.value})
@@ -27,7 +26,6 @@ class _Last:
 
     key: str
     sha256: str
-    likeness: Likeness | None
     repeats: int = 0
     until_ns: int = 0
 
@@ -60,36 +58,24 @@ class Repeats:
     def holder(self, index: Index, item: DataObject, sha256: str) -> Holder | None:
         """The object that holds this content already, if it is what the sensor stored last and is still on its way or there."""
         last = self._next.get(_source(item))
-        if not item.dedup or item.held or last is None:
-            return None
-        distance = 0 if last.sha256 == sha256 else _distance(last.likeness, item.likeness)
-        if distance is None:
+        if not item.dedup or item.held or last is None or last.sha256 != sha256:
             return None
         row = index.row(item.bucket, last.key)
         if row is None or row['state'] not in _HOLDS or row['sha256'] != last.sha256:
             return None  # evicted, say
         index.protect(item.bucket, last.key)  # else an outage that fills the disk would cost all its repeats as well
         self._next[_source(item)] = replace(last, repeats=last.repeats + 1, until_ns=item.t_end_ns)
-        said = {words.CONTENT_KEY: last.key} | ({} if last.sha256 == sha256 else {words.CONTENT_DISTANCE: str(distance)})
-        return Holder(FileBody(Path(last.key), row['bytes'], last.sha256), said)
+        return Holder(FileBody(Path(last.key), row['bytes'], last.sha256), {words.CONTENT_KEY: last.key})
 
     def stored(self, item: DataObject, key: str, sha256: str) -> Mapping[str, str]:
         """The sensor stored this; returns what is to be said of the repeats before it."""
         if not item.dedup or item.held:
             return {}
         last = self._next.get(_source(item))
-        self._next[_source(item)] = _Last(key, sha256, item.likeness)
+        self._next[_source(item)] = _Last(key, sha256)
         if last is None or not last.repeats:
             return {}
         return {words.REPEATS: str(last.repeats), words.REPEATS_OF: last.key, words.REPEATS_UNTIL_NS: str(last.until_ns)}
-
-
-def _distance(one: Likeness | None, other: Likeness | None) -> int | None:
-    """How many bits differ, where no more may."""
-    if one is None or other is None:
-        return None
-    distance = (one.hash ^ other.hash).bit_count()
-    return distance if distance <= other.within else None
 
 
 def _source(item: DataObject) -> tuple[str, str, str | None]:

@@ -18,6 +18,8 @@ from shadowhound_data_logger.model import DataObject, FileBody, Outcome, Spooled
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.worker import Worker
 
+COMMIT_S: Final = 0.1
+"""Least time between two commits."""
 MAX_WAITING_BYTES: Final = 32 << 20
 """Encoded bytes in memory before encoders have to wait."""
 HEARTBEAT_S: Final = 1.0
@@ -34,7 +36,7 @@ _Group = tuple[Sequence[DataObject], Sequence[Outcome]]
 class SpoolWriter:
     """New; ``on_commit``; open once; put, settle, flush from any thread; close once. ``_changed`` guards the lists."""
 
-    def __init__(self, spool: Spool, commit_s: float) -> None:
+    def __init__(self, spool: Spool, commit_s: float = COMMIT_S) -> None:
         self.spool = spool
         self._commit_s = commit_s
         self._spooled: Callable[[Sequence[SpooledObject]], None] = lambda _: None

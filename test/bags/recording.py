@@ -14,7 +14,7 @@ from clocks import Clocks
 from mcap.reader import make_reader
 
 from shadowhound_data_logger.bags.place import BagPlace
-from shadowhound_data_logger.bags.queue import BagQueue, Lot
+from shadowhound_data_logger.bags.queue import MAX_BYTES, BagQueue, Lot
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.config import SpoolSettings
@@ -108,12 +108,13 @@ def desk(home: Path, clock: Clocks | None = None, *, offsets: Mapping[str, int] 
     if clock is None:
         time.set()
     spool = BoundedSpool(home / 'spool', SpoolSettings(min_free_bytes=0, **settings.pop('spool', {})), time, ROBOT)
+    queue = BagQueue(settings.pop('queue_bytes', MAX_BYTES))
     bag = BagSettings(**{'compression': 'none', **settings})
     spool.open()
     spool.carry(BAG)
     writer = SpoolWriter(spool, 0.01)
     writer.open()
-    root, queue = home / 'bags' / ROBOT, BagQueue(bag.queue_bytes)
+    root = home / 'bags' / ROBOT
     made: list[Desk] = []
 
     def listen(on: bool, deadline_s: float) -> bool:

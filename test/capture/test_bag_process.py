@@ -15,7 +15,7 @@ from shadowhound_data_logger.spool.spool import Spool
 
 def _writer(folder: Path, *ended: Manifest) -> ManifestWriter:
     """It was handed these, in this order; it is not open."""
-    writer = ManifestWriter(Spool(folder, SpoolSettings(), SystemClock('a-boot'), 'thor'), 0.01)
+    writer = ManifestWriter(Spool(folder, SpoolSettings(), SystemClock('a-boot'), 'thor'))
     for manifest in ended:
         writer.put(DataObject(
             bucket='sensor-data', key=f'thor/rosbags/{manifest.bag}/manifest.json', body=manifest.to_json(), sensor='_bag',

@@ -19,7 +19,7 @@ from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.capture.subscriber import Surroundings
 from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.options import BagSettings
@@ -53,7 +53,7 @@ class Ear:
         batches: Any = self.batches
         self.bags = BagConsumer(self.graph, BagSettings(), self.accounts, self.queue)
         sensor, types = SensorSettings(name='talk', rate_hz=1.0), MessageTypes()
-        self.sampler = Sampler({'talk': sensor}, IntakeSettings(), self.accounts, types, SystemClock.of_this_machine(), batches)
+        self.sampler = Sampler({'talk': sensor}, self.accounts, types, SystemClock.of_this_machine(), batches)
         self.stream: TopicStream | SensorStream
         if own:
             self.stream = TopicStream(TOPIC, TYPE, [self.bags])
@@ -189,7 +189,7 @@ def test_what_only_the_ring_takes_is_in_a_bag_where_it_is_named_alone(named: tup
     """Without settings a bag has what the sensors take, whatever events keep; what is named needs no subscription more."""
     bags: Any = SimpleNamespace(topics=frozenset(), wants_latched=True, choice=TopicChoice(BagSettings(), named))
     nothing: Any = None
-    extra = ExtraTopics(Surroundings(nothing, IntakeSettings(), nothing, nothing, nothing), [bags], {})
+    extra = ExtraTopics(Surroundings(nothing, nothing, nothing, nothing), [bags], {})
     sensors = dict.fromkeys(('/imu', '/odom'), False)
     extra.refresh(sensors | {'/rosout': False}, sensors, 0.0, paused=False)
     assert bags.topics == expected

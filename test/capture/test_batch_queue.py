@@ -47,10 +47,10 @@ def test_too_many_bytes_drop_the_least_important_oldest_first() -> None:
 
 def test_too_many_messages_drop_as_well() -> None:
     """A batch counts with all of its messages."""
-    queue = BatchQueue(QueueSettings(max_messages=10))
+    queue = BatchQueue(QueueSettings(), max_messages=10)
     queue.put(batch('old', messages=6), 5)
     assert names(queue.put(batch('new', messages=6), 5)) == ['old']
-    assert queue.status() == QueueStatus(1, 6, 10)
+    assert queue.status() == QueueStatus(1, 6, 10, max_messages=10)
 
 
 def test_the_newcomer_may_be_the_one_that_is_dropped() -> None:
@@ -91,7 +91,7 @@ def test_a_closed_queue_is_emptied_and_does_not_wait() -> None:
 @given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, MEBI), st.integers(1, 40))))
 def test_it_is_always_within_its_bounds_and_loses_nothing_silently(arrivals: list[tuple[int, int, int]]) -> None:
     """Every batch is inside, dropped or taken, and a dropped one was never more important than one that stays."""
-    queue = BatchQueue(QueueSettings(max_bytes=MEBI, max_messages=100))
+    queue = BatchQueue(QueueSettings(max_bytes=MEBI), max_messages=100)
     inside: dict[str, int] = {}
     for number, (priority, size, messages) in enumerate(arrivals):
         inside[str(number)] = priority
@@ -102,12 +102,12 @@ def test_it_is_always_within_its_bounds_and_loses_nothing_silently(arrivals: lis
         assert status.messages <= 100
         assert status.batches == len(inside)
     assert sorted(taken(queue)) == sorted(inside)
-    assert queue.status() == QueueStatus(0, 0, 0)
+    assert queue.status() == QueueStatus(0, 0, 0, max_messages=100)
 
 
 def test_one_can_wait_for_what_is_in_it_now() -> None:
     """All batches that were put before the call must have left, done or dropped; those that come later do not count."""
-    queue = BatchQueue(QueueSettings(max_messages=2))
+    queue = BatchQueue(QueueSettings(), max_messages=2)
     assert queue.finished(0.0), 'an empty queue has nothing to wait for'
     queue.put(batch('lidar'), 7)
     queue.put(batch('imu'), 4)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from shadowhound_data_logger.capture.encode_pool import MAX_MESSAGES
 from shadowhound_data_logger.capture.sampling import (
     MAX_ARCHIVE_BYTES,
     MAX_BATCH_BYTES,
     MAX_BATCH_MESSAGES,
-    MAX_BATCH_S,
     Batcher,
 )
 from shadowhound_data_logger.clock import SECOND
@@ -16,8 +16,8 @@ from shadowhound_data_logger.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.model import Batch, Sample
 
 
-def batcher(batch_s: float = 1.0, batch_count: int = 0, format_name: str = 'json') -> Batcher:
-    sensor = SensorSettings(name='imu', batch_s=batch_s, batch_count=batch_count, format=format_name)
+def batcher(batch_s: float = 1.0, format_name: str = 'json') -> Batcher:
+    sensor = SensorSettings(name='imu', batch_s=batch_s, format=format_name)
     return Batcher(sensor, '/imu', 'sensor_msgs/msg/Imu')
 
 
@@ -50,27 +50,6 @@ def test_without_a_window_each_message_is_a_batch() -> None:
     assert not len(open_batch)
 
 
-def test_a_number_of_messages_ends_a_batch() -> None:
-    """With batch_count the batch is closed with its last message, within a window of time as well."""
-    open_batch = batcher(batch_s=0.0, batch_count=3)
-    closed = [batch for stamp in range(7) for batch in open_batch.add(Sample(stamp * SECOND, b''), 0.0)]
-    assert [len(batch.samples) for batch in closed] == [3, 3]
-    assert len(open_batch) == 1
-    open_batch = batcher(batch_s=1.0, batch_count=3)
-    closed = [batch for stamp in range(7) for batch in open_batch.add(Sample(stamp * SECOND // 5, b''), 0.0)]
-    assert [len(batch.samples) for batch in closed] == [3, 2]
-    assert len(open_batch) == 2
-
-
-def test_a_number_alone_does_not_keep_a_batch_open_for_ever() -> None:
-    """A batch that never gets its number of messages is due after a minute, however far its stamps are apart."""
-    open_batch = batcher(batch_s=0.0, batch_count=1000)
-    assert open_batch.add(Sample(0, b''), 10.0) == []
-    assert open_batch.add(Sample(50 * SECOND, b''), 60.0) == []
-    assert not open_batch.is_due(10.0 + MAX_BATCH_S, 0.1)
-    assert open_batch.is_due(10.2 + MAX_BATCH_S, 0.1)
-
-
 @pytest.mark.parametrize(('format_name', 'most'), [('json', MAX_BATCH_BYTES), ('tar', MAX_ARCHIVE_BYTES)])
 def test_a_large_batch_is_closed_early(format_name: str, most: int) -> None:
     """Memory is bounded whatever a topic sends, to what a format makes of it; a message that ends two batches closes both."""
@@ -86,7 +65,7 @@ def test_many_small_messages_are_closed_early() -> None:
     open_batch = batcher(batch_s=3600.0)
     closed = [batch for stamp in range(MAX_BATCH_MESSAGES) for batch in open_batch.add(Sample(stamp, b''), 0.0)]
     assert [len(batch.samples) for batch in closed] == [MAX_BATCH_MESSAGES]
-    assert QueueSettings().max_messages >= 4 * MAX_BATCH_MESSAGES
+    assert MAX_MESSAGES >= 4 * MAX_BATCH_MESSAGES
     assert QueueSettings().max_bytes >= 4 * MAX_ARCHIVE_BYTES
 
 
@@ -114,12 +93,12 @@ def test_a_late_sample_joins_the_open_batch() -> None:
     assert stamps(open_batch.close()) == [5 * SECOND, 3 * SECOND + SECOND // 2]
 
 
-@pytest.mark.parametrize(('batch_s', 'batch_count'), [(1.0, 0), (0.0, 50), (3600.0, 50)])
+@pytest.mark.parametrize('batch_s', [1.0, 3600.0])
 @pytest.mark.parametrize('first', ['boot clock', 'UTC'])
-def test_a_batch_ends_where_the_clock_is_set(batch_s: float, batch_count: int, first: str) -> None:
+def test_a_batch_ends_where_the_clock_is_set(batch_s: float, first: str) -> None:
     """No object holds times of the boot clock and of UTC, in whichever direction the clock is set."""
     noon_ns = 1_760_788_800 * SECOND
     order = [60 * SECOND, noon_ns] if first == 'boot clock' else [noon_ns, 60 * SECOND]
-    open_batch = batcher(batch_s, batch_count)
+    open_batch = batcher(batch_s)
     closed = [batch for stamp in order for batch in open_batch.add(Sample(stamp, b'x'), 0.0)]
     assert [stamps(batch) for batch in (*closed, open_batch.close())] == [[stamp] for stamp in order]

@@ -12,7 +12,7 @@ import pytest
 
 from shadowhound_data_logger.capture import encode_pool as pool_module
 from shadowhound_data_logger.capture.encode_pool import BatchQueue, EncodePool
-from shadowhound_data_logger.config import QueueSettings, SensorSettings, Settings
+from shadowhound_data_logger.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, DataObject, Sample
 
@@ -30,9 +30,8 @@ class Outcome:
         self.lock = threading.Lock()
         self.accounts = self.spool = self
         sensors = {'talk': SensorSettings(name='talk', batch_s=1.0)}
-        settings = Settings.load({'robot': 'thor', 'encode.threads': threads}, {})
         writer: Any = self
-        self.pool = EncodePool(settings, self.queue, sensors, MessageTypes(), writer, [self.mark], observe)
+        self.pool = EncodePool('thor', self.queue, sensors, MessageTypes(), writer, [self.mark], observe, threads=threads)
 
     @staticmethod
     def mark(item: DataObject) -> DataObject:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from shadowhound_data_logger.capture.endpoints import Endpoint, Plan, depth, logged_type, plans
+from shadowhound_data_logger.capture.endpoints import Endpoint, HistoryDepth, Plan, logged_type, plans
 from shadowhound_data_logger.capture.stream import Senders
-from shadowhound_data_logger.config import IntakeSettings
 
 TYPE, OTHER = 'std_msgs/msg/String', 'std_msgs/msg/Int32'
-SETTINGS = IntakeSettings()
+DEPTH = 4000
 RELIABLE, BEST_EFFORT, LATCHED = (True, False), (False, False), (True, True)
 
 
 def planned(*publishers: tuple[bool, bool]) -> list[tuple[bool, bool]]:
     """(reliable, transient_local) of the subscriptions to publishers of these qualities."""
     found = [Endpoint(str(number), TYPE, *quality) for number, quality in enumerate(publishers)]
-    return [(plan.reliable, plan.transient_local) for plan in plans('/topic', TYPE, found, SETTINGS)]
+    return [(plan.reliable, plan.transient_local) for plan in plans('/topic', TYPE, found, DEPTH)]
 
 
 @pytest.mark.parametrize(
@@ -60,22 +59,49 @@ def test_one_type_of_a_topic_is_logged(named: str, current: str, published: list
     assert logged_type(publishers, named, current) == logged
 
 
-@pytest.mark.parametrize(
-    ('type_name', 'settings', 'messages'),
-    [
-        (TYPE, IntakeSettings(), 4000),  # 2000 Hz for two seconds
-        (TYPE, IntakeSettings(max_rate_hz=1.0), 10),
-        ('sensor_msgs/msg/CompressedImage', IntakeSettings(), 120),
-        ('sensor_msgs/msg/Image', IntakeSettings(), 16),
-        ('sensor_msgs/msg/CompressedImage', IntakeSettings(poll_s=1.0, history_bytes=128 << 20), 240),  # four polls
-        ('sensor_msgs/msg/Image', IntakeSettings(history_bytes=4 << 20), 2),
-        ('sensor_msgs/msg/Image', IntakeSettings(history_bytes=1 << 20), 1),
-        (TYPE, IntakeSettings(poll_s=1.0, max_rate_hz=1e5), (32 << 20) // 4096),
-    ],
-)
-def test_the_history_covers_a_stall(type_name: str, settings: IntakeSettings, messages: int) -> None:
-    """Two seconds of messages, at least four polls, within the bytes allowed, never 0."""
-    assert depth(type_name, settings) == messages
+@pytest.mark.parametrize(('type_name', 'messages'), [
+    (TYPE, 4000), ('sensor_msgs/msg/CompressedImage', 120), ('sensor_msgs/msg/Image', 32), ('my_msgs/msg/Unknown', 4000),
+])  # fmt: skip
+def test_the_history_covers_a_stall(type_name: str, messages: int) -> None:
+    """Before anything is heard: two seconds at 2,000 Hz, of large messages at 60 Hz, within 32 MiB."""
+    assert HistoryDepth(type_name).depth == messages
+
+
+@pytest.mark.parametrize(('type_name', 'size', 'rate_hz', 'messages'), [
+    (TYPE, 700, 50, 4000),  # as it is
+    (TYPE, 200, 5_000, 16_384), (TYPE, 40, 15_000, 32_768), (TYPE, 40, 1e6, 65_536),  # faster than most
+    (TYPE, 4096, 15_000, 8192),  # faster, within 32 MiB
+    (TYPE, 100_000, 10, 256),  # larger than most of its like
+    ('sensor_msgs/msg/CompressedImage', 100_000, 30, 120),
+    ('sensor_msgs/msg/CompressedImage', 2_000_000, 30, 16),
+    ('sensor_msgs/msg/Image', 921_656, 30, 32), ('sensor_msgs/msg/Image', 6_220_856, 30, 16),
+])  # fmt: skip
+def test_the_history_is_sized_from_what_is_heard(type_name: str, size: int, rate_hz: float, messages: int) -> None:
+    """Two seconds of messages at the rate at which they come and of the size that they have; it settles at once and stays."""
+    history = HistoryDepth(type_name)
+    depths = []
+    for _ in range(5):
+        history.hear([size] * min(round(rate_hz / 5), history.depth), 0.2)
+        depths.append(history.depth)
+    assert depths[-1] == messages
+    assert len(set(depths)) <= 5
+    assert depths[1:] == sorted(depths[1:])
+
+
+def test_a_full_history_grows() -> None:
+    """More came than it held, so nobody knows how much: it grows until it is no longer full."""
+    history = HistoryDepth(TYPE)
+    history.hear([40] * 4000, 60.0)
+    assert history.depth == 4096
+
+
+def test_a_stall_is_no_rate() -> None:
+    """What gathered while nobody took came in the whole time since the last drain; a first drain counts as one poll at least."""
+    history = HistoryDepth(TYPE)
+    history.hear([40] * 3000, 1.5)
+    assert history.depth == 4000
+    history.hear([40] * 100, 0.0)
+    assert history.depth == 4000
 
 
 def test_a_plan_in_words() -> None:

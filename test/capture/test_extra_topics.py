@@ -22,7 +22,7 @@ from shadowhound_data_logger.capture.consumers import TopicChoice
 from shadowhound_data_logger.capture.extra_topics import ExtraTopics
 from shadowhound_data_logger.capture.reader import PolledGroup
 from shadowhound_data_logger.capture.subscriber import Surroundings
-from shadowhound_data_logger.config import BagSettings, IntakeSettings
+from shadowhound_data_logger.config import BagSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.accounts import Accounts
 
@@ -58,7 +58,7 @@ class Recording:
         self.bags: Any = SimpleNamespace(topics=frozenset(), choice=choice, wants_latched=True, take=lambda _: None,
                                          leave=lambda _: None)  # fmt: skip
         self.group = PolledGroup()
-        self.extra = ExtraTopics(Surroundings(node, IntakeSettings(), self.group, Accounts(), MessageTypes()), [self.bags], {})
+        self.extra = ExtraTopics(Surroundings(node, self.group, Accounts(), MessageTypes()), [self.bags], {})
         self.now_s = time.monotonic()
 
     def look(self, seconds: float = 0.0) -> set[str]:

@@ -20,13 +20,14 @@ from rclpy.serialization import deserialize_message
 from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import Float64, Int32, String
 
+from shadowhound_data_logger.capture import endpoints
 from shadowhound_data_logger.capture import subscriber as module
 from shadowhound_data_logger.capture.endpoints import Endpoint
 from shadowhound_data_logger.capture.reader import FAST_DDS, PolledGroup
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.subscriber import OtherTypes, Subscriber, Surroundings
 from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.account_rows import Totals
 from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts
@@ -35,7 +36,6 @@ pytestmark = pytest.mark.ros
 WAIT_S: Final = 60.0
 INT, STRING, FLOAT = (f'std_msgs/msg/{name}' for name in ('Int32', 'String', 'Float64'))
 ABSENT: Final = 'no_such_msgs/msg/Thing'
-SMALL: Final = IntakeSettings(max_rate_hz=1.0)
 """A history of ten messages: what is published between two drains beyond that is missed."""
 HISTORY: Final = 10
 NUMBERED: Final = get_rmw_implementation_identifier() in FAST_DDS
@@ -59,10 +59,8 @@ class Listening(Participant):
         types = (type_name, fallback[1]) if fallback[0] else (type_name,) if type_name else ()
         sensor = SensorSettings(name='sensor', topics=topics, types=types, rate_hz=0.0, batch_s=3600.0)
         types_here = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
-        around = Surroundings(self.node, SMALL, PolledGroup(), self.accounts, types_here)
-        self.sampler = Sampler(
-            {sensor.name: sensor}, SMALL, self.accounts, types_here, SystemClock.of_this_machine(), self.batches
-        )
+        around = Surroundings(self.node, PolledGroup(), self.accounts, types_here)
+        self.sampler = Sampler({sensor.name: sensor}, self.accounts, types_here, SystemClock.of_this_machine(), self.batches)
         self.source = Subscriber(around, sensor, [self.sampler], self.others)
 
     def turn(self) -> None:
@@ -99,6 +97,10 @@ class Listening(Participant):
         assert {batch.type for batch in self.batches} <= {INT}
         return [deserialize_message(sample.cdr, Int32).data for batch in self.batches for sample in batch.samples]
 
+    def depth(self) -> int:
+        """Of its shortest history."""
+        return min(reader.plan.depth for reader in self.source._readers)
+
     def totals(self, topic: str) -> Totals:
         return self.accounts.totals().get(topic, NOTHING)
 
@@ -126,8 +128,11 @@ def ints(count: int, first: int = 0) -> list[Int32]:
 
 @pytest.mark.parametrize('order', ['squatter, node, robot', 'node, squatter, robot', 'robot, node, squatter'])
 @pytest.mark.parametrize('reliable', [True, False])
-def test_the_type_that_is_named_wins(make: Callable[[str], Any], order: str, *, reliable: bool) -> None:
+def test_the_type_that_is_named_wins(
+    make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch, order: str, *, reliable: bool
+) -> None:
     """Whoever came first, with whatever QoS: the sensor's own messages are logged and their gaps counted, the others refused."""
+    monkeypatch.setattr(endpoints, 'SMALL_RATE_HZ', HISTORY / endpoints.STALL_S)
     logger, robot, squatter = make('logger'), make('robot'), make('squatter')
     steps = {
         'node': lambda: (logger.listen('/odom', INT), logger.turn()),
@@ -275,3 +280,19 @@ def test_a_topic_of_our_own(make: Callable[[str], Any]) -> None:
     logger.listen('/own', STRING)
     logger.until(lambda: logger.source.status().unavailable, 'it is told')
     assert f'no subscription of type {STRING} can be made' in logger.source.status().unavailable  # Humble's rcl loses the reason
+
+
+def test_a_topic_faster_than_its_history_gets_a_longer_one(make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is lost or counted twice as one subscription takes over from the other, and then a stall fits into it."""
+    monkeypatch.setattr(endpoints, 'SMALL_RATE_HZ', HISTORY / endpoints.STALL_S)
+    logger, robot = make('logger'), make('robot')
+    logger.listen('/odom', INT)
+    robot.create(Int32, '/odom', reliable=False)
+    logger.until(lambda: logger.source.status().matched and robot.matched(), 'they are matched')
+    robot.publish(*ints(HISTORY - 1))
+    logger.until(lambda: logger.totals('/odom').received == HISTORY - 1, 'the first ones are received')
+    logger.until(lambda: logger.depth() >= 3 * HISTORY, 'the shorter history is gone')
+    robot.publish(*ints(3 * HISTORY, HISTORY - 1))
+    logger.until(lambda: logger.totals('/odom').received == 4 * HISTORY - 1, 'all are received')
+    assert logger.numbers() == [*range(4 * HISTORY - 1)]
+    assert logger.totals('/odom').missed == (0 if NUMBERED else None)

@@ -27,7 +27,7 @@ from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.reader import FAST_DDS
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import IntakeSettings, SensorSettings
+from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.spool.accounts import EXACT, Accounts
 
@@ -68,10 +68,10 @@ class Listening:
         for name in (*EARLY, *LATE, *EXPECTED, *OTHERS):
             types = ('std_msgs/msg/String',) if name in EXPECTED else ()
             sensors[name] = SensorSettings(name=name, topics=(f'/{name}',), types=types, rate_hz=0.0, batch_s=3600.0)
-        self._accounts, self._batches, settings = Accounts(), Batches(), IntakeSettings()
+        self._accounts, self._batches = Accounts(), Batches()
         installed, queue = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':')), self._batches
-        sampler = Sampler(sensors, settings, self._accounts, installed, SystemClock.of_this_machine(), queue)  # type: ignore[arg-type]
-        self._intake = Intake(self.join('logger').node, sensors, settings, self._accounts, installed, [sampler])
+        sampler = Sampler(sensors, self._accounts, installed, SystemClock.of_this_machine(), queue)  # type: ignore[arg-type]
+        self._intake = Intake(self.join('logger').node, sensors, self._accounts, installed, [sampler])
         self._intake.open()
         stack.callback(self._intake.close, WAIT_S)
         self.late = self.join('late')

@@ -14,7 +14,7 @@ from shadowhound_data_logger.capture.encode_pool import BatchQueue
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.config import IntakeSettings, QueueSettings, SensorSettings
+from shadowhound_data_logger.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, Taken
 from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, RECEIVED_ONLY, Accounts, TopicAccount
@@ -45,7 +45,7 @@ class Talk:
             self.accounts.store({TOPIC: (0, last_kept_ns)})
         self.sensors, types, clock = {'talk': self.sensor}, MessageTypes(), SystemClock.of_this_machine()
         queue: Any = self.batches
-        self.sampler = Sampler(self.sensors, IntakeSettings(), self.accounts, types, clock, queue)
+        self.sampler = Sampler(self.sensors, self.accounts, types, clock, queue)
         self.listen(self.sampler)
 
     def listen(self, *consumers: Consumer) -> None:

@@ -93,7 +93,7 @@ class Node(module.Base):
 COUNT = 200
 TOPICS = ('/one', '/two', '/latched')
 SENSORS = {
-    'sensors': ['one', 'two', 'latched'], 'spool.commit_s': 0.05, 'bag.record': 'always',
+    'sensors': ['one', 'two', 'latched'], 'bag.record': 'always',
     **{f'{name}.{key}': value for name in ('one', 'two', 'latched')
        for key, value in {'topics': [name], 'types': [STRING], 'rate_hz': 0.0, 'batch_s': 0.2}.items()},
 }  # fmt: skip

@@ -41,7 +41,7 @@ class Listening:
 
 @pytest.fixture(scope='module')
 def listening(shared: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> Listening:
-    parameters: dict[str, object] = {'sensors': TOPICS, 'spool.commit_s': 0.05}
+    parameters: dict[str, object] = {'sensors': TOPICS}
     for name in TOPICS:
         parameters |= {f'{name}.topics': [name], f'{name}.rate_hz': 0.0, f'{name}.batch_s': 0.2}
     return Listening(shared, shared.node(seaweed.environment(), parameters), stored)

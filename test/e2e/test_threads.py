@@ -19,7 +19,7 @@ from shadowhound_data_logger.spool import status
 WORKERS = ('intake', 'encode-0', 'spool-writer', 'upload-0')
 PARAMETERS = {
     'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 0.2,
-    'encode.threads': 1, 'upload.threads': 1,
+    'upload.threads': 1,
 }  # fmt: skip
 GROUP = 50
 

@@ -91,12 +91,6 @@ def test_the_object(ros: Any, format_name: str, content_type: str) -> None:
     assert unique(made.key, 1) == f'thor/camera/20251018/120000_front_1.{format_name}'
 
 
-def test_a_number_of_frames(ros: Any) -> None:
-    """Batches that are closed by number can follow each other at any distance: their names tell milliseconds."""
-    made = pack(ros, COMPRESSED, frame(ros, jpeg(1)), format_name='tar', batch_count=1).object
-    assert made.key == 'thor/camera/20251018/120000_250_front.tar'
-
-
 @ARCHIVES
 def test_what_each_type_becomes(ros: Any, format_name: str) -> None:
     """Raw images are JPEG or, where they are depth, PNG; clouds are PCD; everything else is CDR, with header or without."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 from pathlib import Path
 
@@ -10,8 +9,8 @@ import pytest
 from spool.conftest import Open
 from spool.making import BUCKET, NOON_NS, assert_whole, files, make, put, receive, rows, settle, uncatalogued
 
-from shadowhound_data_logger.metadata_words import CONTENT_DISTANCE, CONTENT_KEY
-from shadowhound_data_logger.model import DataObject, Likeness, State
+from shadowhound_data_logger.metadata_words import CONTENT_KEY
+from shadowhound_data_logger.model import DataObject, State
 from shadowhound_data_logger.spool.spool import Spool
 
 
@@ -130,30 +129,3 @@ def test_a_repeat_is_not_asked_for(spool: Spool, root: Path) -> None:
     with sqlite3.connect(root / 'index.db') as index:
         assert index.execute("SELECT count(*) FROM objects WHERE state = 'delivered'").fetchone() == (1,)
     assert spool.pending(9) == []
-
-
-def test_what_looks_like_it_is_a_repeat_where_that_is_asked_for(spool: Spool, root: Path) -> None:
-    """Its row stands for the object that is stored, with that one's size and checksum, and says how far it was."""
-    first, near = picture(0, b'one', likeness=Likeness(0b1111, 2)), picture(1, b'another', likeness=Likeness(0b1100, 2))
-    put(spool, first)
-    assert put(spool, near) == []
-    stored, repeat = rows(root)
-    assert (repeat['state'], repeat['bytes'], repeat['sha256']) == ('deduplicated', 3, stored['sha256'])
-    said = json.loads(repeat['metadata'])
-    assert (said[CONTENT_KEY], said[CONTENT_DISTANCE], said['sha256']) == (stored['key'], '2', stored['sha256'])
-    (item,) = put(spool, picture(2, b'far', likeness=Likeness(0b1000, 2)))
-    assert item.metadata['repeats'] == '1'
-    assert_whole(root)
-
-
-def test_what_changes_slowly_is_stored_again(spool: Spool) -> None:
-    """Each picture is compared with the one that is stored, not with the repeat before it."""
-    stored = [bool(put(spool, picture(step, b'%d' % step, likeness=Likeness((1 << step) - 1, 2)))) for step in range(7)]
-    assert stored == [True, False, False, True, False, False, True]
-
-
-def test_what_has_no_likeness_looks_like_nothing(spool: Spool) -> None:
-    """A picture that could not be decoded is compared by its bytes."""
-    put(spool, picture(0, b'one', likeness=Likeness(0, 64)))
-    assert len(put(spool, picture(1, b'no picture'))) == 1
-    assert put(spool, picture(2, b'no picture')) == []
