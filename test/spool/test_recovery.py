@@ -125,7 +125,7 @@ def test_empty_folders_go(opened: Open, root: Path, used: dict[str, bytes]) -> N
 
 
 def test_what_is_moved_back_from_quarantine_is_tried_again(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """An operator who moves a quarantined file to ready, as the README says, has it delivered."""
+    """A quarantined file that an operator moves to ready is delivered."""
     source = root / f'quarantine/refused/{BUCKET}/thor/a/1.jpg'
     source.rename(root / f'ready/{BUCKET}/thor/a/1.jpg')
     spool = opened()
