@@ -40,23 +40,27 @@ class SensorSettings:
     enabled: bool = _setting(True, 'Log this sensor.', live=True)
     topics: tuple[str, ...] = _setting((), 'Topics it can come from, the preferred one first; relative to the namespace.')
     types: tuple[str, ...] = _setting(
-        (), 'Type of each topic, the only one that is logged; where it is empty or none, the first that is published.'
+        (), 'Message type of each topic; other types on it are not logged. Where empty, the first that is published.'
     )
     rate_hz: float = _setting(
         1.0, 'Keep the first message of each whole period; 0 keeps every message.', low=0.0, high=1e6, live=True
     )
-    on_change: bool = _setting(False, 'Keep a message only when its content, but for its stamp, is not that of the last one.')
-    batch_s: float = _setting(0.0, 'Seconds of messages an object; 0 makes one object of each message.', low=0.0, high=3600.0)
-    format: str = _setting('json', 'What an object is encoded as.', choices=FORMATS)
+    on_change: bool = _setting(False, 'Keep a message only when its content, apart from its stamp, differs from the last one.')
+    batch_s: float = _setting(0.0, 'Seconds of messages in one object; 0 makes an object of each message.', low=0.0, high=3600.0)
+    format: str = _setting('json', 'File format of an object; zip and tar hold several messages.', choices=FORMATS)
     quality: int = _setting(85, 'JPEG quality where an image has to be encoded.', low=1, high=100, live=True)
     bucket: str = _setting('sensor-data', 'Bucket of its objects.')
     key: str = _setting('{robot}/{sensor}/{date}/{time}_{sensor}.{ext}', 'Key of an object; {date} and {time} are UTC.')
-    dedup: bool = _setting(False, 'Store content that follows itself byte for byte once; the repeats stay listed.')
-    priority: int = _setting(5, '0 ships first and is dropped or evicted last, 9 the other way round.', low=0, high=9, live=True)
-    expected_hz: float = _setting(
-        0.0, 'How often it is published, to estimate what is lost where messages have no numbers; 0 learns it.', low=0.0, high=1e5
+    dedup: bool = _setting(False, 'Store content that repeats, byte for byte, only once; the repeats stay in the catalogue.')
+    priority: int = _setting(
+        5, '0 is uploaded first and dropped or evicted last; 9 is uploaded last and evicted first.', low=0, high=9, live=True
     )
-    counter: str = _setting('', 'The same: a field that counts messages or milliseconds, such as tick; used instead of stamps.')
+    expected_hz: float = _setting(
+        0.0, 'Rate at which it is published, to estimate losses where messages have no numbers; 0 learns it.', low=0.0, high=1e5
+    )
+    counter: str = _setting(
+        '', 'Field that counts messages or milliseconds, such as tick, to estimate losses from it instead of from stamps.'
+    )
 
     @property
     def period_ns(self) -> int:
@@ -74,7 +78,7 @@ class CaptureSettings:
 
     rmw: str = _setting(
         RMW_AUTO,
-        "By which RMW to listen: the robot's own, fastrtps, or auto, which is fastrtps where that hears as much as Cyclone DDS.",
+        "RMW to listen with: the robot's own, fastrtps, or auto (fastrtps where that hears as much as Cyclone DDS).",
         choices=(RMW_AUTO, RMW_ROBOT, RMW_FASTRTPS),
     )
 
@@ -83,37 +87,41 @@ class CaptureSettings:
 class QueueSettings:
     """The bounded queue between intake and the encode pool."""
 
-    max_bytes: int = _setting(64 * MEBI, 'Most bytes waiting for an encoder; beyond it the lowest priority is dropped.', low=MEBI)
+    max_bytes: int = _setting(
+        64 * MEBI, 'Memory for messages that wait for an encoder; beyond it those of the lowest priority are dropped.', low=MEBI
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpoolSettings:
-    """The durable spool (D5, D9)."""
+    """The durable spool."""
 
-    max_bytes: int = _setting(20 * GIBI, 'Most payload bytes in the spool; beyond it the least important is evicted.', low=MEBI)
-    min_free_bytes: int = _setting(2 * GIBI, 'Free space of the file system that is never used.', low=0)
-    remember_days: float = _setting(3.0, 'Days for which delivered keys are remembered.', low=1.0, high=3650.0)
+    max_bytes: int = _setting(
+        20 * GIBI, 'Most bytes of objects in the spool; beyond it the least important are evicted.', low=MEBI
+    )
+    min_free_bytes: int = _setting(2 * GIBI, 'Free space to leave on the disk.', low=0)
+    remember_days: float = _setting(
+        3.0, 'Days for which the keys of delivered objects are remembered, for ledger --verify.', low=1.0, high=3650.0
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UploadSettings:
-    """Delivery (D7, D8)."""
+    """Delivery."""
 
-    threads: int = _setting(4, 'Upload threads.', low=1, high=64)
+    threads: int = _setting(4, 'Objects uploaded at a time.', low=1, high=64)
     connect_timeout_s: float = 5.0
     """Not a parameter: of the doctor and of tests."""
-    read_timeout_s: float = _setting(30.0, 'Seconds to wait for an answer.', low=0.1, high=600.0)
-    backoff_s: float = _setting(60.0, 'Longest pause between two tries while the store is away.', low=0.1, high=3600.0)
-    max_mbps: float = _setting(
-        0.0, 'Most megabits of payload a second to an S3 server; 0 is no cap.', low=0.0, high=1e5, live=True
-    )
+    read_timeout_s: float = _setting(30.0, 'Seconds to wait for an answer of the store.', low=0.1, high=600.0)
+    backoff_s: float = _setting(60.0, 'Longest pause between two attempts while the store is away.', low=0.1, high=3600.0)
+    max_mbps: float = _setting(0.0, 'Most megabits a second to an S3 server; 0 is no limit.', low=0.0, high=1e5, live=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShutdownSettings:
     """What a SIGINT or SIGTERM may take."""
 
-    drain_s: float = _setting(3.0, 'Seconds to go on delivering after the open batches are closed.', low=0.0, high=600.0)
+    drain_s: float = _setting(3.0, 'Seconds to go on uploading when the node is stopped.', low=0.0, high=600.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,7 +129,10 @@ class ClockSettings:
     """What becomes of objects that are taken before the clock of this machine was set."""
 
     hold_s: float = _setting(
-        600.0, 'Seconds to wait for a clock that was not set; then objects go without a date.', low=0.0, high=1e6
+        600.0,
+        'Seconds to wait for the clock to be set; then objects are uploaded without a date, under _unsynced.',
+        low=0.0,
+        high=1e6,
     )
 
 
@@ -131,7 +142,7 @@ class MissionSettings:
 
     capture: str = _setting('always', 'When sensor data is stored: always, or only while a mission is active.', choices=CAPTURES)
     join: bool = _setting(True, "Log the robot's state to the mission's run beside the agent.")
-    period_s: float = _setting(1.0, 'Seconds between two points of a metric that the node logs.', low=0.01, high=3600.0)
+    period_s: float = _setting(1.0, 'Seconds between two points of a metric.', low=0.01, high=3600.0)
     battery: str = _setting('lowstate:bms_state.soc', 'Topic and field of battery_pct; empty for none.')
     temperature: str = _setting('imu:temperature', 'Topic and field of temperature_c; empty for none.')
     odometry: str = _setting('odom', 'Topic (nav_msgs/Odometry) of pose, trajectory and distance; empty for none.')
@@ -143,8 +154,8 @@ class MissionSettings:
 class CatalogueSettings:
     """The catalogue of what the store holds, written after delivery."""
 
-    enabled: bool = _setting(True, 'Write a row of each delivered object to the catalogue.')
-    period_s: float = _setting(60.0, 'Seconds between two parts of it.', low=1.0, high=86_400.0)
+    enabled: bool = _setting(True, 'Write a row for each delivered object to the catalogue.')
+    period_s: float = _setting(60.0, 'Seconds between two files of the catalogue.', low=1.0, high=86_400.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,39 +163,46 @@ class BagSettings:
     """Recording at full rate, whatever the sensors keep."""
 
     record: str = _setting(
-        'service', 'When: from ~/bag/start to ~/bag/stop, in every mission besides, or from the start on.', choices=RECORDS
+        'service', 'When: service (from bag start to bag stop), mission (in every mission as well) or always.', choices=RECORDS
     )
-    topics: tuple[str, ...] = _setting(('',), 'Topics to record; where none is named and no regex, those that the sensors take.')
-    regex: str = _setting('', 'Record also the topics whose full name has a match of this; ".*" takes all that are not hidden.')
-    exclude: str = _setting('', 'Of the topics that only the regex names, none whose full name has a match of this.')
-    slice_s: float = _setting(60.0, 'Seconds a slice: each is uploaded while the next one records.', low=1.0, high=86_400.0)
-    slice_bytes: int = _setting(256 * MEBI, 'Most bytes a slice.', low=MEBI)
-    compression: str = _setting('zstd', 'Of the chunks in a slice.', choices=COMPRESSIONS)
-    priority: int = _setting(8, 'Of slices: 0 ships first and is evicted last, 9 the other way round.', low=0, high=9)
+    topics: tuple[str, ...] = _setting(('',), 'Topics to record; with neither topics nor a regex, those of the sensors.')
+    regex: str = _setting('', 'Record also topics whose name matches this regular expression; ".*" is all that are not hidden.')
+    exclude: str = _setting('', 'Leave out topics that match this, unless they are in topics.')
+    slice_s: float = _setting(
+        60.0, 'Seconds in one file of a bag; each is uploaded while the next one is recorded.', low=1.0, high=86_400.0
+    )
+    slice_bytes: int = _setting(256 * MEBI, 'Most bytes in one file of a bag.', low=MEBI)
+    compression: str = _setting('zstd', 'Compression of the bag.', choices=COMPRESSIONS)
+    priority: int = _setting(8, '0 is uploaded first and evicted last; 9 is uploaded last and evicted first.', low=0, high=9)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventSettings:
     """The last seconds of some topics, in memory, of which an event makes a bag; off while no topic is named."""
 
-    topics: tuple[str, ...] = _setting(('',), 'Topics to keep; where none is named and no regex, there are no events.')
-    regex: str = _setting('', 'Keep also the topics whose full name has a match of this; ".*" takes all that are not hidden.')
-    exclude: str = _setting('', 'Of the topics that only the regex names, none whose full name has a match of this.')
-    pre_s: float = _setting(30.0, 'Seconds before a trigger that an event has.', low=0.0, high=3600.0, live=True)
+    topics: tuple[str, ...] = _setting(('',), 'Topics to keep; with neither topics nor a regex, there are no events.')
+    regex: str = _setting('', 'Keep also topics whose name matches this regular expression; ".*" is all that are not hidden.')
+    exclude: str = _setting('', 'Leave out topics that match this, unless they are in topics.')
+    pre_s: float = _setting(30.0, 'Seconds to keep from before a trigger.', low=0.0, high=3600.0, live=True)
     post_s: float = _setting(
-        10.0, 'Seconds after it; a trigger meanwhile makes the event last longer.', low=0.0, high=3600.0, live=True
+        10.0, 'Seconds to keep after it; another trigger in that time prolongs the event.', low=0.0, high=3600.0, live=True
     )
     max_s: float = _setting(
-        120.0, 'Most seconds from the first trigger to the end of an event; another one follows.', low=1.0, high=1e5, live=True
+        120.0,
+        'Most seconds from the first trigger to the end of an event; then another event begins.',
+        low=1.0,
+        high=1e5,
+        live=True,
     )
     max_bytes: int = _setting(
-        64 * MEBI, 'Most bytes of memory that are kept; beyond it the oldest go, whatever pre_s is.', low=MEBI, live=True
+        64 * MEBI, 'Memory for what is kept; beyond it the oldest messages go, whatever pre_s is.', low=MEBI, live=True
     )
     log_event: str = _setting(
-        '.*', "What an agent's log_event triggers: an event where its name has a match of this; empty for none.", live=True
+        '.*', "An agent's log_event triggers an event where its name matches this regular expression; empty for none.", live=True
     )
     conditions: tuple[str, ...] = _setting(
-        ('',), 'What triggers by itself: "low_battery: lowstate:bms_state.soc < 20 for 5": name, topic:field, comparison, time.'
+        ('',),
+        'What triggers an event: "low_battery: lowstate:bms_state.soc < 20 for 5" is name, topic:field, comparison, seconds.',
     )
 
     @property

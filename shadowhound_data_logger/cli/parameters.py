@@ -5,11 +5,10 @@ The page cannot drift: a test compares it with what this prints, and the environ
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import click
 
@@ -23,30 +22,136 @@ HEAD: Final = """\
 
 *Made from the code by `make docs`: change `shadowhound_data_logger/options.py`, not this page.*
 
-They are set in a parameter file (`--ros-args --params-file my.yaml`; [go2.yaml](../launch_configs/go2.yaml) has all of them with
-their defaults: copy it and delete what you do not change) or one by one (`--ros-args -p camera.rate_hz:=5.0`). An unknown name
-or a value that is not allowed stops the start with exit code 2 and a message that says what is.
+The node runs without any of them. Set them in a parameter file (`--ros-args --params-file my.yaml`;
+[go2.yaml](../launch_configs/go2.yaml) has all of them with their defaults: copy it and delete what you do not change) or one by
+one (`--ros-args -p camera.rate_hz:=5.0`). An unknown name or a value that is not allowed stops the start with exit code 2, and
+the message says what is allowed. A parameter of an earlier version does so too, and the message says what does its job now.
 
-**Live** ones can be changed while the node runs, and the others only at its start; a value that is not allowed changes nothing:
+**Live** parameters can be changed while the node runs, the others only at its start; a value that is not allowed changes nothing:
 
     shadowhound-data node set camera.rate_hz 5.0              # on the robot
     ros2 param set /sensor_logger_node camera.rate_hz 5.0     # with ROS, from anywhere
 
-`shadowhound-data node params` lists them as they are.
+`shadowhound-data node params` lists their present values.
 
-## Whose data, and which
-| parameter | default | allowed | |
-|---|---|---|---|
-| `robot` | | a name | Leads every key; where empty, `SHADOWHOUND_ROBOT`, else the node's namespace, else `thor`. |
-| `sensors` | all those below | names | The sensors there are. A name that is not among those below needs its `topics` at least. |
-"""
-SENSORS: Final = """
-## A sensor
-Each name in `sensors` has all of these, `camera.rate_hz` for one. Where a sensor's own default differs, the next table has it.
+## What most people set
+A whole parameter file; where the data goes is in the [environment](#environment-variables).
 
+```yaml
 """
+EXAMPLE: Final = """\
+/**:
+  ros__parameters:
+    robot: tachi
+    camera: {rate_hz: 5.0}            # pictures a second; 0.0 stores every one
+    lidar: {enabled: false}           # do not log the clouds
+    spool: {max_bytes: 100000000000}  # disk for what is not delivered yet: 100 GB
+    upload: {max_mbps: 20.0}          # leave the WiFi to others
+    bag: {record: mission}            # a bag of each mission, at full rate
+    events: {topics: [imu, odom]}     # keep the last 30 s, for an event
+"""
+SENSOR: Final = 'SENSOR'
+"""Stands for the name of any sensor."""
+
+
+class Section(NamedTuple):
+    """What a person wants to do, and the parameters for it, in the order in which most people need them."""
+
+    title: str
+    text: str
+    names: Sequence[str]
+
+
+SECTIONS: Final = (
+    Section(
+        'Choose what is logged',
+        'SENSOR is the name of any sensor: `camera.rate_hz`. The sensors that there are without any '
+        'setting are listed [below](#the-sensors).',
+        (
+            'robot',
+            'SENSOR.enabled',
+            'SENSOR.rate_hz',
+            'mission.capture',
+            'sensors',
+            'SENSOR.topics',
+            'SENSOR.types',
+            'SENSOR.on_change',
+        ),
+    ),
+    Section(
+        'Choose how it is stored',
+        'What an object is, and what it is called in the bucket ([formats](formats.md)).',
+        ('SENSOR.format', 'SENSOR.batch_s', 'SENSOR.quality', 'SENSOR.dedup', 'SENSOR.key', 'SENSOR.bucket'),
+    ),
+    Section(
+        'Limit the disk',
+        'What waits for the store is on the disk of the robot. When that is full, the objects of the lowest '
+        'priority are deleted, the oldest first, and the ledger counts them as `evicted`.',
+        ('spool.max_bytes', 'spool.min_free_bytes', 'SENSOR.priority', 'spool.remember_days'),
+    ),
+    Section(
+        'Upload fast, or leave the network to others',
+        '',
+        ('upload.max_mbps', 'upload.threads', 'upload.backoff_s', 'upload.read_timeout_s', 'shutdown.drain_s'),
+    ),
+    Section(
+        'Record bags',
+        'At full rate, whatever the sensors keep ([bags](bags.md)).',
+        (
+            'bag.record',
+            'bag.topics',
+            'bag.regex',
+            'bag.exclude',
+            'bag.slice_s',
+            'bag.slice_bytes',
+            'bag.compression',
+            'bag.priority',
+        ),
+    ),
+    Section(
+        'Keep what led to an event',
+        'The last seconds of some topics are held in memory, and an event makes a bag of them; off '
+        'while no topic is named ([bags](bags.md)).',
+        (
+            'events.topics',
+            'events.regex',
+            'events.exclude',
+            'events.pre_s',
+            'events.post_s',
+            'events.conditions',
+            'events.log_event',
+            'events.max_s',
+            'events.max_bytes',
+        ),
+    ),
+    Section(
+        'Log missions',
+        'What the node adds to the run of a mission of its robot ([missions](missions.md)).',
+        (
+            'mission.join',
+            'mission.frames',
+            'mission.frame_every_s',
+            'mission.battery',
+            'mission.temperature',
+            'mission.odometry',
+            'mission.period_s',
+        ),
+    ),
+    Section(
+        'Find it later', 'The catalogue of what the store holds ([lake](lake.md)).', ('catalogue.enabled', 'catalogue.period_s')
+    ),
+    Section(
+        'Know what was lost',
+        'Only where messages carry no numbers: without Fast DDS ([formats](formats.md)).',
+        ('SENSOR.expected_hz', 'SENSOR.counter'),
+    ),
+    Section('Wait for the clock', 'For a robot that starts before its clock is set.', ('clock.hold_s',)),
+    Section('Fit the machine and its network', '', ('capture.rmw', 'queue.max_bytes')),
+)
 OWN: Final = """
-## The sensors' own defaults
+## The sensors
+Where the default of a sensor is not the one above.
+
 """
 ENVIRONMENT: Final = """
 ## Environment variables
@@ -80,28 +185,44 @@ def main(*, write: bool) -> None:
 
 def page() -> str:
     """The whole page, as Markdown."""
-    parts = [HEAD, SENSORS, *_table(SensorSettings, '*sensor*'), OWN, *_sensors()]
-    for name, kind in GROUPS.items():
-        summary = re.sub(r' \(D[^)]*\)', '', (kind.__doc__ or '').partition('\n')[0])
-        parts += [f'\n## {name}\n{summary}\n\n', *_table(kind, name)]
-    parts += [ENVIRONMENT, *(_row(f'`{name}`', default, text) for name, default, text in VARIABLES)]
+    parts = [HEAD, EXAMPLE, '```\n']
+    described = _described()
+    for section in SECTIONS:
+        parts += [f'\n## {section.title}\n', f'{section.text}\n\n' if section.text else '', _row(*COLUMNS)]
+        parts += ['|---' * len(COLUMNS) + '|\n', *(described[name] for name in section.names)]
+    parts += [OWN, *_sensors(), ENVIRONMENT, *(_row(f'`{name}`', default, text) for name, default, text in VARIABLES)]
     return ''.join(parts)
 
 
-def _table(kind: type, prefix: str) -> Iterator[str]:
-    """A row for each setting of a class."""
-    yield _row(*COLUMNS)
-    yield '|---' * len(COLUMNS) + '|\n'
-    for spec in fields(kind):
-        if spec.metadata:
-            name = f'{prefix}.`{spec.name}`' if prefix.startswith('*') else f'`{prefix}.{spec.name}`'
-            live = 'yes' if spec.metadata['live'] else ''
-            yield _row(name, _shown(_default(spec)), _allowed(spec), live, spec.metadata['help'])
+def _described() -> dict[str, str]:
+    """The row of each parameter."""
+    rows = {
+        'robot': _row(
+            '`robot`',
+            '',
+            'a name',
+            '',
+            "Leads every key; where empty, `SHADOWHOUND_ROBOT`, else the node's namespace, else `thor`.",
+        ),
+        'sensors': _row(
+            '`sensors`',
+            'all those below',
+            'names',
+            '',
+            'The sensors. One that is not among those below needs its `topics` at least.',
+        ),
+    }
+    for prefix, kind in ((SENSOR, SensorSettings), *GROUPS.items()):
+        for spec in fields(kind):
+            if spec.metadata:
+                name, live = f'{prefix}.{spec.name}', 'yes' if spec.metadata['live'] else ''
+                rows[name] = _row(f'`{name}`', _shown(_default(spec)), _allowed(spec), live, spec.metadata['help'])
+    return rows
 
 
 def _sensors() -> Iterator[str]:
     """A row for each sensor that is there without any setting, with all in which it differs."""
-    yield _row('sensor', 'topics', 'otherwise than above')
+    yield _row('sensor', 'topics', 'defaults of its own')
     yield '|---|---|---|\n'
     for sensor in Settings.load({}, {}).sensors:
         own = DEFAULT_SENSORS[sensor.name]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from pathlib import Path
 
 from click.testing import CliRunner
+from ruamel.yaml import YAML
 
-from shadowhound_data_logger.cli.parameters import PAGE, VARIABLES, main, page
-from shadowhound_data_logger.config import default_parameters
+from shadowhound_data_logger.cli.parameters import EXAMPLE, PAGE, SECTIONS, VARIABLES, main, page
+from shadowhound_data_logger.config import DEFAULT_SENSORS, Settings, default_parameters
 
 PACKAGE = Path(__file__).parents[2] / 'shadowhound_data_logger'
 
@@ -23,16 +25,36 @@ def test_every_parameter_is_on_it() -> None:
     rows = {row.split('|')[1].strip() for row in page().splitlines() if row.startswith('|')}
     names = [name.rpartition('.') for name in default_parameters()]
     missing = [(group, field) for group, dot, field in names
-               if f'`{group}{dot}{field}`' not in rows and not {f'*sensor*.`{field}`', f'`{group}`'} <= rows]  # fmt: skip
+               if f'`{group}{dot}{field}`' not in rows and not {f'`SENSOR.{field}`', f'`{group}`'} <= rows]  # fmt: skip
     assert len(names) > 100
     assert not missing
+
+
+def test_each_is_in_one_section() -> None:
+    """Of what a person wants to do, in whatever group its name is."""
+    listed = Counter(name for section in SECTIONS for name in section.names)
+    known = {
+        f'SENSOR.{name.partition(".")[2]}' if name.partition('.')[0] in DEFAULT_SENSORS else name for name in default_parameters()
+    }
+    assert listed == Counter(known)
+
+
+def test_the_example_is_a_parameter_file() -> None:
+    """What most people set: the node would start with it."""
+    given = YAML(typ='safe').load(EXAMPLE)['/**']['ros__parameters']
+    flat = {
+        f'{group}.{name}': value for group, values in given.items() if isinstance(values, dict) for name, value in values.items()
+    }
+    settings = Settings.load({'robot': given['robot'], **flat}, {})
+    assert (settings.robot, settings.bag.record, settings.events.topics) == ('tachi', 'mission', ('imu', 'odom'))
+    assert len(flat) == 6
 
 
 def test_live_parameters_are_marked() -> None:
     """Those that `ros2 param set` can change, and no others."""
     live = {row.split('|')[1].strip() for row in page().splitlines() if '| yes |' in row}
     events = {f'`events.{name}`' for name in ('pre_s', 'post_s', 'max_s', 'max_bytes', 'log_event')}
-    sensors = {f'*sensor*.`{name}`' for name in ('enabled', 'rate_hz', 'quality', 'priority')}
+    sensors = {f'`SENSOR.{name}`' for name in ('enabled', 'rate_hz', 'quality', 'priority')}
     assert live == {*sensors, '`upload.max_mbps`', *events}
 
 
