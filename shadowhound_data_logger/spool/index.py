@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from heapq import merge
 from itertools import islice
 from operator import itemgetter
@@ -26,7 +26,15 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, ObjectInfo, SpooledObject, State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.gap_table import GapTable
-from shadowhound_data_logger.spool.schema import CATALOGUE, IMPLAUSIBLE, SCHEMA_VERSION, definitions, expected, prepare
+from shadowhound_data_logger.spool.schema import (
+    CATALOGUE,
+    IMPLAUSIBLE,
+    SCHEMA_VERSION,
+    definitions,
+    expected,
+    prepare,
+    version_of,
+)
 
 FORGET_STEP: Final = 10_000
 """Rows that one commit forgets at most: some 50 ms."""
@@ -67,12 +75,11 @@ class Index:
 
     def open(self) -> None:
         """Raises sqlite3.DatabaseError for a damaged file, SpoolError for one of a newer version or no access."""
-        mode = 'ro' if self._read_only else 'rwc'
+        if not self._read_only:
+            with suppress(sqlite3.OperationalError), closing(self._connected('ro')) as view:
+                version_of(view, self._path)  # closing one that may write changes the file: it takes the log of a killed node in
         try:
-            connection = sqlite3.connect(
-                f'{self._path.absolute().as_uri()}?mode={mode}', uri=True, timeout=BUSY_TIMEOUT_S,
-                isolation_level=None, check_same_thread=False,
-            )  # fmt: skip
+            connection = self._connected('ro' if self._read_only else 'rwc')
         except sqlite3.OperationalError as error:
             raise SpoolError(f'cannot open the spool index {self._path}: {error}',
                              remedy='is the path right, and may you read it?') from error  # fmt: skip
@@ -82,6 +89,12 @@ class Index:
             connection.close()
             raise
         self._connection = connection
+
+    def _connected(self, mode: str) -> sqlite3.Connection:
+        return sqlite3.connect(
+            f'{self._path.absolute().as_uri()}?mode={mode}', uri=True, timeout=BUSY_TIMEOUT_S,
+            isolation_level=None, check_same_thread=False,
+        )  # fmt: skip
 
     def close(self) -> None:
         if self._connection is not None:

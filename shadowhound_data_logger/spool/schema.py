@@ -263,17 +263,23 @@ _AS_REGRADED: Final = f"""
 """Besides, where they have other grades."""
 
 
-def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> None:
-    """Make the tables where there are none, bring older ones up to date, and have commits be durable.
+def version_of(connection: sqlite3.Connection, path: Path) -> int:
+    """The version of an index; 0 where it has no tables yet.
 
     Raises sqlite3.DatabaseError for a version that is none, SpoolError for a newer one, which has other tables than ours.
     """
-    version = connection.execute('PRAGMA user_version').fetchone()[0]
+    version = int(connection.execute('PRAGMA user_version').fetchone()[0])
     if not 0 <= version < VERSION_LIMIT or (version > SCHEMA_VERSION and definitions(connection) == expected()):
         raise sqlite3.DatabaseError(f'the version {version} is none')
     if version > SCHEMA_VERSION:
         raise SpoolError(f'the spool index {path} is of version {version}, this program knows {SCHEMA_VERSION}',
                          remedy='update shadowhound_data_logger')  # fmt: skip
+    return version
+
+
+def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> None:
+    """Make the tables where there are none, bring older ones up to date, have commits be durable. Raises as ``version_of``."""
+    version = version_of(connection, path)
     if read_only:
         if 0 < version < JOURNALED:
             connection.executescript(_AS_NOW)
