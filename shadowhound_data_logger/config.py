@@ -37,10 +37,26 @@ from shadowhound_data_logger.options import (
 )
 
 __all__ = [
-    'DEFAULT_SENSORS', 'FOREIGN', 'FORMATS', 'BagSettings',
-    'CaptureSettings', 'CatalogueSettings', 'ClockSettings', 'EventSettings',
-    'MissionSettings', 'QueueSettings', 'SensorSettings', 'Settings', 'ShutdownSettings', 'SpoolSettings', 'StoreSettings',
-    'UploadSettings', 'default_parameters', 'gone', 'home', 'store_settings',
+    'DEFAULT_SENSORS',
+    'FORMATS',
+    'NOT_SETTINGS',
+    'BagSettings',
+    'CaptureSettings',
+    'CatalogueSettings',
+    'ClockSettings',
+    'EventSettings',
+    'MissionSettings',
+    'QueueSettings',
+    'SensorSettings',
+    'Settings',
+    'ShutdownSettings',
+    'SpoolSettings',
+    'StoreSettings',
+    'UploadSettings',
+    'default_parameters',
+    'gone',
+    'home',
+    'store_settings',
 ]  # fmt: skip
 
 MIN_RATE_HZ: Final = 1e-4
@@ -51,7 +67,7 @@ _FIELD: Final = re.compile(r'[^:\s]+:[A-Za-z]\w*(\.\w+)*', re.ASCII)
 """A part of the field that is a number counts in an array: lowstate:motor_state.0.temperature."""
 _BUCKET: Final = re.compile(r'[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]')
 """https://docs.aws.amazon.com/AmazonS3/latest/userguide/bucketnamingrules.html"""
-FOREIGN: Final = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
+NOT_SETTINGS: Final = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 """Parameters that rclpy itself declares; they are not ours to judge."""
 
 
@@ -81,7 +97,7 @@ class Settings:
     @classmethod
     def load(cls, parameters: Mapping[str, Any], environ: Mapping[str, str], namespace: str = '/') -> Settings:
         """Raises SettingError (unknown or wrong parameter or variable) naming it, its value and what is allowed."""
-        given = {name: value for name, value in parameters.items() if name.split('.')[0] not in FOREIGN}
+        given = {name: value for name, value in parameters.items() if name.split('.')[0] not in NOT_SETTINGS}
         _check_gone(given)
         robot = _robot(given.pop('robot', ''), environ, namespace)
         sensors = _sensors(given, robot)
@@ -184,7 +200,7 @@ def _check_gone(given: Mapping[str, Any]) -> None:
 
 
 def _sensor(name: str, given: dict[str, Any], robot: str) -> SensorSettings:
-    if name in {'robot', 'sensors', *GROUPS, *FOREIGN}:
+    if name in {'robot', 'sensors', *GROUPS, *NOT_SETTINGS}:
         raise SettingError('sensors', name, 'names that are not those of other parameters')
     try:
         check_name(name, 'the sensor name')

@@ -96,13 +96,46 @@ def test_who_imports_what(package: str) -> None:
     assert importers <= ALLOWED[package]
 
 
-def test_a_public_class_name_stands_for_one_thing() -> None:
-    """No two modules have a class of the same public name."""
-    uses = Counter(
-        node.name for path in MODULES for node in ast.parse(path.read_text(encoding='utf-8')).body
-        if isinstance(node, ast.ClassDef) and not node.name.startswith('_')
-    )  # fmt: skip
-    assert [name for name, count in uses.items() if count > 1] == []
+def _defined(path: Path) -> Iterator[str]:
+    """The public names that a module defines: classes, type aliases, functions and constants."""
+    for node in ast.parse(path.read_text(encoding='utf-8')).body:
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
+            yield node.name
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield from (target.id for target in targets if isinstance(target, ast.Name))
+
+
+def _module(path: Path) -> str:
+    return '.'.join((PACKAGE, *path.relative_to(ROOT).with_suffix('').parts)).removesuffix('.__init__')
+
+
+def test_a_public_type_name_stands_for_one_thing() -> None:
+    """No two modules have a class or a type alias of the same public name."""
+    uses = Counter(name for path in MODULES for name in set(_defined(path)) if re.match('[A-Z]', name) and not name.isupper())
+    assert [name for name, count in uses.items() if count > 1 and name != 'T'] == []
+
+
+def test_a_name_that_crosses_folders_stands_for_one_thing() -> None:
+    """No two functions or constants that other folders import have the same name.
+
+    Within its module or folder a name may be ordinary (``main``, ``run``, ``check``, ``CLOSE_S``): a reader has its definition
+    at hand. Where another folder imports it, the reader does not. ``ledger.read`` names its module; ``read as read_ledger`` is
+    counted as ``read_ledger``.
+    """
+    defined = {_module(path): set(_defined(path)) for path in MODULES}
+    origins: dict[str, set[str]] = {}
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.ImportFrom) and node.module in defined:
+                home = ROOT.joinpath(*node.module.split('.')[1:])
+                if (home if home.is_dir() else home.parent) == path.parent:
+                    continue
+                for name in node.names:
+                    if name.name in defined[node.module]:
+                        origins.setdefault(name.asname or name.name, set()).add(f'{node.module}.{name.name}')
+    assert len(origins) > 300
+    assert {name: sorted(found) for name, found in origins.items() if len(found) > 1} == {}
 
 
 def test_one_file_knows_mlflow() -> None:
@@ -161,6 +194,18 @@ def test_the_page_on_architecture_names_files_that_are_there() -> None:
     there = {path.relative_to(ROOT).as_posix() for path in MODULES} | {path.name for path in MODULES}
     assert len(named) > 50
     assert sorted(named - there) == []
+
+
+def test_the_glossary_names_what_is_there() -> None:
+    """Each of its terms is in the code or on another page, stands there once, and in order."""
+    page = (ROOT.parent / 'docs' / 'architecture.md').read_text(encoding='utf-8')
+    terms = re.findall(r'^- \*\*(.+?)\*\*', page.partition('## Glossary')[2].partition('\n## ')[0], re.MULTILINE)
+    assert len(terms) > 40
+    assert terms == sorted(set(terms), key=str.lower)
+    pages = [path for path in (ROOT.parent / 'docs').rglob('*.md') if path.name != 'architecture.md']
+    text = '\n'.join(path.read_text(encoding='utf-8').lower() for path in (*MODULES, *pages))
+    words = [word for term in terms for word in term.lower().split(', ')]
+    assert [word for word in words if not re.search(rf'\b{word}', text) and word.replace(' ', '_') not in text] == []
 
 
 PROGRAM = f"""

@@ -28,7 +28,7 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.missions.drawing import NAMES
-from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missions, read_json
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, read_json
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
@@ -121,7 +121,7 @@ class Killer:
         elif what == AGENT:
             self._kill_agent()
             self._start_agent()
-        elif pid := read_json(self.home / FOLDER / 'replay.json').get('pid'):
+        elif pid := read_json(self.home / MISSIONS / 'replay.json').get('pid'):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 

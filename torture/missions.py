@@ -26,7 +26,7 @@ from missions.server import Server
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missions, read_json
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, read_json
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
@@ -96,7 +96,7 @@ class Killer:
         return Agent(next(folder.mission_id for folder in missions(self._home) if given in _ids(folder)), acknowledged)
 
     def _kill_sender(self) -> None:
-        pid = read_json(self._home / FOLDER / 'replay.json').get('pid')
+        pid = read_json(self._home / MISSIONS / 'replay.json').get('pid')
         if pid:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -115,7 +115,7 @@ def audit(server: Server, home: Path, agents: Sequence[Agent], objects: Counter[
         by_mission.setdefault(run.data.tags['shadowhound.mission_id'], []).append(run)
     for agent in agents:
         runs = by_mission.get(agent.mission_id, [])
-        folder = MissionFolder(home / FOLDER / agent.mission_id)
+        folder = MissionFolder(home / MISSIONS / agent.mission_id)
         said = [line.record for line in read(folder.journal) if line.record]
         if len(runs) != 1 or runs[0].info.status != 'KILLED' or runs[0].info.end_time != said[-1]['t'] // 1_000_000:
             found.wrong['runs'].append(f'{agent.mission_id}: {[(run.info.run_id, run.info.status) for run in runs]}')
@@ -171,7 +171,7 @@ def campaign(folder: Path, kills: int, seed: int) -> Found:
             until(lambda: all(each.sent().complete for each in missions(home)), 'every mission is sent', DELIVER_S)
         finally:
             logger.close()
-        until(lambda: not read_json(home / FOLDER / 'replay.json').get('pid'), 'every object is delivered', DELIVER_S)
+        until(lambda: not read_json(home / MISSIONS / 'replay.json').get('pid'), 'every object is delivered', DELIVER_S)
         progress('every run is read back')
         return audit(Server(tower, wire), home, agents, stored(tower))
 

@@ -27,7 +27,7 @@ from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import UNFINISHED, download
 from shadowhound_data_logger.untrusted import path_below
 
-THREADS: Final = 4
+FETCH_THREADS: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Told:
         """So many more are here, downloaded or there already; negative where they turned out wrong."""
 
 
-def fetch(store: ObjectStore, bag: RemoteBag, to: Path, *, threads: int = THREADS, told: Told | None = None) -> FetchedBag:
+def fetch(store: ObjectStore, bag: RemoteBag, to: Path, *, threads: int = FETCH_THREADS, told: Told | None = None) -> FetchedBag:
     """Raises BagError, BagDamaged for what does not arrive as it was sent, StoreError, OSError; what is whole by then stays."""
     with on_disk(to):
         return _fetch(store, bag, to, threads, told or Told())

@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.naming import BUCKET, FOLDER, prefix_of
+from shadowhound_data_logger.bags.naming import BAGS, BUCKET, prefix_of
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.mcap.writer import OPEN
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.index import Index
 
 RECORDS: Final = 'records'
-"""In SHADOWHOUND_HOME: what is being recorded by hand (``bag record``); the node's bags lie in naming.FOLDER."""
+"""In SHADOWHOUND_HOME: what is being recorded by hand (``bag record``); the node's bags lie in naming.BAGS."""
 SPOOL: Final = 'spool'
 QUARANTINE: Final = 'quarantine'
 """Refused by the store for good."""
@@ -45,7 +45,7 @@ class UnsentFile:
 
 def local_files(home: Path, robot: str) -> dict[tuple[str, str], UnsentFile]:
     """By bag and name; what lies in the spool and in the recording folder is in the spool. Raises SpoolError."""
-    found = {(file.bag, file.name): file for folder in (FOLDER, RECORDS) for file in _recording(home / folder / robot)}
+    found = {(file.bag, file.name): file for folder in (BAGS, RECORDS) for file in _recording(home / folder / robot)}
     try:
         found |= {(file.bag, file.name): file for file in _spooled(home / 'spool', robot)}
     except sqlite3.Error as error:

@@ -10,7 +10,7 @@ from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.missions.folder import safe_type
 
 BUCKET: Final = 'sensor-data'
-FOLDER: Final = 'bags'
+BAGS: Final = 'bags'
 """Of what is being recorded, in SHADOWHOUND_HOME."""
 RECORDING: Final = 'recording'
 """What a bag of no mission is called by."""

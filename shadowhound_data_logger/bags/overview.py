@@ -60,7 +60,7 @@ class _Facts:
     t_end_ns: int | None = None
 
 
-def overview(store: ObjectStore, robot: str, home: Path, *, since_ns: int = 0) -> list[BagRow]:
+def bag_overview(store: ObjectStore, robot: str, home: Path, *, since_ns: int = 0) -> list[BagRow]:
     """All bags of a robot that began at ``since_ns`` or later, the newest last. Raises StoreError, SpoolError."""
     remote = {bag.name: bag for bag in find_bags(store, robot)}
     local: dict[str, list[UnsentFile]] = {}

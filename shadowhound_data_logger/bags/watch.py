@@ -39,14 +39,14 @@ DELIVER_S: Final = 5.0
 """For one bag in one round; the spool has it safe, and a later round goes on."""
 RETRY_S: Final = 60.0
 """Before that: to open the spool costs it a row, and the node that runs here delivers by itself."""
-Look = list[list[Any]]
+_Listing = list[list[Any]]
 """Name, size and time of change of every file: what does not change while nobody writes."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class WatchStep:
     """Something that happened to a bag: SPOOLED, STORED, REMOVED or, with a reason, ``refused``."""
 
     bag: str
@@ -65,7 +65,7 @@ class Watch:
         self._settle_s = settle_s
         self._is_removing = is_removing
         self._monotonic = monotonic
-        self._looks: dict[str, tuple[Look, float]] = {}
+        self._looks: dict[str, tuple[_Listing, float]] = {}
         self._told: dict[str, str] = {}
         self._again_s: dict[str, float] = {}
         self._left: set[str] = set()
@@ -79,7 +79,7 @@ class Watch:
                 raise BagError(f'another process watches {self._folder} already', path=str(self._folder))
             yield
 
-    def round(self) -> list[Step]:
+    def round(self) -> list[WatchStep]:
         """Ship what is finished, confirm what was shipped. Raises BagError where the folder itself cannot be used."""
         with on_disk(self._folder):
             marks = self._marks()
@@ -92,7 +92,7 @@ class Watch:
         """Whether the store does not have a bag of this folder yet, for whatever reason."""
         return bool(self._looks or self._left) or any(mark['state'] == SPOOLED for mark in self._marks().values())
 
-    def _step(self, path: Path, marks: dict[str, Any]) -> Iterator[Step]:
+    def _step(self, path: Path, marks: dict[str, Any]) -> Iterator[WatchStep]:
         mark = marks.get(path.name)
         try:
             if mark is None:
@@ -101,19 +101,19 @@ class Watch:
                 finished(path)
                 mark = marks[path.name] = self._ship(path)
                 self._write(marks)
-                yield Step(path.name, SPOOLED)
+                yield WatchStep(path.name, SPOOLED)
             if mark['state'] == SPOOLED and self._monotonic() >= self._again_s.get(path.name, 0.0) and self._confirm(path, mark):
                 self._write(marks)
-                yield Step(path.name, STORED)
+                yield WatchStep(path.name, STORED)
             if self._is_removing and mark['state'] == STORED and self._remove(path, mark):
                 self._write(marks)
-                yield Step(path.name, REMOVED)
+                yield WatchStep(path.name, REMOVED)
         except DataLoggerError as error:
             if self._told.get(path.name) != str(error):
                 self._told[path.name] = str(error)
-                yield Step(path.name, 'refused', str(error))
+                yield WatchStep(path.name, 'refused', str(error))
 
-    def _unfinished(self, path: Path) -> Iterator[Step]:
+    def _unfinished(self, path: Path) -> Iterator[WatchStep]:
         """A bag that nobody seems to write any more, once."""
         times = [changed_ns for name, _, changed_ns in _look(path) if name.endswith(SLICES)]
         if not times or self._clock.wall_ns() - max(times) < UNFINISHED_S * SECOND:
@@ -121,7 +121,7 @@ class Watch:
         elif path.name not in self._left:
             self._left.add(path.name)
             reason = f'it has no {METADATA}, and nothing in it has changed for {UNFINISHED_S / 60:.0f} min'
-            yield Step(path.name, 'refused', f'{reason} (if nobody records into it: `ros2 bag reindex` makes it)')
+            yield WatchStep(path.name, 'refused', f'{reason} (if nobody records into it: `ros2 bag reindex` makes it)')
 
     def _is_settled(self, path: Path) -> bool:
         look = _look(path)
@@ -182,8 +182,8 @@ class Watch:
             file.write(json.dumps({'version': 1, 'bags': marks}, indent=1).encode())
 
 
-def _look(folder: Path) -> Look:
-    found: Look = []
+def _look(folder: Path) -> _Listing:
+    found: _Listing = []
     for path in sorted(folder.rglob('*')):
         with suppress(FileNotFoundError):  # its recorder is at work
             stat = path.stat()

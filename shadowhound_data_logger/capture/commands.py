@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
+from shadowhound_data_logger.bags.recorder import Answer
 from shadowhound_data_logger.capture.diagnostics import told
 from shadowhound_data_logger.capture.status import Stages, Status
 from shadowhound_data_logger.errors import DataLoggerError
@@ -29,8 +30,6 @@ MOST_NAME: Final = 100
 """Letters of an event's name."""
 MOST_NOTE: Final = 1000
 """Letters of what is said of it."""
-Answer = tuple[bool, str]
-"""Whether it was done, and what, in words."""
 
 
 class Settable(Protocol):

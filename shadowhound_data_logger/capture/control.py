@@ -35,8 +35,8 @@ CANCEL_S: Final = 0.2
 OPEN_S: Final = 2.0
 """For how long the start of the node waits for the socket; on a disk that takes it that lasts a few milliseconds."""
 LOCK: Final = 'control.lock'
-Request = Mapping[str, Any]
-Waiting = tuple[Request, 'Future[dict[str, Any]]']
+_Request = Mapping[str, Any]
+Waiting = tuple[_Request, 'Future[dict[str, Any]]']
 
 
 class ControlSocket:
@@ -77,7 +77,7 @@ class ControlSocket:
         """Where it is, once it is open."""
         return self._spool / self._name
 
-    def obey(self, do: Callable[[Request], dict[str, Any]]) -> None:
+    def obey(self, do: Callable[[_Request], dict[str, Any]]) -> None:
         """Have all that is asked for done, one after the other; ``do`` returns what to answer."""
         while self._waiting:
             request, answer = self._waiting.popleft()
@@ -159,7 +159,7 @@ class ControlSocket:
             else:
                 await self._tell(writer, await self._have_done(request))
 
-    async def _have_done(self, request: Request) -> dict[str, Any]:
+    async def _have_done(self, request: _Request) -> dict[str, Any]:
         answer: Future[dict[str, Any]] = Future()
         self._waiting.append((request, answer))
         self._wake()
@@ -177,7 +177,7 @@ class ControlSocket:
         return {'ok': False, 'robot': self._robot, 'error': why}
 
 
-def _parsed(line: bytes) -> Request:
+def _parsed(line: bytes) -> _Request:
     """Raises ValueError."""
     try:
         request = json.loads(line)

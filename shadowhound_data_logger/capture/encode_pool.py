@@ -33,7 +33,7 @@ ENCODER_FAILED: Final = 'encoder_failed'
 """Why samples are rejected whose encoder has a fault."""
 PATIENCE_S: Final = 60.0
 """A batch that takes longer is stuck: the largest images and clouds take a second on a Jetson."""
-Mark = Callable[[DataObject], DataObject]
+Marking = Callable[[DataObject], DataObject]
 """Gives an object more metadata, or another name; from any thread."""
 Observe = Callable[[Batch, 'DataObject | None'], None]
 
@@ -153,7 +153,7 @@ class EncodePool:
     """New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake."""
 
     def __init__(self, robot: str, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,  # noqa: PLR0913 - each is a neighbour
-                 writer: SpoolWriter, marks: Sequence[Mark], observe: Observe, *, threads: int = THREADS) -> None:  # fmt: skip
+                 writer: SpoolWriter, marks: Sequence[Marking], observe: Observe, *, threads: int = THREADS) -> None:  # fmt: skip
         """``sensors`` are the settings in force. An object goes through the ``marks`` one after the other, then to ``writer``.
 
         ``observe`` is shown each batch and its object, if there is one, once that is on its way; what it raises loses nothing.

@@ -30,7 +30,7 @@ from shadowhound_data_logger.capture.interface import Interface
 from shadowhound_data_logger.capture.parameters import Described, declare, parameter, plain
 from shadowhound_data_logger.capture.reader import endpoints
 from shadowhound_data_logger.capture.unheard import MOST_PUBLISHERS
-from shadowhound_data_logger.config import FOREIGN
+from shadowhound_data_logger.config import NOT_SETTINGS
 from shadowhound_data_logger.errors import DataLoggerError, NodeUnavailable
 from shadowhound_data_logger.ros_arguments import NODE
 from shadowhound_data_logger.spool.control import Connection
@@ -173,7 +173,7 @@ class PublicNode:
 
     def _set(self, parameters: list[Parameter]) -> SetParametersResult:
         """Whether the node takes these values."""
-        values = {each.name: plain(each.value) for each in parameters if each.name.partition('.')[0] not in FOREIGN}
+        values = {each.name: plain(each.value) for each in parameters if each.name.partition('.')[0] not in NOT_SETTINGS}
         if self._follows or not values:
             return SetParametersResult(successful=True)
         answer = self._ask({'do': 'set', 'values': values})

@@ -20,7 +20,7 @@ from shadowhound_data_logger.encode.payload import Job
 from shadowhound_data_logger.encode.records import ODOMETRY
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
-from shadowhound_data_logger.missions.node_log import Cloud, Fact, Frame, Reading
+from shadowhound_data_logger.missions.node_log import Cloud, Frame, MissionFact, Reading
 from shadowhound_data_logger.missions.odometer import Pose
 from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE
 from shadowhound_data_logger.model import Batch, DataObject, Sample
@@ -58,7 +58,7 @@ class MissionObserver:
         self._periods: dict[tuple[str, int], int] = {}
         self._told: set[str] = set()
 
-    def facts(self, batch: Batch, item: DataObject | None = None) -> Iterator[Fact]:
+    def facts(self, batch: Batch, item: DataObject | None = None) -> Iterator[MissionFact]:
         """What there is to log of a batch; ``item`` is the object that was made of it, None where there is none."""
         try:
             if batch.topic == self._odometry and batch.type == ODOMETRY:

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from shadowhound_data_logger.conditions import conditions
-from shadowhound_data_logger.config import FOREIGN, Settings, gone
+from shadowhound_data_logger.config import NOT_SETTINGS, Settings, gone
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
 from shadowhound_data_logger.options import GROUPS
 
@@ -39,7 +39,7 @@ class Parameters:
 
     def given(self) -> bool:
         """Whether file or command line set anything of ours; to be asked before ``load`` declares the rest."""
-        return any(name.partition('.')[0] not in FOREIGN for name in self._node.get_parameters_by_prefix(''))
+        return any(name.partition('.')[0] not in NOT_SETTINGS for name in self._node.get_parameters_by_prefix(''))
 
     def load(self) -> Settings:
         """The settings; every parameter is declared then, so that ``ros2 param list`` shows it. Raises SettingError."""
@@ -86,7 +86,7 @@ class Parameters:
         if instead := gone(name):
             raise DataLoggerError(f'there is no parameter {name!r} any more', remedy=instead)
         if not self._node.has_parameter(name):
-            known = [each for each in self._node.get_parameters_by_prefix('') if each.partition('.')[0] not in FOREIGN]
+            known = [each for each in self._node.get_parameters_by_prefix('') if each.partition('.')[0] not in NOT_SETTINGS]
             near = [each for each in known if each.partition('.')[0] == name.partition('.')[0]]
             there_are = ', '.join(sorted(near or {each.partition('.')[0] for each in known}))
             raise DataLoggerError(f'there is no parameter {name!r}', remedy=f'there are {there_are}')

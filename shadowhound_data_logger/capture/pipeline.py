@@ -16,7 +16,7 @@ from typing import Any
 from rclpy.node import Node
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.bags.naming import FOLDER
+from shadowhound_data_logger.bags.naming import BAGS
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
@@ -121,7 +121,7 @@ class Pipeline:
         self.uploader = Uploader(self.spool, self._store, settings.upload, self.writer.settle)
         self.writer.on_commit(spooled=self.uploader.wake, settled=self.uploader.settled)
         accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
-        place = BagPlace(settings.home / FOLDER / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
+        place = BagPlace(settings.home / BAGS / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
                       self._record.offsets)  # fmt: skip
         salvage = Salvage(place, settings.bag.priority)
         self.event_buffer = EventBuffer(node, settings, place, salvage, types)

@@ -23,7 +23,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.dating import now_ns
-from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.worker import Worker
 
@@ -197,7 +197,7 @@ class EventWatch:
         missions = self._missions
         for name in missions:
             if name not in self._tails:
-                self._tails[name] = JournalTail(MissionFolder(self._home / FOLDER / name).journal)
+                self._tails[name] = JournalTail(MissionFolder(self._home / MISSIONS / name).journal)
         for name in tuple(self._tails):
             for logged in self._tails[name].new(now_ns(self._clock)):
                 if self._wanted is not None and self._wanted.search(logged.name):

@@ -30,7 +30,7 @@ REMEDY: Final = (
     "listen through the robot's own RMW (capture.rmw: robot), or have both look in the same networks: interfaces and peers of "
     'CYCLONEDDS_URI, ROS_STATIC_PEERS (docs/thor.md, Middleware)'
 )
-Report = Mapping[str, Any]
+_Report = Mapping[str, Any]
 """{topic: [[gid, type, node], ...]}, as far as it is what the front sends; node is empty where nobody knows it."""
 
 
@@ -51,7 +51,7 @@ class Unheard:
         self._since_s: dict[tuple[str, str], float] = {}
         self._rows: dict[str, dict[str, Any]] = {}
 
-    def compare(self, report: Report) -> dict[str, Any]:
+    def compare(self, report: _Report) -> dict[str, Any]:
         """Take a report of the publishers that the front finds beyond those told to it; what it needs to make the next one."""
         now_s = self._monotonic()
         if self._reported_s is None or now_s - self._reported_s > SILENT_S:

@@ -142,7 +142,7 @@ def _why_undelivered(status: Mapping[str, Any]) -> str:
 
 
 class SilenceDetector:
-    """Notices that a topic has fallen silent although its publisher is there. One for each topic; ``look`` at each status."""
+    """Silence detection: notices that a topic has fallen silent although its publisher is there. One for each topic."""
 
     def __init__(self, topic: str) -> None:
         self._topic = topic

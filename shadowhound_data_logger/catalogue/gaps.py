@@ -22,7 +22,7 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, utc
 FORMAT_VERSION: Final = 1
 """Of the statements. Columns are only ever added, at the end."""
 GAP, WITHDRAWN, COMPLETE = 'gap', 'withdrawn', 'complete'
-KINDS: Final = (GAP, WITHDRAWN, COMPLETE)
+STATEMENT_KINDS: Final = (GAP, WITHDRAWN, COMPLETE)
 """What a statement can be (``what``)."""
 GAPS: Final = TableSchema(
     folder=GAPS_FOLDER,

@@ -15,15 +15,15 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.bags.cut import COMES, Choice, Cut, cut_folder, cut_remote
-from shadowhound_data_logger.bags.fetch import THREADS, fetch
+from shadowhound_data_logger.bags.fetch import FETCH_THREADS, fetch
 from shadowhound_data_logger.bags.info import BagInfo, info_folder, info_of
 from shadowhound_data_logger.bags.manifest import ClockOf, Missing
-from shadowhound_data_logger.bags.overview import BagRow, overview
+from shadowhound_data_logger.bags.overview import BagRow, bag_overview
 from shadowhound_data_logger.bags.record import DEADLINE_S, record
 from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
 from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, planned, spool_upload, upload_now
 from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, verify_remote
-from shadowhound_data_logger.bags.watch import Step, Watch
+from shadowhound_data_logger.bags.watch import Watch, WatchStep
 from shadowhound_data_logger.cli.common import as_json, robot_name, the_home, the_store
 from shadowhound_data_logger.cli.output import (
     duration,
@@ -104,9 +104,9 @@ def bag_list(*, since: str, robot: str, as_json: bool) -> int:
     with the_store(STORE_THREADS) as store:
         where, away = store.describe(), ''
         try:
-            rows = overview(store, robot, the_home(), since_ns=begin_ns)
+            rows = bag_overview(store, robot, the_home(), since_ns=begin_ns)
         except StoreUnavailable as error:
-            rows, away = overview(MemoryStore(name='no store'), robot, the_home(), since_ns=begin_ns), str(error)
+            rows, away = bag_overview(MemoryStore(name='no store'), robot, the_home(), since_ns=begin_ns), str(error)
             click.echo(f'The store is away, so this is what is on this machine: {away}', err=True)
     if as_json:
         print_json([with_dates(asdict(row)) for row in rows])
@@ -163,7 +163,7 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> int
 @bag.command('fetch')
 @click.argument('bag', metavar='BAG')
 @click.option('--to', type=click.Path(path_type=Path, file_okay=False), required=True, help='The folder above that of the bag.')
-@click.option('--threads', type=click.IntRange(1, 32), default=THREADS, show_default=True, help='Files at a time.')
+@click.option('--threads', type=click.IntRange(1, 32), default=FETCH_THREADS, show_default=True, help='Files at a time.')
 @_robot
 @as_json
 def bag_fetch(*, bag: str, to: Path, threads: int, robot: str, as_json: bool) -> int:
@@ -468,7 +468,7 @@ def _told_upload(found: Uploaded) -> str:
     return f'{name}: {number(left)} of {number(found.files)} files wait in the spool for the store{why}'
 
 
-def _tell(steps: list[Step], as_json: bool) -> None:
+def _tell(steps: list[WatchStep], as_json: bool) -> None:
     for step in steps:
         if as_json:
             print_json(asdict(step), is_line=True)

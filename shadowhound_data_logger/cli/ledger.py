@@ -28,7 +28,8 @@ from shadowhound_data_logger.cli.output import (
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT, Gap
-from shadowhound_data_logger.spool.ledger import imbalances, journal, read
+from shadowhound_data_logger.spool.ledger import imbalances, journal
+from shadowhound_data_logger.spool.ledger import read as read_ledger
 from shadowhound_data_logger.spool.status import robots
 from shadowhound_data_logger.times import moment
 
@@ -82,7 +83,7 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
     if again:
         raise click.UsageError('--again is for --verify or --deep')
     names = robots(folder)
-    found = read(folder, _robot(folder))
+    found = read_ledger(folder, _robot(folder))
     found['robots'] = names if len(names) > 1 else [found['robot']]  # a spool that several share has one ledger of them all
     if as_json:
         print_json(found)

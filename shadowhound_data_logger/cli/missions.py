@@ -28,7 +28,7 @@ from shadowhound_data_logger.cli.output import (
 )
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.missions.child import Replayer
-from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder
 from shadowhound_data_logger.missions.overview import ACTIVE, export, find, is_sending, overview, overviews
 from shadowhound_data_logger.untrusted import csv_cell
 
@@ -64,9 +64,9 @@ def list_(*, as_json: bool) -> int:
     if as_json:
         print_json(found)
     elif not found:
-        click.echo(f'No mission has been logged in {where / FOLDER} yet. SHADOWHOUND_HOME names the folder above it.')
+        click.echo(f'No mission has been logged in {where / MISSIONS} yet. SHADOWHOUND_HOME names the folder above it.')
     else:
-        print_page(_table(found), *_verdict(found, is_sending=is_sending(where / FOLDER)))
+        print_page(_table(found), *_verdict(found, is_sending=is_sending(where / MISSIONS)))
     return 1 if _late(found) else 0
 
 

@@ -38,7 +38,8 @@ from shadowhound_data_logger.spool.index import MISSING, Index
 from shadowhound_data_logger.spool.listing import HERE, Heap, heaps, objects
 from shadowhound_data_logger.spool.listing import retry as retry_objects
 from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.spool.status import limits, read, robots
+from shadowhound_data_logger.spool.status import limits, robots
+from shadowhound_data_logger.spool.status import read as read_status
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 MOST: Final = 1000
@@ -129,7 +130,7 @@ def _overview(folder: Path, *, as_json: bool) -> int:
     clock = SystemClock.of_this_machine()
     with _opened(folder) as index:
         found = heaps(index)
-    running = [name for name in robots(folder) if read(folder, name, clock)['running']]
+    running = [name for name in robots(folder) if read_status(folder, name, clock)['running']]
     quarantined = sum(heap.objects for heap in found if heap.state == State.QUARANTINED.value)
     if as_json:
         said = [{**asdict(heap), 'oldest': iso(heap.oldest_ns)} for heap in found]

@@ -31,7 +31,8 @@ from shadowhound_data_logger.cli.output import (
 )
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
 from shadowhound_data_logger.spool.gaps import EXACT
-from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, read, robots
+from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, robots
+from shadowhound_data_logger.spool.status import read as read_status
 
 LOSSES: Final = ('dropped', 'rejected')
 """Columns that appear once there is something in them."""
@@ -72,7 +73,7 @@ def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, sp
 def _look(spool: Path, robot: str | None, clock: Clock) -> dict[str, Any]:
     """The robot asked for, else the first that runs, else the first there is; ``others`` are those that run as well."""
     names = [robot] if robot else robots(spool) or ['thor']
-    found = [read(spool, name, clock) for name in names]
+    found = [read_status(spool, name, clock) for name in names]
     chosen = next((each for each in found if each['running']), found[0])
     return {**chosen, 'others': [each['robot'] for each in found if each['running'] and each is not chosen]}
 

@@ -40,7 +40,7 @@ while it writes them."""
 _AWKWARD: Final = b'7.038531e-26'
 """The shortest decimal of a float32 that comes out as its neighbour when it is read by way of a float64, as JSON readers
 do; there is no other (and its negative) among all float32."""
-Record = Callable[[Job, Sample, Any], dict[str, Any]]
+ToRecord = Callable[[Job, Sample, Any], dict[str, Any]]
 """From a decoded message to what is written of it."""
 Convert = Callable[[Any], dict[str, Any]]
 _BYTES: Final = frozenset({'uint8', 'byte', 'char', 'octet'})
@@ -67,7 +67,7 @@ def encode_records(job: Job, rejections: Rejections) -> Payload | None:
     return Payload(body, tuple(kept), 'json', 'application/json')
 
 
-def _records(job: Job, record: Record, kept: list[Sample], rejections: Rejections) -> Iterator[dict[str, Any]]:
+def _records(job: Job, record: ToRecord, kept: list[Sample], rejections: Rejections) -> Iterator[dict[str, Any]]:
     """What can be decoded of the batch, in its order; adds each such sample to ``kept``."""
     for sample in job.batch.samples:
         try:

@@ -19,7 +19,7 @@ from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.lake import shards
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prefetch import Prefetch
-from shadowhound_data_logger.lake.samples import POSE_GAP_NS, Near, Sample, Samples, Window, is_complete
+from shadowhound_data_logger.lake.samples import POSE_GAP_NS, AlignedSample, Near, Samples, Window, is_complete
 from shadowhound_data_logger.lake.track import Object, Track
 
 if TYPE_CHECKING:
@@ -75,10 +75,10 @@ class MissionDataset:
     def __len__(self) -> int:
         return int(self._ends[-1]) if len(self._ends) else 0
 
-    def __getitem__(self, index: int) -> Sample:
+    def __getitem__(self, index: int) -> AlignedSample:
         return self._samples().sample(*self._at(self._reference(index)))
 
-    def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
+    def __getitems__(self, indices: Sequence[int]) -> list[AlignedSample]:
         """Several at once, whose objects are read at the same time; torch's DataLoader asks for whole batches so."""
         wanted = [self._at(self._reference(index)) for index in indices]
         objects = [each for track, number, _ in wanted for each in self._selection.needed(track, number)]
@@ -126,7 +126,7 @@ class MissionDataset:
         """
         return MissionStream(self, seed if shuffle else None, (rank, ranks))
 
-    def streamed(self, share: tuple[int, int], seed: int | None, epoch: int) -> Iterator[Sample]:
+    def streamed(self, share: tuple[int, int], seed: int | None, epoch: int) -> Iterator[AlignedSample]:
         """One share of (share, shares) of one epoch of a stream."""
         references = shards.order(self._selection.anchors, self._chosen, share=share, seed=seed, epoch=epoch)
         with Prefetch(self._place.read, KEEP_BYTES, THREADS) as prefetch:
@@ -209,7 +209,7 @@ class MissionStream:
         """
         self._epoch = epoch
 
-    def __iter__(self) -> Iterator[Sample]:
+    def __iter__(self) -> Iterator[AlignedSample]:
         worker, workers = shards.worker_share()
         share = self._part[0] * workers + worker, self._part[1] * workers
         epoch, self._epoch = self._epoch, self._epoch + 1

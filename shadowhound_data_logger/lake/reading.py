@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from shadowhound_data_logger.catalogue.gaps import GAPS, KINDS
+from shadowhound_data_logger.catalogue.gaps import GAPS, STATEMENT_KINDS
 from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
 from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
 from shadowhound_data_logger.errors import ObjectRefused
@@ -257,7 +257,7 @@ def _is_sane(table: pa.Table, of: TableSchema) -> pa.ChunkedArray:
         named = [each for each in pc.unique(table['bucket']).to_pylist() if each is not None and is_name(each)]
         sane = pc.and_(sane, pc.is_in(table['bucket'], value_set=pa.array(named, pa.string())))
     if 'what' in table.column_names:
-        sane = pc.and_(sane, pc.is_in(table['what'], value_set=pa.array(KINDS)))
+        sane = pc.and_(sane, pc.is_in(table['what'], value_set=pa.array(STATEMENT_KINDS)))
     for name in (name for name in _COUNTS if name in table.column_names):
         sane = pc.and_(sane, pc.fill_null(pc.greater_equal(table[name], 0), fill_value=name not in of.required))
     if {'from_ns', 'to_ns'}.issubset(table.column_names):

@@ -20,7 +20,7 @@ from shadowhound_data_logger.lake.track import Object, Track
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-Sample = dict[str, Any]
+AlignedSample = dict[str, Any]
 POSE_GAP_NS: Final = 1_500_000_000
 """As on the robot: between poses that are farther apart there is none (capture/pose_track.py)."""
 DECODED_BYTES: Final = 48 << 20
@@ -114,11 +114,11 @@ class Samples:
         self._decoded: OrderedDict[tuple[str, str, str], tuple[Any, int]] = OrderedDict()
         self._decoded_bytes = 0
 
-    def sample(self, track: Track, number: int, member: int = 0) -> Sample:
+    def sample(self, track: Track, number: int, member: int = 0) -> AlignedSample:
         """The sample of the message ``member`` of an object of an anchor. Raises StoreError, LakeError."""
         wanted = track.object(number)
         name, content, stamp_ns = self._anchor(track, number, member, wanted)
-        sample: Sample = {
+        sample: AlignedSample = {
             name: content,
             'stamp_ns': np.int64(stamp_ns),
             'pose': track.pose_at(number, stamp_ns, POSE_GAP_NS).copy(),
@@ -149,7 +149,7 @@ class Samples:
         found: list[ArchiveMember] = self._once(('members', wanted.bucket, wanted.key), wanted, read)
         return found
 
-    def _aligned(self, sensor: str, how: Near | Window, robot: str, stamp_ns: int) -> Sample:
+    def _aligned(self, sensor: str, how: Near | Window, robot: str, stamp_ns: int) -> AlignedSample:
         like = self._selection.like(robot, sensor)
         side = like if like is not None and like.robot == robot else None
         if isinstance(how, Window):
@@ -265,6 +265,6 @@ def _seconds(away_ns: int | None) -> Any:
     return np.float64(np.nan if away_ns is None else away_ns / SECOND)
 
 
-def is_complete(sample: Sample, aligned: Mapping[str, Near | Window]) -> bool:
+def is_complete(sample: AlignedSample, aligned: Mapping[str, Near | Window]) -> bool:
     """Whether the pose and all aligned sensors are there; of a window one message is enough."""
     return not bool(np.isnan(sample['pose']).any()) and all(bool(np.any(sample[f'{name}_ok'])) for name in aligned)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger.catalogue.schema import SENSOR
+from shadowhound_data_logger.catalogue.schema import SENSOR, Row
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import query  # first: it turns Daft's telemetry off
@@ -20,8 +20,6 @@ from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.untrusted import MOST_MEMBERS
 
 from daft import col  # isort: skip
-
-Row = dict[str, Any]
 
 
 def place(source: Bucket | Path | str | None) -> tuple[Place, Bucket]:

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock, SystemClock
 from shadowhound_data_logger.missions import journal
-from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missions
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ class MissionFinder:
     def _find(self) -> None:
         """Take up what is new; once more after a change, because two changes may have one time."""
         try:
-            changed_ns = os.stat(self._home / FOLDER).st_mtime_ns  # noqa: PTH116 - several times a second
+            changed_ns = os.stat(self._home / MISSIONS).st_mtime_ns  # noqa: PTH116 - several times a second
         except FileNotFoundError:
             return
         if changed_ns == self._looked_ns:

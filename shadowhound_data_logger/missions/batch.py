@@ -14,10 +14,10 @@ log = logging.getLogger(__name__)
 
 MOST_POINTS: Final = 1000
 """MLflow's limit of a batch."""
-Part = tuple[Sequence[Point], Mapping[str, str], Mapping[str, str]]
+_Share = tuple[Sequence[Point], Mapping[str, str], Mapping[str, str]]
 
 
-def send(tracking: Tracking, run_id: str, part: Part, refused: Callable[[Exception], None]) -> None:
+def send(tracking: Tracking, run_id: str, part: _Share, refused: Callable[[Exception], None]) -> None:
     """Send; what the server refuses is found by halving, told to ``refused`` and left out. Raises TrackingError."""
     points, params, tags = part
     if not (points or params or tags):
@@ -34,11 +34,11 @@ def send(tracking: Tracking, run_id: str, part: Part, refused: Callable[[Excepti
             refused(error)
 
 
-def _parts(points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> list[Part]:
+def _parts(points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> list[_Share]:
     """What a batch that was refused is sent as; none for a single thing."""
     if len(points) + len(params) + len(tags) <= 1:
         return []
     half = len(points) // 2
-    halves: list[Part] = [(points[:half], {}, {}), (points[half:], {}, {})]
-    singles: list[Part] = [([], {name: value}, {}) for name, value in params.items()]
+    halves: list[_Share] = [(points[:half], {}, {}), (points[half:], {}, {})]
+    singles: list[_Share] = [([], {name: value}, {}) for name, value in params.items()]
     return [*halves, *singles, *(([], {}, {name: value}) for name, value in tags.items())]

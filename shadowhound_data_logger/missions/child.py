@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.missions.folder import FOLDER
+from shadowhound_data_logger.missions.folder import MISSIONS
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ class Replayer:
     def start(self) -> None:
         """Returns at once. A machine that cannot start it now has another chance at ``look``."""
         _let_go[:] = [process for process in _let_go if process.poll() is None]
-        folder = self._home / FOLDER
+        folder = self._home / MISSIONS
         command = [sys.executable, '-m', 'shadowhound_data_logger.missions.replay',
                    '--home', str(self._home), '--experiment', self._experiment]  # fmt: skip
         path = os.pathsep.join(filter(None, (self._environ.get('PYTHONPATH'), PACKAGE)))

@@ -32,7 +32,7 @@ from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import MAX_NAME_BYTES, check_name
 from shadowhound_data_logger.missions.journal import Line, dated, read
 
-FOLDER: Final = 'missions'
+MISSIONS: Final = 'missions'
 UNIQUE_BYTES: Final = 4
 """Of the random end of a mission's id: another robot may begin a patrol in the same second."""
 _UNSAFE: Final = re.compile(r'[^A-Za-z0-9_.-]+')
@@ -156,10 +156,10 @@ class MissionFolder:
 def missions(home: Path) -> Iterator[MissionFolder]:
     """All missions of a home, the newest last as far as their names tell. Raises OSError but for a missing folder."""
     try:
-        names = sorted(entry.name for entry in os.scandir(home / FOLDER) if entry.is_dir() and not entry.name.startswith('.'))
+        names = sorted(entry.name for entry in os.scandir(home / MISSIONS) if entry.is_dir() and not entry.name.startswith('.'))
     except FileNotFoundError:
         return
-    yield from (MissionFolder(home / FOLDER / name) for name in names)
+    yield from (MissionFolder(home / MISSIONS / name) for name in names)
 
 
 def safe_type(mission_type: str) -> str:
@@ -177,9 +177,9 @@ def stamped(mission_type: str, start_ns: int) -> str:
 
 def new_folder(home: Path, mission_type: str, start_ns: int) -> MissionFolder:
     """Make the folder of a new mission, readable by its owner alone. Raises OSError."""
-    (home / FOLDER).mkdir(mode=0o700, parents=True, exist_ok=True)
+    (home / MISSIONS).mkdir(mode=0o700, parents=True, exist_ok=True)
     while True:
-        folder = MissionFolder(home / FOLDER / f'{stamped(mission_type, start_ns)}_{secrets.token_hex(UNIQUE_BYTES)}')
+        folder = MissionFolder(home / MISSIONS / f'{stamped(mission_type, start_ns)}_{secrets.token_hex(UNIQUE_BYTES)}')
         try:
             folder.path.mkdir(mode=0o700)
         except FileExistsError:

@@ -65,7 +65,7 @@ class Cloud(NamedTuple):
     xyz: NDArray[np.float32]
 
 
-Fact = Reading | Pose | Frame | Cloud
+MissionFact = Reading | Pose | Frame | Cloud
 
 
 class Floor:
@@ -119,7 +119,7 @@ class NodeLog:
         self._odometer = Odometer(max_speed_mps)
         self._max_speed_mps = max_speed_mps
         self._lock = threading.Lock()
-        self._waiting: list[Fact] = []
+        self._waiting: list[MissionFact] = []
         self._floor = Floor()
         self._frame_id = ''
         self._poses: list[Pose] = []
@@ -139,7 +139,7 @@ class NodeLog:
         self._frames = story.counts['frame']
         self._floor.load(self.mission.folder.floor)
 
-    def add(self, fact: Fact) -> None:
+    def add(self, fact: MissionFact) -> None:
         """Take what was seen; what is not of the mission's time is left out when it is written."""
         with self._lock:
             if len(self._waiting) < MOST_WAITING:

@@ -21,7 +21,7 @@ from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.missions import copies, values
 from shadowhound_data_logger.missions.dating import now_ns
-from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, new_folder, safe_type, stamped
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, new_folder, safe_type, stamped
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.missions.story import BATTERY, FAILED, FINISHED, TEMPERATURE
 
@@ -273,7 +273,7 @@ class Beginning:
     def nothing(self, mission_type: str) -> Mission:
         """A mission that is over: all its calls do nothing. For a disk that takes no journal."""
         name = stamped(values.text(mission_type, values.MAX_PARAM), now_ns(self.clock))
-        folder = MissionFolder(self.home / FOLDER / f'{name}_unlogged')
+        folder = MissionFolder(self.home / MISSIONS / f'{name}_unlogged')
         mission = Mission(folder, Journal(folder.journal), 0.0, self.clock)
         mission.end()
         return mission

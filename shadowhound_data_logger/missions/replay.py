@@ -29,7 +29,7 @@ from shadowhound_data_logger.errors import DataLoggerError, TrackingRefused, Tra
 from shadowhound_data_logger.missions.dating import give_date
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.drawing import Drawing
-from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, missions, write_json
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, write_json
 from shadowhound_data_logger.missions.objects import Shelf
 from shadowhound_data_logger.missions.overview import LOCK, STATE
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
@@ -222,7 +222,7 @@ class Replay:
         state: dict[str, object] = {'pid': 0 if ended else os.getpid(), 'errors': errors}
         if state != self._told:
             try:
-                write_json(self._home / FOLDER / STATE, state)
+                write_json(self._home / MISSIONS / STATE, state)
             except OSError as error:
                 self._say(STATE, error)
             else:
@@ -282,7 +282,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format='%(asctime)s %(levelname)s %(message)s')
     parent = Parent(sys.stdin.fileno())
     with ExitStack() as opened:
-        while not opened.enter_context(flock(options.home / FOLDER / LOCK, wait=False)):
+        while not opened.enter_context(flock(options.home / MISSIONS / LOCK, wait=False)):
             opened.close()
             parent.wait(LOOK_EVERY_S)
             if parent.gone or asked:

@@ -26,7 +26,7 @@ from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from shadowhound_data_logger.config import FOREIGN
+from shadowhound_data_logger.config import NOT_SETTINGS
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.sim.messages import SimulatedSensor, SimulatedTopic, sources
 from shadowhound_data_logger.sim.world import World
@@ -55,7 +55,7 @@ class SimSettings:
     @classmethod
     def load(cls, parameters: Mapping[str, Any]) -> SimSettings:
         """Raises SettingError for a parameter that is unknown or wrong."""
-        given = {name: value for name, value in parameters.items() if name.split('.')[0] not in FOREIGN}
+        given = {name: value for name, value in parameters.items() if name.split('.')[0] not in NOT_SETTINGS}
         specs = {spec.name: spec for spec in fields(cls)}
         for name, value in given.items():
             if name not in specs:

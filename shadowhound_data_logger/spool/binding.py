@@ -20,7 +20,7 @@ from shadowhound_data_logger.model import Binding, SpooledObject, State
 from shadowhound_data_logger.spool.files import Tree, describe
 from shadowhound_data_logger.spool.index import MISSING, Index, spooled
 
-Row = Mapping[str, Any]
+_Row = Mapping[str, Any]
 """As of ``Index.full_row``."""
 
 
@@ -32,7 +32,7 @@ def bind(index: Index, tree: Tree, bindings: Sequence[Binding], now_ns: int) -> 
     """
     for binding in bindings:
         check_key(binding.key)
-    before: list[Row] = []
+    before: list[_Row] = []
     with index.transaction(undo=lambda: _put_back(tree, before)):
         for binding in bindings:
             row = index.full_row(binding.id)
@@ -83,17 +83,17 @@ def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:
     return False
 
 
-def _to_part(tree: Tree, row: Row) -> bool:
+def _to_part(tree: Tree, row: _Row) -> bool:
     """Whether a held file does not lie under its provisional name any more. One that is gone is the uploader's to notice."""
     path = _held_path(tree, row)
     return tree.place(path, tree.part(row['id'])) or tree.size(path) is None
 
 
-def _held_path(tree: Tree, row: Row) -> Path:
+def _held_path(tree: Tree, row: _Row) -> Path:
     return tree.path(State.HELD, row['reason'], row['bucket'], row['key'])
 
 
-def _change(index: Index, row: Row, binding: Binding, now_ns: int) -> None:
+def _change(index: Index, row: _Row, binding: Binding, now_ns: int) -> None:
     key = free_key(index, row['bucket'], binding.key, row['key'])
     metadata = {**binding.metadata, words.SHA256: row['sha256']}
     created_ns = row['created_ns']
@@ -102,7 +102,7 @@ def _change(index: Index, row: Row, binding: Binding, now_ns: int) -> None:
     index.set_bound(key, binding, metadata, created_ns)
 
 
-def _put_back(tree: Tree, before: Sequence[Row]) -> None:
+def _put_back(tree: Tree, before: Sequence[_Row]) -> None:
     """After a failure, with the transaction still open. What fails here as well is found in its part."""
     for row in before:
         with suppress(OSError):
@@ -110,7 +110,7 @@ def _put_back(tree: Tree, before: Sequence[Row]) -> None:
         tree.place(tree.part(row['id']), _held_path(tree, row))
 
 
-def _describe(path: Path, row: Row) -> None:
+def _describe(path: Path, row: _Row) -> None:
     said: Mapping[str, object] = {
         'bucket': row['bucket'], 'key': row['key'], 'sha256': row['sha256'], 'content_type': row['content_type'],
         'sensor': row['sensor'], 'topic': row['topic'], 'type': row['type'], 'samples': row['samples'],

@@ -181,7 +181,7 @@ class Spool:
         return self.free_bytes() >= self._settings.min_free_bytes // 2
 
     def carry(self, sink: str) -> None:
-        """Take over what this robot's ended sessions left open in a sink. Once, before anything is counted there."""
+        """Carry over what this robot's ended sessions left open in a sink. Call it once, before anything is counted there."""
         with self._lock:
             if self._session is not None:
                 with self._index.transaction():

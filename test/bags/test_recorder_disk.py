@@ -15,7 +15,7 @@ from clocks import Clocks
 from pyarrow.parquet import read_table
 
 from shadowhound_data_logger.bags.naming import BUCKET
-from shadowhound_data_logger.bags.overview import overview
+from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.mcap.writer import SliceWriter
@@ -181,11 +181,11 @@ def test_slices_that_are_given_up_after_the_end_are_told_on_the_robot(tmp_path: 
         start(it.recorder)
         it.hear(range(20), size=100_000)
         it.recorder.stop()
-        (row,) = overview(MemoryStore(), ROBOT, it.home)
+        (row,) = bag_overview(MemoryStore(), ROBOT, it.home)
         assert (row.state, row.finding) == ('complete', '')
         more = DataObject(bucket=BUCKET, key='more', body=bytes(3 << 20), content_type='', sensor='imu', topic=None, type='',
                           samples=0, t_start_ns=0, t_end_ns=0, priority=1)  # fmt: skip
         it.spool.commit([more])
-        (row,) = overview(MemoryStore(), ROBOT, it.home)
+        (row,) = bag_overview(MemoryStore(), ROBOT, it.home)
         assert row.state == 'growing'
         assert row.finding == '1 of 1 slices are not here; 1 were given up by the full spool of this machine'

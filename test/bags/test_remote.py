@@ -11,7 +11,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.naming import BUCKET
-from shadowhound_data_logger.bags.overview import BagRow, named_ns, overview
+from shadowhound_data_logger.bags.overview import BagRow, bag_overview, named_ns
 from shadowhound_data_logger.bags.remote import find_bag, find_bags, natural
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import BagError
@@ -21,7 +21,7 @@ from shadowhound_data_logger.stores.memory import MemoryStore
 
 
 def row(store: MemoryStore | DirectoryStore, home: Path, name: str = NAME) -> BagRow:
-    return next(each for each in overview(store, 'thor', home) if each.bag == name)
+    return next(each for each in bag_overview(store, 'thor', home) if each.bag == name)
 
 
 def test_a_complete_bag(tmp_path: Path) -> None:
@@ -77,9 +77,9 @@ def test_only_those_since(tmp_path: Path) -> None:
     for name in (NAME, 'patrol_20240101_000000'):
         write_ours(tmp_path / name, slices=1, each=10)
         stored(store, tmp_path / name)
-    assert [each.bag for each in overview(store, 'thor', tmp_path, since_ns=T0)] == [NAME]
-    assert overview(store, 'thor', tmp_path, since_ns=T0 + SECOND) == []
-    assert overview(store, 'tachi', tmp_path) == []
+    assert [each.bag for each in bag_overview(store, 'thor', tmp_path, since_ns=T0)] == [NAME]
+    assert bag_overview(store, 'thor', tmp_path, since_ns=T0 + SECOND) == []
+    assert bag_overview(store, 'tachi', tmp_path) == []
 
 
 def test_a_name_that_is_none_is_answered_with_near_ones(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from shadowhound_data_logger.bags.naming import slice_number
 from shadowhound_data_logger.bags.notes import Notes
-from shadowhound_data_logger.bags.overview import overview
+from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.clock import SECOND
@@ -116,14 +116,14 @@ def test_a_bag_that_ends_before_the_clock_is_set_waits_for_it(tmp_path: Path) ->
         assert it.recorder._salvage.is_busy
         assert it.objects() == {}
         assert it.row()['open'] == 3
-        (row,) = overview(MemoryStore(), ROBOT, it.home)
+        (row,) = bag_overview(MemoryStore(), ROBOT, it.home)
         assert (row.bag, row.where) == (name, {'recording': 1})
         clock.set(NOON_NS)
         is_whole(it)
         found = it.objects()
         assert bags_of(found) == {'patrol_20251018_120000': [0, 1, 2]}
         assert manifest(found, 'patrol_20251018_120000')['state'] == 'complete'
-        (row,) = overview(MemoryStore(), ROBOT, it.home)
+        (row,) = bag_overview(MemoryStore(), ROBOT, it.home)
         assert row.t_start_ns == pytest.approx(NOON_NS, abs=SECOND)
         assert (it.row()['stored'], it.row()['received'], it.row()['open']) == (3, 3, 0)
         assert not list(it.root.iterdir())
@@ -143,7 +143,7 @@ def test_a_clock_that_is_not_set_for_too_long(tmp_path: Path) -> None:
         assert bags_of(found) == {UNSET: [0, 1, 2]}
         said = manifest(found, UNSET)['clock']
         assert (said['known'], said['offset_ns']) == ('unset', None)
-        (row,) = [row for row in overview(MemoryStore(), ROBOT, it.home) if row.bag == UNSET]
+        (row,) = [row for row in bag_overview(MemoryStore(), ROBOT, it.home) if row.bag == UNSET]
         assert (row.state, row.messages, row.t_start_ns) == ('complete', 3, None)
         item = next(item for item in it.spool.pending(10) if item.key.endswith('.mcap'))
         assert {name: item.metadata[name] for name in ('clock', 'boot_id', 'boot_start_ns', 'boot_end_ns')} == {

@@ -18,7 +18,7 @@ from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.delivery import Delivery
-from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, write_json
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, write_json
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.missions.overview import BRIEF, LOCK, overview, overviews
 
@@ -39,7 +39,7 @@ def fly(home: Path, mission_type: str = 'patrol') -> str:
 
 def see(home: Path, mission_id: str) -> None:
     """What a node beside the agent logged."""
-    node = MissionFolder(home / FOLDER / mission_id).node
+    node = MissionFolder(home / MISSIONS / mission_id).node
     node.files.mkdir(parents=True)
     writer = Journal(node.journal)
     writer.create()
@@ -48,7 +48,7 @@ def see(home: Path, mission_id: str) -> None:
 
 
 def deliver(home: Path, mission_id: str) -> None:
-    delivery = Delivery(MissionFolder(home / FOLDER / mission_id), FakeTracking(), FakeShelf())  # type: ignore[arg-type]
+    delivery = Delivery(MissionFolder(home / MISSIONS / mission_id), FakeTracking(), FakeShelf())  # type: ignore[arg-type]
     while not delivery.complete():
         delivery.track()
         delivery.attach()
@@ -59,7 +59,7 @@ def test_without_a_mission_it_says_where_it_looked(tmp_path: Path) -> None:
     """That is fine, and no error."""
     found = run(tmp_path, 'list')
     assert found.return_value == 0
-    assert f'No mission has been logged in {tmp_path / FOLDER} yet' in found.output
+    assert f'No mission has been logged in {tmp_path / MISSIONS} yet' in found.output
     assert json.loads(run(tmp_path, 'list', '--json').output) == []
 
 
@@ -82,7 +82,7 @@ def test_the_list_tells_what_is_not_sent(tmp_path: Path) -> None:
 def test_what_somebody_sends_already_needs_no_resume(tmp_path: Path) -> None:
     """While an agent's sender is at it the list says so, and asks for nothing."""
     fly(tmp_path)
-    with flock(tmp_path / FOLDER / LOCK):
+    with flock(tmp_path / MISSIONS / LOCK):
         text = run(tmp_path, 'list').output
     assert '1 not sent whole: being sent' in text
     assert 'resume' not in text
@@ -93,10 +93,10 @@ def test_a_list_does_not_read_what_is_sent(tmp_path: Path) -> None:
     mission_id = fly(tmp_path)
     deliver(tmp_path, mission_id)
     (before,) = overviews(tmp_path)
-    whole = overview(MissionFolder(tmp_path / FOLDER / mission_id))
+    whole = overview(MissionFolder(tmp_path / MISSIONS / mission_id))
     assert whole is not None
     assert before == {name: whole[name] for name in BRIEF}
-    (tmp_path / FOLDER / mission_id / 'journal').unlink()
+    (tmp_path / MISSIONS / mission_id / 'journal').unlink()
     assert overviews(tmp_path) == [before]
 
 
@@ -131,7 +131,7 @@ def test_a_page_tells_why_something_is_not_sent(tmp_path: Path) -> None:
     mission_id = fly(tmp_path)
     see(tmp_path, mission_id)
     error = TrackingUnavailable('Tower is away', remedy='is it on?')
-    write_json(tmp_path / FOLDER / 'replay.json', {'errors': {'tracking': {'error': str(error), 'remedy': error.remedy}}})
+    write_json(tmp_path / MISSIONS / 'replay.json', {'errors': {'tracking': {'error': str(error), 'remedy': error.remedy}}})
     found = run(tmp_path, 'show', mission_id)
     assert found.return_value == 1
     for text in (

@@ -35,7 +35,7 @@ from shadowhound_data_logger.bags.description import of_metadata
 from shadowhound_data_logger.bags.fetch import fetch as fetch_bag
 from shadowhound_data_logger.bags.info import info_folder
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.overview import overview
+from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile
 from shadowhound_data_logger.bags.verify import verify_folder
 from shadowhound_data_logger.catalogue import parts, schema
@@ -610,7 +610,7 @@ def metadata(shop: Shop) -> Round:
         folder.mkdir(parents=True)
         (folder / 'metadata.yaml').write_bytes(body)
         with shop.reading():
-            for each in overview(store, 'thor', shop.input / 'home'):
+            for each in bag_overview(store, 'thor', shop.input / 'home'):
                 assert shown_time(each.t_start_ns)
             said(lambda: verify_folder(folder))
             return said(lambda: of_metadata(body, 'x'))
@@ -636,7 +636,7 @@ def manifests(shop: Shop) -> Round:
             files.append(RemoteFile(told, f'thor/rosbags/a/{name}', rng.choice(((folder / name).stat().st_size, *NUMBERS[:5]))))
         bag = RemoteBag('thor', 'a' if rng.random() < 0.8 else rng.choice(TEXTS), tuple(files))
         with shop.reading():
-            overview(store, 'thor', shop.input / 'home')
+            bag_overview(store, 'thor', shop.input / 'home')
             said(lambda: verify_folder(folder))
             said(lambda: fetch_bag(store, bag, shop.target, threads=2))
             return said(lambda: Manifest.from_json(body))

@@ -22,7 +22,7 @@ from shadowhound_data_logger.bags.cut import Choice, cut_folder
 from shadowhound_data_logger.bags.description import of_metadata
 from shadowhound_data_logger.bags.info import info_folder
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.overview import overview
+from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.verify import verify_folder
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.format import CHUNK, MAGIC, record, text
@@ -171,7 +171,7 @@ def test_one_bad_bag_does_not_end_the_list(tmp_path: Path) -> None:
     ):  # fmt: skip
         (root / name).mkdir(parents=True)
         (root / name / 'metadata.yaml').write_bytes(body)
-    rows = {row.bag: row for row in overview(store, 'thor', tmp_path / 'home')}
+    rows = {row.bag: row for row in bag_overview(store, 'thor', tmp_path / 'home')}
     assert {name: bool(row.finding) for name, row in rows.items()} == {'deep': True, 'late': True, 'large': True, 'fine': False}
     assert rows['fine'].messages == 1
 

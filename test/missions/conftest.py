@@ -11,7 +11,7 @@ from e2e.wire import Wire
 from missions.server import FOREIGN, Server, end_replayers, until
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.missions.folder import FOLDER, read_json
+from shadowhound_data_logger.missions.folder import MISSIONS, read_json
 from shadowhound_data_logger.sim.tower import Tower
 
 
@@ -38,7 +38,7 @@ def warm_home(tower: Tower, tmp_path_factory: pytest.TempPathFactory) -> Iterato
             patched.setenv(name, value)
         keeper = MissionDataLogger(home=home)
     # The sender of a test's own logger must not be the first: it has that test's wire.
-    until(lambda: read_json(home / FOLDER / 'replay.json').get('pid'), 'the sender is there')
+    until(lambda: read_json(home / MISSIONS / 'replay.json').get('pid'), 'the sender is there')
     yield home
     keeper.close()
     end_replayers(home)

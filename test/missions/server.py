@@ -15,7 +15,7 @@ from typing import Any, Final
 from e2e.wire import Wire
 
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.missions.folder import FOLDER, missions, read_json
+from shadowhound_data_logger.missions.folder import MISSIONS, missions, read_json
 from shadowhound_data_logger.missions.tracking import ENVIRONMENT
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
@@ -40,7 +40,7 @@ def complete(home: Path, count: int = 1) -> bool:
 
 def end_replayers(home: Path) -> None:
     """Kill the replayer of a home that a test leaves behind."""
-    pid = read_json(home / FOLDER / 'replay.json').get('pid')
+    pid = read_json(home / MISSIONS / 'replay.json').get('pid')
     if pid and Path(f'/proc/{pid}').exists() and str(home) in Path(f'/proc/{pid}/cmdline').read_text():
         os.kill(pid, signal.SIGKILL)
 

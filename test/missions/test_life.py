@@ -15,7 +15,7 @@ from missions.server import until
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.missions.copies import SPARES
-from shadowhound_data_logger.missions.folder import FOLDER, missions
+from shadowhound_data_logger.missions.folder import MISSIONS, missions
 from shadowhound_data_logger.missions.recorder import Mission
 
 JPEG = b'\xff\xd8 a picture \xff\xd9'
@@ -141,4 +141,4 @@ def test_a_disk_that_is_full_at_the_start_leaves_nothing_open(tmp_path: Path, mo
             patched.setattr(os, 'write', full)
             assert logger.start_mission('patrol', '').endswith('_unlogged')
         opened = [path.resolve() for path in Path('/proc/self/fd').iterdir()]
-        assert not [path for path in opened if path.is_relative_to(tmp_path / FOLDER)]
+        assert not [path for path in opened if path.is_relative_to(tmp_path / MISSIONS)]

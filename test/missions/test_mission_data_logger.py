@@ -14,7 +14,7 @@ from missions.fakes import journal, journalling, journals
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions import copies
-from shadowhound_data_logger.missions.folder import FOLDER, missions
+from shadowhound_data_logger.missions.folder import MISSIONS, missions
 from shadowhound_data_logger.missions.recorder import Mission
 
 JPEG = b'\xff\xd8 a picture \xff\xd9'
@@ -33,7 +33,7 @@ def test_the_guide_s_calls_are_journalled(tmp_path: Path) -> None:
         logger.end_mission(success=True, distance_m=12.0, duration_s=60.0)
         start, frame, state, trajectory, end = journal(tmp_path)
     assert re.fullmatch(r'patrol_\d{8}_\d{6}_[0-9a-f]{8}', mission_id)
-    folder = tmp_path / FOLDER / mission_id
+    folder = tmp_path / MISSIONS / mission_id
     assert (start['type'], start['command'], start['robot']) == ('patrol', 'go round', 'thor')
     assert (frame['id'], (folder / 'files' / frame['file']).read_bytes()) == (7, JPEG)
     assert (state['m'], state['s']) == ({'battery_pct': 88.0, 'temperature_c': 41.5}, 3)
@@ -169,7 +169,7 @@ def test_a_hostile_type_is_made_safe(tmp_path: Path, given: Any, named: str) -> 
     with journalling(tmp_path) as logger:
         mission_id = logger.start_mission(given, 'x')
     assert re.fullmatch(re.escape(named) + r'_\d{8}_\d{6}_[0-9a-f]{8}', mission_id)
-    assert (tmp_path / FOLDER / mission_id / 'journal').is_file()
+    assert (tmp_path / MISSIONS / mission_id / 'journal').is_file()
     assert journal(tmp_path)[0]['type'] == str(given)
 
 

@@ -17,7 +17,7 @@ from missions.server import Server, complete, until
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
-from shadowhound_data_logger.missions.folder import FOLDER, missions, read_json
+from shadowhound_data_logger.missions.folder import MISSIONS, missions, read_json
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.tracking import DUPLICATE_TAG, MISSION_TAG, MlflowTracking
 
@@ -100,18 +100,18 @@ def test_tower_away_for_the_whole_mission(server: Server, home: Path, tmp_path: 
     given = fly(logger, 'away', tmp_path)
     logger.close()
     assert time.monotonic() - began < 5.0
-    assert (home / FOLDER / given / 'journal').is_file()
-    until(lambda: read_json(home / FOLDER / 'replay.json').get('errors'), 'the replayer says what is wrong')
-    os.kill(read_json(home / FOLDER / 'replay.json')['pid'], signal.SIGKILL)  # the robot is switched off
+    assert (home / MISSIONS / given / 'journal').is_file()
+    until(lambda: read_json(home / MISSIONS / 'replay.json').get('errors'), 'the replayer says what is wrong')
+    os.kill(read_json(home / MISSIONS / 'replay.json')['pid'], signal.SIGKILL)  # the robot is switched off
     server.wire.set(PASS)
     again = MissionDataLogger(home=home)
     until(lambda: complete(home), 'it is sent')
     again.close()
     run_id = server.run('away').info.run_id
-    assert read_json(home / FOLDER / given / 'run.json')['run_id'] == run_id
+    assert read_json(home / MISSIONS / given / 'run.json')['run_id'] == run_id
     until(lambda: len(server.keys(f'thor/missions/{run_id}')) == 4, 'the objects are delivered')
     check(server, 'away', home)
-    until(lambda: not read_json(home / FOLDER / 'replay.json')['pid'], 'the sender ends after its agent')
+    until(lambda: not read_json(home / MISSIONS / 'replay.json')['pid'], 'the sender ends after its agent')
 
 
 @pytest.mark.long('a kill')
@@ -168,9 +168,9 @@ def test_a_wrong_password_costs_no_mission(server: Server, home: Path, tmp_path:
         logger.start_mission('patrol', 'with a wrong password')
         logger.log_metric('a', 1.0, step=0)
         logger.end_mission(True, 1.0, 1.0)
-        wrong = until(lambda: read_json(home / FOLDER / 'replay.json').get('errors'), 'the sender says what is wrong')
+        wrong = until(lambda: read_json(home / MISSIONS / 'replay.json').get('errors'), 'the sender says what is wrong')
         assert 'MLFLOW_TRACKING_PASSWORD' in wrong['tracking']['remedy']
-        assert 'mistyped' not in str(wrong) + (home / FOLDER / 'replay.log').read_text()
+        assert 'mistyped' not in str(wrong) + (home / MISSIONS / 'replay.log').read_text()
         assert not complete(home)
         put(password)
         until(lambda: complete(home), 'it is sent')

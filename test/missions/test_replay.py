@@ -18,7 +18,7 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
-from shadowhound_data_logger.missions.folder import FOLDER, MissionFolder, Run, missions, read_json
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, Run, missions, read_json
 from shadowhound_data_logger.missions.overview import report
 from shadowhound_data_logger.missions.replay import KEEP_S, LINGER_S, Gate, Parent, Replay, open_tracking, run
 
@@ -34,7 +34,7 @@ class Now:
 
 
 def new_replay(home: Path, tracking: FakeTracking, now: Now | None = None) -> Replay:
-    (home / FOLDER).mkdir(parents=True, exist_ok=True)
+    (home / MISSIONS).mkdir(parents=True, exist_ok=True)
     return Replay(home, tracking, FakeShelf(), FakeDrawing(), monotonic=now or Now(), rng=random.Random(1))  # type: ignore[arg-type]
 
 
@@ -79,7 +79,7 @@ def test_an_outage_is_probed_ever_more_rarely(tmp_path: Path) -> None:
     while replay.step():
         pass
     assert not replay.owes
-    assert read_json(tmp_path / FOLDER / 'replay.json')['errors'] == {}
+    assert read_json(tmp_path / MISSIONS / 'replay.json')['errors'] == {}
     assert report(newest).complete
 
 
@@ -102,7 +102,7 @@ def test_a_mission_that_begins_ends_a_pause(tmp_path: Path) -> None:
 
 def test_the_newest_mission_comes_first(tmp_path: Path) -> None:
     """An agent that begins does not wait for the backlog of others, whatever its mission is called."""
-    old = tmp_path / FOLDER / fly(tmp_path, 'zzz')
+    old = tmp_path / MISSIONS / fly(tmp_path, 'zzz')
     old.rename(old.with_name('zzz_20200101_000000_00000000'))
     newest = fly(tmp_path, 'aaa')
     tracking = FakeTracking()
@@ -113,7 +113,7 @@ def test_the_newest_mission_comes_first(tmp_path: Path) -> None:
 def test_a_rotten_mission_does_not_stop_the_others(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """One whose first record is damaged is told of and left, the others are sent."""
     rotten = fly(tmp_path)
-    path = tmp_path / FOLDER / rotten / 'journal'
+    path = tmp_path / MISSIONS / rotten / 'journal'
     path.write_bytes(b'X' + path.read_bytes()[1:])
     whole = fly(tmp_path)
     tracking = FakeTracking()
@@ -131,9 +131,9 @@ def test_a_mission_that_arrived_long_ago_goes(tmp_path: Path) -> None:
     while replay.step():
         pass
     unsent = fly(tmp_path)
-    (tmp_path / FOLDER / unsent / 'sent.json').write_text('{}')
+    (tmp_path / MISSIONS / unsent / 'sent.json').write_text('{}')
     for mission_id in (old, unsent):
-        os.utime(tmp_path / FOLDER / mission_id / 'sent.json', (0, time.time() - KEEP_S - 60))
+        os.utime(tmp_path / MISSIONS / mission_id / 'sent.json', (0, time.time() - KEEP_S - 60))
     new_replay(tmp_path, FakeTracking(fail=lambda _: True)).step()
     assert {folder.mission_id for folder in missions(tmp_path)} == {young, unsent}
 
@@ -215,8 +215,8 @@ def test_a_byte_wakes_it() -> None:
 
 def test_a_second_one_waits_and_ends_with_its_agent(tmp_path: Path) -> None:
     """One a home sends."""
-    (tmp_path / FOLDER).mkdir()
-    with flock(tmp_path / FOLDER / 'replay.lock', wait=False) as mine:
+    (tmp_path / MISSIONS).mkdir()
+    with flock(tmp_path / MISSIONS / 'replay.lock', wait=False) as mine:
         assert mine
         command = [sys.executable, '-m', 'shadowhound_data_logger.missions.replay', '--home', str(tmp_path), '--experiment', 'x']
         waiting = subprocess.Popen(command, stdin=subprocess.PIPE)
@@ -245,9 +245,9 @@ def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_one_that_always_fails_holds_up_no_other(tmp_path: Path, what: str) -> None:
     """A journal that the disk does not give back, an artifact that the server never gets: the older missions arrive."""
     for number in range(3):
-        older = tmp_path / FOLDER / fly(tmp_path)
+        older = tmp_path / MISSIONS / fly(tmp_path)
         older.rename(older.with_name(f'patrol_20200101_00000{number}_00000000'))
-    stuck = tmp_path / FOLDER / fly(tmp_path, 'stuck')
+    stuck = tmp_path / MISSIONS / fly(tmp_path, 'stuck')
     now, tracking = Now(), FakeTracking()
     replay = new_replay(tmp_path, tracking, now)
     if what == 'journal':
@@ -270,7 +270,7 @@ def test_one_that_always_fails_holds_up_no_other(tmp_path: Path, what: str) -> N
 
 def test_a_mission_that_is_beyond_help_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`missions list` tells the cause, not the log alone."""
-    broken = MissionFolder(tmp_path / FOLDER / fly(tmp_path))
+    broken = MissionFolder(tmp_path / MISSIONS / fly(tmp_path))
     monkeypatch.setattr(Delivery, 'track', lambda _: 1 / 0)
     replay = new_replay(tmp_path, FakeTracking(), Now())
     replay.step()
@@ -291,7 +291,7 @@ def test_a_full_disk_does_not_end_the_sender(tmp_path: Path, monkeypatch: pytest
             pass
     assert [folder.sent().complete for folder in missions(tmp_path)] == [True]
     replay.step()
-    assert read_json(tmp_path / FOLDER / 'replay.json')['errors'] == {}
+    assert read_json(tmp_path / MISSIONS / 'replay.json')['errors'] == {}
 
 
 def test_a_mission_that_cannot_be_looked_at_stops_no_other(tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def test_a_mission_that_cannot_be_looked_at_stops_no_other(tmp_path: Path) -> No
             raise OSError(5, 'Input/output error')
         return True
 
-    (tmp_path / FOLDER).mkdir(exist_ok=True)
+    (tmp_path / MISSIONS).mkdir(exist_ok=True)
     replay = Replay(tmp_path, FakeTracking(), FakeShelf(), FakeDrawing(), settle=settle)  # type: ignore[arg-type]
     while replay.step():
         pass
