@@ -1,0 +1,117 @@
+"""Which Python `make setup` takes where no ROS is sourced: one that serves, wherever it is, or a line on what to install.
+
+Each Python here is this one, which says that it is another version; it makes no environment, and the script names it then.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TOOLS = ('awk', 'basename', 'cat', 'cut', 'dirname', 'find', 'flock', 'grep', 'ls', 'mkdir', 'printf', 'pwd', 'rm', 'sed', 'sh',
+         'sha256sum', 'sort', 'tail', 'uname', 'xargs')  # fmt: skip
+PLACES = {'PATH': 'bin/{}', 'pyenv': 'home/.pyenv/versions/{}.1/bin/python3', 'uv': 'uv/{}/bin/python3'}
+
+
+class Machine:
+    """A checkout, a home and a PATH of their own, with the tools that the script needs and no Python."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        (folder / 'bin').mkdir()
+        for tool in TOOLS:
+            if found := shutil.which(tool):
+                (folder / 'bin' / tool).symlink_to(found)
+        checkout = folder / 'checkout'
+        (checkout / 'scripts').mkdir(parents=True)
+        shutil.copy(ROOT / 'scripts' / 'setup', checkout / 'scripts')
+        for name in ('interfaces', 'launch_configs', 'package.xml', 'requirements', 'setup.cfg', 'setup.py'):
+            (checkout / name).symlink_to(ROOT / name)
+
+    def python(self, where: str, version: str, *, makes_venvs: bool = True) -> Path:
+        """One that says that it is of this version, such as 3.12."""
+        path = self.folder / PLACES[where].format(f'python{version}' if where == 'PATH' else version)
+        said = f'import sys; sys.version_info = ({version.replace(".", ", ")}, 1)'
+        hidden = '' if makes_venvs else "; sys.modules['ensurepip'] = None"
+        _program(path, f"""[ "$1" = -c ] || exit 1\nexec {sys.executable} -c "{said}{hidden}; $2"\n""")
+        if where == 'uv':
+            known = self.folder / 'known'
+            with known.open('a') as file:
+                file.write(f'cpython-{version}.1-linux-x86_64-gnu    {path}\n')
+            _program(self.folder / 'bin' / 'uv', f'[ "$1 $2" = "python list" ] && cat {known}\n')
+        return path
+
+    def setup(self) -> str:
+        """What the script says; it never succeeds here."""
+        environ = {'PATH': str(self.folder / 'bin'), 'HOME': str(self.folder / 'home'), 'LANG': os.environ.get('LANG', 'C')}
+        command = [str(self.folder / 'checkout' / 'scripts' / 'setup')]
+        said = subprocess.run(command, capture_output=True, text=True, check=False, env=environ, timeout=60)
+        assert said.returncode == 1
+        return said.stderr
+
+    def taken(self) -> str:
+        """The Python that the script takes."""
+        said = self.setup()
+        found = re.search(r'could not make a virtual environment with (\S+)\.$', said, re.MULTILINE)
+        assert found, said
+        return found[1]
+
+
+def _program(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text('#!/bin/sh\n' + text)
+    path.chmod(0o755)
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    return Machine(tmp_path)
+
+
+def test_the_one_on_the_path(machine: Machine) -> None:
+    """It goes before those of pyenv and uv."""
+    for where, version in (('PATH', '3.12'), ('pyenv', '3.10'), ('uv', '3.11')):
+        machine.python(where, version)
+    assert machine.taken() == 'python3.12'
+
+
+@pytest.mark.parametrize('where', ['pyenv', 'uv'])
+def test_one_that_is_not_on_the_path(machine: Machine, where: str) -> None:
+    """Where the one on PATH is newer than the ROS wheels, and so are others."""
+    machine.python('PATH', '3.13')
+    machine.python(where, '3.14')
+    machine.python(where, '3.9')
+    serves = machine.python(where, '3.11')
+    assert machine.taken() == str(serves)
+
+
+def test_one_that_makes_environments(machine: Machine) -> None:
+    """A Python without venv, as Debian has it, gives way to one that has it."""
+    machine.python('PATH', '3.11', makes_venvs=False)
+    serves = machine.python('uv', '3.12')
+    assert machine.taken() == str(serves)
+
+
+def test_what_is_missing_is_said(machine: Machine) -> None:
+    """A Python that lacks nothing but venv is named, with the package that has it."""
+    machine.python('PATH', '3.11', makes_venvs=False)
+    said = machine.setup()
+    assert 'python3.11 cannot make virtual environments' in said
+    assert 'apt install python3-venv' in said
+
+
+def test_no_python_that_serves(machine: Machine) -> None:
+    """One line says which to install, and how."""
+    for where in ('PATH', 'pyenv', 'uv'):
+        machine.python(where, '3.13')
+    (line,) = machine.setup().splitlines()
+    assert 'no Python 3.10, 3.11 or 3.12 found' in line
+    assert 'uv python install 3.12' in line
+    assert 'make setup PYTHON=' in line
