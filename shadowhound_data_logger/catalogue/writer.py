@@ -6,7 +6,6 @@ yet is the spool index's, and a part takes its rows off it in the transaction th
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -123,6 +122,7 @@ class _GapParts:
         self._robot = robot
         self._clock = clock
         self._version: int | None = None
+        self._again = 0
         self._boots: frozenset[str] = frozenset()
         self._marks: dict[tuple[str, str, int], Watermark] = {}
         self._missing: frozenset[int] = frozenset()
@@ -135,16 +135,18 @@ class _GapParts:
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
             index.open()
             with index.snapshot():
+                told, again = index.gaps.told(self._robot)
                 if self._version is None:
-                    self._version = _told(index, self._robot)
+                    self._version, self._again = told, again
                 newest, began_ns, others = index.gaps.extent(self._robot)
                 is_dated_now = not self._boots.issuperset(offsets) and index.gaps.has_undated()
                 self._boots = frozenset(offsets)
                 before = self._missing
                 self._missing = index.missing(BUCKET, GAPS.prefix(self._robot), sensor=SENSOR)
-                # An index that was made anew begins anew.
-                if is_dated_now or self._version > newest or not self._missing <= before:
-                    self._version = 0
+                is_new_index = self._version > newest
+                if is_dated_now or is_new_index or again != self._again or not self._missing <= before:
+                    self._version, self._again = 0, again
+                    self._marks.clear()
                 found = index.gaps.changed(self._version, MOST_ROWS, offsets)
                 self.has_more = bool(found) and found[-1].version < newest and len(found) >= MOST_ROWS
                 # A watermark must not be in the store before a part with gaps that is told before it.
@@ -201,12 +203,3 @@ class _GapParts:
             ))  # fmt: skip
         made[-1] = replace(made[-1], metadata={**made[-1].metadata, words.GAP_VERSION: str(version)})
         return made
-
-
-def _told(index: Index, robot: str) -> int:
-    """Up to which version of the journal parts were written by whoever was here before; 0 where nobody knows."""
-    said = index.newest_metadata(BUCKET, GAPS.prefix(robot), words.GAP_VERSION)
-    try:
-        return max(0, int(json.loads(said)[words.GAP_VERSION])) if said else 0
-    except (ValueError, TypeError, KeyError):
-        return 0

@@ -35,7 +35,7 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus, delivering
 from shadowhound_data_logger.spool.index import MISSING, Index
-from shadowhound_data_logger.spool.listing import HERE, Heap, heaps, objects
+from shadowhound_data_logger.spool.listing import HERE, Heap, heaps, objects, tell_gaps_again
 from shadowhound_data_logger.spool.listing import retry as retry_objects
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import limits, robots
@@ -124,6 +124,27 @@ def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bo
         if done.gone:
             click.echo(f'{number(done.gone)} are not there any more')
     return 1 if done.gone or (names and done.objects < len(frozenset(names))) else 0
+
+
+@spool.command('tell-gaps')
+@as_json
+@click.pass_obj
+def tell_gaps(folder: Path, *, as_json: bool) -> int:
+    """Send all gaps that the journal remembers to the store again, where it lost some of their files.
+
+    A node that runs does so within a minute (catalogue.period_s). What is older than spool.remember_days cannot be told again.
+    """
+    _check(folder)
+    try:
+        rows = tell_gaps_again(folder)
+    except sqlite3.Error as error:
+        remedy = 'is it yours, and its disk neither full nor read-only?'
+        raise SpoolError(f'the spool {folder} cannot be changed: {error}', remedy=remedy) from error
+    if as_json:
+        print_json({'rows': rows})
+    else:
+        click.echo(f'{number(rows)} rows of the gap journal are told again with the next part')
+    return 0
 
 
 def _overview(folder: Path, *, as_json: bool) -> int:

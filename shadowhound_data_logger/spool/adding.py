@@ -113,6 +113,8 @@ class Adding:
                 return
             metadata |= self._repeats.stored(item, key, sha256)
         number = self._index.insert(item, key, sha256, state, reason, metadata, self._now_ns)
+        if words.GAP_VERSION in item.metadata:
+            self._index.gaps.set_told(item.metadata[words.ROBOT], int(item.metadata[words.GAP_VERSION]))
         path = self._tree.part(number)
         if state in {State.PENDING, State.HELD}:
             said = description(item, key, sha256, metadata)

@@ -73,13 +73,27 @@ class Deliveries:
         self._notes.unlink(missing_ok=True)
 
     def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]:
-        """What is delivered and not noted yet, by number and as the store has to describe it."""
+        """What is delivered and not noted yet, as the store has to describe it: at first what has a full row, by number.
+
+        A row that becomes a short one meanwhile is asked for once.
+        """
         last = 0
+        asked: set[int] = set()
         while page := self._of_index(partial(self._index.delivered, last, PAGE)):
-            noted = {number for (number,) in self._ask('SELECT id FROM sound WHERE id > ? AND id <= ?', last, page[-1][0])}
             last = page[-1][0]
-            if left := [(number, item) for number, item in page if number not in noted]:
-                yield left
+            asked.update(number for number, _ in page)
+            yield from self._not_noted(page)
+        place = (0, '')
+        while True:
+            page, place = self._of_index(partial(self._index.delivered_compact, place, PAGE))
+            if not page:
+                return
+            yield from self._not_noted([(number, item) for number, item in page if number not in asked])
+
+    def _not_noted(self, page: list[tuple[int, ObjectInfo]]) -> Iterator[list[tuple[int, ObjectInfo]]]:
+        noted = {number for number, _ in page if self._ask('SELECT 1 FROM sound WHERE id = ?', number)}
+        if left := [(number, item) for number, item in page if number not in noted]:
+            yield left
 
     def note(self, ids: Iterable[int]) -> None:
         """These are sound."""

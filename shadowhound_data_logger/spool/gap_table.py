@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
-from shadowhound_data_logger.spool.gaps import FORGOTTEN, LATELY_NS, OBJECTS, Gap, GapRow, TakenBack, Watermark, split
+from shadowhound_data_logger.spool.gaps import FORGOTTEN, LATELY_NS, OBJECTS, UNTIMED, Gap, GapRow, TakenBack, Watermark, split
 from shadowhound_data_logger.spool.schema import MERGE, NEXT_VERSION
 
 MOST_WAITING: Final = 5_000
@@ -21,6 +21,17 @@ SELECT session, robot, started_ns, received = skipped + stored
 FROM accounts JOIN sessions ON id = session
 WHERE session > (SELECT max(id) FROM sessions) - 20 AND first_ns >= ? AND accounting IN ('exact', 'estimated')
 ORDER BY robot, topic, session"""
+MOST_ROWS: Final = 500_000
+"""Of the journal, some 100 MB: three days of a topic that loses messages in every second are 259,200."""
+_WHOLE_ROW: Final = 'SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged FROM gaps'
+_TOLD: Final = """version <= CASE session WHEN 0 THEN (SELECT ifnull(max(version), 0) FROM gaps_told) ELSE ifnull((
+    SELECT told.version FROM gaps_told AS told JOIN sessions USING (robot) WHERE sessions.id = gaps.session), 0) END"""
+"""Whether the store is told of a row; those of objects have no session."""
+_FORGETTABLE: Final = f"""{_WHOLE_ROW} WHERE begin_ns BETWEEN ? AND ? AND ifnull(to_ns, begin_ns) <= ?
+  AND kind <> 'quarantined' AND {_TOLD}"""
+_OF_OLD_SESSIONS: Final = f"""{_WHOLE_ROW} WHERE (begin_ns BETWEEN {UNTIMED} AND ?1 - 1 OR begin_ns > ?2)
+  AND session BETWEEN 1 AND (SELECT ifnull(max(id), 0) FROM sessions WHERE ended_ns BETWEEN ?1 AND ?3) AND {_TOLD}"""  # noqa: S608 - own constants only
+_LONGEST_UNCHANGED: Final = f"{_WHOLE_ROW} WHERE begin_ns <> {FORGOTTEN} AND kind <> 'quarantined' ORDER BY version"
 _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
 
 
@@ -70,11 +81,18 @@ class GapTable:
             rest -= part
 
     def forget(self, before_ns: int, limit: int) -> bool:
-        """Drop rows of before then, their sums stay; False when there may be more of them. In a transaction."""
-        old = self._db.execute(
-            'SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged FROM gaps'
-            " WHERE begin_ns BETWEEN ? AND ? AND kind <> 'quarantined' LIMIT ?", (EARLIEST_SANE_NS, before_ns, limit),
-        ).fetchall()  # fmt: skip
+        """Drop rows of what was over before then, their sums stay; False when there may be more of them. In a transaction.
+
+        A row stays until a part of the spool tells it. Rows without a time, of before the clock was set or of a time to come go
+        when their session has ended so long ago. Beyond ``MOST_ROWS`` those go that did not change for the longest. Rows of
+        quarantined objects stay.
+        """
+        old = self._db.execute(f'{_FORGETTABLE} LIMIT ?', (EARLIEST_SANE_NS, before_ns, before_ns, limit)).fetchall()
+        if len(old) < limit:
+            old += self._db.execute(f'{_OF_OLD_SESSIONS} LIMIT ?', (EARLIEST_SANE_NS, before_ns, before_ns, limit)).fetchall()
+        over = self._db.execute('SELECT count(*) FROM gaps').fetchone()[0] - MOST_ROWS - len(old)
+        if over > 0:
+            old = list(dict.fromkeys(old + self._db.execute(f'{_LONGEST_UNCHANGED} LIMIT ?', (min(over, limit),)).fetchall()))
         sums = Counter[tuple[Any, ...]]()
         merged = Counter[tuple[Any, ...]]()
         for row in old:
@@ -89,6 +107,25 @@ class GapTable:
             (row[:8] for row in old),
         )
         return len(old) < limit
+
+    def told(self, robot: str) -> tuple[int, int]:
+        """Up to which version the parts of a robot tell all, and how often it was asked to tell all of it again."""
+        found = self._db.execute('SELECT version, again FROM gaps_told WHERE robot = ?', (robot,)).fetchone()
+        return (found[0], found[1]) if found else (0, 0)
+
+    def set_told(self, robot: str, version: int) -> None:
+        """In the transaction that spools the last part of those that tell it."""
+        query = 'INSERT INTO gaps_told VALUES (?, ?, 0) ON CONFLICT DO UPDATE SET version = excluded.version'
+        self._db.execute(query, (robot, version))
+
+    def set_all_told(self) -> None:
+        """Nobody will tell what is there by now."""
+        self._db.execute('UPDATE gaps_told SET version = (SELECT ifnull(max(version), 0) FROM gaps)')
+
+    def tell_again(self) -> int:
+        """Have all robots of this spool tell the store all that is remembered; returns how many rows that is."""
+        self._db.execute('UPDATE gaps_told SET version = 0, again = again + 1')
+        return int(self._db.execute('SELECT count(*) FROM gaps WHERE begin_ns <> ?', (FORGOTTEN,)).fetchone()[0])
 
     def changed(self, after: int, limit: int, offsets: Mapping[str, int]) -> list[Gap]:
         """The rows whose versions are greater, by version: about ``limit``, and all of the last version.

@@ -27,6 +27,10 @@ UNTIMED: Final = -1
 """The beginning of a row whose times nobody knows: of an older home, say."""
 FORGOTTEN: Final = -2
 """The beginning of a row that holds the sum of those that were forgotten: when they were, the store knows."""
+HOUR_NS: Final = 3600 * SECOND
+MOST_NEW_ROWS: Final = 7200
+"""Of a sink and topic in an hour: two a second. Further gaps of a kind and cause are one row, without publisher and mission."""
+MOST_RECENT: Final = 256
 OBJECTS, BAGS, EVENTS = 'objects', 'bags', 'events'
 """Sinks."""
 _SINKS: Final = {'bag:': BAGS, 'event:': EVENTS}
@@ -145,6 +149,11 @@ class TopicGaps:
     _journaled: dict[tuple[str, str, str], int] = field(default_factory=dict)
     _since_ns: int = 0
     """``heard_ns`` at the last commit."""
+    _recent: dict[GapKey, None] = field(default_factory=dict)
+    """Rows that are not new: the last ones that something was added to."""
+    _hour: int = 0
+    _new_rows: int = 0
+    """In this hour since boot."""
     _before: tuple[dict[GapKey, GapRow], dict[tuple[str, str, str], int], int] | None = None
 
     def __post_init__(self) -> None:
@@ -171,7 +180,7 @@ class TopicGaps:
         else:
             start_ns, end_ns = min(from_ns, to_ns), max(from_ns, to_ns)
             begin_ns = start_ns // SECOND * SECOND if end_ns - start_ns < SECOND else start_ns
-        key = GapKey(kind, cause, grade, publisher, self.mission, begin_ns)
+        key = self._bounded(GapKey(kind, cause, grade, publisher, self.mission, begin_ns))
         self.count += 1
         self._change(GapRow('', key, start_ns, end_ns, messages, 1))
         return key
@@ -208,6 +217,26 @@ class TopicGaps:
         self._before = None
         for row in newer.values():
             self._change(row)
+
+    def _bounded(self, key: GapKey) -> GapKey:
+        """The row; the one of the hour, where too many are new in it: publishers choose their stamps, and come and go."""
+        if self.clock is None or key in self._recent:
+            return key
+        boot_ns = self.clock.boot_ns()
+        if boot_ns // HOUR_NS != self._hour:
+            self._hour, self._new_rows = boot_ns // HOUR_NS, 0
+        self._new_rows += 1
+        if self._new_rows > MOST_NEW_ROWS:
+            begin_ns = key.begin_ns
+            if begin_ns >= EARLIEST_SANE_NS:
+                begin_ns = max(self.clock.wall_ns(), EARLIEST_SANE_NS) // HOUR_NS * HOUR_NS
+            elif begin_ns != UNTIMED:
+                begin_ns = self._hour * HOUR_NS
+            return key._replace(publisher='', mission='', begin_ns=begin_ns)
+        self._recent[key] = None
+        if len(self._recent) > MOST_RECENT:
+            del self._recent[next(iter(self._recent))]
+        return key
 
     def _time(self, stamp_ns: int) -> int:
         if stamp_ns <= 0 or stamp_ns - FUTURE_SLACK_NS > latest(self.clock):

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, ObjectInfo, SpooledObject, State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
@@ -37,7 +37,11 @@ from shadowhound_data_logger.spool.schema import (
 )
 
 FORGET_STEP: Final = 10_000
-"""Rows that one commit forgets at most: some 50 ms."""
+"""Rows that one commit looks at to forget them, at most: some 50 ms."""
+COMPACT_STEP: Final = 500
+"""Rows that one commit makes short, at most: some 10 ms."""
+COMPACT_STATES: Final = (State.DELIVERED, State.DEDUPLICATED, State.EVICTED)
+"""Those that a short row can have, by its number."""
 BUSY_TIMEOUT_S: Final = 10.0
 MISSING: Final = 'missing'
 """Reason of a quarantined object whose file is gone."""
@@ -50,8 +54,21 @@ _IN_SPOOL_TALLY: Final = f"""
 SELECT topic, state, objects, bytes, samples FROM tally
 WHERE {_IN_SPOOL} AND (objects OR bytes OR samples)"""  # noqa: S608 - own constants only
 _DELIVERED: Final = f"FROM objects WHERE state = 'delivered' AND sensor <> '{CATALOGUE}'"
+_COMPACT_DELIVERED: Final = (
+    f"FROM compact_objects JOIN folders ON folders.id = folder WHERE state = 0 AND sensor <> '{CATALOGUE}'"
+)
+_COMPACT: Final = """
+SELECT compact_objects.id, bucket, path || name AS key, bytes, lower(hex(sha256)) AS sha256, '' AS content_type,
+  '{}' AS metadata, 0 AS priority, settled_s * 1000000000 AS created_ns,
+  CASE state WHEN 0 THEN 'delivered' WHEN 1 THEN 'deduplicated' ELSE 'evicted' END AS state,
+  CASE state WHEN 2 THEN 'no_room' END AS reason
+FROM folders JOIN compact_objects ON folder = folders.id"""
+"""The columns of ``_OBJECT``, as far as they are remembered; ``created_ns`` is when it left the spool, to the second."""
 _OF_SENSOR: Final = 'bucket = ? AND sensor = ? AND key >= ? AND key < ?'
 _OBJECT: Final = 'id, bucket, key, bytes, sha256, content_type, metadata, priority, created_ns, state, reason'
+
+
+_NOTHING_SWEPT: Final = (0, '')
 
 
 class UncataloguedObject(NamedTuple):
@@ -72,6 +89,8 @@ class Index:
         self._path = path
         self._read_only = read_only
         self._connection: sqlite3.Connection | None = None
+        self._swept: tuple[int, str] = _NOTHING_SWEPT
+        """The last short row that ``forget`` looked at."""
 
     def open(self) -> None:
         """Raises sqlite3.DatabaseError for a damaged file, SpoolError for one of a newer version or no access."""
@@ -170,24 +189,38 @@ class Index:
     # -- objects ---------------------------------------------------------------------------------------------------
 
     def has(self, bucket: str, key: str) -> bool:
-        return self._db.execute('SELECT 1 FROM objects WHERE bucket = ? AND key = ?', (bucket, key)).fetchone() is not None
+        return self.row(bucket, key) is not None
 
     def row(self, bucket: str, key: str) -> sqlite3.Row | None:
-        """The row of a key."""
-        return next(iter(self._rows('bucket = ? AND key = ?', (bucket, key))), None)
+        """The row of a key: of what left the spool an hour ago without ``content_type``, ``metadata`` and ``priority``."""
+        path, name = _split(key)
+        found = self._rows('bucket = ? AND key = ?', (bucket, key))
+        return next(iter(found or self._compact_rows('bucket = ? AND path = ? AND name = ?', (bucket, path, name))), None)
 
     def rows(self) -> list[sqlite3.Row]:
         """Of all objects, as they were spooled."""
-        return self._rows('1 ORDER BY id')
+        return sorted(self._rows('1') + self._compact_rows('1'), key=itemgetter('id'))
 
     def with_prefix(self, bucket: str, prefix: str, states: Collection[State] = tuple(State)) -> list[sqlite3.Row]:
         """Rows in these states whose keys begin so, as they were spooled."""
         values = (bucket, prefix, _after(prefix), *(state.value for state in states))
-        return self._rows(f'bucket = ? AND key >= ? AND key < ? AND state IN ({_marks(len(values) - 3)}) ORDER BY id', values)
+        found = self._rows(f'bucket = ? AND key >= ? AND key < ? AND state IN ({_marks(len(values) - 3)})', values)
+        found += [row for row in self._compact_with_prefix(bucket, prefix) if State(row['state']) in states]
+        return sorted(found, key=itemgetter('id'))
 
     def with_content(self, bucket: str, prefix: str, sha256: str) -> list[sqlite3.Row]:
         """Rows of this content whose keys begin so."""
-        return self._rows('bucket = ? AND key >= ? AND key < ? AND sha256 = ?', (bucket, prefix, _after(prefix), sha256))
+        found = self._rows('bucket = ? AND key >= ? AND key < ? AND sha256 = ?', (bucket, prefix, _after(prefix), sha256))
+        return found + self._compact_with_prefix(bucket, prefix, 'AND sha256 = ?', (_digest(sha256),))
+
+    def _compact_with_prefix(self, bucket: str, prefix: str, more: str = '', values: Sequence[object] = ()) -> list[sqlite3.Row]:
+        """Of the folder that the prefix ends in, and of all folders that begin with it."""
+        path, name = _split(prefix)
+        found = self._compact_rows(f'bucket = ? AND path = ? AND name >= ? AND name < ? {more}',
+                                   (bucket, path, name, _after(name), *values))  # fmt: skip
+        below = self._compact_rows(f'bucket = ? AND path > ? AND path >= ? AND path < ? {more}',
+                                   (bucket, path, prefix, _after(prefix), *values))  # fmt: skip
+        return found + below
 
     def in_spool(self) -> list[sqlite3.Row]:
         """Rows of what is pending, held or quarantined, as it was spooled."""
@@ -251,10 +284,10 @@ class Index:
         """Add a row under the final key; returns its id."""
         cursor = self._db.execute(
             'INSERT INTO objects (bucket, key, state, reason, priority, protected, sensor, topic, type, samples, bytes, sha256,'
-            ' content_type, metadata, t_start_ns, t_end_ns, created_ns) VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
+            ' content_type, metadata, t_start_ns, t_end_ns, created_ns, settled_ns) VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
             (item.bucket, key, state.value, reason, item.priority, item.protected, item.sensor, item.topic, item.type,
              item.samples, len(item.body), sha256, item.content_type, json.dumps(dict(metadata)),
-             item.t_start_ns, item.t_end_ns, now_ns),
+             item.t_start_ns, item.t_end_ns, now_ns, now_ns if state is State.EVICTED else None),
         )  # fmt: skip
         number = int(cursor.lastrowid or 0)
         if item.counts:
@@ -319,6 +352,11 @@ class Index:
         cursor.row_factory = sqlite3.Row
         return cursor.fetchall()
 
+    def _compact_rows(self, where: str, values: Sequence[object] = ()) -> list[sqlite3.Row]:
+        cursor = self._db.execute(f'{_COMPACT} WHERE {where}', tuple(values))
+        cursor.row_factory = sqlite3.Row
+        return cursor.fetchall()
+
     def protect(self, bucket: str, key: str) -> None:
         """Never evict this object from now on."""
         self._db.execute('UPDATE objects SET protected = 1 WHERE bucket = ? AND key = ?', (bucket, key))
@@ -357,19 +395,50 @@ class Index:
             " AND state = 'quarantined'", (number,),
         )  # fmt: skip
 
-    def forget(self, before_ns: int) -> bool:
-        """Drop rows of objects that left the spool before then, totals stay; False when there may be more of them.
+    def compact(self, before_ns: int) -> bool:
+        """Give some of what left the spool before then a short row instead; False when there may be more of it.
 
-        What the catalogue has no row of yet stays as well.
+        What stays known is the key, size, SHA-256, state, and when it left: not its metadata. What the catalogue has no row of
+        yet stays as it is. Totals do not change.
+        """
+        rows = self._db.execute(
+            'SELECT id, bucket, key, sensor, state, bytes, sha256, settled_ns FROM objects INDEXED BY settled'
+            " WHERE state IN ('delivered', 'deduplicated', 'evicted') AND settled_ns < ?"
+            ' AND NOT EXISTS (SELECT 1 FROM uncatalogued WHERE uncatalogued.id = objects.id) ORDER BY settled_ns LIMIT ?',
+            (before_ns, COMPACT_STEP),
+        ).fetchall()
+        folders: dict[tuple[str, str, str], int] = {}
+        short = []
+        for number, bucket, key, sensor, state, size, sha256, settled_ns in rows:
+            path, name = _split(key)
+            place = bucket, path, sensor
+            if place not in folders:
+                self._db.execute('INSERT OR IGNORE INTO folders (bucket, path, sensor) VALUES (?,?,?)', place)
+                query = 'SELECT id FROM folders WHERE bucket = ? AND path = ? AND sensor = ?'
+                folders[place] = self._db.execute(query, place).fetchone()[0]
+            of = COMPACT_STATES.index(State(state))
+            short.append((folders[place], name, number, of, size, _digest(sha256), settled_ns // SECOND))
+        self._db.executemany('INSERT OR REPLACE INTO compact_objects VALUES (?,?,?,?,?,?,?)', short)
+        self._db.executemany('DELETE FROM objects WHERE id = ?', ((row[0],) for row in rows))
+        return len(rows) < COMPACT_STEP
+
+    def forget(self, before_ns: int) -> bool:
+        """Drop some of the short rows of what left the spool before then, totals stay; False when there may be more of them.
 
         Rows of a time before the clock was set stay: the next boot may begin at that time again, and their keys are taken.
         """
-        cursor = self._db.execute(
-            "DELETE FROM objects WHERE id IN (SELECT id FROM objects WHERE state IN ('delivered', 'deduplicated', 'evicted')"
-            ' AND settled_ns BETWEEN ? AND ? AND id NOT IN (SELECT id FROM uncatalogued) LIMIT ?)',
-            (EARLIEST_SANE_NS, before_ns, FORGET_STEP),
-        )  # fmt: skip
-        return self.gaps.forget(before_ns, FORGET_STEP) and cursor.rowcount < FORGET_STEP
+        first = self._swept
+        end = 'SELECT folder, name FROM compact_objects WHERE (folder, name) > (?, ?) ORDER BY folder, name LIMIT 1 OFFSET ?'
+        self._swept = self._db.execute(end, (*first, FORGET_STEP - 1)).fetchone() or _NOTHING_SWEPT
+        is_last = self._swept == _NOTHING_SWEPT
+        until, last = ('', ()) if is_last else ('AND (folder, name) <= (?, ?)', self._swept)
+        self._db.execute(
+            f'DELETE FROM compact_objects WHERE (folder, name) > (?, ?) {until} AND settled_s BETWEEN ? AND ?',  # noqa: S608
+            (*first, *last, EARLIEST_SANE_NS // SECOND, before_ns // SECOND),
+        )
+        if is_last:
+            self._db.execute('DELETE FROM folders WHERE NOT EXISTS (SELECT 1 FROM compact_objects WHERE folder = folders.id)')
+        return self.gaps.forget(before_ns, FORGET_STEP) and is_last
 
     # -- what the catalogue lacks ------------------------------------------------------------------------------------
 
@@ -397,9 +466,10 @@ class Index:
         return True
 
     def clear_uncatalogued(self) -> None:
-        """No part will have what is delivered by now."""
+        """No part will have what is delivered by now, nor the gaps."""
         with self.transaction():
             self._db.execute('DELETE FROM uncatalogued')
+            self.gaps.set_all_told()
 
     def has_waiting(self, bucket: str, prefix: str, *, sensor: str, priority: int) -> bool:
         """Whether one of a sensor's objects whose keys begin so is pending with this priority, or quarantined with its file."""
@@ -414,44 +484,48 @@ class Index:
         values = MISSING, bucket, sensor, prefix, _after(prefix)
         return frozenset(row['id'] for row in self._rows(f"state = 'quarantined' AND reason = ? AND {_OF_SENSOR}", values))
 
-    def newest_metadata(self, bucket: str, prefix: str, word: str) -> str | None:
-        """The metadata, as JSON, of the newest object whose key begins so and whose metadata has this word."""
-        said = self._db.execute(
-            'SELECT metadata FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND metadata LIKE ?'
-            ' ORDER BY +id DESC LIMIT 1',
-            (bucket, prefix, _after(prefix), f'%"{word}"%'),
-        ).fetchone()
-        return said[0] if said else None
-
     # -- what was delivered ------------------------------------------------------------------------------------------
 
     def delivered(self, after: int, limit: int) -> list[tuple[int, ObjectInfo]]:
-        """Delivered objects with greater numbers, by number and as the store has to describe them.
+        """Delivered objects with greater numbers that have full rows, by number and as the store has to describe them.
 
         Without the catalogue's parts: others stand for them in time, and they go; they can be made again.
         """
         query = f'SELECT id, bucket, key, bytes, sha256 {_DELIVERED} AND id > ? ORDER BY id LIMIT ?'
         return [(number, ObjectInfo(*of_store)) for number, *of_store in self._db.execute(query, (after, limit))]
 
+    def delivered_compact(self, after: tuple[int, str], limit: int) -> tuple[list[tuple[int, ObjectInfo]], tuple[int, str]]:
+        """The same of those that have short rows, in their order; and the place of the last one, for the next call."""
+        rows = self._db.execute(
+            f'SELECT folder, name, compact_objects.id, bucket, path, bytes, lower(hex(sha256)) {_COMPACT_DELIVERED}'
+            ' AND (folder, name) > (?, ?) ORDER BY folder, name LIMIT ?', (*after, limit),
+        ).fetchall()  # fmt: skip
+        found = [(number, ObjectInfo(bucket, path + name, size, sha256)) for _, name, number, bucket, path, size, sha256 in rows]
+        return found, rows[-1][:2] if rows else after
+
     def delivered_count(self) -> int:
         """Of those, how many are remembered."""
-        return int(self._db.execute(f'SELECT count(*) {_DELIVERED}').fetchone()[0])
+        queries = (f'SELECT count(*) {kept}' for kept in (_DELIVERED, _COMPACT_DELIVERED))
+        return sum(self._db.execute(query).fetchone()[0] for query in queries)
 
     def delivered_since_ns(self) -> int | None:
         """When the first of them was delivered; None without any."""
-        found = self._db.execute(f'SELECT min(settled_ns) {_DELIVERED}').fetchone()[0]
-        return None if found is None else int(found)
+        compact = self._db.execute(f'SELECT min(settled_s) {_COMPACT_DELIVERED}').fetchone()[0]
+        full = self._db.execute(f'SELECT min(settled_ns) {_DELIVERED}').fetchone()[0]
+        return min((found for found in (compact and compact * SECOND, full) if found is not None), default=None)
 
     def forgotten_count(self) -> int:
         """Delivered objects that are counted and not remembered, the catalogue's parts among them."""
         ever = self._db.execute("SELECT ifnull(sum(objects), 0) FROM tally WHERE state = 'delivered'").fetchone()[0]
-        return int(ever) - int(self._db.execute("SELECT count(*) FROM objects WHERE state = 'delivered'").fetchone()[0])
+        full = self._db.execute("SELECT count(*) FROM objects WHERE state = 'delivered'").fetchone()[0]
+        return int(ever) - int(full) - int(self._db.execute('SELECT count(*) FROM compact_objects WHERE state = 0').fetchone()[0])
 
     # -- accounts --------------------------------------------------------------------------------------------------
 
     def begin_session(self, robot: str, boot_id: str, pid: int, now_ns: int) -> int:
         query = 'INSERT INTO sessions (robot, boot_id, pid, started_ns) VALUES (?,?,?,?)'
         cursor = self._db.execute(query, (robot, boot_id, pid, now_ns))
+        self._db.execute('INSERT OR IGNORE INTO gaps_told VALUES (?, 0, 0)', (robot,))
         return int(cursor.lastrowid or 0)
 
     def end_session(self, session: int, now_ns: int) -> None:
@@ -567,6 +641,20 @@ class Index:
 def _after(prefix: str) -> str:
     """The first text after all those that begin so."""
     return f'{prefix[:-1]}{chr(ord(prefix[-1]) + 1)}' if prefix else '\U0010ffff'
+
+
+def _split(key: str) -> tuple[str, str]:
+    """Its folder, with the slash, and the rest."""
+    folder, slash, name = key.rpartition('/')
+    return folder + slash, name
+
+
+def _digest(sha256: str) -> bytes:
+    """Of hex; empty for what a flipped bit made of it."""
+    try:
+        return bytes.fromhex(sha256)
+    except ValueError:
+        return b''
 
 
 def _marks(count: int) -> str:

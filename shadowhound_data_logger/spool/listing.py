@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -90,6 +91,19 @@ def retry(root: Path, *, reason: str | None = None, names: Collection[str] = ())
         finally:
             index.close()
     return Retried(len(moved), sum(row['bytes'] for row in moved), len(wanted) - len(moved))
+
+
+def tell_gaps_again(root: Path) -> int:
+    """Have the next part with gaps begin anew, with all that the journal remembers: the store lost parts. Returns how many rows.
+
+    A node that runs does so within a period of the catalogue. Raises SpoolError or sqlite3.Error.
+    """
+    if not (root / 'index.db').is_file():
+        raise SpoolError(f'there is no spool in {root}', remedy='SHADOWHOUND_HOME names its folder')
+    with closing(Index(root / 'index.db')) as index:
+        index.open()
+        with index.transaction():
+            return index.gaps.tell_again()
 
 
 def _moved(tree: Tree, reason: str, bucket: str, key: str) -> bool:

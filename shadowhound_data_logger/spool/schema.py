@@ -11,13 +11,15 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.gaps import FORGOTTEN, UNTIMED
 
-SCHEMA_VERSION: Final = 6
+SCHEMA_VERSION: Final = 7
 CATALOGUE: Final = '_catalog'
 """The sensor of the catalogue's own objects, which have no rows in it."""
 REGRADED: Final = 5
 """The version from which on accounts have grades as they are now."""
 JOURNALED: Final = 6
 """The version from which on losses have times."""
+COMPACTED: Final = 7
+"""The version from which on what left the spool an hour ago has a short row."""
 VERSION_LIMIT: Final = 1000
 """A version from here on is damage, not a future."""
 NEXT_VERSION: Final = '(SELECT ifnull(max(version), 0) + 1 FROM gaps)'
@@ -158,6 +160,35 @@ END;
 """What was lost, and when (gaps.py). What the samples of lost objects are in it follows the objects: session 0."""
 
 
+_COMPACT_OBJECTS: Final = """
+CREATE TABLE folders (
+  id INTEGER PRIMARY KEY, bucket TEXT NOT NULL, path TEXT NOT NULL, sensor TEXT NOT NULL, UNIQUE (bucket, path, sensor));
+CREATE TABLE compact_objects (
+  folder INTEGER NOT NULL, name TEXT NOT NULL, id INTEGER NOT NULL, state INTEGER NOT NULL, bytes INTEGER NOT NULL,
+  sha256 BLOB NOT NULL, settled_s INTEGER NOT NULL, PRIMARY KEY (folder, name)) WITHOUT ROWID;
+"""
+"""Objects that left the spool (``Index.compact``): what must be known of a key that was given out, in a tenth of the bytes.
+
+``path`` and ``name`` are the key. The states have numbers (``index.COMPACT_STATES``), since those take no byte.
+"""
+_GAPS_TOLD: Final = """
+CREATE TABLE gaps_told (robot TEXT NOT NULL PRIMARY KEY, version INTEGER NOT NULL, again INTEGER NOT NULL) WITHOUT ROWID;
+"""
+"""Up to which version of the journal the parts of a robot tell all; and how often it was asked to tell all of it again."""
+_COMPACTED: Final = f"""
+{_COMPACT_OBJECTS}
+{_GAPS_TOLD}
+INSERT OR REPLACE INTO gaps_told SELECT robot, version, 0 FROM (
+  SELECT id, substr(key, 1, instr(key, '/') - 1) AS robot,
+    CASE WHEN json_valid(metadata) THEN CAST(json_extract(metadata, '$.gap_version') AS INTEGER) END AS version
+  FROM objects WHERE bucket = 'sensor-data' AND sensor = '{CATALOGUE}' AND key GLOB '*/_gaps/*'
+  ) WHERE version > 0 ORDER BY id;
+INSERT OR IGNORE INTO gaps_told SELECT DISTINCT robot, 0, 0 FROM sessions;
+UPDATE objects SET settled_ns = created_ns WHERE state = 'evicted' AND settled_ns IS NULL;
+"""  # noqa: S608 - own constants only
+"""Rows are made short step by step afterwards. What a full disk never took in had no time, and was never forgotten."""
+
+
 def _untimed(table: str, column: str, kind: str, grade: str) -> str:
     """The rows of what an older version counted: it knew of no times."""
     return (f"INSERT INTO gaps SELECT session, topic, '{kind}', cause.key, '{grade}', '', '', {UNTIMED}, NULL, NULL,"  # noqa: S608
@@ -241,6 +272,8 @@ CREATE TABLE sessions (
 {_OTHER_TYPES}
 {_ESTIMATES}
 {_GAP_TABLE}
+{_COMPACT_OBJECTS}
+{_GAPS_TOLD}
 PRAGMA user_version = {SCHEMA_VERSION};
 """  # noqa: S608 - own constants only
 MIGRATIONS: Final = {
@@ -249,6 +282,7 @@ MIGRATIONS: Final = {
     3: _OTHER_TYPES,
     4: f'{_ESTIMATES} {_REGRADED}',
     5: _JOURNALED,
+    6: _COMPACTED,
 }
 """Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
 _AS_NOW: Final = """
@@ -281,6 +315,8 @@ def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> N
     """Make the tables where there are none, bring older ones up to date, have commits be durable. Raises as ``version_of``."""
     version = version_of(connection, path)
     if read_only:
+        if 0 < version < COMPACTED:
+            connection.executescript(_COMPACT_OBJECTS.replace('CREATE TABLE', 'CREATE TEMP TABLE'))
         if 0 < version < JOURNALED:
             connection.executescript(_AS_NOW)
         if 0 < version < REGRADED:
@@ -318,10 +354,13 @@ _NUMBERS: Final = {
     'tally': ('objects', 'bytes', 'samples'),
     'contents': ('id', 'samples'),
     'gaps': ('session', 'begin_ns', 'from_ns', 'to_ns', 'count', 'merged', 'version'),
+    'folders': ('id',),
+    'compact_objects': ('folder', 'id', 'state', 'bytes', 'settled_s'),
+    'gaps_told': ('version', 'again'),
     'sqlite_sequence': ('seq',),
 }
 _COUNTS: Final = frozenset({'id', 'samples', 'bytes', 'received', 'skipped', 'stored', 'published', 'objects', 'seq', 'session',
-                            'messages', 'estimated', 'unknown', 'count', 'merged', 'version'})  # fmt: skip
+                            'messages', 'estimated', 'unknown', 'count', 'merged', 'version', 'folder', 'again'})  # fmt: skip
 """Never below 0, and no more than can be counted. Times and the numbers of messages are whatever a publisher says."""
 _MOST: Final = 1 << 53
 _TEXTS: Final = {
@@ -335,6 +374,9 @@ _TEXTS: Final = {
     'tally': ('topic', 'state'),
     'contents': ('topic',),
     'gaps': ('topic', 'kind', 'cause', 'grade', 'publisher', 'mission'),
+    'folders': ('bucket', 'path', 'sensor'),
+    'compact_objects': ('name',),
+    'gaps_told': ('robot',),
     'sqlite_sequence': ('name',),
 }
 _JSON: Final = {
@@ -357,7 +399,9 @@ def _implausible(table: str) -> str:
     if table == 'rhythms':
         conditions.append(f"typeof(period) <> 'real' OR period NOT BETWEEN 0 AND {_MOST}")
     conditions += [f"{column} NOT GLOB '{{*}}'" for column in _JSON.get(table, ())]
-    name = 'rowid' if table in {'objects', 'sessions', 'sqlite_sequence'} else 'topic'  # the others have no rowid
+    if table == 'compact_objects':
+        conditions.append("typeof(sha256) <> 'blob' OR state > 2")
+    name = 'rowid' if table in {'objects', 'sessions', 'sqlite_sequence', 'folders'} else _TEXTS[table][0]  # without a rowid
     where = ' OR '.join((*conditions, *([_UNSAFE] if table == 'objects' else [])))
     return f'SELECT {name} FROM {table} WHERE {where} LIMIT 1'  # noqa: S608 - own constants only
 

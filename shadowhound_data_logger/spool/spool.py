@@ -17,7 +17,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
+from shadowhound_data_logger.clock import SECOND, Clock
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import SpoolError
@@ -42,6 +42,8 @@ log = logging.getLogger(__name__)
 CLOSE_S: Final = 10.0
 """For a commit that is under way when the spool is closed."""
 DAY_NS: Final = 24 * 3600 * SECOND
+FULL_ROWS_NS: Final = 3600 * SECOND
+"""For so long the index keeps all that it knows of an object that left the spool; then its key, size, checksum and state."""
 LAST: Final = '\x7f'
 """After everything that a key has."""
 _LEFT: Final = frozenset({State.DELIVERED, State.DEDUPLICATED, State.EVICTED})
@@ -65,7 +67,7 @@ class Spool:
         self._index = Index(root / 'index.db')
         self._view = Index(root / 'index.db', read_only=True)
         self._session: Session | None = None
-        self._forgot_ns = 0
+        self._compacted_ns = self._forgot_ns = 0
         self._shortage = Shortage(root)
         self._ballast = Ballast(root / 'ballast')
         self._repeats = Repeats()
@@ -264,7 +266,7 @@ class Spool:
                     self._index.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
                 if snapshot is not None and self._session is not None:
                     self._index.write(self._session.number, snapshot)
-                self._forget(now_ns)
+                self._tidy(now_ns)
         except BaseException:
             self.accounts.mark_dirty()
             raise
@@ -293,9 +295,14 @@ class Spool:
         except (OSError, sqlite3.Error) as error:
             log.warning('cannot move %s to the quarantine: %s', item.path, error)
 
-    def _forget(self, now_ns: int) -> None:
-        """Once an hour, drop rows of deliveries that nobody will ask for any more."""
-        if not 0 <= now_ns - self._forgot_ns < 3600 * SECOND and now_ns > EARLIEST_SANE_NS:
+    def _tidy(self, now_ns: int) -> None:
+        """Once a minute, give what left the spool an hour ago short rows; once an hour, drop what nobody will ask for any more.
+
+        While there is more to do, each commit does a step of it.
+        """
+        if not 0 <= now_ns - self._compacted_ns < 60 * SECOND:
+            self._compacted_ns = now_ns if self._index.compact(now_ns - FULL_ROWS_NS) else 0
+        if not 0 <= now_ns - self._forgot_ns < 3600 * SECOND:
             done = self._index.forget(now_ns - round(self._settings.remember_days * DAY_NS))
             self._forgot_ns = now_ns if done else 0
 

@@ -19,7 +19,7 @@ from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.lake.gaps import folded, of_rows
 from shadowhound_data_logger.lake.reading import arrow_schema
 from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
-from shadowhound_data_logger.spool.listing import retry
+from shadowhound_data_logger.spool.listing import retry, tell_gaps_again
 from shadowhound_data_logger.spool.spool import Spool
 
 CAMERA = '/camera'
@@ -180,6 +180,38 @@ def test_what_a_lost_part_told_is_told_again(spool: Spool, root: Path) -> None:
     spool.commit(outcomes=[Outcome(part, State.QUARANTINED, 'missing')])
     assert [row['what'] for row in told(catalogue.parts())] == ['gap']
     assert catalogue.parts() == []
+
+
+def test_a_full_disk_keeps_the_parts(root: Path) -> None:
+    """None is evicted, nor left out: what they told would not be told again."""
+    spool = new_spool(root, FakeClock(), max_bytes=1)
+    spool.open()
+    catalogue = writer(root)
+    hear(spool, 1, 6)
+    spool.commit([make('a')])
+    (part,) = spool.commit([part for part in catalogue.parts() if '/_gaps/' in part.key])
+    spool.commit([make('b', priority=0)])
+    assert spool.states('sensor-data', '') == {'a': State.EVICTED, 'b': State.EVICTED, part.key: State.PENDING}
+    spool.close()
+
+
+def test_all_that_is_remembered_is_told_again_when_asked(spool: Spool, root: Path) -> None:
+    """Where the store lost its parts: every gap, and the watermark behind them."""
+    catalogue = writer(root)
+    hear(spool, 1, 6)
+    store(spool, 'a', samples=2)
+    before = told(catalogue.parts())
+    assert [row['what'] for row in before] == ['gap', 'complete']
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(writer(root).parts())])
+    assert catalogue.parts() == []
+    assert tell_gaps_again(root) == 1
+    again = catalogue.parts()
+    assert told(again) == before
+    assert catalogue.parts() == [], 'once'
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(again)])
+    assert [row['what'] for row in told(writer(root).parts())] == ['complete'], 'a new process does not begin anew'
+    assert tell_gaps_again(root) == 1
+    assert len(told(writer(root).parts())) == len(before), 'also where no process ran when it was asked'
 
 
 def test_a_session_that_died_ends_where_it_was_heard_last(root: Path) -> None:

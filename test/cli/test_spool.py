@@ -97,7 +97,7 @@ def test_an_empty_spool_is_fine(tmp_path: Path) -> None:
     assert 'Nothing waits' in answer.stdout
 
 
-@pytest.mark.parametrize('verb', [(), ('list',), ('drain',), ('retry',)])
+@pytest.mark.parametrize('verb', [(), ('list',), ('drain',), ('retry',), ('tell-gaps',)])
 def test_no_spool(tmp_path: Path, verb: tuple[str, ...]) -> None:
     """Every verb says which folder, and what names it; none makes one."""
     answer = run('--spool', str(tmp_path / 'none'), *verb)
@@ -138,6 +138,13 @@ def test_one_object_waits_again(home: Path) -> None:
     assert run('retry', f'{BUCKET}/thor/camera/a.jpg').return_value == 1
     assert run('retry', f'{BUCKET}/thor/camera/d.jpg').return_value == 0
     assert states(home)['d.jpg'] == 'pending'
+
+
+def test_gaps_are_told_again(home: Path) -> None:
+    """The next part begins anew."""
+    assert said('tell-gaps') == {'rows': 1}
+    answer = run('tell-gaps')
+    assert (answer.return_value, answer.stdout) == (0, '1 rows of the gap journal are told again with the next part\n')
 
 
 def test_a_file_that_is_gone_does_not_wait(home: Path) -> None:

@@ -22,7 +22,13 @@ NOON_NS = 1_760_788_800 * SECOND
 BUCKET = 'sensor-data'
 READY = f'ready/{BUCKET}'
 KEY = 'thor/camera/20251018/120000_front.jpg'
-WITHOUT_GAPS = """
+WITHOUT_SHORT_ROWS = """
+DROP TABLE folders; DROP TABLE compact_objects; DROP TABLE gaps_told;
+PRAGMA user_version = 6;
+"""
+"""What makes an index of version 6, with full rows alone, of a new one."""
+WITHOUT_GAPS = f"""
+{WITHOUT_SHORT_ROWS}
 DROP TRIGGER object_lost; DROP TRIGGER contents_lost; DROP TRIGGER lost_or_found; DROP TABLE gaps;
 ALTER TABLE accounts DROP COLUMN first_ns; ALTER TABLE accounts DROP COLUMN heard_ns;
 ALTER TABLE accounts DROP COLUMN complete_ns;
@@ -109,6 +115,16 @@ def rows(root: Path) -> list[dict[str, Any]]:
     connection.row_factory = sqlite3.Row
     try:
         return [dict(row) for row in connection.execute('SELECT * FROM objects ORDER BY id')]
+    finally:
+        connection.close()
+
+
+def short_rows(root: Path) -> list[dict[str, Any]]:
+    """All rows of what left the spool an hour ago, read by somebody else."""
+    connection = sqlite3.connect(root / 'index.db')
+    connection.row_factory = sqlite3.Row
+    try:
+        return [dict(row) for row in connection.execute('SELECT * FROM compact_objects ORDER BY id')]
     finally:
         connection.close()
 

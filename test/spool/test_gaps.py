@@ -14,14 +14,16 @@ from spool.making import NOON_NS, WITHOUT_GAPS, FakeClock, abandon, make, new_sp
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.model import Outcome, SpooledObject, State
-from shadowhound_data_logger.spool import gaps, ledger
+from shadowhound_data_logger.spool import gap_table, gaps, ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.gaps import Gap, TopicGaps
+from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 MS = SECOND // 1000
+DAY_NS = 24 * 3600 * SECOND
 CAMERA = '/camera'
 
 
@@ -37,6 +39,13 @@ def short(root: Path) -> list[tuple[str, str, int | None, float | None, float | 
         (gap.kind, gap.cause, gap.count, *(None if at is None else (at - NOON_NS) / SECOND for at in (gap.from_ns, gap.to_ns)))
         for gap in journal(root)
     ]
+
+
+def tell(root: Path) -> None:
+    """As after a part that tells all."""
+    with closing(Index(root / 'index.db')) as index:
+        index.open()
+        index.clear_uncatalogued()
 
 
 def hear(spool: Spool, *numbers: int, publisher: str = 'p', topic: str = CAMERA, period_ns: int = 100 * MS) -> None:
@@ -376,7 +385,11 @@ def test_what_is_forgotten_stays_in_the_sums(root: Path) -> None:
     spool.open()
     hear(spool, 1, 5, 25, 50)
     spool.commit()
-    clock.now_ns += 1000 * 24 * 3600 * SECOND
+    clock.now_ns += 1000 * DAY_NS
+    spool.commit()
+    assert len(short(root)) == 3, 'nobody was told yet'
+    tell(root)
+    clock.now_ns += DAY_NS
     spool.commit()
     assert short(root) == [('missed', 'transport', 46, None, None)]
     hear(spool, 30, 3, 60)
@@ -388,19 +401,135 @@ def test_what_is_forgotten_stays_in_the_sums(root: Path) -> None:
 
 @pytest.mark.parametrize('counts', [{}, {CAMERA: 1}], ids=['of one topic', 'of several'])
 def test_an_old_object_that_was_evicted_on_its_way_and_arrived_is_no_loss(root: Path, counts: dict[str, int]) -> None:
-    """Its row is forgotten as soon as it is written, since its messages are that old; the sum is put right all the same."""
+    """Its row is forgotten early, since its messages are that old; the sum is put right all the same."""
     clock = FakeClock()
     spool = new_spool(root, clock)
     spool.open()
     hear(spool, 1)
     (item,) = spool.commit([make('a', counts=counts, **({'topic': None, 'samples': 0} if counts else {}))])
-    clock.now_ns += 1000 * 24 * 3600 * SECOND
+    clock.now_ns += 1000 * DAY_NS
     spool.commit(outcomes=[Outcome(item, State.EVICTED, 'no_room')])
+    tell(root)
+    spool._forgot_ns = 0
+    spool.commit()
     assert short(root) == [('evicted', 'no_room', 1, None, None)]
     deliver(spool, item)
     assert journal(root) == []
     assert ledger.read(root, 'thor')['balanced']
     spool.close()
+
+
+class BootedAtNoon(FakeClock):
+    """Its boot clock is none of UTC."""
+
+    def boot_ns(self) -> int:
+        return self.now_ns - NOON_NS
+
+
+def test_rows_of_an_hour_are_bounded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Publishers that come and go, with stamps of any time: further gaps of a cause share a row, and each message is counted."""
+    monkeypatch.setattr(gaps, 'MOST_NEW_ROWS', 20)
+    clock = BootedAtNoon(NOON_NS + 1800 * SECOND)
+    spool = new_spool(root, clock)
+    spool.open()
+    lost = 0
+    for number in range(300):
+        with spool.accounts.entry(CAMERA) as account:
+            stamp_ns = NOON_NS - number * DAY_NS if number % 3 else 0
+            account.receive(f'p{number}', 1, stamp_ns)
+            account.receive(f'p{number}', 5, stamp_ns + 10 * SECOND)
+            lost += 3
+        if number % 10 == 0:
+            spool.commit()
+    spool.commit()
+    rows = journal(root)
+    assert len(rows) == 20 + 2
+    assert sum(row.count or 0 for row in rows) == lost
+    (shared,) = [row for row in rows if row.publisher is None and row.from_ns is not None]
+    assert shared.from_ns == NOON_NS - 299 * DAY_NS, 'it reaches from the first one to the last one'
+    assert shared.begin_ns == NOON_NS, 'and is of the hour in which they were found'
+    with spool.accounts.entry(CAMERA) as account:
+        assert account.receive('p299', 3, NOON_NS)
+    spool.commit()
+    assert sum(row.count or 0 for row in journal(root)) == lost - 1, 'a late message is taken out of it'
+    assert ledger.read(root, 'thor')['balanced']
+    clock.now_ns += 3600 * SECOND
+    with spool.accounts.entry(CAMERA) as account:
+        account.receive('p299', 50, clock.now_ns)
+    spool.commit()
+    assert 'p299' in {row.publisher for row in journal(root)}, 'the next hour has rows of its own again'
+    spool.close()
+
+
+def test_a_gap_stays_until_it_is_told(root: Path) -> None:
+    """Of a robot that was off for longer than rows are kept it began too long ago already. One that just ended stays as well."""
+    clock = FakeClock()
+    spool = new_spool(root, clock)
+    spool.open()
+    hear(spool, 1)
+    spool.commit([make('a')])
+    spool.close()
+    clock.now_ns += 30 * DAY_NS
+    spool = new_spool(root, clock)
+    spool.open()
+    with spool.accounts.entry(CAMERA) as account:
+        account.receive('p', 9, clock.now_ns)
+    spool.commit()
+    spool.commit()
+    assert [(gap.cause, gap.count) for gap in journal(root)] == [('restart', 7)]
+    tell(root)
+    clock.now_ns += 2 * DAY_NS
+    spool.commit()
+    assert [gap.from_ns for gap in journal(root)] == [NOON_NS + 100 * MS], 'it ended two days ago'
+    clock.now_ns += 2 * DAY_NS
+    spool.commit()
+    assert short(root) == [('missed', 'restart', 7, None, None)]
+    spool.close()
+
+
+def test_rows_of_no_known_time_go_with_their_session(root: Path) -> None:
+    """Of before the clock was set, of no time and of a time to come: they cannot be told by their age."""
+    clock = FakeClock(now_ns=500 * SECOND)
+    spool = new_spool(root, clock)
+    spool.open()
+    for publisher, first_ns in (('boot', 100 * SECOND), ('future', NOON_NS * 3), ('none', 0)):
+        with spool.accounts.entry(CAMERA) as account:
+            account.receive(publisher, 1, first_ns)
+            account.receive(publisher, 4, first_ns + 10 * SECOND if first_ns else 0)
+    spool.commit()
+    assert {gap.publisher for gap in journal(root)} >= {'boot', 'future'}
+    clock.now_ns = NOON_NS
+    spool.close()
+    tell(root)
+    spool = new_spool(root, clock)
+    spool.open()
+    spool.commit()
+    assert len(journal(root)) >= 2
+    clock.now_ns += 4 * DAY_NS
+    spool.commit()
+    assert [gap for gap in journal(root) if gap.begin_ns != gaps.FORGOTTEN] == []
+    assert ledger.read(root, 'thor')['balanced']
+    spool.close()
+
+
+def test_there_are_never_more_rows_than_that(spool: Spool, root: Path, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Told or not, and where no clock is ever set: those that did not change for the longest become a sum."""
+    monkeypatch.setattr(gap_table, 'MOST_ROWS', 10)
+    clock.now_ns = 500 * SECOND
+    for number in range(30):
+        with spool.accounts.entry(CAMERA) as account:
+            account.receive(f'p{number}', 1, 400 * SECOND)
+            account.receive(f'p{number}', 3, 402 * SECOND)
+        spool.commit()
+    clock.now_ns += 3600 * SECOND
+    for _ in range(3):
+        spool.commit()
+        spool._forgot_ns = 0
+    found = journal(root)
+    assert len(found) <= 11
+    assert sum(gap.count or 0 for gap in found) == 30
+    assert {gap.publisher for gap in found} >= {'p29', 'p28'}
+    assert ledger.read(root, 'thor')['balanced']
 
 
 def test_before_the_clock_is_set_losses_have_times_since_boot() -> None:
@@ -442,10 +571,18 @@ STEPS = st.lists(
 
 
 @settings(max_examples=examples(60), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(steps=STEPS)
-def test_the_journal_adds_up_at_every_commit(tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, int]]) -> None:
-    """Whatever comes late, fails, dies, is evicted, quarantined, tried again or forgotten."""
-    root = tmp_path_factory.mktemp('any') / 'spool'
+@given(steps=STEPS, bounds=st.sampled_from([(7200, 500_000), (2, 500_000), (2, 3)]))
+def test_the_journal_adds_up_at_every_commit(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, int]], bounds: tuple[int, int]
+) -> None:
+    """Whatever comes late, fails, dies, is evicted, quarantined, tried again, forgotten, or too much for rows of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gaps, 'MOST_NEW_ROWS', bounds[0])
+        patch.setattr(gap_table, 'MOST_ROWS', bounds[1])
+        _take_steps(tmp_path_factory.mktemp('any') / 'spool', steps)
+
+
+def _take_steps(root: Path, steps: list[tuple[str, str, int]]) -> None:
     clock = FakeClock()
     spool = new_spool(root, clock)
     spool.open()
@@ -471,6 +608,7 @@ def _do(spool: Spool, root: Path, clock: FakeClock, step: tuple[str, str, int], 
         spool = new_spool(root, clock)
         spool.open()
     elif what == 'forget':
+        tell(root)
         clock.now_ns += number * 20 * 24 * 3600 * SECOND
     elif what in {'store', 'quarantine', 'deliver', 'retry', 'evict'}:
         _do_with_objects(spool, root, clock, what, number, items)
