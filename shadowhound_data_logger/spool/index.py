@@ -36,8 +36,8 @@ from shadowhound_data_logger.spool.schema import (
     version_of,
 )
 
-FORGET_STEP: Final = 10_000
-"""Rows that one commit looks at to forget them, at most: some 50 ms."""
+FORGET_STEP: Final = 5_000
+"""Rows that one commit looks at to forget them, at most: some 20 ms."""
 COMPACT_STEP: Final = 500
 """Rows that one commit makes short, at most: some 10 ms."""
 COMPACT_STATES: Final = (State.DELIVERED, State.DEDUPLICATED, State.EVICTED)

@@ -10,7 +10,7 @@ import sqlite3
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Final
 
 from shadowhound_data_logger.keys import check_key
@@ -26,6 +26,9 @@ HEARTBEAT_S: Final = 1.0
 """How often accounts and outcomes become durable when there is no object to commit them with."""
 MANY_OUTCOMES: Final = 64
 """So many outcomes are worth a commit of their own."""
+MOST_OBJECTS: Final = 32
+MOST_BYTES: Final = 4 << 20
+"""In one commit: its files are written and synced with the index locked, for which other processes wait."""
 HANGING_S: Final = 10.0
 """A commit that takes longer hangs in the disk: usual is a hundredth of a second, a slow card at its worst takes a few."""
 
@@ -127,12 +130,14 @@ class SpoolWriter:
             raise
 
     def _groups(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> list[_Group]:
-        """One commit of all; where the disk has no room for it several, since files leave only after the commit that says so.
+        """One commit of all, or several of a burst; also where the disk has no room, since files leave only after a commit.
 
-        First what was delivered, then the files, which lie there already and of which some may be given up, last what is written.
+        Then first what was delivered, then the files, which lie there already and of which some may be given up, last what is
+        written.
         """
         if not objects or self.spool.fits(objects):
-            return [(objects, outcomes)]
+            first, *more = list(_parted(objects)) or [[]]
+            return [(first, outcomes), *((part, []) for part in more)]
         files = [item for item in objects if isinstance(item.body, FileBody)]
         rest = [item for item in objects if not isinstance(item.body, FileBody)]
         groups: list[_Group] = [([], outcomes), (files, []), (rest, [])]
@@ -161,6 +166,20 @@ class SpoolWriter:
             self._settled({outcome.item.id for outcome in outcomes})
         if spooled:
             self._spooled(spooled)
+
+
+def _parted(objects: Sequence[DataObject]) -> Iterator[list[DataObject]]:
+    """The same in their order, as many at a time as one commit takes."""
+    part: list[DataObject] = []
+    size = 0
+    for item in objects:
+        if part and (len(part) >= MOST_OBJECTS or size + _in_memory(item) > MOST_BYTES):
+            yield part
+            part, size = [], 0
+        part.append(item)
+        size += _in_memory(item)
+    if part:
+        yield part
 
 
 def _in_memory(item: DataObject) -> int:
