@@ -42,6 +42,8 @@ RECEIVED_ONLY: Final = 'received-only'
 MOST_CAUSES: Final = 64
 """Of a topic, by name; all further ones are one, ``MORE_CAUSES``. Ours are some twenty; a part may have one for each row."""
 MORE_CAUSES: Final = '(more)'
+FOLD_ROWS: Final = 200_000
+"""Statements that are read before those that newer ones replace are dropped: some 40 MB."""
 _ORDER: Final = [('robot', 'ascending'), ('id', 'ascending'), ('revision', 'descending'), ('what', 'ascending')]
 _FIRST: Final = [*_ORDER, *((name, 'descending') for name in GAPS.columns if name not in dict(_ORDER))]
 """The newest statement first; a gap before the withdrawal of the same revision, with which it moved to another day."""
@@ -162,7 +164,7 @@ def newest(source: Bucket | None = None, *, robot: str | None = None, topic: str
            since_ns: int | None = None, findings: Findings | None = None) -> pa.Table:  # fmt: skip
     """The statements that count, about times from then on or none, with the columns of ``catalogue.gaps.GAPS``.
 
-    Raises StoreError.
+    In memory are at most twice as many as count, and ``FOLD_ROWS``. Raises StoreError.
     """
     source = source or Bucket(store_settings(os.environ, home(os.environ)), BUCKET)
     findings = Findings() if findings is None else findings
@@ -177,6 +179,8 @@ def newest(source: Bucket | None = None, *, robot: str | None = None, topic: str
             if value is not None:
                 table = table.filter(pc.equal(table[name], value))  # noqa: PLW2901
         rows.append(table)
+        if sum(map(len, rows)) > max(FOLD_ROWS, 2 * len(rows[0])):
+            rows = [folded(pa.concat_tables(rows))]
     return folded(pa.concat_tables([arrow_schema(GAPS).empty_table(), *rows]))
 
 

@@ -21,6 +21,7 @@ from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.lake import gaps, reading
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.gaps import MOST_CAUSES, Stretch, coverage, folded, known, of_rows
@@ -136,6 +137,24 @@ def test_a_part_of_a_time_needs_no_second_look(store: StoreSettings, tmp_path: P
         assert found.between(first_ns, last_ns) == ask(store, first_s, last_s)
     with pytest.raises(ValueError, match='is not within'):
         found.between(NOON_NS, NOON_NS + 91 * SECOND)
+
+
+def test_what_is_replaced_is_not_kept(store: StoreSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a journal is read: memory is as what counts in it, not as how often that was told."""
+    for part in range(30):
+        tell(store, tmp_path, *(lost(str(gap), gap, gap + 1, part + 1, count=part + 1) for gap in range(5)), name=f'{part:02}')
+    held: list[int] = []
+
+    def spied(rows: pa.Table) -> pa.Table:
+        held.append(len(rows))
+        return folded(rows)
+
+    monkeypatch.setattr(gaps, 'folded', spied)
+    monkeypatch.setattr(gaps, 'FOLD_ROWS', 20)
+    monkeypatch.setattr(reading, 'BATCH_BYTES', 1)
+    found = gaps.newest(Bucket(store, BUCKET))
+    assert sorted(row['count'] for row in found.to_pylist()) == [30] * 5
+    assert max(held) <= 25
 
 
 def test_a_question_that_is_none(store: StoreSettings) -> None:
