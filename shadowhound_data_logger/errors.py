@@ -1,31 +1,45 @@
 """One tree of errors: each says what happened, carries its data, and names a remedy.
 
-``str(error)`` is one sentence an operator can act on; ``error.data`` is for programs; no error ever holds a secret.
+``str(error)`` is one sentence an operator can act on; ``error.data`` is for programs; no error ever holds a secret. An error
+without a remedy of its own has that of its class, ``DEFAULT_REMEDY``.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 
 class DataLoggerError(Exception):
     """Base of everything this package raises on purpose."""
+
+    DEFAULT_REMEDY: ClassVar[str] = 'shadowhound-data doctor looks for the cause'
 
     def __init__(self, message: str, *, remedy: str = '', **data: Any) -> None:
         super().__init__(message)
         self.remedy = remedy
         self.data = data
 
+    @property
+    def what(self) -> str:
+        """What happened, and where, without the remedy."""
+        return super().__str__()
+
     def __str__(self) -> str:
-        message = super().__str__()
-        return f'{message} ({self.remedy})' if self.remedy else message
+        return f'{self.what} ({self.remedy})' if self.remedy else self.what
 
 
 class SettingError(DataLoggerError):
     """A parameter or environment variable is unknown or wrong; ``data`` has name, value and allowed."""
 
+    DEFAULT_REMEDY = 'docs/parameters.md describes each parameter and environment variable'
+
     def __init__(self, name: str, value: object, allowed: str) -> None:
-        super().__init__(f'{name} = {value!r} is refused; allowed is {allowed}', name=name, value=value, allowed=allowed)
+        super().__init__(
+            f'{name} = {value!r} is refused', remedy=f'allowed is {allowed}', name=name, value=value, allowed=allowed
+        )
+
+    def __str__(self) -> str:
+        return f'{self.what}; {self.remedy}'
 
 
 class SettingGone(SettingError):
@@ -35,13 +49,20 @@ class SettingGone(SettingError):
         DataLoggerError.__init__(self, f'{name} = {value!r}: there is no such parameter any more', remedy=f'remove it: {instead}',
                                  name=name, value=value, allowed=instead)  # fmt: skip
 
+    def __str__(self) -> str:
+        return DataLoggerError.__str__(self)
+
 
 class NameRefused(DataLoggerError):
     """A name that would become part of an object key is not safe there."""
 
+    DEFAULT_REMEDY = 'use letters, digits, "-", "_" and "."'
+
 
 class Rejected(DataLoggerError):
     """A message could not be encoded; ``reason`` is the short word under which the ledger counts it."""
+
+    DEFAULT_REMEDY = 'shadowhound-data ledger counts rejected messages by reason'
 
     def __init__(self, reason: str, detail: str = '') -> None:
         super().__init__(f'{reason}: {detail}' if detail else reason, reason=reason)
@@ -51,13 +72,19 @@ class Rejected(DataLoggerError):
 class SpoolError(DataLoggerError):
     """The spool cannot be opened or written (another process, no space, no permission)."""
 
+    DEFAULT_REMEDY = 'shadowhound-data doctor --only spool looks for the cause'
+
 
 class NodeUnavailable(DataLoggerError):
     """No node runs here, it cannot be chosen among several, or the one that runs does not answer."""
 
+    DEFAULT_REMEDY = 'shadowhound-data status says whether a node runs here'
+
 
 class StoreError(DataLoggerError):
     """Base of what a store reports about a request; the subclass decides what delivery does next."""
+
+    DEFAULT_REMEDY = 'shadowhound-data doctor --only s3 looks for the cause'
 
 
 class StoreUnavailable(StoreError):
@@ -91,6 +118,8 @@ class ForeignObject(StoreError):
 class TrackingError(DataLoggerError):
     """Base of what the tracking server (MLflow) reports about a request."""
 
+    DEFAULT_REMEDY = 'shadowhound-data doctor --only mlflow looks for the cause'
+
 
 class TrackingUnavailable(TrackingError):
     """Transient, or nobody's mission's fault: away, overloaded, credentials refused. The same request may succeed later."""
@@ -103,10 +132,16 @@ class TrackingRefused(TrackingError):
 class BagError(DataLoggerError):
     """A bag, or a file that should be one, does not allow what is asked."""
 
+    DEFAULT_REMEDY = 'shadowhound-data bag list shows the bags there are'
+
 
 class BagDamaged(BagError):
     """A file of a bag is not whole, or its content contradicts itself; ``data['path']`` names it."""
 
+    DEFAULT_REMEDY = 'shadowhound-data bag verify says which files are sound; bag fetch downloads the others again'
+
 
 class LakeError(DataLoggerError):
     """What was asked of the catalogue cannot be answered: a question that is none, or a catalogue that contradicts itself."""
+
+    DEFAULT_REMEDY = 'shadowhound-data query --help has examples; lake status describes the catalogue'

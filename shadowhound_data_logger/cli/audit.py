@@ -10,14 +10,14 @@ from typing import Any
 from rich.console import RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import the_store
+from shadowhound_data_logger.cli.common import ExitCode, exit_code, the_store
 from shadowhound_data_logger.cli.output import number, plain, print_json, print_page, progress, shown_time
 from shadowhound_data_logger.ship.audit import KEYS, KINDS, THREADS, Audit, audit
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.status import targets
 
 
-def verify_delivered(spool: Path, *, deep: bool, again: bool, as_json: bool) -> int:
+def verify_delivered(spool: Path, *, deep: bool, again: bool, as_json: bool) -> ExitCode:
     """Ask the store that the environment names; 0 when all is there as it was delivered, else 1."""
     with the_store(THREADS) as store, closing(Deliveries(spool)) as deliveries:
         deliveries.open(f'{"deep" if deep else "head"} {store.describe()}', again=again)
@@ -33,7 +33,7 @@ def verify_delivered(spool: Path, *, deep: bool, again: bool, as_json: bool) -> 
         print_json(said)
     else:
         print_page(plain(_scope(said)), *finding_lines(said['findings'], KINDS), '', _verdict(said), *_doubt(said))
-    return 0 if said['ok'] else 1
+    return exit_code(finding=not said['ok'])
 
 
 def _said(found: Audit, deliveries: Deliveries, store: str, *, deep: bool, earlier: int) -> dict[str, Any]:

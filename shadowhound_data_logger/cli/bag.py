@@ -15,7 +15,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.bags.cut import COMES, Choice, Cut, cut_folder, cut_remote
-from shadowhound_data_logger.bags.fetch import FETCH_THREADS, fetch
+from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.info import BagInfo, info_folder, info_of
 from shadowhound_data_logger.bags.manifest import ClockOf, Missing
 from shadowhound_data_logger.bags.overview import BagRow, bag_overview
@@ -24,7 +24,7 @@ from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
 from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, planned, spool_upload, upload_now
 from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, verify_remote
 from shadowhound_data_logger.bags.watch import Watch, WatchStep
-from shadowhound_data_logger.cli.common import as_json, robot_name, the_home, the_store
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, robot_name, the_home, the_store
 from shadowhound_data_logger.cli.output import (
     duration,
     number,
@@ -47,6 +47,8 @@ from shadowhound_data_logger.stores.memory import MemoryStore
 from shadowhound_data_logger.times import moment
 
 STORE_THREADS: Final = 8
+LOOK_S: Final = 5.0
+"""Between two looks for bags that are finished."""
 STATES: Final = {'complete': 'green', 'growing': 'cyan', 'recovered': 'yellow', 'gaps': 'yellow', 'foreign': 'dim'}
 STEPS: Final = {'spooled': 'cyan', 'stored': 'green', 'removed': 'green', 'refused': 'red'}
 DURABILITY: Final = {1: 'transient_local', 2: 'volatile'}
@@ -59,12 +61,12 @@ def _bag(_: click.Context, __: click.Parameter, name: str) -> str | Path:
     path = Path(name)
     if '/' in name or name in {'.', '..'}:
         if not path.is_dir():
-            raise click.BadParameter(f'there is no folder {name}')
+            raise BadUsage(f'there is no folder {name}', 'the name of a bag in the store has no slash: shadowhound-data bag list')
         return path.absolute()
     try:
         return check_name(name, 'the bag', MAX_BAG_BYTES)
     except NameRefused as error:
-        raise click.BadParameter(str(error)) from error
+        raise BadUsage(error.what, error.remedy or error.DEFAULT_REMEDY) from error
 
 
 _robot = click.option(
@@ -73,23 +75,28 @@ _robot = click.option(
 _bag_or_folder = click.argument('bag', metavar='BAG|DIR', callback=_bag)
 
 
-@click.group()
+@click.group(
+    epilog=examples(
+        'bag list --since yesterday',
+        'bag fetch patrol_20251018_120000 --to bags',
+    )
+)
 def bag() -> None:
-    """Recordings in rosbag2's format: find, look at, check, download, cut out, send and record them.
+    """Find, download, check, cut and upload bags.
 
     BAG is the name of a bag of the store, as `bag list` tells it. The store is the S3 server that AWS_ENDPOINT_URL names, else
     the folder SHADOWHOUND_HOME/store. A bag in a folder is named by a path with a slash in it: ./patrol_20251018_120000
     """
 
 
-@bag.command('list')
+@bag.command('list', epilog=examples('bag list --since yesterday', 'bag list --robot tachi --json'))
 @click.option(
     '--since', default='', metavar='TIME', help='Those that began since: yesterday, 2025-10-18, 2025-10-18T12:00, 90min, 2d.'
 )
 @_robot
 @as_json
-def bag_list(*, since: str, robot: str, as_json: bool) -> int:
-    """One line a bag, the newest last: those in the store, and those still on this machine.
+def bag_list(*, since: str, robot: str, as_json: bool) -> ExitCode:
+    """List the bags in the store and on this machine.
 
     \b
     growing    still recorded, or not all of it has arrived yet
@@ -114,15 +121,21 @@ def bag_list(*, since: str, robot: str, as_json: bool) -> int:
         click.echo(f'There is no bag of {robot} in {where}, nor on this machine{" since then" if since else ""}.')
     else:
         print_page(_rows(rows), *_findings(rows))
-    return 1 if away or any(row.finding and row.state != GROWING for row in rows) else 0
+    return exit_code(finding=away or any(row.finding and row.state != GROWING for row in rows))
 
 
-@bag.command('info')
+@bag.command(
+    'info',
+    epilog=examples('bag info patrol_20251018_120000', 'bag info ./patrol_20251018_120000'),
+)
 @_bag_or_folder
 @_robot
 @as_json
-def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> int:
-    """Topics, types, rates, QoS, times and slices of a bag, from a few short reads. Exit code 1 when a slice is missing."""
+def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> ExitCode:
+    """Show topics, rates, times and files of a bag.
+
+    It downloads almost nothing. Exit code 1 when a file is missing.
+    """
     if isinstance(bag, Path):
         found = info_folder(bag)
     else:
@@ -132,16 +145,18 @@ def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> int:
         print_json(_info_json(found))
     else:
         print_page(*_page(found))
-    return 1 if found.missing else 0
+    return exit_code(finding=found.missing)
 
 
-@bag.command('verify')
+@bag.command('verify', epilog=examples('bag verify patrol_20251018_120000 --deep'))
 @click.option('--deep', is_flag=True, help='Read every byte: content against checksums, and the CRC of every chunk.')
 @_bag_or_folder
 @_robot
 @as_json
-def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> int:
-    """Whether every slice is there as it was recorded. Exit code 0 only when it is, and the bag is not growing.
+def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> ExitCode:
+    """Check that a bag is there as it was recorded.
+
+    Exit code 0 only when every file is, and the bag is not growing.
 
     In the store sizes and checksums are compared, and nothing is downloaded but each slice's summary; in a folder everything is
     read. --deep reads everything in the store as well, and unpacks every chunk.
@@ -157,27 +172,26 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> int
         print_json(said)
     else:
         print_page(*_verdict(found))
-    return 0 if found.is_sound and found.state != GROWING else 1
+    return exit_code(finding=not (found.is_sound and found.state != GROWING))
 
 
-@bag.command('fetch')
+@bag.command('fetch', epilog=examples('bag fetch patrol_20251018_120000 --to bags'))
 @click.argument('bag', metavar='BAG')
 @click.option('--to', type=click.Path(path_type=Path, file_okay=False), required=True, help='The folder above that of the bag.')
-@click.option('--threads', type=click.IntRange(1, 32), default=FETCH_THREADS, show_default=True, help='Files at a time.')
 @_robot
 @as_json
-def bag_fetch(*, bag: str, to: Path, threads: int, robot: str, as_json: bool) -> int:
-    """Download a bag as TO/BAG, or what is there of it yet, each file checked against its SHA-256.
+def bag_fetch(*, bag: str, to: Path, robot: str, as_json: bool) -> ExitCode:
+    """Download a bag, verified.
 
-    Run it again after it was stopped: it goes on where it ended. What is there and right is not downloaded again. A bag that is
-    still growing gets a metadata.yaml of what there is, so that players open it; fetch it again later for the rest.
+    It becomes TO/BAG. Run it again after it was interrupted: files that are already complete are skipped. A bag that is still
+    growing gets a metadata.yaml of what there is, so that players open it; fetch it again later for the rest.
     """
     with the_store(STORE_THREADS) as store, progress('fetched', of='bytes') as bar:
         there = find_bag(store, robot, bag)
-        found = fetch(store, there, to, threads=threads, told=bar)
+        found = fetch(store, there, to, told=bar)
     if as_json:
         print_json({**asdict(found), 'folder': str(found.folder)})
-        return 0
+        return ExitCode.FINE
     lines = [plain(f'{found.folder}: {number(found.files)} files, {volume(found.bytes)}; downloaded {volume(found.downloaded)}')]
     if found.unverified:
         lines.append(plain(f'No checksum is known of {", ".join(found.unverified)}: only the size was compared.', 'yellow'))
@@ -186,10 +200,16 @@ def bag_fetch(*, bag: str, to: Path, threads: int, robot: str, as_json: bool) ->
     elif not found.is_complete:
         lines.append(plain('The bag is still growing: fetch it again for the rest.', 'cyan'))
     print_lines(*lines)
-    return 0
+    return ExitCode.FINE
 
 
-@bag.command('cut')
+@bag.command(
+    'cut',
+    epilog=examples(
+        'bag cut patrol_20251018_120000 --start +30 --end +60 --output cut',
+        'bag cut ./patrol_20251018_120000 --topics /imu,/odom --output cut',
+    ),
+)
 @_bag_or_folder
 @click.option('--start', default='', metavar='TIME', help='From then on  [default: the start of the bag]')
 @click.option('--end', default='', metavar='TIME', help='Before then  [default: the end of the bag]')
@@ -198,8 +218,8 @@ def bag_fetch(*, bag: str, to: Path, threads: int, robot: str, as_json: bool) ->
 @click.option('-o', '--output', type=click.Path(path_type=Path), required=True, help='The new folder, which becomes a bag.')
 @_robot
 @as_json
-def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str, as_json: bool, **wanted: str) -> int:
-    """Copy a span of time and some topics of a bag into a new bag, message by message.
+def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str, as_json: bool, **wanted: str) -> ExitCode:
+    """Copy a span of time or some topics into a new bag.
 
     \b
     TIME   2025-10-18T12:00:05.5   a date, UTC where it names no zone
@@ -221,10 +241,10 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
         print_json(with_dates({**asdict(found), 'folder': str(found.folder)}))
     else:
         print_lines(*_told_cut(found))
-    return 1 if found.missing else 0
+    return exit_code(finding=found.missing)
 
 
-@bag.command('upload')
+@bag.command('upload', epilog=examples('bag upload my_bag', 'bag upload my_bag --name patrol_2 --tar-gz'))
 @click.argument('folder', metavar='DIR', type=click.Path(path_type=Path))
 @click.option('--name', default='', help='The name of the bag in the store  [default: that of DIR]')
 @click.option('--tar-gz', is_flag=True, help='As one ROBOT/rosbags/NAME.tar.gz instead of its files.')
@@ -232,8 +252,10 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
 @click.option('--deadline', type=click.FloatRange(0.0, 1e7), default=600.0, show_default=True, help='Seconds to wait for Tower.')
 @_robot
 @as_json
-def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: str, as_json: bool, tar_gz: bool) -> int:
-    """Send a finished bag, SQLite or MCAP, as rosbag2 wrote it: its files as they are, and a manifest with their checksums.
+def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: str, as_json: bool, tar_gz: bool) -> ExitCode:
+    """Upload a finished bag.
+
+    SQLite or MCAP, as rosbag2 wrote it: its files as they are, and a manifest with their checksums.
 
     It goes through the spool of this machine and waits until the store has it. When Tower is away for longer than the deadline
     the bag stays in the spool, safe, and is delivered by the node that runs here, or by the next upload; exit code 1 says so.
@@ -256,19 +278,20 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
         print_json({**asdict(found), 'is_delivered': found.is_delivered})
     else:
         print_lines(_told_upload(found))
-    return 0 if found.is_delivered else 1
+    return exit_code(finding=not found.is_delivered)
 
 
-@bag.command('watch')
+@bag.command('watch', epilog=examples('bag watch bags --remove'))
 @click.argument('folder', metavar='DIR', type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option('--settle', type=click.FloatRange(0.0, 86_400.0), default=10.0, show_default=True, help='Seconds without a change.')
-@click.option('--every', type=click.FloatRange(0.1, 3600.0), default=5.0, show_default=True, help='Seconds between two looks.')
 @click.option('--remove', is_flag=True, help='Remove a bag from DIR once the store has confirmed every file of it.')
 @click.option('--once', is_flag=True, help='Look, wait for what is still changing, look again, and end. For a timer.')
 @_robot
 @as_json
-def bag_watch(*, folder: Path, settle: float, every: float, once: bool, robot: str, as_json: bool, remove: bool) -> int:
-    """Send every bag that `ros2 bag record` finishes in DIR, each once, until Ctrl-C.
+def bag_watch(*, folder: Path, settle: float, once: bool, robot: str, as_json: bool, remove: bool) -> ExitCode:
+    """Upload every bag that is finished in DIR, until Ctrl-C.
+
+    Those that `ros2 bag record` writes, for one; each is sent once.
 
     Finished is a folder in DIR with a metadata.yaml and all that it names, unchanged for --settle seconds. What was sent stands
     in DIR/.shadowhound-bags.json: it is not sent again after a restart. With --once exit code 1 says that something is not in
@@ -280,15 +303,15 @@ def bag_watch(*, folder: Path, settle: float, every: float, once: bool, robot: s
         try:
             while True:
                 _tell(watching.round(), as_json)
-                time.sleep(settle if once else every)
+                time.sleep(settle if once else LOOK_S)
                 if once:
                     _tell(watching.round(), as_json)
-                    return 1 if watching.is_owing() else 0
+                    return exit_code(finding=watching.is_owing())
         except KeyboardInterrupt:
-            return 0
+            return ExitCode.FINE
 
 
-@bag.command('record')
+@bag.command('record', epilog=examples('bag record kitchen --duration 60 --topics /imu,/odom'))
 @click.argument('name')
 @click.option('--duration', type=click.FloatRange(0.1, 86_400.0), required=True, help='Seconds; Ctrl-C ends it earlier.')
 @click.option('--topic', '--topics', 'topics', multiple=True, help='Record it; more by repeating it, or with commas.')
@@ -296,8 +319,10 @@ def bag_watch(*, folder: Path, settle: float, every: float, once: bool, robot: s
 @click.option('--deadline', type=click.FloatRange(0.0, 1e6), default=DEADLINE_S, show_default=True, help='Seconds for Tower.')
 @_robot
 @as_json
-def bag_record(*, topics: tuple[str, ...], as_json: bool, **wanted: Any) -> int:
-    """Record topics as NAME_YYYYMMDD_HHMMSS and have it in the store; without a topic those that the node logs by default.
+def bag_record(*, topics: tuple[str, ...], as_json: bool, **wanted: Any) -> ExitCode:
+    """Record topics into a bag and upload it.
+
+    It becomes NAME_YYYYMMDD_HHMMSS; without a topic it has those that the node logs by default.
 
     It needs ROS 2, but not its rosbag2, and no node that runs. Slices leave while it records. When Tower is away the bag waits in
     the spool, and exit code 1 says so.
@@ -313,7 +338,7 @@ def bag_record(*, topics: tuple[str, ...], as_json: bool, **wanted: Any) -> int:
             f'{number(found.slices)} slices, {volume(found.bytes)}, {state}')  # fmt: skip
         if found.dropped:
             print_lines(f'{number(found.dropped)} messages were dropped: this machine was too slow for them.')
-    return 0 if found.delivered and not found.dropped else 1
+    return exit_code(finding=not (found.delivered and not found.dropped))
 
 
 def _rows(rows: Sequence[BagRow]) -> RenderableType:

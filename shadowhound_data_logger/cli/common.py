@@ -1,11 +1,13 @@
-"""What the verbs share: options, and the store that the environment names."""
+"""What the verbs share: options, exit codes, examples, and the store that the environment names."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from enum import IntEnum
 from pathlib import Path
+from typing import Final
 
 import click
 
@@ -16,13 +18,50 @@ from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 
+PROGRAM: Final = 'shadowhound-data'
+
+
+class ExitCode(IntEnum):
+    """What every verb ends with; ``MEANINGS`` is the table of it, for the help and the docs."""
+
+    FINE = 0
+    FINDING = 1
+    USAGE = 2
+    INTERRUPTED = 130
+
+
+MEANINGS: Final = {
+    ExitCode.FINE: 'done, and nothing is wrong',
+    ExitCode.FINDING: 'something is wrong, or could not be done',
+    ExitCode.USAGE: 'wrong usage, setting or query',
+    ExitCode.INTERRUPTED: 'interrupted with Ctrl-C',
+}
+
+
+def exit_code(*, finding: object) -> ExitCode:
+    """Of a verb that did what it was asked: whether it found something wrong."""
+    return ExitCode.FINDING if finding else ExitCode.FINE
+
+
+def examples(*commands: str) -> str:
+    """The end of a verb's help: command lines that follow the program's name."""
+    return '\n'.join(('\b', 'Examples:', *(f'  {PROGRAM} {command}' for command in commands)))
+
+
+class BadUsage(click.UsageError):
+    """Something is wrong with how a verb was called; ``remedy`` says what to do instead of looking at its help."""
+
+    def __init__(self, message: str, remedy: str = '') -> None:
+        super().__init__(message)
+        self.remedy = remedy
+
 
 def robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str | None:
     """What ``--robot`` names; raises BadParameter for what is no name of a robot."""
     try:
         return None if name is None else check_name(name, 'the robot name')
     except NameRefused as error:
-        raise click.BadParameter(str(error)) from error
+        raise BadUsage(error.what, error.remedy or error.DEFAULT_REMEDY) from error
 
 
 as_json = click.option('--json', 'as_json', is_flag=True, help='Print it as JSON.')

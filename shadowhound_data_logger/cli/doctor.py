@@ -14,7 +14,7 @@ from rich.console import Console, RenderableType
 from rich.padding import Padding
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import as_json
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code
 from shadowhound_data_logger.cli.output import plain, print_json, progress
 from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make
@@ -43,7 +43,7 @@ def _rates(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> dic
         except ValueError:
             topic = ''
         if not topic:
-            raise click.BadParameter(f'{text!r} is not TOPIC=HZ, such as /imu=50')
+            raise BadUsage(f'--rate {text!r} is not a topic and its rate', '--rate /imu=50 is one')
     return found
 
 
@@ -52,7 +52,7 @@ def _selected(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> 
     names = [check.name for check in CHECKS]
     for name in given:
         if not any(_is_of(each, name) for each in names):
-            raise click.BadParameter(f'{name!r} is none of {", ".join(names)}')
+            raise BadUsage(f'there is no check {name!r}', f'there are {", ".join(names)}')
     return tuple(check for check in CHECKS if not given or any(_is_of(check.name, name) for name in given))
 
 
@@ -60,7 +60,7 @@ def _is_of(check: str, name: str) -> bool:
     return check == name or check.startswith(f'{name}.')
 
 
-@click.command()
+@click.command(epilog=examples('doctor', 'doctor --only s3 --only clock', 'doctor --fix'))
 @click.option('--role', type=click.Choice([role.value for role in Role]), help='What this machine is  [default: guessed]')
 @click.option('--only', 'checks', multiple=True, metavar='CHECK', callback=_selected, help='Ask this alone; may be repeated.')
 @as_json
@@ -74,8 +74,10 @@ def _is_of(check: str, name: str) -> bool:
 def doctor(  # noqa: PLR0913 - one for each option
     *, role: str | None, checks: tuple[Check, ...], as_json: bool, fix: bool, timeout: float, params_file: Path | None,
     namespace: str, rates: dict[str, float], verbose: bool,
-) -> int:  # fmt: skip
-    """Why does it not work? Asks this machine, its network, Tower and ROS, and says what to do.
+) -> ExitCode:  # fmt: skip
+    """Find out why it does not work, and what to do.
+
+    It checks this machine, its network, Tower and ROS.
 
     Leaves probe objects of 64 bytes under ROBOT/_doctor/ in the store and in the missions of MLflow; changes nothing
     else without --fix. Exit code 1 on errors and warnings, 0 when there are none.
@@ -85,7 +87,7 @@ def doctor(  # noqa: PLR0913 - one for each option
             os.environ, role=Role(role) if role else None, parameter_file=params_file, namespace=namespace, rates_hz=rates
         )
     except ParametersUnreadable as error:
-        raise click.BadParameter(str(error), param_hint='--params-file') from error
+        raise BadUsage(error.what, error.remedy or error.DEFAULT_REMEDY) from error
     began_s = time.monotonic()
     results = _examine([check for check in checks if context.role in check.roles], context, timeout)
     fixed = list(fix_results(results, context)) if fix else []
@@ -96,7 +98,7 @@ def doctor(  # noqa: PLR0913 - one for each option
     else:
         for part in report(results, fixed, context, took_s, verbose=verbose):
             console().print(part)
-    return 1 if left else 0
+    return exit_code(finding=left)
 
 
 def console() -> Console:

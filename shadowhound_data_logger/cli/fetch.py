@@ -12,32 +12,39 @@ from typing import Any, Final
 import click
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import as_json, the_store_settings
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store_settings
 from shadowhound_data_logger.cli.output import duration, number, plain, print_json, print_lines, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 from shadowhound_data_logger.stores import open_reader
 
+THREADS: Final = 16
+"""Objects at a time."""
 SHOWN: Final = 20
 """Of what could not be fetched; --json has all."""
 
 
-@click.command()
+@click.command(
+    epilog=examples(
+        'fetch thor/camera/20251018/ --to data',
+        'fetch --sensor camera --since yesterday --near 2.0,6.5,3 --to data',
+    )
+)
 @click.argument('prefix', required=False)
 @question
 @click.option('--limit', type=click.IntRange(1), metavar='N', help='At most so many objects of a question, the earliest.')
 @click.option('--to', type=click.Path(file_okay=False, path_type=Path), required=True, metavar='DIR', help='Where: DIR/KEY.')
 @click.option('--bucket', default='sensor-data', show_default=True, help='Of a prefix.')
 @click.option('--verify', is_flag=True, help='Read again what is there already.')
-@click.option('--threads', type=click.IntRange(1, 256), default=16, show_default=True, help='Objects at a time.')
 @as_json
-def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to: Path, bucket: str, verify: bool, threads: int,  # noqa: PLR0913 - one an option
-          as_json: bool) -> int:  # fmt: skip
-    """Download objects, each verified; a second time only what is new. Exit code 1 when something could not be fetched.
+def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to: Path, bucket: str, verify: bool,
+          as_json: bool) -> ExitCode:  # fmt: skip
+    """Download objects, verified.
 
-    Either everything under a PREFIX (thor/camera/20261121/), or what the flags ask for.
+    Either everything under a PREFIX (thor/camera/20261121/), or what the flags ask for. A second time only what is new is
+    downloaded. Exit code 1 when something could not be fetched.
     """
     if (prefix is None) == (not flags):
-        raise click.UsageError('name either a prefix or what to ask the catalogue for')
+        raise BadUsage('give either a prefix or flags that choose objects', 'shadowhound-data fetch thor/camera/ --to data')
     with asking():
         from shadowhound_data_logger.lake import fetch as lake  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
@@ -60,7 +67,7 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
             bar.have(size)
             bar.say(f'{number(here)} of {number(len(wishes))} objects')
 
-        found = lake.fetch(wishes, to, source, verify=verify, threads=threads, tell=tell)
+        found = lake.fetch(wishes, to, source, verify=verify, threads=THREADS, tell=tell)
         keep_rows(to, [row for row in rows if f'{row["bucket"]}/{row["key"]}' not in found.failed])
     took_s = time.monotonic() - begun_s
     if as_json:
@@ -72,7 +79,7 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
         where = f'{"" if prefix is None else f"under {prefix} "}in {Bucket(store, bucket).describe()}'
         print_lines(*_report(found, len(wishes), took_s, to, where))
         tell_left_out(left_out)
-    return 1 if found.failed or len(left_out) else 0
+    return exit_code(finding=found.failed or len(left_out))
 
 
 def _asked(flags: Mapping[str, Any], limit: int | None, left_out: Any) -> list[dict[str, Any]]:

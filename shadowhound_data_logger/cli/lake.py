@@ -16,7 +16,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.cli.audit import finding_lines, findings
-from shadowhound_data_logger.cli.common import as_json, the_store, the_store_settings
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 from shadowhound_data_logger.clock import SECOND, SystemClock, utc
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.lake.gaps import Coverage
     from shadowhound_data_logger.lake.verify import Rows
 
+THREADS: Final = 16
+"""Objects at a time."""
 UNLISTED: Final = 'unlisted'
 DAY_NS: Final = 24 * 3600 * SECOND
 MOST_COVERED_NS: Final = 400 * DAY_NS
@@ -36,16 +38,19 @@ COLUMNS: Final = ('robot', 'days', 'first', 'last', 'files', 'size', 'compacted'
 _robot = click.option('--robot', metavar='NAME', help='Of this robot alone.')
 
 
-@click.group()
+@click.group(epilog=examples('lake status', 'lake compact'))
 def lake() -> None:
-    """The catalogue of what is stored, in the store itself: BUCKET/ROBOT/_catalog/."""
+    """Look after the catalogue of what is stored.
+
+    It is in the store itself: BUCKET/ROBOT/_catalog/.
+    """
 
 
-@lake.command('status')
+@lake.command('status', epilog=examples('lake status'))
 @_robot
 @as_json
-def lake_status(*, robot: str | None, as_json: bool) -> int:
-    """How many files the catalogue has, of which days, and what compacting would do."""
+def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
+    """Show the size of the catalogue, by robot."""
     with asking():
         from shadowhound_data_logger.lake.live_files import state  # noqa: PLC0415
         from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
@@ -66,15 +71,20 @@ def lake_status(*, robot: str | None, as_json: bool) -> int:
     return tell_left_out(left_out)
 
 
-@lake.command('compact')
+@lake.command(
+    'compact',
+    epilog=examples('lake compact', 'lake compact --robot thor --before yesterday --keep'),
+)
 @_robot
 @click.option('--before', metavar='DATE', help='Days earlier than this  [default: today, UTC]')
 @click.option('--keep', is_flag=True, help='Delete nothing.')
 @click.option('--grace', type=click.FloatRange(0.0), default=60.0, show_default=True, metavar='MIN',
               help='How long superseded files stay: somebody may be reading them.')  # fmt: skip
 @as_json
-def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: float, as_json: bool) -> int:
-    """Make one file of the many of each day that is over, and delete those that an earlier run made one of.
+def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: float, as_json: bool) -> ExitCode:
+    """Merge the many files of each past day into one.
+
+    Files that an earlier run merged are deleted.
 
     Exit code 1 when a file is no part of a catalogue, or has rows that are not its robot's: it is named and stays as it is.
     """
@@ -105,11 +115,14 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
     return tell_left_out(left_out)
 
 
-@lake.command('reindex')
+@lake.command('reindex', epilog=examples('lake reindex --robot thor'))
 @click.option('--robot', metavar='NAME', required=True, help='Whose objects.')
 @as_json
-def lake_reindex(*, robot: str, as_json: bool) -> int:
-    """Add what the catalogue lacks, by listing the store and asking each object that is missing."""
+def lake_reindex(*, robot: str, as_json: bool) -> ExitCode:
+    """Add objects that the catalogue lacks.
+
+    It lists the store, and asks for each object that has no row.
+    """
     with asking():
         from shadowhound_data_logger.lake import reindex as library  # noqa: PLC0415
         from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
@@ -130,21 +143,22 @@ def lake_reindex(*, robot: str, as_json: bool) -> int:
     return tell_left_out(left_out)
 
 
-@lake.command('verify')
+@lake.command('verify', epilog=examples('lake verify --since 7d', 'lake verify --robot thor --deep'))
 @question
 @click.option('--catalogue', type=click.Path(exists=True, file_okay=False, path_type=Path), metavar='DIR',
               help='Of another store, as `fetch ROBOT/_catalog/ --to DIR` brought it.')  # fmt: skip
 @click.option('--deep', is_flag=True, help='Read every object back.')
-@click.option('--threads', type=click.IntRange(1, 256), default=16, show_default=True, help='Objects at a time.')
 @as_json
-def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool, threads: int, as_json: bool) -> int:
-    """Ask the store for every object of the catalogue: is it there, with its size and checksum?
+def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool, as_json: bool) -> ExitCode:
+    """Check that the store has what the catalogue says.
+
+    It asks for every object, its size and its checksum.
 
     All objects, or those that the flags ask for. Of a store that was moved, name the catalogue of the old one as well: what the
     new one lost of its own is found only so. Exit code 1 when something is not as the catalogue says, or when it says nothing.
     """
     if catalogue and 'success' in flags:
-        raise click.UsageError('which missions failed is not in a catalogue: --failed and --succeeded do not go with --catalogue')
+        raise BadUsage('a catalogue does not say which missions failed', 'leave out --failed and --succeeded, or --catalogue')
     with asking():
         from shadowhound_data_logger.lake import query, selecting  # noqa: PLC0415 - Daft takes half a second
         from shadowhound_data_logger.lake import verify as library  # noqa: PLC0415
@@ -155,10 +169,10 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
         own = library.rows(query.default_source(store), left_out, **flags)
         theirs = library.rows(selecting.fetched(catalogue), left_out, **flags) if catalogue else own
         if not len(theirs) and catalogue:
-            raise click.UsageError(f'there are no rows in {catalogue}: `shadowhound-data fetch ROBOT/_catalog/ --to {catalogue}`')
+            raise BadUsage(f'there are no rows in {catalogue}', f'shadowhound-data fetch ROBOT/_catalog/ --to {catalogue}')
         rows, lacking = (theirs.joined(own), theirs.lacking(own)) if catalogue else (own, [])
     with closing(open_reader(store)) as target, progress('read back' if deep else 'asked for', len(rows), of='objects') as bar:
-        found = audit(rows, target, deep=deep, threads=threads, keys=None, tell=bar.have)
+        found = audit(rows, target, deep=deep, threads=THREADS, keys=None, tell=bar.have)
         where = target.describe()
     said = {'store': where, 'catalogue': catalogue and str(catalogue), **_said(rows, found, lacking, deep=deep)}
     said['took_s'] = round(time.monotonic() - begun_s, 3)
@@ -169,10 +183,13 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
     else:
         print_page(*_page(said))
         tell_left_out(left_out)
-    return 0 if said['ok'] else 1
+    return exit_code(finding=not said['ok'])
 
 
-@lake.command('coverage')
+@lake.command(
+    'coverage',
+    epilog=examples('lake coverage --since yesterday', 'lake coverage --topic /imu --map imu.png'),
+)
 @_robot
 @click.option('--topic', metavar='NAME', help='Of this topic alone.')
 @click.option('--sink', type=click.Choice(['objects', 'bags', 'events']), default='objects', show_default=True,
@@ -184,8 +201,10 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
 @click.option('--map', 'chart', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw it, a line a topic.')
 @as_json
 def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str, until: str, chart: Path | None,
-                  as_json: bool) -> int:  # fmt: skip
-    """How much of the time is in the store, by topic and hour, what was lost and why, and what is not known yet.
+                  as_json: bool) -> ExitCode:  # fmt: skip
+    """Show which hours of a topic are stored or lost.
+
+    By topic and hour, with the causes, and what is not known yet.
 
     Below a topic's watermark everything is known: it is stored, downsampled by the settings, or in a gap. Above it, and while the
     robot was off or cannot be reached, nobody knows.
@@ -197,7 +216,10 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
         now_ns = SystemClock.of_this_machine().wall_ns()
         since_ns, until_ns = moment('--since', since, now_ns), moment('--until', until, now_ns)
         if not 0 < until_ns - since_ns <= MOST_COVERED_NS:
-            raise click.UsageError(f'--since {since} --until {until} is not a time of up to {MOST_COVERED_NS // DAY_NS} days')
+            raise BadUsage(
+                f'--since {since} --until {until} is no span of time',
+                f'--since before --until, up to {MOST_COVERED_NS // DAY_NS} days',
+            )
         left_out = quietly()
         found = library.coverage(since_ns, until_ns, robot=robot, topic=topic, sink=sink, findings=left_out,
                                  source=default_source(the_store_settings()))  # fmt: skip

@@ -12,7 +12,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.cli.audit import verify_delivered
-from shadowhound_data_logger.cli.common import as_json, spool_folder, the_spool
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, spool_folder, the_spool
 from shadowhound_data_logger.cli.output import (
     duration,
     figure,
@@ -45,7 +45,13 @@ ACCOUNTING: Final = {
 }
 
 
-@click.command()
+@click.command(
+    epilog=examples(
+        'ledger',
+        'ledger --gaps --since 2h',
+        'ledger --verify',
+    )
+)
 @as_json
 @spool_folder
 @click.option('--verify', 'ask', is_flag=True, help='Ask the store for every delivered object: is it there, with its checksum?')
@@ -59,8 +65,10 @@ ACCOUNTING: Final = {
     '--cause', default='', metavar='WORD', help='With --gaps: for this cause or of this kind: restart, missed, no_room.'
 )
 def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: bool, when: bool, topic: str, since: str,  # noqa: PLR0913 - one an option
-           until: str, cause: str) -> int:  # fmt: skip
-    """What became of the messages: stored and where, or lost and why. ~ is an estimate, - is not known.
+           until: str, cause: str) -> ExitCode:  # fmt: skip
+    """Account for every message: stored, or lost and why.
+
+    ~ is an estimate, - is not known.
 
     Reads the spool while the node runs and when it does not. Exit code 1 when the ledger does not balance, or when the store
     does not hold what was delivered; an interrupted --verify goes on where it was. Times are UTC.
@@ -75,13 +83,13 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
             print_json({'gaps': [gap.as_dict() for gap in rows]})
         else:
             print_page(*gaps_page(rows))
-        return 0
+        return ExitCode.FINE
     if topic or since or until or cause:
-        raise click.UsageError('--topic, --since, --until and --cause are for --gaps')
+        raise BadUsage('--topic, --since, --until and --cause choose among gaps', 'add --gaps')
     if ask or deep:
         return verify_delivered(folder, deep=deep, again=again, as_json=as_json)
     if again:
-        raise click.UsageError('--again is for --verify or --deep')
+        raise BadUsage('--again is for --verify and --deep', 'add --verify')
     names = robots(folder)
     found = read_ledger(folder, _robot(folder))
     found['robots'] = names if len(names) > 1 else [found['robot']]  # a spool that several share has one ledger of them all
@@ -89,7 +97,7 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
         print_json(found)
     else:
         print_page(*page(found))
-    return 0 if found['balanced'] else 1
+    return exit_code(finding=not found['balanced'])
 
 
 def _robot(folder: Path) -> str:

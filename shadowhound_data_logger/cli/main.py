@@ -1,68 +1,115 @@
-"""``shadowhound-data VERB``: exit code 0 is fine, 1 a finding, 2 bad usage."""
+"""``shadowhound-data VERB``: the verbs by who needs them, and how every one of them ends.
+
+An error has one form: the verb, what is wrong and where, and on the next line what to do. ``common.ExitCode`` has the exit codes.
+"""
 
 from __future__ import annotations
 
-import io
+import sqlite3
 import sys
+from collections.abc import Sequence
+from typing import Final
 
 import click
 
 from shadowhound_data_logger.cli.bag import bag
+from shadowhound_data_logger.cli.common import MEANINGS, PROGRAM, BadUsage, ExitCode, examples
 from shadowhound_data_logger.cli.doctor import doctor
 from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.cli.ledger import ledger
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.node import node
+from shadowhound_data_logger.cli.output import tell_error
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.cli.spool import spool
 from shadowhound_data_logger.cli.status import status
-from shadowhound_data_logger.errors import DataLoggerError
-from shadowhound_data_logger.untrusted import visible
+from shadowhound_data_logger.errors import DataLoggerError, SettingError
+
+SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
+    'On every machine': (doctor,),
+    'On the robot': (status, ledger, spool, node),
+    'On Tower and Spark': (query, fetch, bag, lake),
+    'Missions': (missions,),
+}
+"""The verbs by who needs them, in the order of the help."""
+GONE: Final = {
+    ('fetch', '--threads'): 'it downloads 16 objects at a time',
+    ('bag fetch', '--threads'): 'it downloads several files at a time',
+    ('lake verify', '--threads'): 'it asks for 16 objects at a time',
+    ('bag watch', '--every'): 'it looks every 5 seconds',
+}
+"""Options of earlier versions, by verb, and what does their job now."""
+CODES: Final = '\n'.join(('\b', 'Exit codes:', *(f'  {code.value:<4} {meaning}' for code, meaning in MEANINGS.items())))
 
 
-@click.group(context_settings={'help_option_names': ['-h', '--help']})
-@click.version_option(package_name='shadowhound_data_logger', prog_name='shadowhound-data')
+class Verbs(click.Group):
+    """Its help lists the verbs section by section."""
+
+    def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
+        room = formatter.width - 6 - max(len(name) for name in self.commands)
+        for title, verbs in SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl([(verb.name or '', verb.get_short_help_str(room)) for verb in verbs])
+
+    def format_epilog(self, _: click.Context, formatter: click.HelpFormatter) -> None:
+        for part in (examples('doctor', 'status --watch', 'bag fetch --help'), CODES):
+            formatter.write_paragraph()
+            formatter.write_text(part)
+
+
+@click.group(cls=Verbs, context_settings={'help_option_names': ['-h', '--help']})
+@click.version_option(package_name='shadowhound_data_logger', prog_name=PROGRAM)
 def cli() -> None:
     """What became of a robot's data: ask its spool and its store.
 
-    SHADOWHOUND_HOME names the folder of the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT the robot (default: who ran).
+    SHADOWHOUND_HOME is the folder of the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT the robot (default: the one that ran
+    here), AWS_ENDPOINT_URL the S3 server (default: the folder SHADOWHOUND_HOME/store). Most verbs print JSON with --json.
     """
 
 
-cli.add_command(doctor)
-cli.add_command(bag)
-cli.add_command(fetch)
-cli.add_command(lake)
-cli.add_command(ledger)
-cli.add_command(missions)
-cli.add_command(node)
-cli.add_command(query)
-cli.add_command(spool)
-cli.add_command(status)
+for _verb in (verb for section in SECTIONS.values() for verb in section):
+    cli.add_command(_verb)
 
 
 def main() -> None:
     """The console script."""
     try:
-        sys.exit(cli(standalone_mode=False) or 0)
+        sys.exit(ExitCode(cli(prog_name=PROGRAM, standalone_mode=False) or 0))
     except click.exceptions.Exit as error:
         sys.exit(error.exit_code)
-    except click.ClickException as error:
-        told = io.StringIO()
-        error.show(told)
-        click.echo(visible_lines(told.getvalue()), nl=False, err=True)
-        sys.exit(2)
     except click.Abort:
-        sys.exit(130)
-    except DataLoggerError as error:
-        click.echo(f'shadowhound-data: {visible_lines(str(error))}', err=True)
-        sys.exit(1)
+        sys.exit(ExitCode.INTERRUPTED)
+    except (click.ClickException, DataLoggerError, OSError, sqlite3.Error) as error:
+        tell_error(*described(error, sys.argv[1:]))
+        sys.exit(ExitCode.USAGE if isinstance(error, (click.ClickException, SettingError)) else ExitCode.FINDING)
 
 
-def visible_lines(text: str) -> str:
-    """An error may name what a robot wrote."""
-    return '\n'.join(map(visible, text.split('\n')))
+def described(error: Exception, arguments: Sequence[str]) -> tuple[str, str, str]:
+    """The verb that failed, what is wrong and where, and what to do about it."""
+    verb = ' '.join((PROGRAM, *verb_of(arguments)))
+    if isinstance(error, DataLoggerError):
+        return verb, error.what, error.remedy or error.DEFAULT_REMEDY
+    if isinstance(error, click.NoSuchOption) and (instead := GONE.get((verb.partition(' ')[2], error.option_name))):
+        return verb, f'there is no {error.option_name} any more', f'leave it out: {instead}'
+    if isinstance(error, click.ClickException):
+        return verb, error.format_message().rstrip('.'), (isinstance(error, BadUsage) and error.remedy) or f'{verb} --help'
+    if isinstance(error, OSError):
+        names = ' and '.join(str(name) for name in (error.filename, error.filename2) if name)
+        what = error.strerror or str(error)
+        return verb, f'{names}: {what}' if names else what, 'does the path exist, is it yours, and has its disk room?'
+    return verb, f'the index of the spool cannot be used: {error}', f'{PROGRAM} doctor --only spool looks for the cause'
+
+
+def verb_of(arguments: Sequence[str]) -> list[str]:
+    """The verb, and the verb of that, which a command line names."""
+    command: click.Command = cli
+    found: list[str] = []
+    for argument in arguments:
+        if isinstance(command, click.Group) and argument in command.commands:
+            command = command.commands[argument]
+            found.append(argument)
+    return found
 
 
 if __name__ == '__main__':

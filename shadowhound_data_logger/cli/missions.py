@@ -14,7 +14,7 @@ import click
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import as_json, the_home
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_home
 from shadowhound_data_logger.cli.output import (
     duration,
     number,
@@ -41,24 +41,30 @@ COLUMNS: Final = ('time', 'kind', 'key', 'value', 'step', 'source')
 def _folder(_: click.Context, __: click.Parameter, wanted: str) -> MissionFolder:
     found = find(the_home(), wanted)
     if not found:
-        raise click.BadParameter(f'no mission here has the id {wanted!r}, nor has its run: shadowhound-data missions list')
+        raise BadUsage(f'no mission here has the id {wanted!r}, nor has its run', 'shadowhound-data missions list shows the ids')
     if len(found) > 1:
-        raise click.BadParameter(f'{wanted!r} begins the ids of {len(found)} missions')
+        raise BadUsage(f'{wanted!r} begins the ids of {len(found)} missions', 'give more of the id')
     return found[0]
 
 
 _mission = click.argument('folder', metavar='ID', callback=_folder)
 
 
-@click.group()
+@click.group(epilog=examples('missions list', 'missions resume'))
 def missions() -> None:
-    """Missions that were logged on this machine. ID is a mission's id or that of its MLflow run, or how one begins."""
+    """Show and send missions logged on this machine.
+
+    ID is a mission's id or that of its MLflow run, or how one begins.
+    """
 
 
-@missions.command('list')
+@missions.command('list', epilog=examples('missions list'))
 @as_json
-def list_(*, as_json: bool) -> int:
-    """One row a mission, the newest last. Exit code 1 when one that is over is not sent."""
+def list_(*, as_json: bool) -> ExitCode:
+    """List the missions, the newest last.
+
+    Exit code 1 when one that is over is not sent.
+    """
     where = the_home()
     found = overviews(where)
     if as_json:
@@ -67,33 +73,39 @@ def list_(*, as_json: bool) -> int:
         click.echo(f'No mission has been logged in {where / MISSIONS} yet. SHADOWHOUND_HOME names the folder above it.')
     else:
         print_page(_table(found), *_verdict(found, is_sending=is_sending(where / MISSIONS)))
-    return 1 if _late(found) else 0
+    return exit_code(finding=_late(found))
 
 
-@missions.command()
+@missions.command(epilog=examples('missions show 20251018T120000'))
 @as_json
 @_mission
-def show(*, folder: MissionFolder, as_json: bool) -> int:
-    """All there is to know of one mission. Exit code 1 when it is over and not sent: then what is left, and why."""
+def show(*, folder: MissionFolder, as_json: bool) -> ExitCode:
+    """Show everything about one mission.
+
+    Exit code 1 when it is over and not sent; the output says what is left, and why.
+    """
     found = overview(folder)
     if found is None:
-        raise click.UsageError(f'{folder.path} has no mission in it')
+        raise BadUsage(f'{folder.path} has no mission in it', 'shadowhound-data missions list shows those that are whole')
     if as_json:
         print_json(found)
     else:
         print_page(*_page(found))
-    return 1 if _late([found]) else 0
+    return exit_code(finding=_late([found]))
 
 
-@missions.command()
+@missions.command(epilog=examples('missions resume --deadline 300'))
 @click.option('--deadline', type=click.FloatRange(0.0, 1e6), default=60.0, show_default=True, help='Seconds to wait.')
 @click.option('--experiment', help='The MLflow experiment of new runs.  [default: ROBOT_missions]')
-def resume(*, deadline: float, experiment: str | None) -> int:
-    """Send what is unsent, and wait for it. Exit code 1 when something stays; it is tried on for ten minutes then."""
+def resume(*, deadline: float, experiment: str | None) -> ExitCode:
+    """Send what is not sent yet, and wait for it.
+
+    Exit code 1 when something is left after the deadline; it is tried for ten more minutes in the background.
+    """
     where = the_home()
     if not _late(overviews(where)):
         click.echo('Nothing is left to send.')
-        return 0
+        return ExitCode.FINE
     robot = os.environ.get('SHADOWHOUND_ROBOT') or 'thor'
     replayer = Replayer(where, experiment or f'{robot}_missions', os.environ)
     replayer.start()
@@ -104,15 +116,18 @@ def resume(*, deadline: float, experiment: str | None) -> int:
     for each in left:
         print_page(*_reason(each), console=Console(highlight=False, stderr=True))
     click.echo(f'{number(len(left))} not sent within {deadline:g} s.' if left else 'All is sent.')
-    return 1 if left else 0
+    return exit_code(finding=left)
 
 
-@missions.command('export')
+@missions.command('export', epilog=examples('missions export 20251018T120000 --format csv --to mission.csv'))
 @click.option('--format', 'kind', type=click.Choice(['json', 'csv']), default='json', show_default=True, help='What to write.')
 @click.option('--to', type=click.File('w', encoding='utf-8', lazy=True), default='-', help='The file  [default: standard output]')
 @_mission
-def export_(*, folder: MissionFolder, kind: str, to: IO[str]) -> int:
-    """Write out all points, events and parameters of one mission. As they were logged on this machine: without MLflow."""
+def export_(*, folder: MissionFolder, kind: str, to: IO[str]) -> ExitCode:
+    """Write one mission to JSON or CSV.
+
+    All points, events and parameters, as they were logged on this machine; MLflow is not asked.
+    """
     found = export(folder)
     if kind == 'json':
         json.dump(found, to, indent=2)
@@ -121,7 +136,7 @@ def export_(*, folder: MissionFolder, kind: str, to: IO[str]) -> int:
         rows = csv.writer(to, lineterminator='\n')
         rows.writerow(COLUMNS)
         rows.writerows(map(csv_cell, row) for row in _rows(found))
-    return 0
+    return ExitCode.FINE
 
 
 def _rows(found: Mapping[str, Any]) -> Iterator[tuple[object, ...]]:

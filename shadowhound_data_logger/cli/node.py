@@ -13,8 +13,8 @@ from rich.console import RenderableType
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from shadowhound_data_logger.cli.common import as_json, robot_name, spool_folder, the_spool
-from shadowhound_data_logger.cli.output import plain, plain_table, print_json, print_page
+from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, robot_name, spool_folder, the_spool
+from shadowhound_data_logger.cli.output import plain, plain_table, print_json, print_page, tell_error
 from shadowhound_data_logger.spool.control import connect
 
 F = TypeVar('F', bound=Callable[..., Any])
@@ -34,70 +34,79 @@ def _of_node(verb: F) -> F:
     return verb
 
 
-@click.group()
+@click.group(epilog=examples('node flush', 'node set camera.rate_hz 5.0'))
 def node() -> None:
-    """Have the node that runs here do what its services and parameters do, without ROS.
+    """Control the node on this machine, without ROS.
+
+    These verbs do what its services and parameters do.
 
     It is asked through a socket in its spool, by its own user alone. Exit code 1 when it refuses, fails, or does not run.
     """
 
 
-@node.group()
+@node.group(epilog=examples('node bag start', 'node bag stop'))
 def bag() -> None:
-    """Record at full rate: begin a bag, end it, end a slice of it, let it rest."""
+    """Record a bag at full rate."""
 
 
 def _add(group: click.Group, name: str, do: str, text: str) -> None:
-    @group.command(name, help=text)
+    @group.command(name, help=text, epilog=examples(f'{"node " * (group is bag)}{group.name} {name}'))
     @_of_node
-    def ask(*, robot: str | None, spool: Path | None, as_json: bool) -> int:
+    def ask(*, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:
         return _ask(spool, robot, do, as_json=as_json)
 
 
-_add(node, 'flush', 'flush', 'Make all durable that was taken so far, open batches included; says how much that was.')
-_add(node, 'pause', 'pause', 'Store nothing from now on; messages are still counted, and delivery goes on.')
+_add(node, 'flush', 'flush', 'Write everything received so far to disk, open batches too.')
+_add(node, 'pause', 'pause', 'Store nothing from now on; uploads go on.')
 _add(node, 'resume', 'resume', 'Store messages again.')
-_add(bag, 'start', 'bag start', 'Begin a bag; says its name.')
-_add(bag, 'stop', 'bag stop', 'End the bag; it is whole in the spool then.')
-_add(bag, 'split', 'bag split', 'End the slice, so that it is delivered now.')
-_add(bag, 'pause', 'bag pause', 'Drop what comes, counted, until it is resumed.')
+_add(bag, 'start', 'bag start', 'Begin a bag and print its name.')
+_add(bag, 'stop', 'bag stop', 'End the bag.')
+_add(bag, 'split', 'bag split', 'End the file that is being written, so that it is uploaded now.')
+_add(bag, 'pause', 'bag pause', 'Record nothing until it is resumed; messages are counted.')
 _add(bag, 'resume', 'bag resume', 'Record again.')
 
 
-@node.command()
+@node.command(epilog=examples('node event', "node event slipped --note 'wet floor'"))
 @click.argument('name', default='manual')
 @click.option('--note', default='', help='What it was, for its manifest.')
 @_of_node
-def event(*, name: str, note: str, robot: str | None, spool: Path | None, as_json: bool) -> int:
-    """Make a bag of the seconds before now and after; says its name. One that goes on lasts longer instead."""
+def event(*, name: str, note: str, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:
+    """Save the seconds before and after now as a bag.
+
+    It prints its name. An event that is still going on is prolonged instead.
+    """
     return _ask(spool, robot, 'event', as_json=as_json, name=name, note=note)
 
 
-@node.command('set', context_settings={'ignore_unknown_options': True})
+@node.command('set', context_settings={'ignore_unknown_options': True},
+              epilog=examples('node set camera.rate_hz 5.0', 'node set upload.max_mbps 20'))  # fmt: skip
 @click.argument('name')
 @click.argument('value')
 @_of_node
-def set_(*, name: str, value: str, robot: str | None, spool: Path | None, as_json: bool) -> int:
-    """Set a parameter while the node runs, until it ends: 5.0, true, or a word, as in a parameter file.
+def set_(*, name: str, value: str, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:
+    """Set a parameter until the node ends.
 
-    docs/parameters.md says which can be set; `shadowhound-data node params` as well.
+    The value is written as in a parameter file: 5.0, true, or a word. `shadowhound-data node params` says which can be set.
     """
     return _ask(spool, robot, 'set', as_json=as_json, values={name: _value(value)})
 
 
-@node.command()
+@node.command(epilog=examples('node get camera.rate_hz'))
 @click.argument('name')
 @_of_node
-def get(*, name: str, robot: str | None, spool: Path | None, as_json: bool) -> int:
+def get(*, name: str, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:
     """Print the value of a parameter."""
     return _ask(spool, robot, 'get', as_json=as_json, show=lambda answer: [_shown(answer['values'][name])], names=[name])
 
 
-@node.command()
+@node.command(epilog=examples('node params', 'node params camera'))
 @click.argument('prefix', default='', metavar='[SENSOR|GROUP]')
 @_of_node
-def params(*, prefix: str, robot: str | None, spool: Path | None, as_json: bool) -> int:
-    """List the parameters with their values, and which can be set while it runs: all, or those of a sensor or group."""
+def params(*, prefix: str, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:
+    """List the parameters, and which can be set now.
+
+    All of them, or those of a sensor or group.
+    """
 
     def chosen(answer: dict[str, Any]) -> dict[str, Any]:
         found = [each for each in answer['parameters'] if not prefix or f'{each["name"]}.'.startswith(f'{prefix}.')]
@@ -112,7 +121,7 @@ def params(*, prefix: str, robot: str | None, spool: Path | None, as_json: bool)
 def _ask(
     spool: Path | None, robot: str | None, do: str, *, as_json: bool, show: Callable[[dict[str, Any]], Any] | None = None,
     chosen: Callable[[dict[str, Any]], dict[str, Any]] = lambda answer: answer, **arguments: Any,
-) -> int:  # fmt: skip
+) -> ExitCode:  # fmt: skip
     """Ask, print what is answered, and say by the exit code whether it was done."""
     with closing(connect(the_spool(spool), robot)) as connection:
         answer = connection.ask(do, **arguments)
@@ -121,12 +130,12 @@ def _ask(
     if as_json:
         print_json(answer)
     elif not answer['ok']:
-        click.echo(f'shadowhound-data: {answer["error"]}', err=True)
+        tell_error(f'shadowhound-data node {do}', answer['error'], 'shadowhound-data status says what the node does')
     elif show is not None:
         print_page(*show(answer))
     else:
         click.echo(answer['message'])
-    return 0 if answer['ok'] else 1
+    return exit_code(finding=not answer['ok'])
 
 
 def _table(answer: dict[str, Any]) -> Iterator[RenderableType]:

@@ -31,6 +31,7 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.keys import printable
 from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED
+from shadowhound_data_logger.untrusted import visible
 
 BAR_COLUMNS: Final = 10
 WIDEST: Final = 1000
@@ -41,6 +42,12 @@ UNITS: Final = ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min'), (60, 'min', 1, 
 def print_json(value: object, *, is_line: bool = False) -> None:
     """On standard output, for programs: one value, or one of many, a line each. What JSON does not know is told as text."""
     click.echo(json.dumps(value, indent=None if is_line else 2, default=str))
+
+
+def tell_error(verb: str, what: str, remedy: str) -> None:
+    """On standard error: the verb, what is wrong and where, and on the next line what to do."""
+    for start, text in ((f'{verb}: ', what), ('  -> ', remedy)):  # which may quote what a robot wrote
+        click.echo(start + '\n'.join(map(visible, text.split('\n'))), err=True)
 
 
 def print_page(*parts: RenderableType, console: Console | None = None) -> None:

@@ -13,7 +13,7 @@ from typing import Any, Final
 import click
 from rich.console import RenderableType
 
-from shadowhound_data_logger.cli.common import as_json, the_store_settings
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, the_store_settings
 from shadowhound_data_logger.cli.output import number, plain, plain_table, print_json, print_page, volume
 from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, tell_left_out
 from shadowhound_data_logger.untrusted import csv_cell, visible
@@ -26,7 +26,13 @@ MOST_POSES: Final = 20_000
 _OBJECTS: Final = {'bucket', 'key'}
 
 
-@click.command()
+@click.command(
+    epilog=examples(
+        'query --sensor camera --since yesterday --near 2.0,6.5,3 --sheet kitchen.jpg',
+        'query --topic /odom --limit 5 --format csv',
+        'query "SELECT sensor, count(*) AS n FROM objects GROUP BY sensor" --since 7d',
+    )
+)
 @click.argument('sql', required=False)
 @question
 @click.option('--order', metavar='COLUMN', help="What to sort by, such as 't_start desc'  [default: t_start]")
@@ -36,14 +42,14 @@ _OBJECTS: Final = {'bucket', 'key'}
 @click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')
 @click.option('--map', 'ground', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw where the objects lie.')
 def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str, as_json: bool,  # noqa: PLR0913 - one an option
-          sheet: Path | None, ground: Path | None) -> int:  # fmt: skip
-    """Ask what is stored. All flags that are given must hold; times are UTC.
+          sheet: Path | None, ground: Path | None) -> ExitCode:  # fmt: skip
+    """Search what is stored, by flags or SQL.
 
-    SQL knows the views objects, missions and topics, restricted by the flags:
+    All flags that are given must hold; times are UTC.
 
-        shadowhound-data query "SELECT sensor, count(*) AS n FROM objects GROUP BY sensor" --since yesterday
+    SQL knows the views objects, missions, topics, gaps and watermarks, restricted by the flags.
 
-    Exit code 1 when parts of the catalogue are none and left out; they are named on standard error.
+    Exit code 1 when files of the catalogue are damaged: they are left out, and named on standard error.
     """
     with asking():
         from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
@@ -55,7 +61,7 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
             frame = _ordered(frame, order or ('t_start_ns' if not sql else None))
             found = (frame.limit(limit) if limit else frame).to_arrow()
     if (sheet or ground or kind == 'keys') and not _OBJECTS.issubset(found.column_names):
-        raise click.UsageError('keys and pictures need the columns bucket and key among what the SQL selects')
+        raise BadUsage('keys and pictures need the columns bucket and key', 'SELECT bucket, key FROM objects ...')
     with asking():
         if sheet or ground:
             _pictures(source, found.to_pylist(), flags, left_out, sheet, ground)
@@ -68,7 +74,7 @@ def _ordered(frame: Any, order: str | None) -> Any:
         return frame
     columns = [part.split() for part in order.split(',')]
     if not all(len(words_) in (1, 2) and words_[-1].lower() in {words_[0].lower(), 'asc', 'desc'} for words_ in columns):
-        raise click.UsageError(f"--order {order!r} is none: a column, and 'desc' if so")
+        raise BadUsage(f'--order {order!r} is not a column', "--order 't_start desc' is one, in descending order")
     return frame.sort([words_[0] for words_ in columns], desc=[words_[-1].lower() == 'desc' for words_ in columns])
 
 

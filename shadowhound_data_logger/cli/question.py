@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, exit_code
 from shadowhound_data_logger.cli.output import number
 from shadowhound_data_logger.errors import LakeError, SettingError
 
@@ -56,15 +57,15 @@ def question_text(flags: Mapping[str, Any]) -> str:
 
 @contextmanager
 def asking() -> Iterator[None]:
-    """A question that is none is bad usage, and so is a machine without the library."""
+    """An invalid query is bad usage, and so is a machine without the library."""
     try:
         yield
     except (LakeError, SettingError) as error:
-        raise click.UsageError(str(error)) from error
+        raise BadUsage(error.what, error.remedy or error.DEFAULT_REMEDY) from error
     except ModuleNotFoundError as error:
         if error.name not in EXTRA:
             raise
-        raise click.UsageError(f"{error.name} is not installed: pip install 'shadowhound_data_logger[lake]'") from error
+        raise BadUsage(f'{error.name} is not installed', "pip install 'shadowhound_data_logger[lake]'") from error
 
 
 def quietly() -> Findings:
@@ -74,11 +75,11 @@ def quietly() -> Findings:
     return Findings(lambda _: None)
 
 
-def tell_left_out(left_out: Findings) -> int:
+def tell_left_out(left_out: Findings) -> ExitCode:
     """Each on standard error; the exit code."""
     for one in left_out:
         click.echo(str(one), err=True)
     if len(left_out):
         text = f'{number(len(left_out))} of the catalogue are left out. Move them away, and run `shadowhound-data lake reindex`.'
         click.echo(text, err=True)
-    return 1 if len(left_out) else 0
+    return exit_code(finding=len(left_out))

@@ -17,7 +17,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
-from shadowhound_data_logger.cli.common import as_json, spool_folder, the_spool
+from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, spool_folder, the_spool
 from shadowhound_data_logger.cli.output import (
     ProgressBar,
     duration,
@@ -50,28 +50,34 @@ OTHER: Final = 'another process delivers from this spool: look at it with shadow
 STYLES: Final = {State.HELD.value: 'yellow', State.QUARANTINED.value: 'red'}
 
 
-@click.group(invoke_without_command=True)
+@click.group(invoke_without_command=True, epilog=examples('spool', 'spool drain'))
 @spool_folder
 @as_json
 @click.pass_context
-def spool(context: click.Context, *, spool: Path | None, as_json: bool) -> int:
-    """What lies on this machine and is not in the store: how much, how old, and why.
+def spool(context: click.Context, *, spool: Path | None, as_json: bool) -> ExitCode:
+    """Show what is not in the store yet, and why.
 
     It reads the spool while a node runs and when none does. Exit code 1 when something is quarantined.
     """
     context.obj = folder = the_spool(spool).absolute()
-    return 0 if context.invoked_subcommand else _overview(folder, as_json=as_json)
+    return ExitCode.FINE if context.invoked_subcommand else _overview(folder, as_json=as_json)
 
 
-@spool.command('list')
+@spool.command(
+    'list',
+    epilog=examples('spool list --state quarantined', 'spool list sensor-data/thor/camera/'),
+)
 @click.argument('prefix', default='', metavar='[BUCKET/PREFIX]')
 @click.option('--state', type=click.Choice([state.value for state in HERE]), help='Only these.')
 @click.option('--sensor', help='Only of this sensor.')
 @click.option('--limit', type=click.IntRange(1), default=MOST, show_default=True, help='So many at most, the oldest first.')
 @as_json
 @click.pass_obj
-def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, limit: int, as_json: bool) -> int:
-    """Each object, the oldest first: its bucket and key, its state, and where its file lies below the spool."""
+def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, limit: int, as_json: bool) -> ExitCode:
+    """List the objects, the oldest first.
+
+    Each with its bucket and key, its state, and its file in the spool.
+    """
     with _opened(folder) as index:
         found = objects(index, folder, state=State(state) if state else None, sensor=sensor, prefix=prefix)
         rows, more = list(islice(found, limit)), next(found, None) is not None
@@ -84,31 +90,34 @@ def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, l
         print_page(table if rows else Text('Nothing.'))
     if more:
         click.echo(f'... there are more than {number(limit)}: --limit', err=True)
-    return 0
+    return ExitCode.FINE
 
 
-@spool.command()
+@spool.command(epilog=examples('spool drain', 'spool --spool /mnt/dead_robot/spool drain'))
 @click.option('--patience', type=click.FloatRange(1.0, 1e6), default=60.0, show_default=True,
               help='Seconds in which nothing gets on after which it gives up.')  # fmt: skip
 @as_json
 @click.pass_obj
-def drain(folder: Path, *, patience: float, as_json: bool) -> int:
-    """Deliver all that waits, where no node runs to do it: before a robot is put away, or from the disk of one that is broken.
+def drain(folder: Path, *, patience: float, as_json: bool) -> ExitCode:
+    """Upload everything that waits, without a node.
 
-    The store is the one that the environment names. Each object is verified as by the node, and gets its row in the catalogue.
+    For before a robot is put away, or for the disk of one that is broken. The store is the one that the environment names. Each
+    object is verified as by the node, and gets its row in the catalogue.
     Exit code 1 when something of that is left or refused. Ctrl-C loses nothing.
     """
     _check(folder)
     return _drain(folder, patience_s=patience, as_json=as_json)
 
 
-@spool.command()
+@spool.command(epilog=examples('spool retry', 'spool retry --reason access_denied'))
 @click.argument('names', nargs=-1, metavar='[BUCKET/KEY]...')
 @click.option('--reason', help='Only those quarantined for this reason, such as access_denied.')
 @as_json
 @click.pass_obj
-def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bool) -> int:
-    """Let what was quarantined wait for delivery again, once the cause is gone: all of it, or these objects.
+def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bool) -> ExitCode:
+    """Try quarantined objects again, once the cause is gone.
+
+    All of them, or those that are named.
 
     A node that runs tries them at once; without one, `shadowhound-data spool drain` does.
     """
@@ -123,16 +132,17 @@ def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bo
         click.echo(f'{number(done.objects)} objects ({volume(done.bytes)}) wait for delivery again')
         if done.gone:
             click.echo(f'{number(done.gone)} are not there any more')
-    return 1 if done.gone or (names and done.objects < len(frozenset(names))) else 0
+    return exit_code(finding=done.gone or (names and done.objects < len(frozenset(names))))
 
 
-@spool.command('tell-gaps')
+@spool.command('tell-gaps', epilog=examples('spool tell-gaps'))
 @as_json
 @click.pass_obj
-def tell_gaps(folder: Path, *, as_json: bool) -> int:
-    """Send all gaps that the journal remembers to the store again, where it lost some of their files.
+def tell_gaps(folder: Path, *, as_json: bool) -> ExitCode:
+    """Send the gap journal to the store again.
 
-    A node that runs does so within a minute (catalogue.period_s). What is older than spool.remember_days cannot be told again.
+    For a store that lost some of its files. A node that runs does so within a minute (catalogue.period_s). What is older than
+    spool.remember_days cannot be told again.
     """
     _check(folder)
     try:
@@ -144,10 +154,10 @@ def tell_gaps(folder: Path, *, as_json: bool) -> int:
         print_json({'rows': rows})
     else:
         click.echo(f'{number(rows)} rows of the gap journal are told again with the next part')
-    return 0
+    return ExitCode.FINE
 
 
-def _overview(folder: Path, *, as_json: bool) -> int:
+def _overview(folder: Path, *, as_json: bool) -> ExitCode:
     clock = SystemClock.of_this_machine()
     with _opened(folder) as index:
         found = heaps(index)
@@ -158,7 +168,7 @@ def _overview(folder: Path, *, as_json: bool) -> int:
         print_json({'spool': str(folder), 'running': running, 'heaps': said, 'quarantined': quarantined})
     else:
         print_page(*_view(folder, found, running, clock))
-    return 1 if quarantined else 0
+    return exit_code(finding=quarantined)
 
 
 def _view(folder: Path, found: Sequence[Heap], running: Sequence[str], clock: Clock) -> Iterator[RenderableType]:
@@ -219,7 +229,7 @@ def _opened(folder: Path) -> Iterator[Index]:
         raise SpoolError(f'the spool {folder} cannot be read: {error}') from error
 
 
-def _drain(folder: Path, *, patience_s: float, as_json: bool) -> int:
+def _drain(folder: Path, *, patience_s: float, as_json: bool) -> ExitCode:
     """The exit code."""
     settings, clock = Settings.load({}, os.environ), SystemClock.of_this_machine()
     # A robot of its own: its session is none of the node's, and what that left open is not for it to settle.
@@ -241,7 +251,7 @@ def _drain(folder: Path, *, patience_s: float, as_json: bool) -> int:
         print_json(said)
     else:
         click.echo(_told(said))
-    return 0 if said['ok'] else 1
+    return exit_code(finding=not said['ok'])
 
 
 def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalogue: CatalogueWriter, patience_s: float,

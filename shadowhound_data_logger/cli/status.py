@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import as_json, robot_name, spool_folder, the_spool
+from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, robot_name, spool_folder, the_spool
 from shadowhound_data_logger.cli.output import (
     duration,
     figure,
@@ -39,7 +39,7 @@ LOSSES: Final = ('dropped', 'rejected')
 HEADS: Final = {'running': ('running', 'green'), 'not_answering': ('NOT ANSWERING', 'red'), 'not_running': ('not running', 'red')}
 
 
-@click.command()
+@click.command(epilog=examples('status', 'status --watch'))
 @click.option('--watch', is_flag=True, help='Go on until Ctrl-C: a live view, or with --json one line each time.')
 @click.option(
     '--interval', type=click.FloatRange(0.05, 3600.0), default=1.0, show_default=True, help='Seconds between two looks.'
@@ -47,11 +47,11 @@ HEADS: Final = {'running': ('running', 'green'), 'not_answering': ('NOT ANSWERIN
 @as_json
 @click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Whose node  [default: the one that runs here]')
 @spool_folder
-def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, spool: Path | None) -> int:
-    """Rates and ages of the topics, queue, spool, store and workers of the node that runs on this machine.
+def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, spool: Path | None) -> ExitCode:
+    """Show what the node on this machine does now.
 
-    Without one: what lies in its spool. Exit code 1 when something needs a look: the node does not run, the store is away,
-    messages were lost. With --watch it is 0.
+    Rates and ages of its topics, its queue, spool, store and workers; when no node runs, what is in its spool. Exit code 1 when
+    something needs attention: the node does not run, the store is away, messages were lost. With --watch it is 0.
     """
     folder, clock = the_spool(spool), SystemClock.of_this_machine()
 
@@ -61,13 +61,13 @@ def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, sp
     console = Console(highlight=False)
     if watch:
         _watch(look, console, interval, as_json=as_json)
-        return 0
+        return ExitCode.FINE
     found = look()
     if as_json:
         print_json(found)
     else:
         print_page(*view(found, console), console=console)
-    return 1 if found['findings'] else 0
+    return exit_code(finding=found['findings'])
 
 
 def _look(spool: Path, robot: str | None, clock: Clock) -> dict[str, Any]:

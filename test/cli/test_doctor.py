@@ -92,8 +92,8 @@ def test_only_some(found: list[model.Result], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
-        (('--only', 'everything'), 'none of some, some.part'),
-        (('--rate', '/imu'), 'TOPIC=HZ'),
+        (('--only', 'everything'), 'there are some, some.part'),
+        (('--rate', '/imu'), '--rate /imu=50'),
         (('--role', 'laptop'), 'laptop'),
         (('--timeout', '0'), '0'),
     ],
@@ -103,7 +103,7 @@ def test_bad_usage(found: list[model.Result], tmp_path: Path, arguments: tuple[s
     """Is refused with what is allowed, before anything is asked."""
     error = run(tmp_path, *arguments).exception
     assert isinstance(error, click.UsageError)
-    assert words in error.format_message()
+    assert words in f'{error.format_message()} {getattr(error, "remedy", "")}'
 
 
 def test_a_parameter_file_that_is_none(found: list[model.Result], tmp_path: Path) -> None:

@@ -228,16 +228,16 @@ def test_the_command_reads_a_spool_in_use(tmp_path: Path) -> None:
     assert found['objects']['pending'] == 1
 
 
-def test_no_spool_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """A folder without a spool ends with exit code 1 and one line that names it and a remedy."""
+def test_no_spool_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A folder without a spool ends with exit code 1, a line that names it, and one with a remedy."""
     monkeypatch.setattr(sys, 'argv', ['shadowhound-data', 'ledger', '--spool', str(tmp_path / 'none')])
     with pytest.raises(SystemExit) as caught:
         main()
     assert caught.value.code == 1
     error = capsys.readouterr().err
-    assert error.count('\n') == 1
-    assert str(tmp_path / 'none') in error
-    assert 'SHADOWHOUND_HOME' in error
+    what, remedy = error.splitlines()
+    assert str(tmp_path / 'none') in what
+    assert 'SHADOWHOUND_HOME' in remedy
 
 
 @pytest.mark.parametrize(
@@ -333,4 +333,4 @@ def test_questions_about_gaps_need_gaps(tmp_path: Path) -> None:
     """An option that would do nothing is refused."""
     found = CliRunner().invoke(ledger, ['--topic', '/camera', '--spool', str(tmp_path)])
     assert found.exit_code == 2
-    assert 'are for --gaps' in found.output
+    assert 'choose among gaps' in found.output

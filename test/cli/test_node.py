@@ -83,7 +83,8 @@ def test_a_verb_asks_for_what_it_says(serving: Serving, words: list[str], reques
 def test_what_the_node_refuses_is_a_finding(serving: Serving) -> None:
     """Exit code 1, and its words on standard error; with --json on standard output."""
     result = run('bag', 'stop')
-    assert (result.return_value, result.stdout, result.stderr) == (1, '', 'shadowhound-data: nothing is recorded\n')
+    assert (result.return_value, result.stdout) == (1, '')
+    assert result.stderr.splitlines()[0] == 'shadowhound-data node bag stop: nothing is recorded'
     result = run('bag', 'stop', '--json')
     assert (result.return_value, json.loads(result.stdout)['error']) == (1, 'nothing is recorded')
 

@@ -1,6 +1,6 @@
-"""``python -m shadowhound_data_logger.cli.parameters``: docs/parameters.md, made from the settings themselves.
+"""``python -m shadowhound_data_logger.cli.pages``: docs/parameters.md and docs/commands.md, made from the code.
 
-The page cannot drift: a test compares it with what this prints, and the environment variables with those that are read.
+The pages cannot drift: a test compares them with what this writes, and the environment variables with those that are read.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ from typing import Any, Final, NamedTuple
 
 import click
 
+from shadowhound_data_logger.cli.common import MEANINGS
+from shadowhound_data_logger.cli.main import SECTIONS as VERBS
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.options import DEFAULT_SENSORS, GIBI, GROUPS, MEBI, SensorSettings
 
-PAGE: Final = Path(__file__).parents[2] / 'docs' / 'parameters.md'
+DOCS: Final = Path(__file__).parents[2] / 'docs'
 COLUMNS: Final = ('parameter', 'default', 'allowed', 'live', '')
 HEAD: Final = """\
 # Parameters
@@ -49,6 +51,23 @@ EXAMPLE: Final = """\
     upload: {max_mbps: 20.0}          # leave the WiFi to others
     bag: {record: mission}            # a bag of each mission, at full rate
     events: {topics: [imu, odom]}     # keep the last 30 s, for an event
+"""
+COMMANDS: Final = """\
+# Commands
+
+*Made from the code by `make docs`: change `shadowhound_data_logger/cli/`, not this page.*
+
+`shadowhound-data VERB --help` describes each verb with all of its options; almost every one prints JSON with `--json`. Times
+are UTC, and all of them are written alike: `yesterday`, `2h`, `2025-10-18`, `2025-10-18T12:30`.
+
+An error names the verb, what is wrong and where, and on the next line what to do:
+
+    shadowhound-data bag info: no bag 'patrol' in the folder /home/hound/.shadowhound/store
+      -> shadowhound-data bag list shows the bags there are
+
+## Exit codes
+Of every verb; the node ends with 0, 1 or 2 in the same sense.
+
 """
 SENSOR: Final = 'SENSOR'
 """Stands for the name of any sensor."""
@@ -174,17 +193,38 @@ VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
 
 
 @click.command()
-@click.option('--write', is_flag=True, help='Write docs/parameters.md rather than print it.')
+@click.option('--write', is_flag=True, help='Write them below docs/ rather than print them.')
 def main(*, write: bool) -> None:
-    """Print the page that tells every parameter and environment variable."""
-    if write:
-        PAGE.write_text(page(), encoding='utf-8')
-    else:
-        click.echo(page(), nl=False)
+    """Make the pages on parameters, environment variables and commands."""
+    for name, page in (('parameters.md', parameters()), ('commands.md', commands())):
+        if write:
+            (DOCS / name).write_text(page, encoding='utf-8')
+        else:
+            click.echo(page, nl=False)
 
 
-def page() -> str:
-    """The whole page, as Markdown."""
+def commands() -> str:
+    """The page on the verbs, as Markdown."""
+    parts = [COMMANDS, _row('code', 'meaning'), '|---|---|\n']
+    parts += [_row(f'`{code.value}`', meaning) for code, meaning in MEANINGS.items()]
+    for title, verbs in VERBS.items():
+        parts += [f'\n## {title}\n', _row('verb', '', 'for example'), '|---|---|---|\n']
+        for verb in verbs:
+            parts += _verbs((verb.name or '',), verb)
+    return ''.join(parts)
+
+
+def _verbs(path: tuple[str, ...], verb: click.Command) -> Iterator[str]:
+    """A row of the verb, and of each verb of it."""
+    lines = ((verb.epilog or '').splitlines())[2:]
+    yield _row(f'`{" ".join(path)}`', verb.get_short_help_str(1000), '<br>'.join(f'`{line.strip()}`' for line in lines))
+    if isinstance(verb, click.Group):
+        for name, each in verb.commands.items():
+            yield from _verbs((*path, name), each)
+
+
+def parameters() -> str:
+    """The page on parameters and environment variables, as Markdown."""
     parts = [HEAD, EXAMPLE, '```\n']
     described = _described()
     for section in SECTIONS:

@@ -1,4 +1,4 @@
-"""docs/parameters.md says what the code says."""
+"""docs/parameters.md and docs/commands.md say what the code says."""
 
 from __future__ import annotations
 
@@ -9,20 +9,32 @@ from pathlib import Path
 from click.testing import CliRunner
 from ruamel.yaml import YAML
 
-from shadowhound_data_logger.cli.parameters import EXAMPLE, PAGE, SECTIONS, VARIABLES, main, page
+from shadowhound_data_logger.cli.common import MEANINGS, ExitCode
+from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.cli.pages import DOCS, EXAMPLE, SECTIONS, VARIABLES, commands, main, parameters
 from shadowhound_data_logger.config import DEFAULT_SENSORS, Settings, default_parameters
 
 PACKAGE = Path(__file__).parents[2] / 'shadowhound_data_logger'
 
 
-def test_the_page_is_the_one_that_the_code_makes() -> None:
-    """Whoever changes a setting runs `make docs`."""
-    assert PAGE.read_text(encoding='utf-8') == page()
+def test_the_pages_are_those_that_the_code_makes() -> None:
+    """Whoever changes a setting or a verb runs `make docs`."""
+    assert (DOCS / 'parameters.md').read_text(encoding='utf-8') == parameters()
+    assert (DOCS / 'commands.md').read_text(encoding='utf-8') == commands()
+
+
+def test_the_exit_codes_are_in_one_table() -> None:
+    """That page has each with its meaning, and `--help` names them."""
+    told = CliRunner().invoke(cli, ['--help']).stdout
+    assert set(MEANINGS) == set(ExitCode)
+    for code, meaning in MEANINGS.items():
+        assert f'| `{code.value}` | {meaning} |' in commands()
+        assert re.search(rf'^  {code.value} +{meaning}$', told, re.MULTILINE)
 
 
 def test_every_parameter_is_on_it() -> None:
     """Each parameter that the node declares has a row of its own, or one that all sensors share."""
-    rows = {row.split('|')[1].strip() for row in page().splitlines() if row.startswith('|')}
+    rows = {row.split('|')[1].strip() for row in parameters().splitlines() if row.startswith('|')}
     names = [name.rpartition('.') for name in default_parameters()]
     missing = [(group, field) for group, dot, field in names
                if f'`{group}{dot}{field}`' not in rows and not {f'`SENSOR.{field}`', f'`{group}`'} <= rows]  # fmt: skip
@@ -52,7 +64,7 @@ def test_the_example_is_a_parameter_file() -> None:
 
 def test_live_parameters_are_marked() -> None:
     """Those that `ros2 param set` can change, and no others."""
-    live = {row.split('|')[1].strip() for row in page().splitlines() if '| yes |' in row}
+    live = {row.split('|')[1].strip() for row in parameters().splitlines() if '| yes |' in row}
     events = {f'`events.{name}`' for name in ('pre_s', 'post_s', 'max_s', 'max_bytes', 'log_event')}
     sensors = {f'`SENSOR.{name}`' for name in ('enabled', 'rate_hz', 'quality', 'priority')}
     assert live == {*sensors, '`upload.max_mbps`', *events}
@@ -66,10 +78,10 @@ def test_every_environment_variable_is_on_it() -> None:
 
 def test_every_table_is_whole() -> None:
     """The rows of a table have as many cells as its head."""
-    for table in re.findall(r'(?:^\|.*\n)+', page(), re.MULTILINE):
+    for table in re.findall(r'(?:^\|.*\n)+', parameters() + commands(), re.MULTILINE):
         assert len({len(re.findall(r'(?<!\\)\|', row)) for row in table.splitlines()}) == 1, table
 
 
 def test_the_command_prints_it() -> None:
     """Without --write nothing is written."""
-    assert CliRunner().invoke(main, []).stdout == page()
+    assert CliRunner().invoke(main, []).stdout == parameters() + commands()

@@ -1,0 +1,237 @@
+"""Every verb helps with an example, every error says what to do, and every verb ends with an exit code of the table."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import re
+import shlex
+import sqlite3
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import click
+import pytest
+
+import shadowhound_data_logger
+from shadowhound_data_logger.cli import main as main_module
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode
+from shadowhound_data_logger.cli.main import GONE, PROGRAM, SECTIONS, cli, described, main, verb_of
+from shadowhound_data_logger.errors import BagError, DataLoggerError, SettingError, SettingGone
+
+
+def verbs(command: click.Command = cli, path: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
+    """All there are, with the verbs of verbs."""
+    yield ' '.join(path), command
+    if isinstance(command, click.Group):
+        for name, each in command.commands.items():
+            yield from verbs(each, (*path, name))
+
+
+VERBS = dict(verbs())
+LEAVES = {name: verb for name, verb in VERBS.items() if name and not isinstance(verb, click.Group)}
+
+
+def help_of(name: str, width: int = 80) -> str:
+    verb = VERBS[name]
+    return verb.get_help(
+        click.Context(verb, info_name=f'{PROGRAM} {name}'.strip(), max_content_width=width, terminal_width=width)
+    )
+
+
+def examples_of(name: str) -> list[str]:
+    """As the help shows them: one line each, however narrow the terminal."""
+    return re.findall(rf'^ +({PROGRAM} .*)$', help_of(name, 40).partition('Examples:')[2], re.MULTILINE)
+
+
+def parsed(arguments: Sequence[str]) -> tuple[click.Command, click.Context]:
+    """The verb of a command line, once every option is one of it and has a value of its type, and nothing is missing."""
+    command, context, rest = cli, click.Context(cli, info_name=PROGRAM), list(arguments)
+    while True:
+        given, rest, order = command.make_parser(context).parse_args(args=rest)
+        for option in (each for each in command.params if isinstance(each, click.Option)):
+            assert option.name is not None
+            if option in order:
+                option.type_cast_value(context, given[option.name])
+            assert option in order or not option.required, f'{option.name} is missing'
+        for argument in (each for each in command.params if isinstance(each, click.Argument)):
+            value = given.get(argument.name or '')
+            assert (isinstance(value, (str, tuple)) and value) or not argument.required, f'{argument.name} is missing'
+        if not isinstance(command, click.Group) or not rest:
+            return command, context
+        name, command, rest = command.resolve_command(context, rest)
+        assert command is not None
+        context = click.Context(command, parent=context, info_name=name)
+
+
+@pytest.mark.parametrize('name', VERBS)
+def test_every_verb_has_examples_that_parse(name: str) -> None:
+    """Each is of this verb, or of one of its own; no option in it is unknown, without its value, or missing."""
+    found = examples_of(name)
+    assert found
+    for example in found:
+        program, *arguments = shlex.split(example)
+        assert program == PROGRAM
+        assert ' '.join(verb_of(arguments)).startswith(name)
+        if '--help' not in arguments:
+            command, _ = parsed(arguments)
+            assert not isinstance(command, click.Group) or getattr(command, 'invoke_without_command', False)
+
+
+def test_an_example_with_a_wrong_option_would_be_found() -> None:
+    """The parser above is no rubber stamp."""
+    for wrong in ('bag fetch x', 'bag fetch --to y', 'bag list --sinc yesterday', 'missions export x --format xml', 'bag lst'):
+        with pytest.raises((click.UsageError, AssertionError)):
+            parsed(wrong.split())
+
+
+def test_the_verbs_are_in_sections() -> None:
+    """Each in one of them, and in full: no line of the list is cut."""
+    listed = [verb.name for section in SECTIONS.values() for verb in section]
+    assert sorted(map(str, listed)) == sorted(cli.commands)
+    text = help_of('')
+    for title in SECTIONS:
+        assert f'\n{title}:\n' in text
+    for name in (name for name, verb in VERBS.items() if isinstance(verb, click.Group)):
+        assert '...' not in help_of(name).partition('Options:')[2]
+
+
+@pytest.mark.parametrize('name', LEAVES)
+def test_every_verb_ends_with_a_code_of_the_table(name: str) -> None:
+    """It returns an ExitCode, which mypy checks."""
+    callback = LEAVES[name].callback
+    assert callback is not None
+    assert callback.__annotations__['return'] in {'ExitCode', 'Any'}  # what ``question`` wraps has its own annotation below
+    inner = getattr(callback, '__wrapped__', callback)
+    assert inner.__annotations__['return'] == 'ExitCode'
+
+
+# -- errors ------------------------------------------------------------------------------------------------------------
+
+
+def classes(base: type[Exception] = DataLoggerError) -> Iterator[type[Exception]]:
+    for each in pkgutil.walk_packages(shadowhound_data_logger.__path__, 'shadowhound_data_logger.'):
+        if each.name.rpartition('.')[2] not in {'main', '__main__'} and '.capture.' not in each.name:
+            importlib.import_module(each.name)
+    pending = [base]
+    while pending:
+        pending += (one := pending.pop()).__subclasses__()
+        yield one
+
+
+def ended(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, list[str]]:
+    """Exit code and lines on standard error of the program."""
+    monkeypatch.setattr(sys, 'argv', [PROGRAM, *arguments])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    return int(caught.value.code or 0), capsys.readouterr().err.splitlines()
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name in ('AWS_ENDPOINT_URL', 'SHADOWHOUND_ROBOT'):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.setenv('COLUMNS', '150')
+    return tmp_path
+
+
+def made(kind: type[Exception]) -> Exception:
+    if issubclass(kind, SettingError):
+        return kind('camera.rate_hz', 'fast', 'a number')
+    return kind('it went wrong in /here')
+
+
+def test_every_class_of_errors_has_a_remedy(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """In two lines: the verb, what and where; what to do. A command in it is one."""
+    kinds = [*classes(), OSError, PermissionError, sqlite3.OperationalError, sqlite3.DatabaseError]
+    assert len(kinds) > 25
+    for kind in kinds:
+
+        def fail(*_: object, kind: type[Exception] = kind, **__: object) -> None:
+            raise made(kind)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(main_module.cli.commands['bag'].commands['list'], 'callback', fail)  # type: ignore[attr-defined]
+            code, (what, remedy) = ended(patched, capsys, 'bag', 'list')
+        assert code == (ExitCode.USAGE if issubclass(kind, SettingError) else ExitCode.FINDING), kind
+        assert what.startswith(f'{PROGRAM} bag list: '), kind
+        assert ('camera.rate_hz' if issubclass(kind, SettingError) else 'it went wrong in /here') in what, kind
+        assert re.fullmatch(r'  -> \S.{10,}', remedy), kind
+        for command in re.findall(rf'{PROGRAM} ([a-z]+(?: [a-z]+)?)', remedy):
+            assert command in VERBS or command.split()[0] in VERBS, remedy
+
+
+def test_a_remedy_of_its_own_comes_first() -> None:
+    """That of its class is for those without."""
+    error = BagError('no bag x', remedy='look again')
+    assert described(error, ['bag', 'info', 'x']) == (f'{PROGRAM} bag info', 'no bag x', 'look again')
+    assert described(SettingGone('a.b', 1, 'c does its job'), [])[2] == 'remove it: c does its job'
+    missing = FileNotFoundError(2, 'No such file or directory', '/nowhere')
+    assert described(missing, ['spool', '--spool', 'x', 'list'])[:2] == (
+        f'{PROGRAM} spool list', '/nowhere: No such file or directory',
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(('arguments', 'code', 'what', 'remedy'), [
+    (['nope'], ExitCode.USAGE, "No such command 'nope'", f'{PROGRAM} --help'),
+    (['bag', 'fetch'], ExitCode.USAGE, 'Missing argument', f'{PROGRAM} bag fetch --help'),
+    (['bag', 'list', '--sinc', 'now'], ExitCode.USAGE, 'No such option', f'{PROGRAM} bag list --help'),
+    (['bag', 'list', '--since', 'soon'], ExitCode.USAGE, "--since = 'soon' is refused", 'allowed is now, today'),
+    (['bag', 'list', '--robot', '../x'], ExitCode.USAGE, 'the robot name', 'letters'),
+    (['bag', 'info', './none'], ExitCode.USAGE, 'there is no folder ./none', f'{PROGRAM} bag list'),
+    (['bag', 'info', 'none'], ExitCode.FINDING, 'none', '--robot'),
+    (['missions', 'show', 'x'], ExitCode.USAGE, "no mission here has the id 'x'", f'{PROGRAM} missions list'),
+    (['ledger', '--topic', '/imu'], ExitCode.USAGE, 'choose among gaps', '--gaps'),
+    (['ledger', '--since', 'now', '--gaps', '--until', 'x'], ExitCode.USAGE, "--until = 'x' is refused", 'allowed is now'),
+    (['status', '--interval', '0'], ExitCode.USAGE, 'Invalid value', f'{PROGRAM} status --help'),
+    (['spool', 'list'], ExitCode.FINDING, 'there is no spool in', 'SHADOWHOUND_HOME'),
+    (['node', 'flush'], ExitCode.FINDING, 'no node', ''),
+    (['fetch', '--to', '/x'], ExitCode.USAGE, 'a prefix or flags', f'{PROGRAM} fetch'),
+    (['query', '--since', 'soon'], ExitCode.USAGE, "since = 'soon' is refused", 'allowed is now'),
+    (['query', 'SELEKT 1'], ExitCode.USAGE, 'SELEKT', ''),
+])  # fmt: skip
+def test_an_error_says_what_and_what_to_do(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+                                           arguments: list[str], code: ExitCode, what: str, remedy: str) -> None:  # fmt: skip
+    """As somebody makes them: the verb and what is wrong, then what to do; wrong usage is 2, the rest 1."""
+    assert home.is_dir()
+    found, lines = ended(monkeypatch, capsys, *arguments)
+    assert found == code
+    assert lines[0].startswith(f'{PROGRAM}{"" if arguments == ["nope"] else " " + arguments[0]}')
+    assert what in lines[0]
+    assert lines[-1].startswith('  -> ')
+    assert remedy in lines[-1]
+
+
+@pytest.mark.parametrize(('verb', 'option'), GONE)
+def test_an_option_that_is_gone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: str, option: str
+) -> None:
+    """Wrong usage, with what does its job now."""
+    code, lines = ended(monkeypatch, capsys, *verb.split(), option, '8')
+    assert code == ExitCode.USAGE
+    assert lines == [f'{PROGRAM} {verb}: there is no {option} any more', f'  -> leave it out: {GONE[verb, option]}']
+    assert option not in {name for each in VERBS[verb].params for name in each.opts}
+
+
+def test_the_environment_is_usage_too(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """As with the node: a setting that is refused is 2."""
+    assert home.is_dir()
+    monkeypatch.setenv('AWS_ENDPOINT_URL', 'tower:9000')
+    code, lines = ended(monkeypatch, capsys, 'bag', 'list')
+    assert code == ExitCode.USAGE
+    assert "AWS_ENDPOINT_URL = 'tower:9000' is refused" in lines[0]
+
+
+@pytest.mark.parametrize(('error', 'code'), [(KeyboardInterrupt(), ExitCode.INTERRUPTED), (BadUsage('x', 'y'), ExitCode.USAGE)])
+def test_how_it_ends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, code: ExitCode
+) -> None:
+    """Ctrl-C is 130, as for a shell."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(cli.commands['status'], 'callback', fail)
+    assert ended(monkeypatch, capsys, 'status')[0] == code
