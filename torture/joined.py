@@ -81,8 +81,10 @@ class Flight:
 class Killer:
     """One robot, and agents and nodes one after the other in one home. Life: New; run once."""
 
-    def __init__(self, processes: Processes, wires: Sequence[Wire], environ: dict[str, str], rng: random.Random) -> None:
+    def __init__(self, processes: Processes, wires: Sequence[Wire], environ: dict[str, str], rng: random.Random,
+                 agent_period_s: float = AGENT_PERIOD_S) -> None:  # fmt: skip
         self._processes, self._wires, self._environ, self._rng = processes, wires, environ, rng
+        self._agent_period_s = agent_period_s
         self.home = processes.folder / 'home'
         self._csv = processes.folder / 'trajectory.csv'
         self._csv.write_text('timestamp,x,y,yaw\n')
@@ -131,7 +133,7 @@ class Killer:
     def _start_agent(self) -> None:
         """A half of them log no trajectory, so that the node's is the mission's."""
         csv = self._rng.choice((str(self._csv), NO_CSV))
-        command = [sys.executable, '-m', 'missions.agent', str(self.home), COMMAND, csv, str(AGENT_PERIOD_S)]
+        command = [sys.executable, '-m', 'missions.agent', str(self.home), COMMAND, csv, str(self._agent_period_s)]
         test = str(Path(__file__).parents[1] / 'test')
         path = os.pathsep.join(filter(None, (test, os.environ.get('PYTHONPATH'))))
         environ = {**os.environ, **self._environ, 'SHADOWHOUND_ROBOT': ROBOT, 'PYTHONPATH': path}

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import socket
 import threading
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
@@ -20,7 +21,9 @@ HANG: Final = 'hang'
 class Wire:
     """A TCP proxy on 127.0.0.1; ``set`` takes PASS, REFUSE, HANG or an S3 error as ``(status, code)``. It owns one thread."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, heard: Callable[[bytes], None] = lambda _: None) -> None:
+        """``heard`` gets what passes to the server, as it comes."""
+        self._heard = heard
         self._target = (urlsplit(url).hostname, urlsplit(url).port)
         self._mode: str | tuple[int, str] = PASS
         self._tasks: set[asyncio.Task[None]] = set()
@@ -93,7 +96,7 @@ class Wire:
             except asyncio.CancelledError:
                 (await opening)[1].close()
                 raise
-            pumps = [asyncio.create_task(_pump(reader, back)), asyncio.create_task(_pump(there, writer))]
+            pumps = [asyncio.create_task(_pump(reader, back, self._heard)), asyncio.create_task(_pump(there, writer))]
             try:
                 await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
             finally:
@@ -117,8 +120,10 @@ class Wire:
             await writer.drain()
 
 
-async def _pump(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
+async def _pump(source: asyncio.StreamReader, target: asyncio.StreamWriter,
+                heard: Callable[[bytes], None] = lambda _: None) -> None:  # fmt: skip
     with contextlib.suppress(OSError):
         while data := await source.read(65536):
+            heard(data)
             target.write(data)
             await target.drain()
