@@ -10,6 +10,7 @@ import re
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +19,7 @@ from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import StoreUnavailable
+from shadowhound_data_logger.errors import SpoolError, StoreUnavailable
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, safe_type, stamped
 from shadowhound_data_logger.missions.story import BUCKET, TRAJECTORIES
 from shadowhound_data_logger.model import Binding, DataObject
@@ -114,40 +115,37 @@ class Shelf:
         """Make them durable in the spool; what is or was there already is left out. Raises SpoolError."""
         if not objects:
             return
-        spool = self._opened()
-        known = Index(spool.root / 'index.db', read_only=True)
-        try:
+        with self._using(self._opened()) as spool, closing(Index(spool.root / 'index.db', read_only=True)) as known:
             known.open()
             new = [item for item in objects if not _has(known, item)]
             if new:
                 spool.commit(new)
-        except (OSError, sqlite3.Error) as error:
-            raise spool.unwritable(error) from error
-        finally:
-            known.close()
 
     def bind(self, mission_id: str, run_id: str) -> bool:
         """Give what is held for a mission its final names; False when nothing is held any more. Raises SpoolError."""
-        spool = self._opened()
-        try:
+        with self._using(self._opened()) as spool:
             found = spool.held(held_reason(mission_id))
             spool.bind([
                 Binding(item.id, item.key.replace(f'/missions/{mission_id}/', f'/missions/{run_id}/', 1),
                         {**item.metadata, words.RUN_ID: run_id}, item.t_start_ns, item.t_end_ns)
                 for item in found
             ])  # fmt: skip
-        except (OSError, sqlite3.Error) as error:
-            raise spool.unwritable(error) from error
         return bool(found)
 
     def pending(self) -> int:
-        """What waits for delivery, as far as this process has the spool open."""
-        return self._spool.pending_count() if self._spool else 0
+        """What waits for delivery, as far as this process has the spool open. Raises SpoolError."""
+        if self._spool is None:
+            return 0
+        with self._using(self._spool) as spool:
+            return spool.pending_count()
 
     @property
     def owes(self) -> bool:
-        """Whether something waits for delivery, and no node is there to deliver it."""
-        return not self._node_drains and self.pending() > 0
+        """Whether something waits for delivery, as far as that is known, and no node is there to deliver it."""
+        try:
+            return not self._node_drains and self.pending() > 0
+        except SpoolError:
+            return True
 
     def drain(self) -> None:
         """Deliver for a moment where no node does. Raises StoreError, SettingError or SpoolError when that does not work."""
@@ -160,10 +158,11 @@ class Shelf:
             if self._monotonic() - self._used_s > REST_S:
                 self.close()
             return
-        with self._spool.drain_lock() as mine:
-            self._node_drains = not mine
-        if mine:
-            self._drain(self._spool)
+        with self._using(self._spool) as spool:
+            with spool.drain_lock() as mine:
+                self._node_drains = not mine
+            if mine:
+                self._drain(spool)
 
     def close(self) -> None:
         if self._spool is not None:
@@ -171,17 +170,29 @@ class Shelf:
             self._spool = None
 
     def _drain(self, spool: Spool) -> None:
-        try:
-            with delivering(spool, self._settings, SLICE_S) as (uploader, writer):
-                drained = uploader.drain(SLICE_S)
-                writer.flush(SLICE_S)
-                for part in self._catalogue.due():
-                    writer.put(part)
-                status = uploader.status()
-        except sqlite3.Error as error:
-            raise spool.unwritable(error) from error
+        with delivering(spool, self._settings, SLICE_S) as (uploader, writer):
+            drained = uploader.drain(SLICE_S)
+            writer.flush(SLICE_S)
+            for part in self._catalogue.due():
+                writer.put(part)
+            status = uploader.status()
+        if writer.damaged:
+            raise sqlite3.DatabaseError(f'the index of the spool {spool.root} is damaged')
         if not drained and not status.delivered and status.last_error:
             raise StoreUnavailable(status.last_error)
+
+    @contextmanager
+    def _using(self, spool: Spool) -> Iterator[Spool]:
+        """The spool, which is closed where its index is lost or damaged: it is rebuilt when it is opened the next time."""
+        try:
+            yield spool
+        except (OSError, sqlite3.OperationalError) as error:
+            raise spool.unwritable(error) from error
+        except (SpoolError, sqlite3.DatabaseError) as error:
+            self._spool = None
+            with suppress(SpoolError):
+                spool.close()
+            raise spool.unwritable(error) if isinstance(error, sqlite3.Error) else error from error
 
     def _opened(self) -> Spool:
         self._used_s = self._monotonic()

@@ -11,6 +11,7 @@ triggers and migrations are in schema.py. What to do is decided elsewhere.
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -91,6 +92,7 @@ class Index:
         self._connection: sqlite3.Connection | None = None
         self._swept: tuple[int, str] = _NOTHING_SWEPT
         """The last short row that ``forget`` looked at."""
+        self._file: os.stat_result | None = None
 
     def open(self) -> None:
         """Raises sqlite3.DatabaseError for a damaged file, SpoolError for one of a newer version or no access."""
@@ -108,6 +110,7 @@ class Index:
             connection.close()
             raise
         self._connection = connection
+        self._file = self._stat()
 
     def _connected(self, mode: str) -> sqlite3.Connection:
         return sqlite3.connect(
@@ -164,6 +167,16 @@ class Index:
             if counted.get(what) != said.get(what):
                 yield f'{what[0] or "bookkeeping"}: {what[1]} {said.get(what)}, but in the spool {counted.get(what)}'
 
+    def _is_in_place(self) -> bool:
+        now = self._stat()
+        return now is not None and self._file is not None and os.path.samestat(now, self._file)
+
+    def _stat(self) -> os.stat_result | None:
+        try:
+            return self._path.stat()
+        except FileNotFoundError:
+            return None
+
     @contextmanager
     def snapshot(self) -> Iterator[None]:
         """All that is read inside is of one instant."""
@@ -175,7 +188,12 @@ class Index:
 
     @contextmanager
     def transaction(self, undo: Callable[[], None] = lambda: None) -> Iterator[None]:
-        """All or nothing, durable on leaving; ``undo`` runs before it is rolled back, with other writers still shut out."""
+        """All or nothing, durable on leaving; ``undo`` runs before it is rolled back, with other writers still shut out.
+
+        Raises sqlite3.DatabaseError where the file that was opened is gone from its place: nobody would see what is written.
+        """
+        if not self._is_in_place():
+            raise sqlite3.DatabaseError(f'{self._path} was lost: it was deleted or replaced')
         self._db.execute('BEGIN IMMEDIATE')
         try:
             yield
@@ -527,6 +545,14 @@ class Index:
         cursor = self._db.execute(query, (robot, boot_id, pid, now_ns))
         self._db.execute('INSERT OR IGNORE INTO gaps_told VALUES (?, 0, 0)', (robot,))
         return int(cursor.lastrowid or 0)
+
+    def begin_after(self, session: int, number: int) -> None:
+        """Give the next session and the next object greater numbers than these."""
+        with self.transaction():
+            for table, last in (('sessions', session), ('objects', number)):
+                self._db.execute('INSERT INTO sqlite_sequence SELECT ?1, 0 WHERE NOT EXISTS'
+                                 ' (SELECT 1 FROM sqlite_sequence WHERE name = ?1)', (table,))  # fmt: skip
+                self._db.execute('UPDATE sqlite_sequence SET seq = max(seq, ?) WHERE name = ?', (last, table))
 
     def end_session(self, session: int, now_ns: int) -> None:
         self._db.execute('UPDATE sessions SET ended_ns = ? WHERE id = ?', (now_ns, session))

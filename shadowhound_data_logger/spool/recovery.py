@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 
 DAMAGED: Final = 'damaged'
 REBUILT: Final = 'damaged index rebuilt'
+MILLISECOND: Final = 10**6
 _DAMAGED: Final = ('malformed', 'disk I/O', 'already exists', 'no such', 'decode', 'unsupported file format')
 
 
@@ -96,6 +97,7 @@ def _set_aside(path: Path) -> None:
 
 def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery, *, has_log: bool) -> None:
     """Make index and tree agree and settle dead sessions."""
+    _stay_apart(tree, index, now_ns)
     _follow_rows(tree, index, now_ns, report)
     _settle_parts(tree, index, report, adopt=_went_back(tree, index, has_log=has_log))
     Adoption(tree, index, now_ns, report).run()
@@ -113,6 +115,14 @@ def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery, *, has_log
         log.error('the ledger of %s does not close, its index was damaged: %s', tree.root, sentence)
         report.counts['sums of the ledger that do not close'] += 1
     tree.prune()
+
+
+def _stay_apart(tree: Tree, index: Index, now_ns: int) -> None:
+    """Give out no number that a process has given out which lives with the index before, until it finds that this was lost."""
+    known = {*index.sessions(ended=False), *index.sessions(ended=True)}
+    strangers = set(tree.sessions()).difference(known)
+    if strangers:
+        index.begin_after(max(strangers), now_ns // MILLISECOND)
 
 
 def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:

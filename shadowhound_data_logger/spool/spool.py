@@ -84,7 +84,10 @@ class Spool:
             log.warning('spool %s: %s', self.root, self.recovery.describe())
 
     def close(self) -> None:
-        """Commit the last accounts and end the session; idempotent. Raises SpoolError when the disk does not take them."""
+        """Commit the last accounts and end the session; idempotent. Raises SpoolError when the disk does not take them.
+
+        Where the index is lost or damaged the accounts cannot be kept: it is closed, and raises SpoolError.
+        """
         session = self._session
         if session is None:
             return
@@ -95,13 +98,14 @@ class Spool:
             snapshot = self.accounts.snapshot({})
             try:
                 self._ballast.work(lambda: session.end(self._index, snapshot, self._clock.wall_ns()))
-            except (OSError, sqlite3.Error) as error:
+            except (OSError, sqlite3.OperationalError) as error:
                 self.accounts.mark_dirty()
                 raise self.unwritable(error) from error
-            self._view.close()
-            self._index.close()
-            session.leave()
-            self._session = None
+            except sqlite3.DatabaseError as error:
+                self._leave(session)
+                raise SpoolError(f'the index of the spool {self.root} is damaged: {error}',
+                                 remedy='start again: it is rebuilt from the files then') from error  # fmt: skip
+            self._leave(session)
 
     def commit(self, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (), *,
                durable: Callable[[list[SpooledObject]], None] = lambda _: None) -> list[SpooledObject]:  # fmt: skip
@@ -222,6 +226,12 @@ class Spool:
         """Held by the one node that takes this robot's messages: a second one would count and store them again."""
         with flock(self.root / f'node-{self._robot}.lock', wait=False) as mine:
             yield mine
+
+    def _leave(self, session: Session) -> None:
+        self._view.close()
+        self._index.close()
+        session.leave()
+        self._session = None
 
     @contextmanager
     def _had_within(self, seconds: float) -> Iterator[None]:

@@ -13,6 +13,7 @@ from spool.making import make, new_spool, put, rows
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.objects import Shelf, objects_of
@@ -138,3 +139,15 @@ def test_a_node_s_larger_spool_is_left_to_it(tmp_path: Path, folder: MissionFold
         shelf.close()
         node.close()
     assert set(spooled(tmp_path).values()) == {'pending'}
+
+
+def test_an_index_that_is_lost_meanwhile(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+    """The objects that come then are refused once, and taken when they are handed over again."""
+    first, *others = objects(folder, RUN)
+    shelf.add([first])
+    (tmp_path / 'spool' / 'index.db').unlink()
+    with pytest.raises(SpoolError):
+        shelf.add(others)
+    shelf.add(others)
+    prefix = 'thor/missions/abc/camera/'
+    assert set(spooled(tmp_path)) == {item.key for item in (first, *others)} | {f'{prefix}frame_000007_1.jpg'}

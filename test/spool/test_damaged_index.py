@@ -211,3 +211,31 @@ def test_a_file_system_without_attributes(opened: Open, root: Path, monkeypatch:
     assert reopened(opened, root) == {}
     (root / 'index.db').unlink()
     assert reopened(opened, root) == {'files adopted': 1}
+
+
+@pytest.mark.parametrize('damage', ['deleted', 'set aside'])
+def test_an_index_that_is_lost_in_use(opened: Open, root: Path, damage: str) -> None:
+    """Who has it open can write no more, and is told to start again; another process goes on beside it, and nothing is lost."""
+    first = opened()
+    put(first, make('old'))
+    if damage == 'deleted':
+        (root / 'index.db').unlink()
+    else:
+        (root / 'index.db').rename(root / 'index.db.damaged-1')
+    with pytest.raises(sqlite3.DatabaseError, match='lost'):
+        put(first, make('late'))
+    second = opened()
+    (new,) = put(second, make('new'))
+    assert first._session is not None
+    assert second._session is not None
+    assert first._session.number != second._session.number
+    assert new.id > 1000
+    with pytest.raises(SpoolError, match='start again'):
+        first.close()
+    first.close()
+    put(second, make('newer'))
+    second.close()
+    spool = opened()
+    assert {item.key for item in spool.pending(9)} == {'old', 'new', 'newer'}
+    assert not list((root / 'incoming').iterdir())
+    assert_whole(root)
