@@ -15,7 +15,8 @@ import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
@@ -37,13 +38,14 @@ from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.errors import BagError, DataLoggerError
+from shadowhound_data_logger.errors import BagError, DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.worker import Worker
 
 NODE: Final = 'shadowhound_bag_record'
@@ -53,6 +55,30 @@ MORE_S: Final = 0.5
 """For the others, once one is known."""
 STEP_S: Final = 0.1
 CLOSE_S: Final = 5.0
+DAMAGED_S: Final = 0.5
+"""For the same where the spool takes nothing any more."""
+RECOVERY_S: Final = 30.0
+
+log = logging.getLogger(__name__)
+
+
+class _IndexLostError(SpoolError):
+    """The spool's index was deleted, replaced or damaged while a bag was recorded."""
+
+    def __init__(self, bag: str) -> None:
+        super().__init__('the index of the spool was lost', remedy='it is rebuilt from the files when the spool is opened')
+        self.bag = bag
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """What is to be recorded."""
+
+    name: str
+    cut_off: str
+    """The bag that was recorded when the index was lost; empty for the first."""
+    end_s: float
+    deadline_s: float
 
 
 class ManifestWriter(SpoolWriter):
@@ -110,29 +136,52 @@ def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[st
     topics = given.topic or ([] if given.regex else _topics_there(node, given.robot, stop))
     parameters = {'robot': given.robot, 'bag.topics': topics or [''], 'bag.regex': given.regex}
     settings = Settings.load(parameters, os.environ)
+    end_s, bag = time.monotonic() + given.duration, ''
+    with _alone(settings), closing(open_store(settings.store, settings.upload)) as store:
+        while True:
+            try:
+                return _record_bag(node, settings, store, _Wanted(name, bag, end_s, given.deadline), stop)
+            except _IndexLostError as lost:
+                bag = lost.bag
+                log.warning('%s: %s is made whole, and another bag follows it', lost, bag)
+
+
+def _record_bag(node: Node, settings: Settings, store: ObjectStore, wanted: _Wanted, stop: StopSignals) -> dict[str, Any]:
+    """Raises _IndexLostError where the spool has to be opened anew."""
     with ExitStack() as opened:
-        opened.enter_context(_alone(settings))
-        store = open_store(settings.store, settings.upload)
-        opened.callback(store.close)
         # An owner of its own: what a killed one left open is for the next one to settle, and none of the node's.
         owner = f'{settings.robot} {RECORDS}'
         spool = Spool(settings.spool_path, settings.spool, SystemClock.of_this_machine(), owner)
         spool.open()
-        opened.callback(spool.close)
         writer = ManifestWriter(spool)
+        opened.callback(_close, spool, writer)
         uploader = Uploader(spool, store, settings.upload, writer.settle)
         writer.on_commit(spooled=uploader.wake, settled=uploader.settled)
         recorder = _open_recorder(opened, node, settings, writer)
         uploader.open()
         opened.callback(uploader.close, CLOSE_S)
         workers = *uploader.workers, writer.worker
-        bag, dropped = _until_over(recorder, workers, name, given.duration, stop)
+        if wanted.cut_off and (stop.received or time.monotonic() > wanted.end_s):
+            bag, dropped = wanted.cut_off, 0
+            _wait_for_recovery(recorder, writer, workers, bag)
+        else:
+            bag, dropped = _until_over(recorder, writer, workers, wanted, stop)
         manifest = writer.manifest_of(bag)
         if manifest is None:
+            topics = [topic for topic in settings.bag.topics if topic]
             raise BagError('nothing was published on the topics that were to be recorded', topics=topics,
-                           remedy=f'`ros2 topic list`; asked for was {" ".join(topics) or given.regex}')  # fmt: skip
-        waiting = _wait_for_delivery(settings, writer, workers, manifest.bag, given.deadline)
+                           remedy=f'`ros2 topic list`; asked for was {" ".join(topics) or settings.bag.regex}')  # fmt: skip
+        waiting = _wait_for_delivery(settings, writer, workers, manifest.bag, wanted.deadline_s)
         return _told(manifest, dropped, waiting=waiting, last_error=uploader.status().last_error)
+
+
+def _close(spool: Spool, writer: SpoolWriter) -> None:
+    """The accounts of a spool whose index is lost are lost as well: that was told."""
+    try:
+        spool.close()
+    except SpoolError:
+        if not writer.damaged:
+            raise
 
 
 def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: SpoolWriter) -> Recorder:
@@ -149,7 +198,7 @@ def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: Sp
     intake.open()
     opened.callback(intake.close, CLOSE_S)
     recorder.open()
-    opened.callback(recorder.close, CLOSE_S)
+    opened.callback(lambda: recorder.close(DAMAGED_S if writer.damaged else CLOSE_S))
     return recorder
 
 
@@ -165,22 +214,32 @@ def _topics_there(node: Node, robot: str, stop: StopSignals) -> list[str]:
     return [next((topic for topic in topics if node.count_publishers(topic)), topics[0]) for topics in sensors]
 
 
-def _until_over(recorder: Recorder, workers: Sequence[Worker], name: str, duration_s: float,
+def _until_over(recorder: Recorder, writer: SpoolWriter, workers: Sequence[Worker], wanted: _Wanted,
                 stop: StopSignals) -> tuple[str, int]:  # fmt: skip
     """Record; the name of the bag when it began, and how many messages were dropped meanwhile."""
-    recorder.on_mission({'type': name, 'mission_id': None})
-    done, text = recorder.start()
+    recorder.on_mission({'type': wanted.name, 'mission_id': None})
+    done, bag = recorder.start()
     if not done:
-        raise BagError(f'no bag was recorded: {text}')
-    end_s = time.monotonic() + duration_s
-    while time.monotonic() < end_s and not stop.received:
-        time.sleep(min(STEP_S, max(0.0, end_s - time.monotonic())))
+        raise BagError(f'no bag was recorded: {bag}')
+    while time.monotonic() < wanted.end_s and not stop.received:
+        time.sleep(min(STEP_S, max(0.0, wanted.end_s - time.monotonic())))
         _supervise((*recorder.workers, *workers))
-    dropped, bag = recorder.status().dropped, text
+        if writer.damaged:
+            raise _IndexLostError(bag)
+    dropped = recorder.status().dropped
     done, text = recorder.stop()
+    if not done and writer.damaged:
+        raise _IndexLostError(bag)
     if not done:
         raise BagError(f'{bag} could not be ended: {text}', remedy='the next `shadowhound-data bag record` makes it whole')
     return bag, dropped
+
+
+def _wait_for_recovery(recorder: Recorder, writer: ManifestWriter, workers: Sequence[Worker], bag: str) -> None:
+    end_s = time.monotonic() + RECOVERY_S
+    while writer.manifest_of(bag) is None and time.monotonic() < end_s:
+        time.sleep(STEP_S)
+        _supervise((*recorder.workers, *workers))
 
 
 def _wait_for_delivery(settings: Settings, writer: SpoolWriter, workers: Sequence[Worker], bag: str,

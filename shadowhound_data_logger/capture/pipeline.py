@@ -58,6 +58,8 @@ from shadowhound_data_logger.stores import open_store
 log = logging.getLogger(__name__)
 
 CLOSE_S = 5.0
+DAMAGED_S = 0.5
+"""The same where the spool takes nothing any more."""
 """Time for what is in memory to become durable at a stop; it takes a fraction of that unless the disk hangs."""
 LEDGER_BUCKET = 'sensor-data'
 
@@ -185,16 +187,17 @@ class Pipeline:
 
     def _finish(self) -> None:
         """Everything that is in memory to the spool, and from there what can be delivered in time."""
-        end_s = time.monotonic() + CLOSE_S
+        close_s = DAMAGED_S if self.writer.damaged else CLOSE_S
+        end_s = time.monotonic() + close_s
         finished = {
-            'bag recorder': self.recorder.close(CLOSE_S),
-            'intake': self.intake.close(CLOSE_S),
+            'bag recorder': self.recorder.close(close_s),
+            'intake': self.intake.close(close_s),
             'event writer': self.event_buffer.close(end_s - time.monotonic()),
             'encode pool': self.pool.close(end_s - time.monotonic()),
             'spool writer': self.writer.flush(end_s - time.monotonic()),
         }
         for name in (name for name, done in finished.items() if not done):
-            log.error('the %s did not finish its work in %.0f s', name, CLOSE_S)
+            log.error('the %s did not finish its work in %g s', name, close_s)
         if not all(finished.values()):
             return
         self._ship_ledger()

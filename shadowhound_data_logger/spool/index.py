@@ -23,6 +23,7 @@ from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
+from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, ObjectInfo, SpooledObject, State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
@@ -167,9 +168,27 @@ class Index:
             if counted.get(what) != said.get(what):
                 yield f'{what[0] or "bookkeeping"}: {what[1]} {said.get(what)}, but in the spool {counted.get(what)}'
 
-    def _is_in_place(self) -> bool:
+    def is_in_place(self) -> bool:
+        """Whether the file that was opened is where it was."""
         now = self._stat()
         return now is not None and self._file is not None and os.path.samestat(now, self._file)
+
+    def put_back(self) -> None:
+        """Write what is open as a new file where nobody has one: it was deleted. To be opened anew then, by all who had it open.
+
+        The caller holds the recovery lock. Raises OSError, sqlite3.Error.
+        """
+        self._db.execute('BEGIN IMMEDIATE')  # whoever is about to commit to the deleted file has done so then
+        self._db.execute('COMMIT')
+        copy = self._path.with_name(f'{self._path.name}.copy')
+        copy.unlink(missing_ok=True)
+        copy.touch(mode=0o600)
+        with closing(sqlite3.connect(copy)) as target:
+            self._db.backup(target)
+        for suffix in ('-wal', '-shm'):
+            Path(f'{self._path}{suffix}').unlink(missing_ok=True)
+        os.replace(copy, self._path)
+        sync(self._path.parent)
 
     def _stat(self) -> os.stat_result | None:
         try:
@@ -192,10 +211,10 @@ class Index:
 
         Raises sqlite3.DatabaseError where the file that was opened is gone from its place: nobody would see what is written.
         """
-        if not self._is_in_place():
-            raise sqlite3.DatabaseError(f'{self._path} was lost: it was deleted or replaced')
         self._db.execute('BEGIN IMMEDIATE')
         try:
+            if not self.is_in_place():  # asked now: whoever put a copy there waited for the transactions before
+                raise sqlite3.DatabaseError(f'{self._path} was lost: it was deleted or replaced')
             yield
             self._db.execute('COMMIT')
         except BaseException:

@@ -185,6 +185,11 @@ def _settle_parts(tree: Tree, index: Index, report: Recovery, *, adopt: bool) ->
                 report.counts['uncommitted parts removed'] += 1
 
 
+def any_alive(tree: Tree) -> bool:
+    """Whether a process has the spool open."""
+    return any(not _is_dead(tree, session) for session in tree.sessions())
+
+
 def _is_dead(tree: Tree, session: int) -> bool:
     """Whether the process of a session is gone: its lock file can be locked."""
     try:

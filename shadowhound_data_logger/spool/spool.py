@@ -12,8 +12,9 @@ import logging
 import os
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -31,7 +32,7 @@ from shadowhound_data_logger.spool.ballast import Ballast, says_full
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index, spooled
-from shadowhound_data_logger.spool.recovery import open_recovered
+from shadowhound_data_logger.spool.recovery import any_alive, open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, fits, make_room
 from shadowhound_data_logger.spool.session import Session, carry
@@ -41,6 +42,8 @@ log = logging.getLogger(__name__)
 
 CLOSE_S: Final = 10.0
 """For a commit that is under way when the spool is closed."""
+PUT_BACK_S: Final = 2.5
+"""For a process that lives to put back an index that was deleted under it: it commits each second."""
 DAY_NS: Final = 24 * 3600 * SECOND
 FULL_ROWS_NS: Final = 3600 * SECOND
 """For so long the index keeps all that it knows of an object that left the spool; then its key, size, checksum and state."""
@@ -66,6 +69,8 @@ class Spool:
         self._lock = threading.Lock()
         self._index = Index(root / 'index.db')
         self._view = Index(root / 'index.db', read_only=True)
+        self._lost: list[Index] = []
+        """Views of indexes that were deleted."""
         self._session: Session | None = None
         self._compacted_ns = self._forgot_ns = 0
         self._shortage = Shortage(root)
@@ -91,6 +96,8 @@ class Spool:
         session = self._session
         if session is None:
             return
+        with suppress(OSError, sqlite3.Error):
+            self._keep_index()
         with self._had_within(CLOSE_S):
             lost = self.accounts.drop_open('shutdown')
             if lost:
@@ -115,6 +122,7 @@ class Spool:
         Raises OSError or sqlite3.OperationalError when nothing of it became durable; the caller tries again. Objects
         for which there is no room at all are recorded as evicted, those whose file is gone as quarantined.
         """
+        self._keep_index()
         with staged(self._tree, self._session.number if self._session else 0, objects) as ready:
             with self._lock:
                 placed = self._ballast.work(lambda: self._commit(ready, outcomes))
@@ -227,7 +235,39 @@ class Spool:
         with flock(self.root / f'node-{self._robot}.lock', wait=False) as mine:
             yield mine
 
+    def _keep_index(self) -> None:
+        """Put the index back where somebody deleted it, or go over to the copy that another process has put there.
+
+        Raises sqlite3.DatabaseError where another index is in its place, OSError.
+        """
+        session = self._session
+        if session is None or self._index.is_in_place():
+            return
+        with flock(self.root / 'recovery.lock'), self._lock:
+            if self._index.is_in_place():
+                return
+            first, path = self._index.first_session(), self.root / 'index.db'
+            if not path.exists():
+                self._index.put_back()
+                log.error('the spool index %s was deleted: it is put back', path)
+            copy, view = Index(path), Index(path, read_only=True)
+            try:
+                copy.open()
+                if copy.first_session() != first or session.number not in copy.sessions(ended=False):
+                    raise sqlite3.DatabaseError(f'{path} was lost: it was deleted or replaced')
+                view.open()
+            except BaseException:
+                copy.close()
+                raise
+            self._index.close()
+            self._index = copy
+            self._lost.append(self._view)  # other threads may be in the middle of a question
+            self._view = view
+
     def _leave(self, session: Session) -> None:
+        for view in self._lost:
+            view.close()
+        self._lost.clear()
         self._view.close()
         self._index.close()
         session.leave()
@@ -248,6 +288,7 @@ class Spool:
     def _open(self) -> None:
         try:
             self._tree.create()
+            self._wait_for_index()
             with flock(self.root / 'recovery.lock'):
                 self._index = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
                 self._view.open()
@@ -257,6 +298,12 @@ class Spool:
             self._index.close()
             self._view.close()
             raise
+
+    def _wait_for_index(self) -> None:
+        """Where it was deleted under a process that lives, that one puts it back with its next commit."""
+        end_s = time.monotonic() + PUT_BACK_S
+        while not (self.root / 'index.db').exists() and any_alive(self._tree) and time.monotonic() < end_s:
+            time.sleep(PUT_BACK_S / 50)
 
     def _commit(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> list[SpooledObject]:
         now_ns = self._clock.wall_ns()

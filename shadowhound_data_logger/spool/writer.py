@@ -93,12 +93,13 @@ class SpoolWriter:
             return self._written['objects'], self._written['messages']
 
     def flush(self, deadline_s: float) -> bool:
-        """Whether everything put and settled before this call became durable in time."""
+        """Whether everything put and settled before this call became durable in time; False at once where nothing can."""
         with self._changed:
             target = self._added
             self._urgent = True
             self._changed.notify_all()
-            return self._changed.wait_for(lambda: self._done >= target, deadline_s)
+            self._changed.wait_for(lambda: self._done >= target or self.damaged, deadline_s)
+            return self._done >= target
 
     def close(self, deadline_s: float) -> bool:
         """Commit what is queued and end the thread; False when that did not work in time. Idempotent."""
@@ -126,7 +127,9 @@ class SpoolWriter:
         except (OSError, sqlite3.OperationalError) as error:
             raise self.spool.unwritable(error) from error
         except sqlite3.DatabaseError:
-            self.damaged = True
+            with self._changed:
+                self.damaged = True
+                self._changed.notify_all()
             raise
 
     def _groups(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> list[_Group]:

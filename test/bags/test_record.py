@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from bags.real_bags import by_rosbags
+from e2e.processes import until
 
 from shadowhound_data_logger.bags import record_and_upload_rosbag
 from shadowhound_data_logger.bags.manifest import Manifest
@@ -91,3 +93,25 @@ def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
     manifest = Manifest.from_json((folder / 'manifest.json').read_bytes())
     assert manifest.state == 'recovered'
     assert len(by_rosbags(folder)) == manifest.slices[0].messages > 0
+
+
+@long
+def test_the_spools_index_is_lost_meanwhile(home: Path) -> None:
+    """The bag is made whole and another follows it; both are in the store, and the call tells of the last."""
+    program = 'shadowhound_data_logger.capture.bag_process'
+    command = [sys.executable, '-m', program, '--duration=60', '--topic=/odom', 'patrol']
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as child:
+        until(lambda: any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')), 'it records')
+        (home / 'spool' / 'index.db').unlink()
+        until(lambda: len(list(rosbags_of(home).glob('patrol_*/manifest.json'))) == 1, 'the first bag is whole')
+        until(lambda: any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')), 'it records again')
+        child.send_signal(signal.SIGINT)
+        said = json.loads(child.communicate()[0].splitlines()[-1])
+    assert (child.returncode, said['delivered']) == (0, True)
+    folders = sorted(rosbags_of(home).iterdir())
+    assert [folder.name for folder in folders][-1] == said['bag']
+    for folder in folders:
+        manifest = Manifest.from_json((folder / 'manifest.json').read_bytes())
+        assert manifest.state == 'complete'
+        assert len(by_rosbags(folder)) == sum(each.messages for each in manifest.slices) > 0
+    assert len(folders) == 2
