@@ -212,9 +212,10 @@ class Index:
         Raises sqlite3.DatabaseError where the file that was opened is gone from its place: nobody would see what is written.
         """
         self._db.execute('BEGIN IMMEDIATE')
+        if not self.is_in_place():  # asked now: whoever put a copy there waited for the transactions before
+            self._db.execute('ROLLBACK')
+            raise lost(self._path)
         try:
-            if not self.is_in_place():  # asked now: whoever put a copy there waited for the transactions before
-                raise sqlite3.DatabaseError(f'{self._path} was lost: it was deleted or replaced')
             yield
             self._db.execute('COMMIT')
         except BaseException:
@@ -704,6 +705,11 @@ def _digest(sha256: str) -> bytes:
 
 def _marks(count: int) -> str:
     return ', '.join('?' * count)
+
+
+def lost(path: Path) -> sqlite3.DatabaseError:
+    """The file that was opened is gone from its place."""
+    return sqlite3.DatabaseError(f'{path} was lost: it was deleted or replaced')
 
 
 def spooled(row: sqlite3.Row | Mapping[str, Any], path: Path) -> SpooledObject:

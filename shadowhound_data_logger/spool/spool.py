@@ -31,7 +31,7 @@ from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.ballast import Ballast, says_full
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
-from shadowhound_data_logger.spool.index import Index, spooled
+from shadowhound_data_logger.spool.index import Index, lost, spooled
 from shadowhound_data_logger.spool.recovery import any_alive, open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, fits, make_room
@@ -246,19 +246,23 @@ class Spool:
         with flock(self.root / 'recovery.lock'), self._lock:
             if self._index.is_in_place():
                 return
-            first, path = self._index.first_session(), self.root / 'index.db'
-            if not path.exists():
-                self._index.put_back()
-                log.error('the spool index %s was deleted: it is put back', path)
+            path = self.root / 'index.db'
             copy, view = Index(path), Index(path, read_only=True)
             try:
+                first = self._index.first_session()
+                if not path.exists():
+                    self._index.put_back()
+                    log.error('the spool index %s was deleted: it is put back', path)
                 copy.open()
-                if copy.first_session() != first or session.number not in copy.sessions(ended=False):
-                    raise sqlite3.DatabaseError(f'{path} was lost: it was deleted or replaced')
+                is_copy = copy.first_session() == first and session.number in copy.sessions(ended=False)
                 view.open()
-            except BaseException:
+            except sqlite3.Error as error:
                 copy.close()
-                raise
+                raise lost(path) from error
+            if not is_copy:
+                copy.close()
+                view.close()
+                raise lost(path)
             self._index.close()
             self._index = copy
             self._lost.append(self._view)  # other threads may be in the middle of a question

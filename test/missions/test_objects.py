@@ -145,8 +145,13 @@ def test_an_index_that_is_lost_meanwhile(tmp_path: Path, shelf: Shelf, folder: M
     """The objects that come then are refused once, and taken when they are handed over again."""
     first, *others = objects(folder, RUN)
     shelf.add([first])
-    (tmp_path / 'spool' / 'index.db').unlink()
-    with pytest.raises(SpoolError):
+    index = tmp_path / 'spool' / 'index.db'
+    index.rename(index.with_name('index.db.damaged-1'))
+    index.touch()
+    other = new_spool(tmp_path / 'spool')
+    other.open()
+    other.close()
+    with pytest.raises(SpoolError, match='was lost'):
         shelf.add(others)
     shelf.add(others)
     prefix = 'thor/missions/abc/camera/'

@@ -6,6 +6,7 @@ import errno
 import os
 import random
 import sqlite3
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -213,18 +214,18 @@ def test_a_file_system_without_attributes(opened: Open, root: Path, monkeypatch:
     assert reopened(opened, root) == {'files adopted': 1}
 
 
-@pytest.mark.parametrize('damage', ['deleted', 'set aside'])
-def test_an_index_that_is_lost_in_use(opened: Open, root: Path, damage: str) -> None:
+@pytest.mark.parametrize('logs', [(), ('-wal', '-shm')])
+def test_an_index_that_is_replaced_in_use(opened: Open, root: Path, logs: tuple[str, ...]) -> None:
     """Who has it open can write no more, and is told to start again; another process goes on beside it, and nothing is lost."""
     first = opened()
     put(first, make('old'))
-    if damage == 'deleted':
-        (root / 'index.db').unlink()
-    else:
-        (root / 'index.db').rename(root / 'index.db.damaged-1')
+    (root / 'index.db').rename(root / 'index.db.damaged-1')
+    for end in logs:
+        (root / f'index.db{end}').unlink()
+    (root / 'index.db').touch()
+    second = opened()
     with pytest.raises(sqlite3.DatabaseError, match='lost'):
         put(first, make('late'))
-    second = opened()
     (new,) = put(second, make('new'))
     assert first._session is not None
     assert second._session is not None
@@ -239,3 +240,36 @@ def test_an_index_that_is_lost_in_use(opened: Open, root: Path, damage: str) -> 
     assert {item.key for item in spool.pending(9)} == {'old', 'new', 'newer'}
     assert not list((root / 'incoming').iterdir())
     assert_whole(root)
+
+
+@pytest.mark.parametrize('logs', [(), ('-wal',), ('-shm',), ('-wal', '-shm')])
+def test_an_index_that_is_deleted_in_use(opened: Open, root: Path, logs: tuple[str, ...]) -> None:
+    """The next commit of a process that has it open puts it back with all that it knew; the others go on with the copy."""
+    first, second = opened(), opened()
+    (old,) = put(first, make('old'))
+    put(second, make('beside', topic='/beside'))
+    settle(first, old, State.DELIVERED)
+    for end in ('', *logs):
+        (root / f'index.db{end}').unlink()
+    put(first, make('new', b'new'))
+    put(second, make('newer', b'newer', topic='/beside'))
+    first.close()
+    second.close()
+    found = assert_whole(root)
+    assert {row['key']: row['state'] for row in rows(root)} == {
+        'old': 'delivered', 'beside': 'pending', 'new': 'pending', 'newer': 'pending'
+    }  # fmt: skip
+    assert (found['topics']['/camera']['received'], found['topics']['/beside']['received']) == (2, 2)
+    assert not opened().recovery.found_anything
+
+
+def test_a_start_waits_for_an_index_that_was_deleted(opened: Open, root: Path) -> None:
+    """A process that lives puts it back within a second or so, and the one that starts finds the accounts."""
+    first = opened()
+    put(first, make('old'))
+    (root / 'index.db').unlink()
+    with ThreadPoolExecutor() as pool:
+        second = pool.submit(opened)
+        put(first, make('new'))
+        assert not second.result().recovery.found_anything
+    assert {row['key'] for row in rows(root)} == {'old', 'new'}
