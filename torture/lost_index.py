@@ -65,7 +65,7 @@ NOTICED_S: Final = (0.0, 3.0)
 """From a damage to the first death."""
 UNTOUCHED: Final = 0.2
 """Share of the damages after which nobody is killed."""
-GO_ON_S: Final = 30.0
+GO_ON_S: Final = 90.0
 STEADY_S: Final = 1.0
 DELIVER_S: Final = 300.0
 AGENT_PERIOD_S: Final = 0.05
