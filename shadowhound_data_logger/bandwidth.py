@@ -42,7 +42,10 @@ class _Waiter:
 
 
 class Pace:
-    """Thread-safe: ``_lock`` guards all of it, and each waiter's condition is one of this lock."""
+    """Limits how fast all puts of a store send, together.
+
+    Thread-safe: ``_lock`` guards all of it, and each waiter's condition is one of this lock.
+    """
 
     def __init__(self, max_mbps: float = 0.0, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._now = monotonic

@@ -33,7 +33,7 @@ _CONDITION: Final = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One of the settings."""
+    """A condition on a field of a topic, as the settings have it."""
 
     text: str
     name: str

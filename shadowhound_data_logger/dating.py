@@ -16,7 +16,10 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
 
 @dataclass(frozen=True, slots=True)
 class Dating:
-    """The rule; no state of its own, from any thread."""
+    """The rule by which objects, bags and missions get their dates.
+
+    It has no state of its own; use it from any thread.
+    """
 
     clock: Clock
     hold_s: float

@@ -51,7 +51,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """What came of it."""
+    """What a cut copied, and how much it read."""
 
     folder: Path
     messages: int

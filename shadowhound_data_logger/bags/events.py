@@ -81,7 +81,9 @@ class _Event:
 
 
 class Events:
-    """Life: New; open once; ``trigger`` and ``status`` from any thread; ``close`` after the intake is closed.
+    """Records events: makes a bag of what the ring holds and what follows, for each trigger.
+
+    Life: New; open once; ``trigger`` and ``status`` from any thread; ``close`` after the intake is closed.
 
     ``_lock`` guards which event goes on and what is asked of it; the writing belongs to the thread ``event-writer``.
     """

@@ -32,7 +32,7 @@ FETCH_THREADS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class FetchedBag:
-    """What came of it."""
+    """What a fetch brought."""
 
     folder: Path
     files: int

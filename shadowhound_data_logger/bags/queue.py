@@ -33,7 +33,10 @@ Mark = Callable[[], None]
 
 
 class BagQueue:
-    """Thread-safe. ``put`` and ``mark`` from any thread, ``wait`` and ``next`` by the writer."""
+    """Messages on their way from the intake to the bag writer, in order, bounded in bytes.
+
+    Thread-safe. ``put`` and ``mark`` from any thread, ``wait`` and ``next`` by the writer.
+    """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
         self._max_bytes = max_bytes

@@ -67,7 +67,9 @@ class _Current:
 
 
 class Recorder:
-    """Life: New; open once; start, stop, ... from any thread; ``close`` before the intake is closed.
+    """Starts, splits and stops recordings, and writes their messages.
+
+    Life: New; open once; start, stop, ... from any thread; ``close`` before the intake is closed.
 
     ``_control`` makes each of these one step; the recording itself belongs to the thread ``bag-writer``.
     """

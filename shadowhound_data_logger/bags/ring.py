@@ -40,7 +40,10 @@ class Held(NamedTuple):
 
 
 class Ring:
-    """Thread-safe. ``put`` by the intake; ``claim``, ``next`` and ``release`` by whoever writes events."""
+    """The latest messages of some topics, in memory, bounded in seconds and bytes.
+
+    Thread-safe. ``put`` by the intake; ``claim``, ``next`` and ``release`` by whoever writes events.
+    """
 
     def __init__(self, max_bytes: int, keep_s: float) -> None:
         self.max_bytes = max_bytes
@@ -166,7 +169,10 @@ def _is_of(message: Taken, kept: Taken) -> bool:
 
 
 class Claims:
-    """New; from any thread."""
+    """Accounts for the messages that events claim of the ring.
+
+    New; from any thread.
+    """
 
     def __init__(self, accounts: Accounts) -> None:
         self._accounts = accounts

@@ -43,7 +43,7 @@ class FileCheck:
 
 @dataclass(frozen=True, slots=True)
 class VerifiedBag:
-    """What came of it."""
+    """What a verification found."""
 
     bag: str
     state: str

@@ -55,7 +55,10 @@ class WatchStep:
 
 
 class Watch:
-    """New; ``round`` any number of times, by one thread. Errors of one bag cost that bag alone."""
+    """Ships the finished bags of a folder.
+
+    New; ``round`` any number of times, by one thread. Errors of one bag cost that bag alone.
+    """
 
     def __init__(self, folder: Path, settings: Settings, clock: Clock, *, settle_s: float, is_removing: bool = False,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip

@@ -49,7 +49,10 @@ class _Command:
 
 
 class Commands:
-    """All of them. Used by the main thread alone: one is done after the other, and a flush may take ``FLUSH_S``."""
+    """Everything that the node can be asked to do.
+
+    Used by the main thread alone: one command is done after the other, and a flush may take ``FLUSH_S``.
+    """
 
     def __init__(self, stages: Stages, parameters: Settable, status: Status, robot: str, node: str) -> None:
         """``node`` is the full name under which ROS knows the node."""

@@ -40,7 +40,9 @@ Waiting = tuple[_Request, 'Future[dict[str, Any]]']
 
 
 class ControlSocket:
-    """Life: New; open once, by the robot's one node; ``obey`` by the main thread whenever ``wake`` was called; close once.
+    """Serves commands to programs without ROS, through a Unix socket in the spool.
+
+    Life: New; open once, by the robot's one node; ``obey`` by the main thread whenever ``wake`` was called; close once.
 
     Owns the thread ``control``, which reads and writes; what is asked for waits in a queue for the main thread.
     """

@@ -150,7 +150,10 @@ class BatchQueue:
 
 
 class EncodePool:
-    """New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake."""
+    """The threads that encode batches and hand the objects to the spool.
+
+    New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake.
+    """
 
     def __init__(self, robot: str, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,  # noqa: PLR0913 - each is a neighbour
                  writer: SpoolWriter, marks: Sequence[Marking], observe: Observe, *, threads: int = THREADS) -> None:  # fmt: skip

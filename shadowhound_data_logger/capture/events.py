@@ -85,7 +85,10 @@ def _is_latched(profile: QoSProfile) -> bool:
 
 
 class EventBuffer:
-    """Life: New; open once; ``close`` after the intake."""
+    """Keeps the latest messages for events: the ring, its consumer, and the recording of events.
+
+    Life: New; open once; ``close`` after the intake.
+    """
 
     def __init__(self, node: Node, settings: Settings, place: BagPlace, salvage: Salvage,
                  types: MessageTypes) -> None:  # fmt: skip

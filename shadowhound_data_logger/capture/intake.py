@@ -33,7 +33,9 @@ PATIENCE_S: Final = 5.0
 
 
 class Intake:
-    """New; open once; close once. What is asked of it is done by the thread, between two drains.
+    """Takes all messages, on one thread, and hands them to the consumers.
+
+    New; open once; close once. The thread does what is asked of it between two drains.
 
     ``sensors`` are the settings in force, shared with consumers and encoders; while it runs, this thread alone replaces entries.
     """

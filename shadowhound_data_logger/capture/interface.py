@@ -34,7 +34,9 @@ Ask = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 class Interface:
-    """New; open once; ``publish_diagnostics`` once a second; close once.
+    """The node's services, topics and diagnostics in ROS.
+
+    New; open once; ``publish_diagnostics`` once a second; close once.
 
     A service answers when it is done, from the thread of the executor: for up to ``commands.FLUSH_S`` others wait meanwhile.
     ``~/mission`` says which mission is active, latched, as JSON in a std_msgs/msg/String; it is empty while there is none:

@@ -39,7 +39,9 @@ CLOSE_S: Final = 2.0
 
 
 class MissionWatch:
-    """Life: New; open once; ``stop`` before the intake is closed, ``close`` after the encoders. Owns the thread ``mission``.
+    """Joins the robot's active mission: marks objects with it, and logs to its run.
+
+    Life: New; open once; ``stop`` before the intake is closed, ``close`` after the encoders. Owns the thread ``mission``.
 
     ``mark`` and ``observe`` are called by the encoders; they see the mission as a whole, as it is replaced.
     """

@@ -34,7 +34,9 @@ FLOAT32: Final = 7
 
 
 class MissionObserver:
-    """New; ``facts`` of each batch, on any thread. What cannot be read is said once a topic.
+    """Reads from batches what a mission logs: battery, temperature, poses, frames, floor.
+
+    New; ``facts`` of each batch, on any thread. A topic that cannot be read is logged once.
 
     Two threads that have batches of one topic may both take a value of one period: there is one more then.
     """

@@ -78,7 +78,10 @@ class Ros:
 
 
 class Pipeline:
-    """New; open once; close once."""
+    """Puts the stages of the node together, and starts and stops them in order.
+
+    New; open once; close once.
+    """
 
     def __init__(self, ros: Ros, settings: Settings, parameters: Parameters) -> None:
         self._settings = settings

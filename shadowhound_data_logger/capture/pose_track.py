@@ -103,7 +103,10 @@ class KeptMessages:
 
 
 class RobotTrack(Consumer):
-    """New; ``take`` what the intake drained, ``mark`` each object on its way to the spool, on any thread."""
+    """Knows where the robot was, and its battery, over the last minute.
+
+    New; ``take`` what the intake drained, ``mark`` each object on its way to the spool, on any thread.
+    """
 
     def __init__(self, settings: MissionSettings, types: MessageTypes, clock: Clock, resolve: Callable[[str], str]) -> None:
         """The topics are those of missions; ``resolve`` makes their full names."""

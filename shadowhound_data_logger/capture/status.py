@@ -50,7 +50,7 @@ _NOTHING: Final = Totals('', None, 0, 0, 0, 0, 0, 0, None, None, 0)
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """What is asked."""
+    """The stages that the status asks."""
 
     spool: Spool
     intake: Intake
@@ -77,7 +77,10 @@ class Stages:
 
 
 class Status:
-    """New; ``look`` once a second, ``write`` what it found. ``earlier`` is the status of up to ``WINDOW_S`` before the last."""
+    """Gathers the state of all stages, and writes it to the status file.
+
+    New; ``look`` once a second, ``write`` what it found. ``earlier`` is the status of up to ``WINDOW_S`` before the last.
+    """
 
     def __init__(self, stages: Stages, settings: Settings, clock: ClockWatch, target: str,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip

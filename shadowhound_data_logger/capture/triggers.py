@@ -138,7 +138,10 @@ class JournalTail:
 
 
 class EventWatch:
-    """Life: New; open once; ``on_mission`` from any thread; close once. Owns the thread ``event-watch``."""
+    """Looks for triggers of events: conditions, and what agents log.
+
+    Life: New; open once; ``on_mission`` from any thread; close once. Owns the thread ``event-watch``.
+    """
 
     def __init__(self, inbox: Inbox, types: MessageTypes, home: Path, clock: Clock, log_event: str, trigger: Trigger) -> None:
         """``log_event`` is a regular expression for names of what an agent logs; empty for none."""

@@ -35,7 +35,10 @@ _Report = Mapping[str, Any]
 
 
 class Unheard:
-    """New; ``compare`` whenever the front reports; ``rows`` at any time. Used by the main thread alone."""
+    """Publishers that the robot's RMW finds and the node does not.
+
+    New; ``compare`` whenever the front reports; ``rows`` at any time. Used by the main thread alone.
+    """
 
     def __init__(self, rmw: str, robot: str, topics: Callable[[], Mapping[str, str]], known: Callable[[str], set[str]], *,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip

@@ -47,7 +47,9 @@ UNHEARD_S: Final = 30.0
 
 
 class Watchdog:
-    """New; ``look`` at each status, in their order. ``request_s`` is what one request to the store may take, seconds.
+    """Notices what makes no progress though it should.
+
+    New; ``look`` at each status, in their order. ``request_s`` is what one request to the store may take, seconds.
 
     The keys of what it returns are topics, names of threads, ``encode`` and ``delivery``.
     """

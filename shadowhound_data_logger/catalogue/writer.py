@@ -36,7 +36,10 @@ PRIORITY: Final = 1
 
 
 class CatalogueWriter:
-    """New; ``due`` now and then, on one thread. What it returns is to be spooled, by the thread that commits."""
+    """Makes parts of the catalogue and of the gap journal from what was delivered and lost.
+
+    New; ``due`` now and then, on one thread. The thread that commits spools what it returns.
+    """
 
     def __init__(self, spool: Path, settings: CatalogueSettings, robot: str, clock: Clock,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip

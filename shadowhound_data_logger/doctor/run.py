@@ -51,7 +51,10 @@ class Running:
 
 
 class Examination:
-    """New; ``run`` once, from one thread. A check that misses its deadline is left alone; what it says later is not heard."""
+    """Runs the checks side by side, each with a deadline.
+
+    New; ``run`` once, from one thread. A check that misses its deadline is abandoned; its later results are ignored.
+    """
 
     def __init__(
         self,

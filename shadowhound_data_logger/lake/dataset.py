@@ -38,7 +38,9 @@ KEEP_BYTES: Final = 32 << 20
 
 
 class MissionDataset:
-    """Map-style. Pickled it is a value: no socket, thread or content goes along.
+    """A data set of messages with their aligned neighbours, by number (map-style).
+
+    Pickled it is a value: no socket, thread or content goes with it.
 
     A sample is a dict: ``image`` (height, width, 3) uint8 RGB or ``cloud`` (n, 4) float32, ``stamp_ns``, ``pose`` (x y yaw),
     ``battery_pct``; and for each aligned sensor NAME its numbers, ``NAME_ok`` (of a window for each row) and ``NAME_dt_s``, how
@@ -193,7 +195,10 @@ class MissionDataset:
 
 
 class MissionStream:
-    """Iterable, once or several times at a time. The order of a shuffled one depends on ``set_epoch`` and earlier iterations."""
+    """The samples of a data set one after the other, optionally shuffled.
+
+    Iterable once, or several times at a time. A shuffled order depends on ``set_epoch`` and on earlier iterations.
+    """
 
     def __init__(self, dataset: MissionDataset, seed: int | None, part: tuple[int, int]) -> None:
         self._dataset = dataset

@@ -56,7 +56,9 @@ class Verified:
 
 
 class Fetched:
-    """Enter once, leave once, on one thread. A file counts as it stands: of other size or time than noted, it is unknown.
+    """Which files of a folder are known to be complete.
+
+    Enter once, leave once, on one thread. A file whose size or time differs from what was noted is unknown.
 
     Files are not synced one by one, which would take longer than to move them. What was noted and not synced, because the process
     was killed, is believed in the same boot and read again after the next: a power cut may have taken it.

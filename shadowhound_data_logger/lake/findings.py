@@ -31,7 +31,10 @@ def warn(one: LeftOut) -> None:
 
 
 class Findings:
-    """Each is told once, however many questions meet it. Thread-safe. In another process it begins anew, and warns."""
+    """Collects what an answer leaves out.
+
+    Each is reported once, however many queries meet it. Thread-safe. In another process it starts anew, and warns.
+    """
 
     def __init__(self, tell: Callable[[LeftOut], None] = warn) -> None:
         self._tell = tell

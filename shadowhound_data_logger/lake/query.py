@@ -73,7 +73,7 @@ _SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """What is asked, and where what it leaves out is told."""
+    """A query, and where it reports what it leaves out."""
 
     source: Bucket
     findings: Findings

@@ -32,7 +32,7 @@ _TRIES: Final = 3
 
 @dataclass(slots=True)
 class Reindexed:
-    """What was found, as it goes on."""
+    """What a reindex has found so far."""
 
     listed: int = 0
     added: int = 0

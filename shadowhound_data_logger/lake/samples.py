@@ -106,7 +106,10 @@ class Selection:
 
 
 class Samples:
-    """Makes them, on one thread; keeps what it decoded, because neighbours need it again."""
+    """Makes the samples of a data set, and keeps what it decoded, because neighbours need it again.
+
+    One thread at a time.
+    """
 
     def __init__(self, selection: Selection, prefetch: Prefetch) -> None:
         self._selection = selection

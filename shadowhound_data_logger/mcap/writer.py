@@ -36,7 +36,9 @@ _MESSAGE: Final = int(Opcode.MESSAGE)
 
 
 class SliceWriter:
-    """New; ``write`` and ``sync`` any number of times; ``close`` or ``abort`` once. One thread at a time.
+    """Writes one slice, so that a crash costs only what was not synced.
+
+    New; ``write`` and ``sync`` any number of times; ``close`` or ``abort`` once. One thread at a time.
 
     The file is ``<path>.open`` until ``close`` gives it its name. Disk errors are OSErrors; after one, only ``abort`` is left,
     and recovery makes a whole slice of what was written before.

@@ -26,7 +26,10 @@ PACKAGE: Final = str(Path(__file__).resolve().parents[2])
 
 
 class Replayer:
-    """Life: New; start once; wake and look any number; let_go once. Not thread-safe but for ``wake``."""
+    """Starts and wakes the process that sends missions.
+
+    Life: New; start once; wake and look any number; let_go once. Not thread-safe but for ``wake``.
+    """
 
     def __init__(self, home: Path, experiment: str, environ: Mapping[str, str]) -> None:
         self._home = home

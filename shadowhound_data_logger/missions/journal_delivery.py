@@ -43,7 +43,10 @@ class ObjectBatch:
 
 
 class JournalDelivery:
-    """Life: New; the rest in turns, each a bounded piece of work. Not thread-safe. Its methods raise OSError."""
+    """Reads one journal of a mission, and sends what is new in it.
+
+    Life: New; the rest in turns, each a bounded piece of work. Not thread-safe. Its methods raise OSError.
+    """
 
     def __init__(self, mission: MissionFolder, folder: MissionFolder, read: Callable[[int], Iterator[journal.Line]],
                  leaves_out: Callable[[Point], bool] = lambda _: False) -> None:  # fmt: skip

@@ -108,7 +108,10 @@ class Floor:
 
 
 class NodeLog:
-    """Life: New; open once; ``add`` from any thread, ``write`` from one; close once. ``_lock`` guards what waits."""
+    """The node's own journal of a mission.
+
+    Life: New; open once; ``add`` from any thread, ``write`` from one; close once. ``_lock`` guards what waits.
+    """
 
     def __init__(self, mission: Active, period_ns: int, max_speed_mps: float = MAX_SPEED_MPS) -> None:
         """Of the poses, one every ``period_ns`` becomes points of the metrics pose_x, pose_y, pose_yaw and the distance."""

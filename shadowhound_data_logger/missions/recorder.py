@@ -32,7 +32,9 @@ MOST_FRAME_ARTIFACTS: Final = 500
 
 
 class Mission:
-    """Life: made by MissionDataLogger; log_... from any thread; end once, after which calls do nothing but warn once.
+    """The calls by which an agent logs one mission.
+
+    Life: made by MissionDataLogger; log_... from any thread; end once, after which calls do nothing but warn once.
 
     ``_lock`` makes a record one step with what is remembered of it: that it is to be synced, and that the last one was written.
     """

@@ -68,7 +68,10 @@ class Tracking(Protocol):
 
 
 class MlflowTracking:
-    """Life: New; open once, before anything else; not thread-safe."""
+    """MLflow as a mission's runs need it.
+
+    Life: New; open once, before anything else; not thread-safe.
+    """
 
     def __init__(self, uri: str, experiment: str, artifact_root: Path | None = None) -> None:
         """``artifact_root`` is where a new experiment's artifacts go; None leaves that to the server."""

@@ -57,7 +57,7 @@ class Finding:
 
 @dataclass(slots=True)
 class Audit:
-    """What came of it."""
+    """What an audit found."""
 
     asked: int = 0
     sound: int = 0

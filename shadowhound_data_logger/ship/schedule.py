@@ -80,7 +80,10 @@ class Snapshot:
 
 
 class Schedule:
-    """Thread-safe; ``_changed`` is the one lock over all of it. Times are seconds of the clock that is handed in."""
+    """Decides which object is sent next, and what a failure means for the others.
+
+    Thread-safe; ``_changed`` is the one lock over all of it. Times are seconds of the clock that is handed in.
+    """
 
     def __init__(self, threads: int, backoff_s: float, monotonic: Callable[[], float], rng: random.Random,
                  bytes_in: Callable[[float], float] = lambda _: float('inf')) -> None:  # fmt: skip

@@ -74,7 +74,9 @@ class UploadStatus:
 
 
 class Uploader:
-    """Life: New; open once; wake, settled, status, drain from any thread; close any number of times.
+    """Delivers what is spooled to the store.
+
+    Life: New; open once; wake, settled, status, drain from any thread; close any number of times.
 
     It owns the threads ``upload-0`` ... and ``upload-lock``, which holds the drain lock while they run. ``settle`` is
     called from its threads (``SpoolWriter.settle``); whoever makes the outcomes durable calls ``settled`` afterwards

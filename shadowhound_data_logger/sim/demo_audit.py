@@ -58,7 +58,7 @@ class Messages:
 
 @dataclass(frozen=True, slots=True)
 class DemoAudit:
-    """What was found."""
+    """What the audit of a demo found."""
 
     ledger: Mapping[str, Any]
     messages: Mapping[str, Messages]

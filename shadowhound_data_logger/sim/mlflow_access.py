@@ -267,7 +267,7 @@ def prepare(url: str, password: str, robots: Iterable[str], trust: ssl.SSLContex
 
 
 class _Server:
-    """As ``tower``. Raises NotPrepared."""
+    """The MLflow server, asked as ``tower``. Raises NotPrepared."""
 
     def __init__(self, url: str, password: str, trust: ssl.SSLContext | None) -> None:
         self._url = url

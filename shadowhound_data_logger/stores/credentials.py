@@ -115,7 +115,7 @@ def has_keys(settings: StoreSettings) -> bool:
 
 
 class _Provider:
-    """In the place of botocore's own: it knows the keys already."""
+    """Gives botocore the keys that are known already, in place of its own providers."""
 
     def __init__(self, keys: Keys) -> None:
         self._keys = keys

@@ -22,7 +22,9 @@ from shadowhound_data_logger.stores.content import (
 
 
 class MemoryStore:
-    """Holds objects in a dict under one lock.
+    """A store in memory, for tests.
+
+    It holds objects in a dict under one lock.
 
     ``fail`` is asked before each put (with the item) and each probe (with None); the exception it returns is raised.
     """

@@ -54,7 +54,10 @@ class _Condition(Enum):
 
 
 class S3Store:
-    """``_lock`` guards what was learnt of the server: ``_condition``, and which buckets it refused to create."""
+    """A store on an S3 server: a put never overwrites, and is confirmed only when its content has been verified.
+
+    ``_lock`` guards what was learnt of the server: ``_condition``, and which buckets it refused to create.
+    """
 
     def __init__(self, settings: StoreSettings, upload: UploadSettings) -> None:
         self._s3 = S3Requests(settings, upload)

@@ -59,7 +59,9 @@ _awaiting: Any = AWSConnection
 
 
 class ContentRequests:
-    """Thread-safe. New; ask any number of times; close once. Raises what botocore's client would.
+    """Requests with content, signed and sent without botocore's client.
+
+    Thread-safe. New; ask any number of times; close once. Raises what botocore's client would raise.
 
     In a forked process make a new one: two processes must not share its connections.
     """

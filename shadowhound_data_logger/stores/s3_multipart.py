@@ -42,7 +42,10 @@ class HeldPart:
 
 
 class Multipart:
-    """Thread-safe. Two that send one object at a time take each other's upload up, or abort it: neither does harm."""
+    """Puts large objects in parts, and continues interrupted uploads.
+
+    Thread-safe. Two that send one object at a time continue or abort each other's upload: neither does harm.
+    """
 
     def __init__(self, s3: S3Requests) -> None:
         self._s3 = s3

@@ -46,7 +46,10 @@ class Sent(Enum):
 
 
 class S3Requests:
-    """Thread-safe after ``open``. Raises the errors of ``classify``."""
+    """Single S3 requests, with errors translated to ours.
+
+    Thread-safe after ``open``. Raises the errors of ``classify``.
+    """
 
     def __init__(self, settings: StoreSettings, upload: UploadSettings) -> None:
         self.endpoint = public_url(settings.endpoint_url or '')
