@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from time import thread_time
+from typing import Any
 
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import SECOND, utc
@@ -25,8 +26,11 @@ from shadowhound_data_logger.spool.spool import Spool
 
 START_NS = 1_760_774_400 * SECOND
 HOUR_S = 3600
+MEMORY = Path('/dev/shm') if Path('/dev/shm').is_dir() else None  # noqa: S108 - a folder of its own in it
+"""On a disk most of the time goes into its syncs."""
 OLD_BYTES_AN_OBJECT = 906.0
 """With full rows for as long as keys are remembered (this file, three hours)."""
+BAR = 0.1
 SENSORS = {
     # sensor: (topic, type, messages an object, seconds an object, ending, facts of the content)
     'camera': ('/camera/compressed', 'sensor_msgs/msg/CompressedImage', 1, 1, 'front.jpg', {'width': '640', 'height': '480'}),
@@ -123,7 +127,7 @@ def tables(root: Path) -> dict[str, int]:
             return {}
 
 
-def measure(root: Path, hours: int, remember_days: float) -> dict[str, object]:
+def measure(root: Path, hours: int, remember_days: float) -> dict[str, Any]:
     """Bytes by the hour, and what is in them at the end."""
     robot = Robot(root, remember_days)
     delivered = robot.run(3 * HOUR_S)
@@ -149,12 +153,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
     parser.add_argument('--hours', type=int, default=6)
     parser.add_argument('--day', action='store_true', help='a day and a half, with remember_days 1')
-    parser.add_argument('--folder', type=Path, help='where the spool lies meanwhile; in memory it takes a minute')
+    parser.add_argument('--folder', type=Path, default=MEMORY, help='where the spool lies meanwhile (default in memory)')
     parser.add_argument('--json', action='store_true')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         found = measure(Path(folder, 'spool'), 36 if options.day else options.hours, 1.0 if options.day else 3.0)
-    print(json.dumps(found) if options.json else json.dumps(found, indent=1))
+    bar = {
+        'what': 'growth of the index, to full rows all the time', 'bar': f'at most {BAR:g}', 'value': found['to_full_rows'],
+        'unit': 'of the bytes', 'holds': found['to_full_rows'] <= BAR, 'rounds': [],
+    }  # fmt: skip
+    print(json.dumps({'bars': [bar], 'figures': found}, indent=None if options.json else 1))
 
 
 if __name__ == '__main__':

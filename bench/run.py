@@ -54,8 +54,9 @@ STEPS: Final = (
     Step('lake', quick=('--days', '2', '--objects', '500')),
     Step('encode_formats'),
     Step('spool_commits', quick=None),
+    Step('index_growth', quick=None),
 )
-FOLDERLESS: Final = ('encode_formats',)
+FOLDERLESS: Final = ('encode_formats', 'index_growth')
 
 
 def run(step: Step, folder: Path, *, quick: bool) -> dict[str, Any] | None:
