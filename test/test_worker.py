@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -37,6 +38,29 @@ def test_it_goes_round_until_it_is_stopped() -> None:
     assert worker.join(60)
     assert worker.stopping
     assert (worker.failures, worker.failing) == (0, False)
+
+
+def test_the_system_knows_the_name() -> None:
+    """As ``top -H`` shows it, cut to what Linux takes."""
+    names: list[str] = []
+    worker = Worker('a-thread-with-a-long-name', lambda: names.append(worker_module.SYSTEM_NAME.read_text(encoding='utf-8')))
+    worker.start()
+    until(lambda: names)
+    worker.stop()
+    assert worker.join(60)
+    assert names[0] == 'a-thread-with-a\n'
+
+
+def test_a_system_that_keeps_no_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is no failure."""
+    monkeypatch.setattr(worker_module, 'SYSTEM_NAME', tmp_path / 'none' / 'comm')
+    rounds = threading.Semaphore(0)
+    worker = Worker('rounds', rounds.release)
+    worker.start()
+    assert rounds.acquire(timeout=60)
+    worker.stop()
+    assert worker.join(60)
+    assert worker.failures == 0
 
 
 def test_a_failure_is_counted_said_and_survived(caplog: pytest.LogCaptureFixture) -> None:
@@ -82,10 +106,16 @@ def test_a_stop_ends_the_pause(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_round_that_hangs_is_told() -> None:
     """Join says that it did not end in time; one that never started has nothing to wait for."""
-    released = threading.Event()
-    worker = Worker('hanging', lambda: bool(released.wait(30)) and None)
+    began, released = threading.Event(), threading.Event()
+
+    def step() -> None:
+        began.set()
+        released.wait(30)
+
+    worker = Worker('hanging', step)
     assert worker.join(0.0)
     worker.start()
+    assert began.wait(60)
     worker.stop()
     assert not worker.join(0.01)
     released.set()
