@@ -155,6 +155,14 @@ def _memory(figures: Figures) -> str:
     ])  # fmt: skip
 
 
+def _backlog_memory(figures: Figures) -> str:
+    words = {'there': 'store there', 'away': 'store away', 'back': 'store back, backlog leaving'}
+    rows = [(words[name], f'{figures["greatest_mb"][name]:.0f} MB', f'{100 * figures["cores"][name]:.0f} %') for name in words]
+    backlog = f'{figures["backlog_objects"]:,} objects of {figures["backlog_mb"]:.0f} MB waited as the store came back.'
+    level = f'The level, the median with the store there, is {figures["level_mb"]:.0f} MB. {backlog}'
+    return _table(('phase', 'resident memory, greatest', 'node, of a core'), rows) + '\n\n' + level
+
+
 def _latency(figures: Figures) -> str:
     words = {'durable': 'durable: the group commit returned', 'confirmed': 'confirmed: the put returned',
              'created_ns': 'index: `created_ns`', 'settled_ns': 'index: `settled_ns`'}  # fmt: skip
@@ -221,6 +229,7 @@ _WHOLE: Final[Mapping[str, Callable[[Figures], str]]] = {'bars': _bars, 'machine
 _PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
     'node_cpu': ('node_cpu', _node_cpu), 'intake': ('intake', _intake), 'vendors': ('vendors', _vendors),
     'small_messages': ('small_messages', _small), 'full_rate': ('full_rate', _full_rate), 'memory': ('full_rate', _memory),
+    'backlog_memory': ('backlog_memory', _backlog_memory),
     'latency': ('latency', _latency), 'encode_formats': ('encode_formats', _encode), 'spool_commits': ('spool_commits', _spool),
     'index_growth': ('index_growth', _growth),
     'drain': ('drain', _drain), 'mission_calls': ('mission_calls', _mission_calls), 'missions': ('missions', _missions),
