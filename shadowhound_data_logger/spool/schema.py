@@ -184,7 +184,7 @@ INSERT OR REPLACE INTO gaps_told SELECT robot, version, 0 FROM (
   FROM objects WHERE bucket = 'sensor-data' AND sensor = '{CATALOGUE}' AND key GLOB '*/_gaps/*'
   ) WHERE version > 0 ORDER BY id;
 INSERT OR IGNORE INTO gaps_told SELECT DISTINCT robot, 0, 0 FROM sessions;
-UPDATE objects SET settled_ns = created_ns WHERE state = 'evicted' AND settled_ns IS NULL;
+UPDATE objects SET settled_ns = created_ns WHERE state IN ('delivered', 'deduplicated', 'evicted') AND settled_ns IS NULL;
 """  # noqa: S608 - own constants only
 """Rows are made short step by step afterwards. What a full disk never took in had no time, and was never forgotten."""
 
