@@ -1,10 +1,11 @@
 """Loses messages on purpose and holds the gap journal to what was sent: when, how many, and why.
 
 A publisher numbers and stamps what it sends on four topics, RELIABLE and BEST_EFFORT, small and large, and the node stores every
-message of them. Meanwhile the node is stopped for seconds, starved, paused, and killed and started again. A second node has no
-store and room for few objects, which it evicts. What is not in the store, between two messages that are, is a gap: the journal
-must have it from the one message to the other, within a period, with its count and its cause, and nothing else. All the time
-somebody reads the ledger, whose every commit must balance.
+message of them. Meanwhile the node is stopped for seconds, starved, paused, and killed and started again; files of its objects
+are damaged before they are sent, so that they are quarantined, and some are mended and retried. A second node has no store and
+room for few objects, which it evicts, and its disk is filled up. What is not in the store, between two messages that are, is a
+gap: the journal must have it from the one message to the other, within a period, with its count and its cause, and nothing
+else. All the time somebody reads the ledger, whose every commit must balance.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -25,7 +26,7 @@ from typing import Any, Final, NamedTuple
 
 from domains import free_domain
 from e2e.numbered import told
-from e2e.processes import Node, Processes, Publisher
+from e2e.processes import Node, Processes, Publisher, until
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import SpoolError
@@ -34,7 +35,9 @@ from shadowhound_data_logger.spool.accounts import WRONG_TYPE
 from shadowhound_data_logger.spool.control import connect
 from shadowhound_data_logger.spool.gaps import Gap
 from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.listing import retry
 from torture._command import Bar, parser, progress, verdict, workshop
+from torture._disks import Disk, NotAllowed, small_disk
 from torture.losses import quiet
 
 DISTURBANCES: Final = 200
@@ -56,6 +59,11 @@ BESIDE_S: Final = 0.5
 """So long before and after a disturbance a loss is its doing: a commit, a poll."""
 LATE_NS: Final = 40_000_000
 """So much late the publisher may send a message: its machine does other things as well."""
+FILLED_S: Final = 3.0
+DISK_MB: Final = 96
+RETRIED: Final = 0.5
+"""Share of the damaged files that are mended and retried."""
+KINDS: Final = ('stopped', 'killed', 'paused', 'starved', 'filled', 'damaged')
 RESTARTED_S: Final = 10.0
 """What a kill cost ends with the first message of the next start."""
 
@@ -76,7 +84,7 @@ STREAMS: Final = tuple(
 )
 ALLOWED: Final = {
     'stopped': {'transport'}, 'starved': {'transport'}, 'paused': {'paused', 'transport'}, 'killed': {'restart', 'transport'},
-    'evicted': {'no_room'},
+    'evicted': {'no_room'}, 'filled': {'no_room', 'queue_full'}, 'damaged': {'damaged'},
 }  # fmt: skip
 """By disturbance, the causes that its losses may have."""
 
@@ -108,6 +116,7 @@ class Found:
     """Messages by cause."""
     gaps: int = 0
     commits: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
 
     def say(self, bar: str, text: str, *, holds: bool) -> None:
         self.wrong.setdefault(bar, [])
@@ -229,7 +238,13 @@ class Scene:
     processes: Processes
     publisher: Publisher
     node: Node
+    small: Node
+    """Without a store, on a disk of its own where that may be."""
     done: list[Done]
+    rng: random.Random
+    disk: Disk | None
+    counts: Counter[str] = field(default_factory=Counter)
+    """Objects that were quarantined, and those of them that were retried."""
 
     def heard(self) -> None:
         """Wait until more has come of each topic."""
@@ -261,6 +276,60 @@ class Scene:
         self.node = start(self.processes)
         self.heard()
 
+    def filled(self) -> None:
+        """Nothing is free on the disk of the other node."""
+        assert self.disk is not None
+        filler, end_s = self.disk.path / 'filler', time.monotonic() + FILLED_S
+        with filler.open('wb', buffering=0) as file:
+            while time.monotonic() < end_s:
+                with suppress(OSError):
+                    while file.write(bytes(1 << 16)):
+                        pass
+                time.sleep(0.02)
+        filler.unlink()
+
+    def damaged(self) -> None:
+        """Files change while their objects wait for delivery; some are as they were when they are tried again."""
+        spool, before = self.node.home / 'spool', self.node.ledger()['objects']['quarantined']
+        bodies: dict[str, bytes] = {}
+        names: list[str] = []
+
+        def is_damaged() -> bool:
+            new = self._damage(spool / 'ready')
+            bodies.update(new)
+            names.extend(name for name in new if self._is_quarantined(name))
+            return bool(names)
+
+        until(is_damaged, 'a damaged object is quarantined')
+        self.counts['quarantined'] += len(names)
+        again = [name for name in names if self.rng.random() < RETRIED]
+        for name in again:
+            with (spool / 'quarantine' / 'damaged' / name).open('r+b') as file:
+                file.write(bodies[name][:1])
+        assert self.node.ledger()['objects']['quarantined'] == before + len(names)
+        assert not again or retry(spool, names=again).objects == len(again)
+        self.counts['retried'] += len(again)
+        until(lambda: all((self.node.home / 'store' / name).exists() for name in again), 'what was mended is delivered')
+
+    def _damage(self, ready: Path) -> dict[str, bytes]:
+        """Change the first byte of what waits just now, while the node does nothing; what it was before, by bucket and key."""
+        bodies: dict[str, bytes] = {}
+        self.node.signal(signal.SIGSTOP)
+        try:
+            for path in ready.glob(f'sensor-data/{ROBOT}/*_*/*/*.json'):
+                bodies[str(path.relative_to(ready))] = body = path.read_bytes()
+                with path.open('r+b') as file:
+                    file.write(bytes([body[0] ^ 1]))
+        finally:
+            self.node.signal(signal.SIGCONT)
+        return bodies
+
+    def _is_quarantined(self, name: str) -> bool:
+        """Or delivered: it had been read already."""
+        quarantined = self.node.home / 'spool' / 'quarantine' / 'damaged' / name
+        until(lambda: quarantined.exists() or (self.node.home / 'store' / name).exists(), f'{name} leaves')
+        return quarantined.exists()
+
     def disturb(self, what: str) -> None:
         """Do it, and note when it was done."""
         begin_ns = time.time_ns()
@@ -284,17 +353,27 @@ def start(processes: Processes, home: str = '', tower: dict[str, str] | None = N
     return processes.node(tower, given, home=home or 'home')
 
 
+def _disk(folder: Path, opened: ExitStack) -> Disk | None:
+    try:
+        return opened.enter_context(small_disk(folder, DISK_MB))
+    except NotAllowed:
+        progress('this machine lets nobody mount anything: no disk is filled')
+        return None
+
+
 def campaign(folder: Path, disturbances: int, rng: random.Random) -> Found:
     """Run and judge."""
     found = Found()
-    with free_domain() as domain:
+    with free_domain() as domain, ExitStack() as opened:
+        disk = _disk(folder, opened)
         processes = Processes(folder, domain, ROBOT)
         try:
             publisher = processes.publisher()
             for stream in STREAMS:
                 publisher.create(stream.topic, STRING, reliable=stream.reliable, depth=10)
             node = start(processes)
-            small = start(processes, 'small', NO_STORE, **{'spool.max_bytes': SMALL_ROOM, 'shutdown.drain_s': 0.0})
+            room = {'spool.max_bytes': SMALL_ROOM, 'shutdown.drain_s': 0.0}
+            small = start(processes, str(disk.path / 'home') if disk else 'small', NO_STORE, **room)
             for stream in STREAMS:
                 publisher.matched(stream.topic, 2)
                 publisher.begin_numbered(stream.topic, 'p', stream.size, stream.period_s)
@@ -302,12 +381,12 @@ def campaign(folder: Path, disturbances: int, rng: random.Random) -> Found:
             for reader in readers:
                 reader.open()
             began_ns = time.time_ns()
-            scene = Scene(processes, publisher, node, found.done)
+            scene = Scene(processes, publisher, node, small, found.done, rng, disk)
             scene.heard()
             time.sleep(STEADY_S)
-            kinds = ('stopped', 'killed', 'paused', 'starved')
+            kinds = [kind for kind in KINDS if disk or kind != 'filled']
             for turn in range(disturbances):
-                what = kinds[turn % 4] if turn < 4 else rng.choice(kinds)
+                what = kinds[turn] if turn < len(kinds) else rng.choice(kinds)
                 progress(f'{turn + 1}: {what}')
                 scene.disturb(what)
             scene.heard()
@@ -323,11 +402,13 @@ def campaign(folder: Path, disturbances: int, rng: random.Random) -> Found:
                 found.say('the ledger balances at every commit', '; '.join(reader.unbalanced[:3]), holds=not reader.unbalanced)
         finally:
             processes.end()
-    audit(found, scene.node, [scene.node.home / 'store' / 'sensor-data' / ROBOT], 'disturbed')
-    own, found.done = found.done, [Done('evicted', began_ns - 60 * SECOND, time.time_ns())]
-    audit(found, small, [small.home / 'spool' / 'ready' / 'sensor-data' / ROBOT], 'without room')
-    found.done = own
-    for cause in ('transport', 'restart', 'paused', 'no_room'):
+        audit(found, scene.node, [scene.node.home / 'store' / 'sensor-data' / ROBOT], 'disturbed')
+        own, filled = found.done, [each for each in found.done if each.what == 'filled']
+        found.done = [Done('evicted', began_ns - 60 * SECOND, time.time_ns()), *filled]
+        audit(found, small, [small.home / 'spool' / 'ready' / 'sensor-data' / ROBOT], 'without room')
+        found.done = own
+    found.counts = scene.counts
+    for cause in ('transport', 'restart', 'paused', 'no_room', 'damaged'):
         found.say(f'messages were lost by {cause}', f'{found.lost}', holds=found.lost[cause] > 0)
     return found
 
@@ -343,7 +424,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         found = campaign(shop.folder, count, random.Random(given.seed))
         shop.passed = all(bar.holds for bar in found.bars())
     figures = {'seed': given.seed, 'disturbances': Counter(each.what for each in found.done), 'gaps': found.gaps,
-               'lost': found.lost, 'readings': found.commits}  # fmt: skip
+               'lost': found.lost, **found.counts, 'readings': found.commits}  # fmt: skip
     if not given.json:
         print(figures)
     return verdict(figures, found.bars(), as_json=given.json)
