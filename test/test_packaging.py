@@ -101,7 +101,9 @@ def test_every_dependency_has_its_reason(name: str) -> None:
         ('robot.txt', ['runtime.in']),
         ('wheels.txt', ['runtime.in', 'ros.in', 'dev.in']),
         ('sourced.txt', ['runtime.in', 'dev.in']),
+        ('lyrical.txt', ['runtime.in', 'dev.in']),
         ('jazzy.txt', ['jazzy.in']),
+        ('jazzy_wheels.txt', ['runtime.in', 'jazzy.in', 'dev.in']),
     ],
 )
 def test_a_lock_file_holds_what_it_is_made_from(lock: str, sources: list[str]) -> None:
@@ -117,6 +119,13 @@ def test_a_lock_file_holds_what_it_is_made_from(lock: str, sources: list[str]) -
 def test_beside_a_sourced_ros_numpy_stays_at_1(lock: str) -> None:
     """The message packages of Humble and Jazzy were compiled against numpy 1 and crash on numpy 2."""
     assert set(re.findall(r'^numpy==(\d+)\.', (REQUIREMENTS / lock).read_text(), re.MULTILINE)) == {'1'}
+
+
+def test_beside_lyrical_numpy_and_empy_are_free() -> None:
+    """Its message packages are compiled against numpy 2, and its rosidl takes empy 4."""
+    text = (REQUIREMENTS / 'lyrical.txt').read_text()
+    assert set(re.findall(r'^numpy==(\d+)\.', text, re.MULTILINE)) == {'2'}
+    assert 'sourced.in' not in text
 
 
 def test_the_shared_memory_segment_holds_a_second_of_raw_images() -> None:

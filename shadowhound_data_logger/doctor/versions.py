@@ -17,6 +17,8 @@ NAME: Final = 'versions'
 PACKAGE: Final = 'shadowhound_data_logger'
 OLDEST_PYTHON: Final = (3, 10)
 DISTROS: Final = frozenset({'humble', 'jazzy', 'kilted'})
+NOT_TESTED: Final = frozenset({'lyrical'})
+"""Those that the package is made for besides."""
 _NEED: Final = re.compile(r'([A-Za-z0-9_.-]+)\s*>=\s*([0-9.]+)\s*$')
 
 
@@ -29,7 +31,8 @@ def check(context: Context) -> Iterator[Result]:
         )
     distro = context.environ.get('ROS_DISTRO', '')
     if distro and distro not in DISTROS:
-        yield info('versions.ros', f'ROS 2 {distro}', f'tested are {", ".join(sorted(DISTROS))}')
+        known = 'the package is made for it too, but ' if distro in NOT_TESTED else ''
+        yield info('versions.ros', f'ROS 2 {distro}', f'{known}tested are {", ".join(sorted(DISTROS))}')
     yield from _packages(python, distro)
     if context.role is Role.THOR:
         yield from _node(context)

@@ -276,6 +276,19 @@ def test_a_robot_with_cyclone_dds_is_judged_by_how_it_is_heard(robot: Scene) -> 
     assert [result.check for result in robot.findings('sockets')] == ['sockets.cyclone']
 
 
+@pytest.mark.parametrize(
+    ('distro', 'told'),
+    [('jazzy', []), ('lyrical', ['the package is made for it too, but tested are humble, jazzy, kilted']),
+     ('foxy', ['tested are humble, jazzy, kilted'])],
+)  # fmt: skip
+def test_a_distribution_without_tests_is_told(robot: Scene, distro: str, told: list[str]) -> None:
+    """As no finding, and Lyrical otherwise than one that nobody thought of."""
+    robot.environ['ROS_DISTRO'] = distro
+    results = robot.ask('versions')
+    assert [result.cause for result in results if result.check == 'versions.ros'] == told
+    assert not any(result.is_finding for result in results)
+
+
 def test_a_parameter_file_for_another_node(robot: Scene, tmp_path: Path) -> None:
     """A misspelt section is no error to ROS: the node runs with its defaults, and only here somebody says so."""
     path = tmp_path / 'mine.yaml'
