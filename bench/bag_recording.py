@@ -1,7 +1,7 @@
 """What recording costs: CPU of the node while it records the Go2 profile, against its intake alone; and small messages a second.
 
 One node, one simulated robot: rounds without a bag and with one take turns, and next to nothing is stored as objects. The
-bag is not compressed, and no slice ends within a round, so that uploads are no part of it. Then a publisher of serialized
+bag is not compressed, and no slice ends within a round, so that uploads are not part of it. Then a publisher of serialized
 messages sends 10,000 a second into a bag; the ledger says whether any was lost.
 """
 

@@ -32,7 +32,7 @@ def timed_write(events: Events, event: object) -> None:
 
 
 if __name__ == '__main__':
-    setattr(Intake, '_step', timed_step)  # noqa: B010 - a plain assignment is no method to mypy
+    setattr(Intake, '_step', timed_step)  # noqa: B010 - a plain assignment is not a method to mypy
     setattr(Events, '_write', timed_write)  # noqa: B010
     code = main()
     print(json.dumps({'rounds': rounds, 'writing': writing}), flush=True)

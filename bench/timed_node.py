@@ -42,7 +42,7 @@ def timed_put(store: S3Store, item: SpooledObject) -> Put:
 
 
 if __name__ == '__main__':
-    setattr(Spool, 'commit', timed_commit)  # noqa: B010 - a plain assignment is no method to mypy
+    setattr(Spool, 'commit', timed_commit)  # noqa: B010 - a plain assignment is not a method to mypy
     setattr(S3Store, 'put', timed_put)  # noqa: B010
     code = main()
     print(json.dumps({'durable': durable_ns, 'confirmed': confirmed}), flush=True)

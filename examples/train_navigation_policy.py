@@ -59,7 +59,7 @@ class Policy(nn.Module):
 
 
 def motions(stamps_ns: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """(n, 2): speed ahead and yaw rate from each frame to the next; NaN where there is none or it is no neighbour."""
+    """(n, 2): speed ahead and yaw rate from each frame to the next; NaN where there is none or it is not a neighbour."""
     found = np.full((len(poses), 2), np.nan)
     if len(poses) < 2:
         return found

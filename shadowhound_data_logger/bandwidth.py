@@ -62,7 +62,7 @@ class Pace:
     def set(self, max_mbps: float) -> None:
         """The cap in megabits a second of payload, 0 for none; at once, for bodies under way as well."""
         if not 0.0 <= max_mbps < float('inf'):
-            raise ValueError(f'{max_mbps} Mbit/s is no cap')
+            raise ValueError(f'{max_mbps} Mbit/s is not a cap')
         with self._lock:
             self._max_mbps = max_mbps
             self._free_at = self._now()

@@ -142,6 +142,6 @@ class BagDamaged(BagError):
 
 
 class LakeError(DataLoggerError):
-    """What was asked of the catalogue cannot be answered: a question that is none, or a catalogue that contradicts itself."""
+    """A query of the catalogue cannot be answered: an invalid query, or a catalogue that contradicts itself."""
 
     DEFAULT_REMEDY = 'shadowhound-data query --help has examples; lake status describes the catalogue'

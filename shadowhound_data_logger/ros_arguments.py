@@ -61,7 +61,7 @@ def read_parameters(path: Path, node: str | None = None) -> dict[str, Any]:
             if _pattern(section).fullmatch(node or f'/{NODE}') or (node is None and section.endswith(f'/{NODE}')):
                 flat |= _flat(content)
     except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError) as error:
-        text = f'{path} is no parameter file: {error}'
+        text = f'{path} is not a parameter file: {error}'
         raise ParametersUnreadable(text, remedy='see launch_configs/go2.yaml') from error
     return flat
 

@@ -19,7 +19,7 @@ TIMES_IN_BAG: Final = (
     'a UTC time such as 2025-10-18T12:00:05.5, seconds since the start such as 12.5, or -30 for 30 s before the end'
 )
 EPOCH_S: Final = 1_000_000_000
-"""In a bag a number from here on is no duration but seconds since 1970, as ``ros2 bag info`` prints them."""
+"""In a bag a number from here on is not a duration but seconds since 1970, as ``ros2 bag info`` prints them."""
 MOST_AGE_S: Final = 10**11
 _NUMBER: Final = re.compile(r'[+-]?\d{1,19}(\.\d{1,9})?', re.ASCII)
 _ISO: Final = re.compile(

@@ -44,9 +44,9 @@ _NUMBER: Final = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?', re.ASCII)
 
 
 def path_below(folder: Path, key: str) -> Path:
-    """Where the file of a key lies below a folder. Raises NameRefused for a key that is no path below it."""
+    """Where the file of a key lies below a folder. Raises NameRefused for a key that is not a path below it."""
     if not is_path(key):
-        raise NameRefused(f'the key {key[:200]!r} is no path below a folder', name=key)
+        raise NameRefused(f'the key {key[:200]!r} is not a path below a folder', name=key)
     return folder / key
 
 
@@ -145,7 +145,7 @@ def unpacked(compression: str, content: bytes, size: int | None = None) -> bytes
     most = MOST_CHUNK_BYTES if size is None else size
     check_size(most, MOST_CHUNK_BYTES)
     if compression not in {'zstd', 'lz4'}:
-        raise ValueError(f'it is compressed with {compression!r}, which nobody here knows')
+        raise ValueError(f'it is compressed with {compression!r}, which is not supported')
     try:
         found, is_whole = _zstd(content, most) if compression == 'zstd' else _lz4(content, most)
     except (RuntimeError, EOFError) as error:  # lz4 raises the former

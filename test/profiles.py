@@ -18,6 +18,6 @@ def examples(full: int) -> int:
 
 
 def load() -> None:
-    """For tests that say nothing else. Each run tests the same, and a busy machine is no finding."""
+    """For tests that say nothing else. Each run tests the same, and a busy machine is not a finding."""
     settings.register_profile('tests', max_examples=examples(FULL), deadline=None, derandomize=True)
     settings.load_profile('tests')

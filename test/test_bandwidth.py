@@ -162,7 +162,7 @@ def test_how_much_leaves_in_a_while_is_known() -> None:
 def test_what_is_no_cap_is_refused(cap: float) -> None:
     """And the old one stays."""
     pace = Pace(3.0)
-    with pytest.raises(ValueError, match='no cap'):
+    with pytest.raises(ValueError, match='not a cap'):
         pace.set(cap)
     assert pace.max_mbps == 3.0
     assert repr(pace) == 'Pace(3 Mbit/s)'

@@ -55,7 +55,7 @@ def test_what_is_none_stops_the_start(text: str) -> None:
     ('events.pre_s', {'events.pre_s': math.nan}),
 ])  # fmt: skip
 def test_what_makes_no_sense_stops_the_start(name: str, given: dict[str, object]) -> None:
-    """A name twice, conditions without anything to keep, an event shorter than its end, what is no expression."""
+    """A name twice, conditions without anything to keep, an event shorter than its end, what is not an expression."""
     with pytest.raises(SettingError) as refused:
         Settings.load(given, {})
     assert refused.value.data['name'] == name

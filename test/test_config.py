@@ -132,7 +132,7 @@ def test_a_topic_has_one_sensor() -> None:
 
 
 def test_a_sensor_of_ones_own() -> None:
-    """A sensor that is no default takes any topic; whole numbers pass where fractions are allowed."""
+    """A sensor that is not a default takes any topic; whole numbers pass where fractions are allowed."""
     (sensor,) = load(sensors=['thermal'], thermal__topics=['thermal/raw'], thermal__rate_hz=2).sensors
     assert (sensor.name, sensor.topics, sensor.rate_hz, sensor.period_ns) == ('thermal', ('thermal/raw',), 2.0, 500_000_000)
 

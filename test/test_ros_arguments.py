@@ -57,7 +57,7 @@ def test_what_is_no_parameter_file(text: str, tmp_path: Path) -> None:
     """It says so, and which."""
     file = tmp_path / 'a.yaml'
     file.write_text(text)
-    with pytest.raises(ParametersUnreadable, match=r'a\.yaml is no parameter file'):
+    with pytest.raises(ParametersUnreadable, match=r'a\.yaml is not a parameter file'):
         parameter(['--ros-args', '--params-file', str(file)], NAME)
 
 

@@ -1,4 +1,4 @@
-"""The scripts of tower/ as modules: they are run where the package is not installed, and are no part of it."""
+"""The scripts of tower/ as modules: they are run where the package is not installed, and are not part of it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TOWER = Path(__file__).resolve().parents[1] / 'tower'
 
 
 def load(name: str) -> ModuleType:
-    """A script that is no part of the package."""
+    """A script that is not part of the package."""
     spec = importlib.util.spec_from_file_location(name, TOWER / f'{name}.py')
     assert spec
     assert spec.loader

@@ -60,7 +60,7 @@ class Crowd:
 
 
 def resident(node: Node) -> int:
-    """Bytes of the process that are no file's and no other's (proc(5), RssAnon): shared memory is the middleware's segment."""
+    """Bytes of the process that are not a file's and no other's (proc(5), RssAnon): shared memory is the middleware's segment."""
     status = Path(f'/proc/{node.popen.pid}/status').read_text(encoding='ascii')
     return int(status.partition('RssAnon:')[2].split()[0]) << 10
 

@@ -134,7 +134,7 @@ def _judge(found: Found, server: Server, agent: Agent, said: list[Any], run_id: 
     wanted = {f'camera/frame_{number:06d}.jpg' for number in frames} | {'summary.json'}
     wanted |= {'trajectories/trajectory.csv'} if any(record['k'] == 'trajectory' for record in said) else set()
     there = server.artifacts(run_id)
-    pictures = {'battery.png'} if len(steps) > 1 else set()  # frames are no pictures here, and nobody walks
+    pictures = {'battery.png'} if len(steps) > 1 else set()  # frames are not pictures here, and nobody walks
     if wanted | pictures != there or not frames >= set(range(0, agent.acknowledged + 1, FRAME_EVERY)):
         found.wrong['artifacts'].append(f'{agent.mission_id}: {sorted((wanted | pictures) ^ there)[:5]}')
     prefix = f'thor/missions/{run_id}/'

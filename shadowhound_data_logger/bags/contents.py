@@ -95,7 +95,7 @@ def _times(told: Description | None, sources: Sequence[Ranged]) -> list[BagPart 
 
 
 class Packed:
-    """A bag that is no plain MCAP: SQLite, or compressed outside the storage. Its files are those that the metadata name.
+    """A bag that is not plain MCAP: SQLite, or compressed outside the storage. Its files are those that the metadata name.
 
     SQLite knows one stamp alone, when a message came; it stands for both.
     """
@@ -126,7 +126,7 @@ class Packed:
             yield path
             return
         if not self._told.compression.startswith('zstd'):
-            raise BagDamaged(f'{path} is compressed with {self._told.compression!r}, which nobody here knows', path=str(path))
+            raise BagDamaged(f'{path} is compressed with {self._told.compression!r}, which is not supported', path=str(path))
         with tempfile.TemporaryDirectory(prefix='shadowhound-bag-') as folder:
             whole = Path(folder, path.stem)
             _unpack(path, whole)
@@ -141,7 +141,7 @@ def check_tables(path: Path) -> None:
     except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
         raise BagDamaged(f'{path} cannot be read: {error}', path=str(path)) from error
     if why:
-        raise BagDamaged(f'{path} is no SQLite bag: {why}', path=str(path))
+        raise BagDamaged(f'{path} is not an SQLite bag: {why}', path=str(path))
 
 
 def _refusal(database: sqlite3.Connection) -> str:
@@ -164,7 +164,7 @@ def channel_of(connection: Connection) -> Channel:
     """A bag without definitions (SQLite before Iron) gets those that are known here."""
     encoding, definition, type_hash = _ENCODINGS.get(connection.msgdef.format, ''), connection.msgdef.data, connection.digest
     if not all(isinstance(text, str) for text in (connection.topic, connection.msgtype, definition, type_hash)):
-        raise TypeError('the name, type or definition of a topic is no text')
+        raise TypeError('the name, type or definition of a topic is not text')
     if not encoding or not definition:
         encoding, definition, known = describe(connection.msgtype)
         type_hash = type_hash or known
@@ -201,7 +201,7 @@ def _plain(message: RecordedMessage, path: Path) -> RecordedMessage:
 
 
 def _unpack(path: Path, whole: Path) -> None:
-    """Raises BagDamaged for what is no zstd, or unpacks to more than it may."""
+    """Raises BagDamaged for what is not zstd, or unpacks to more than it may."""
     try:
         most = min(path.stat().st_size * MOST_RATIO, shutil.disk_usage(whole.parent).free // 2)
         with path.open('rb') as raw, ZstdFile(raw, 'rb') as packed, whole.open('wb') as out:

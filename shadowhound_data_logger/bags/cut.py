@@ -1,6 +1,6 @@
 """A piece of a bag as a bag of its own: a span of time and some of the topics, message by message as they were recorded.
 
-Of an MCAP slice in a store only the summary and the chunks that hold something wanted are read. What is no plain MCAP (SQLite, or
+Of an MCAP slice in a store only the summary and the chunks that are needed are read. What is not plain MCAP (SQLite, or
 compressed outside the storage) is downloaded first.
 """
 
@@ -83,7 +83,9 @@ class CutSource(Protocol):
 def cut_remote(store: ObjectStore, bag: RemoteBag, out: Path, choice: Choice) -> Cut:
     """Into the new folder ``out``. Raises BagError, BagDamaged, SettingError, StoreError."""
     if bag.is_archive:
-        raise BagError(f'{bag.name} is an archive, of which no part can be read', remedy='fetch it, unpack it and cut the folder')
+        raise BagError(
+            f'{bag.name} is an archive, which can only be read as a whole', remedy='fetch it, unpack it and cut the folder'
+        )
     meter = Meter()
     file = bag.file(METADATA)
     told = of_metadata(document(store, file), file.key) if file else None

@@ -64,7 +64,7 @@ def of_metadata(content: bytes, name: str) -> Description:
     try:
         return _described(from_yaml(content.decode())['rosbag2_bagfile_information'])
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise BagDamaged(f'{name} is no metadata of a rosbag2 bag: {type(error).__name__} {error}', path=name) from error
+        raise BagDamaged(f'{name} is not metadata of a rosbag2 bag: {type(error).__name__} {error}', path=name) from error
 
 
 def of_slices(slices: Sequence[SliceInfo]) -> Description:
@@ -144,7 +144,7 @@ def _whole(told: Mapping[str, Any], name: str) -> int:
     if isinstance(found, str) and found.isdecimal() and len(found) < 20:
         found = int(found)
     if type(found) is not int or not 0 <= found < _LATEST_NS:
-        raise ValueError(f'{name} is no whole number of 0 ... 2^63')
+        raise ValueError(f'{name} is not a whole number of 0 ... 2^63')
     return found
 
 

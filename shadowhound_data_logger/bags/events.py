@@ -244,7 +244,7 @@ class Events:
             event.again_s = now_s + RETRY_S
             discard(self._place.root / event.bag)
             if not event.refused:
-                log.error('nothing of %s is written while the disk takes nothing: %s', event.bag, error)  # noqa: TRY400 - an operator's
+                log.error('%s is not written while the disk accepts no writes: %s', event.bag, error)  # noqa: TRY400 - an operator's
             event.refused = UNWRITABLE
             return False
         event.refused = ''
@@ -294,4 +294,4 @@ class Events:
         while held := self._ring.next(event.until_s + self._poll_s):
             self.claims.lose([held], UNWRITABLE)
         if self._end(event):
-            log.error('%s is lost: the disk took nothing', event.bag)
+            log.error('%s is lost: the disk accepted no writes', event.bag)

@@ -15,7 +15,7 @@ class JsonObject:
     def __init__(self, value: object, file: str, place: str) -> None:
         self._file, self._place = file, place
         if not isinstance(value, dict):
-            raise BagDamaged(f'{file}: {place or "it"} is no JSON object', path=file)
+            raise BagDamaged(f'{file}: {place or "it"} is not JSON object', path=file)
         self._fields: dict[str, Any] = value
 
     def text(self, name: str, *, is_any: bool = False) -> str:

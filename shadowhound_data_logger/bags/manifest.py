@@ -153,7 +153,7 @@ class Manifest:
         try:
             found = from_json(content)
         except ValueError as error:
-            raise BagDamaged(f'{name} is no JSON: {error}', path=name) from error
+            raise BagDamaged(f'{name} is not JSON: {error}', path=name) from error
         top = JsonObject(found, name, '')
         if (version := top.count('version')) != VERSION:
             raise BagDamaged(f'{name} has version {version}; this program reads {VERSION}', remedy='update it', path=name)

@@ -52,7 +52,7 @@ def record_and_upload_rosbag(mission_name: str, duration_s: int) -> Recorded:
     """Record the robot's sensors for so many seconds as ``<mission_name>_YYYYMMDD_HHMMSS`` and upload it.
 
     Recorded is what the node logs by default, each topic at full rate. Raises BagError when nothing could be recorded. A Tower
-    that is away is no error: ``delivered`` says so.
+    that is away is not an error: ``delivered`` says so.
     """
     found = record(mission_name, duration_s)
     print(f'Uploaded: {found.where}' if found.delivered else f'Waits in the spool: {found.where}')  # noqa: T201 - as the guide's

@@ -235,8 +235,8 @@ class Recorder:
         else:
             self._end_after(after.recording, STOP_S, then=recording)
         if not self._listen(True, STOP_S):
-            log.warning('the intake did not begin to record within %.0f s; it does as soon as it can', STOP_S)
-        log.info('bag %s is recorded', name)
+            log.warning('the intake did not begin to record within %.0f s; it will as soon as it can', STOP_S)
+        log.info('recording bag %s', name)
         return True, name
 
     def _stop(self, deadline_s: float) -> Answer:

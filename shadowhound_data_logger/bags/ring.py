@@ -183,7 +183,7 @@ class Claims:
         self._accounts.rebase_all(EVENT)
 
     def receive(self, held: Held) -> list[Taken]:
-        """An event has it now; what is no repeat of it."""
+        """An event has it now; what is not a repeat of it."""
         with self._accounts.entry(f'{EVENT}{held.lot.topic}') as account:
             account.type = held.lot.type
             if held.again:

@@ -65,11 +65,11 @@ class UploadPlan:
 def finished(folder: Path) -> Description:
     """What a finished bag holds. Raises BagError saying why it is none."""
     if not folder.is_dir():
-        raise BagError(f'{folder} is no folder', remedy='name the folder that ros2 bag record -o made', path=str(folder))
+        raise BagError(f'{folder} is not a folder', remedy='name the folder that ros2 bag record -o made', path=str(folder))
     names = {path.name: path for path in folder.iterdir()}
     if METADATA not in names:
         remedy = 'ros2 bag record writes it when it ends; after a crash, `ros2 bag reindex` makes it'
-        raise BagError(f'{folder} is no finished bag: it has no {METADATA}', remedy=remedy, path=str(folder))
+        raise BagError(f'{folder} is not a finished bag: it has no {METADATA}', remedy=remedy, path=str(folder))
     for name, path in names.items():
         if name.endswith(_UNFINISHED) and path.stat().st_size:
             raise BagError(f'{folder} is not finished: {name} is there', remedy='does somebody record into it?', path=str(folder))

@@ -244,14 +244,14 @@ def _check_sqlite(path: Path, expected: _Expected) -> FileCheck:
     try:
         check_tables(path)
     except BagDamaged as error:
-        return FileCheck(expected.name, f'is no SQLite bag: {error}', 'content')
+        return FileCheck(expected.name, f'is not an SQLite bag: {error}', 'content')
     try:
         with sqlite3.connect(f'{path.absolute().as_uri()}?mode=ro&immutable=1', uri=True) as database:
             answer = database.execute('PRAGMA quick_check(1)').fetchone()[0]
             count = database.execute('SELECT count(*) FROM messages').fetchone()[0]
         database.close()
     except sqlite3.Error as error:
-        return FileCheck(expected.name, f'is no SQLite bag: {error}', 'content')
+        return FileCheck(expected.name, f'is not an SQLite bag: {error}', 'content')
     if answer != 'ok':
         return FileCheck(expected.name, f'is damaged: {answer}', 'content')
     if expected.messages not in {None, count}:

@@ -44,7 +44,7 @@ class BagConsumer(Consumer):
         self._before = self._accounts.last_numbers(BAG)
 
     def take(self, drained: Drained) -> None:
-        """Count messages that are no repeats, and hand them on."""
+        """Count messages that are not repeats, and hand them on."""
         topic, type_name = drained.topic, drained.type
         paused = drained.paused or self._queue.paused
         with self._accounts.entry(f'{BAG}{topic}') as account:

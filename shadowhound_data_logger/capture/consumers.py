@@ -135,5 +135,5 @@ def count_failure(consumer: Consumer, topic: str, error: Exception) -> None:
     consumer.failures += 1
     consumer.last_error = f'{type(error).__name__}: {error}'
     if str(consumer.failures).strip('0') == '1':
-        text = '%s fails to take messages of %s (%d times so far), which all others get: %s'
+        text = '%s failed to take messages of %s (%d times so far); all other consumers get them: %s'
         log.error(text, type(consumer).__name__, topic, consumer.failures, error, exc_info=error)

@@ -157,7 +157,9 @@ class ControlSocket:
             try:
                 request = _parsed(line)
             except ValueError as error:
-                await self._tell(writer, self._refused(f'that is no request, which is a line such as {{"do": "flush"}}: {error}'))
+                await self._tell(
+                    writer, self._refused(f'that is not a request, which is a line such as {{"do": "flush"}}: {error}')
+                )
             else:
                 await self._tell(writer, await self._have_done(request))
 
@@ -187,7 +189,7 @@ def _parsed(line: bytes) -> _Request:
     except RecursionError as error:
         raise ValueError('it is nested too deep') from error
     if not isinstance(request, dict):
-        raise ValueError('it is no object')  # noqa: TRY004 - one error for whatever is wrong with a line
+        raise ValueError('it is not an object')  # noqa: TRY004 - one error for whatever is wrong with a line
     return request
 
 

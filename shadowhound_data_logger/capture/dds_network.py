@@ -236,7 +236,7 @@ PROPERTIES: Final = """
         <propertiesPolicy><properties>
           <property><name>fastdds.type_propagation</name><value>disabled</value></property>
         </properties></propertiesPolicy>"""
-"""Types match by their names. Fast DDS 3 describes them as well, and so does a driver that is no ROS;
+"""Types match by their names. Fast DDS 3 describes them as well, and so does a driver that is not a ROS;
 where the two cannot be compared (that of sensor_msgs/Image, for one) they never match."""
 TRANSPORT: Final = """
       <transport_descriptor><transport_id>shadowhound_{name}</transport_id><type>{kind}</type>{rest}</transport_descriptor>"""

@@ -224,4 +224,4 @@ class EncodePool:
         for reason, text in details.items():
             if (topic, reason) not in self._told:
                 self._told.add((topic, reason))
-                log.warning('%s: a message cannot be stored: %s; more of these are only counted', topic, text)
+                log.warning('%s: a message cannot be stored: %s; further ones are only counted', topic, text)

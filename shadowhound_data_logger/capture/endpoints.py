@@ -43,7 +43,7 @@ class Endpoint:
     reliable: bool
     transient_local: bool
     node: str = ''
-    """Full name of its node, safe to print; empty where it is not known: for a program that is no ROS node, for one."""
+    """Full name of its node, safe to print; empty where it is not known: for a program that is not a ROS node, for one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -190,7 +190,7 @@ class PublicNode:
 
 
 def _ascii(name: str) -> str:
-    """As ROS has names; who is no ROS may have others."""
+    """As ROS has names; who is not a ROS may have others."""
     return name[:MOST_LETTERS].encode('ascii', 'replace').decode()
 
 
@@ -203,7 +203,7 @@ def main() -> int:
                 _serve(connection, arguments)
     except (OSError, NodeUnavailable, RuntimeError) as error:  # the last one of rcl, where there is no such RMW
         print(f'the front ends: {error}', file=sys.stderr)  # noqa: T201 - it may have no logger yet
-    return 1  # as far as the node still is there, this was no end that it asked for
+    return 1  # as far as the node still is there, this was not an end that it asked for
 
 
 def _serve(connection: Connection, arguments: Sequence[str]) -> None:

@@ -138,7 +138,7 @@ class MissionWatch:
                 self._log = node_log
         self._mission = mission
         if not self._set_idle(idle=False):
-            log.warning('the intake did not begin mission %s within %.0f s; it does as soon as it can', mission.id, FLUSH_S)
+            log.warning('the intake did not begin mission %s within %.0f s; it will as soon as it can', mission.id, FLUSH_S)
         log.info('mission %s is active', mission.id)
         self._tell(self.status())
 
@@ -154,7 +154,7 @@ class MissionWatch:
             node_log.close(over)
         self._last = replace(over, end_ns=noticed_ns if over.end_ns is None else over.end_ns), self._marks
         self._mission, self._marks = None, {}
-        log.info('mission %s is over', mission.id)
+        log.info('mission %s has ended', mission.id)
         self._tell({})
 
     def _set_idle(self, *, idle: bool) -> bool:

@@ -1,6 +1,6 @@
 """What the node sees of the robot while a mission is active: read from batches that were just encoded, by the encoders' threads.
 
-It is no listener: those get each message from the intake (``consumers.py``).
+It is not a listener: those get each message from the intake (``consumers.py``).
 Only what is logged is deserialized: one message a period of the battery's and the thermometer's topic, every pose that is kept.
 """
 

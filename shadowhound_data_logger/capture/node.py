@@ -52,7 +52,7 @@ GIVE_BACK_S = 20.0
 SECOND_SIGNAL_S = 1.0
 """A second signal later than this ends the node at once; an earlier one is the same key press."""
 WATCHDOG_PART: Final = 3
-"""The node says that it lives this many times within the time that systemd allows, so that one lost word is no death."""
+"""The node says that it lives this many times within the time that systemd allows, so that one lost word is not a death."""
 
 
 class SystemdService:
@@ -85,7 +85,7 @@ class SystemdService:
         self._tell('STOPPING=1\nSTATUS=closing: open batches are finished and delivered')
 
     def _tell(self, text: str) -> None:
-        """Never raises and never waits: systemd's silence is no reason to stop logging."""
+        """Never raises and never waits: systemd's silence is not a reason to stop logging."""
         if not self._address:
             return
         name = '\0' + self._address[1:] if self._address.startswith('@') else self._address
@@ -95,7 +95,7 @@ class SystemdService:
         except OSError as error:
             if not self._told:
                 self._told = True
-                log.warning('systemd is not told how the node is: %s', error)
+                log.warning('cannot report to systemd: %s', error)
 
 
 class StopSignals:
@@ -137,7 +137,7 @@ def refuse(rest: list[str]) -> int:
     if rest[0] in {'-h', '--help'}:
         print(USAGE)  # noqa: T201
         return 0
-    print(f'sensor_logger_node: {rest[0]!r} is no argument of it; settings follow --ros-args\n{USAGE}', file=sys.stderr)  # noqa: T201
+    print(f'sensor_logger_node: {rest[0]!r} is not an argument of it; settings follow --ros-args\n{USAGE}', file=sys.stderr)  # noqa: T201
     return 2
 
 
@@ -159,7 +159,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
         node, name = make_node(arguments, is_public=not middleware.is_foreign)
     logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
     node.get_logger().info(f'listening by {middleware.describe()}')
-    if '--params-file' in arguments and not Parameters(node).given():  # which is no error to rcl
+    if '--params-file' in arguments and not Parameters(node).given():  # which is not an error to rcl
         node.get_logger().warning(UNHEARD.format(name=name))
     front = Front(arguments, robot) if middleware.is_foreign and middleware.has_robot else None
     if middleware.is_foreign and front is None:

@@ -212,7 +212,9 @@ class Pipeline:
         self._spool_parts(self._catalogue.parts)
         self.writer.flush(1.0)
         if self._settings.shutdown.drain_s and not self.uploader.drain(end_s - time.monotonic()):
-            log.warning('%d objects stay in the spool %s and are delivered later', self.spool.pending_count(), self.spool.root)
+            log.warning(
+                '%d objects stay in the spool %s and will be delivered later', self.spool.pending_count(), self.spool.root
+            )
 
     def tick(self) -> None:
         """Called several times a second: starts threads again that died, and once a second tells what goes on.
@@ -306,7 +308,7 @@ class Pipeline:
             if named := self._redating.step():
                 self.uploader.wake(named)
         except (OSError, sqlite3.Error) as error:
-            log.warning('objects that wait for the clock are not named yet: %s', error)
+            log.warning('objects that wait for the clock have no names yet: %s', error)
 
     def _ledger(self) -> DataObject:
         """The ledger as an object of its own, for the store."""

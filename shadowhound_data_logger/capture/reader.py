@@ -83,7 +83,7 @@ _TYPE: Final = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', re.ASCII
 MAX_PUBLISHERS: Final = 1000
 """Senders that a subscription knows by name at once."""
 UNKNOWN_NODES: Final = frozenset({'_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_'})
-"""What rmw calls the node of a publisher that is no ROS node, or of which it does not know yet."""
+"""What rmw calls the node of a publisher that is not a ROS node, or of which it does not know yet."""
 
 
 class TypeUnavailable(LookupError):
@@ -102,7 +102,7 @@ def message_class(type_name: str) -> type:
     """
     match = _TYPE.fullmatch(type_name)
     if match is None:
-        raise TypeUnavailable(f'{type_name}: this is no name of a message')
+        raise TypeUnavailable(f'{type_name}: this is not a name of a message')
     package, name = match.groups()
     if not _has_messages(package):
         raise TypeUnavailable(f'{type_name}: no package {package} with messages')
@@ -276,9 +276,9 @@ def takes_through_librcl(node: Node) -> bool:
         problem = disproof(node)
         _PROVED[rmw] = not problem
         if problem:
-            log.warning('messages are taken through rclpy, which does not tell whose they are: through librcl %s', problem)
+            log.warning('taking messages through rclpy, which does not tell their publishers: through librcl %s', problem)
         else:
-            log.info('messages are taken through librcl, which tells their numbers and publishers as rclpy does not')
+            log.info('taking messages through librcl, which tells their numbers and publishers; rclpy does not')
     return _PROVED[rmw]
 
 

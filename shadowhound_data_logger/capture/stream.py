@@ -188,11 +188,11 @@ class SensorStream:
                 self._counter = types.counter(self._type, sensor.counter)
                 return Expectation(f'counter:{sensor.counter}', wrap=self._counter.wrap)
             except Rejected as error:
-                log.warning('%s.counter is not used, stamps are instead: %s', sensor.name, error)
+                log.warning('%s.counter cannot be used, using stamps instead: %s', sensor.name, error)
         return Expectation(period=SECOND / sensor.expected_hz if sensor.expected_hz else 0.0)
 
     def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool) -> None:
-        """Count messages, in the order in which they came, and hand on those that are no repeats."""
+        """Count messages, in the order in which they came, and hand on those that are not repeats."""
         fresh: list[Taken] = []
         sent: dict[str, list[int]] = {}
         counter = self._counter
@@ -221,7 +221,7 @@ class SensorStream:
                 account.gaps.heard_ns = newest_ns
         if is_refuted and not self._is_refuted:
             self._is_refuted = True
-            text = '%s: messages come more often than expected_hz says: how often they are published is learned instead'
+            text = '%s: messages come more often than expected_hz says: their rate is learned instead'
             log.warning(text, self._topic)
         for consumer, defect in failed.items():
             count_failure(consumer, self._topic, defect)

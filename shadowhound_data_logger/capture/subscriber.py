@@ -293,7 +293,7 @@ class Subscriber:
                 self._accounts.see_other(account, name, by, counted=name == counted, named=named, only_known=self._others is None)
             if name not in self._told and (any(by) or self._has_waited(now_s)):
                 how = 'counted as rejected (wrong_type)' if name == counted else 'not listened to'
-                whose = ', '.join(filter(None, by[:MAX_NODES])) or 'a program that is no ROS node'
+                whose = ', '.join(filter(None, by[:MAX_NODES])) or 'a program that is not a ROS node'
                 text = f'{self._chosen} is published as {name} too, by {whose}; {type_name} is logged, and that is {how}'
                 self._tell(name, text)
         if not nodes:

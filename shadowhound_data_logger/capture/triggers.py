@@ -36,7 +36,7 @@ LARGE_BYTES: Final = 64 << 10
 REARM_S: Final = 1.0
 """Shortest time in which a condition must not hold before it triggers again."""
 LATE_NS: Final = 10 * 10**9
-"""What an agent logged longer ago is no trigger: the node has just been started, or the clock was set."""
+"""What an agent logged longer ago is not a trigger: the node has just been started, or the clock was set."""
 LOOK_S: Final = 0.2
 PATIENCE_S: Final = 30.0
 DETAIL_BYTES: Final = 1000

@@ -67,7 +67,7 @@ class Watchdog:
         found = {name: text for name, text in stuck.items() if writes or not name.startswith('encode-')}
         found |= self._topics(status, now_s, takes='intake' not in stuck and not _failing(status, 'intake'))
         encoding, delivery = self._encode(status, now_s), self._deliver(status, now_s)
-        if writes:  # else what waits for the disk is no stall of its own
+        if writes:  # else what waits for the disk is not a stall of its own
             found |= {name: text for name, text in (('encode', encoding), ('delivery', delivery)) if text}
         self._tell(found)
         return found
@@ -76,7 +76,7 @@ class Watchdog:
         for name in found.keys() - self._told.keys():
             log.warning('%s: %s', name, found[name])
         for name in self._told.keys() - found.keys():
-            log.info('%s: it goes on', name)
+            log.info('%s: working again', name)
         self._told = found
 
     def _topics(self, status: Mapping[str, Any], now_s: float, *, takes: bool) -> dict[str, str]:

@@ -106,7 +106,7 @@ class CatalogueWriter:
         )  # fmt: skip
 
     def _named(self, robot: str | None) -> str:
-        """The robot of a row, or this one where that is no name."""
+        """The robot of a row, or this one where that is not a name."""
         try:
             return check_name(robot or '', 'the robot name')
         except NameRefused:

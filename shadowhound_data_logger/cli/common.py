@@ -57,7 +57,7 @@ class BadUsage(click.UsageError):
 
 
 def robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str | None:
-    """What ``--robot`` names; raises BadParameter for what is no name of a robot."""
+    """What ``--robot`` names; raises BadParameter for what is not a name of a robot."""
     try:
         return None if name is None else check_name(name, 'the robot name')
     except NameRefused as error:

@@ -86,7 +86,7 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
 
     Files that an earlier run merged are deleted.
 
-    Exit code 1 when a file is no part of a catalogue, or has rows that are not its robot's: it is named and stays as it is.
+    Exit code 1 when a file is not part of a catalogue, or has rows that are not its robot's: it is named and stays as it is.
     """
     found = []
     with asking():
@@ -217,7 +217,7 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
         since_ns, until_ns = moment('--since', since, now_ns), moment('--until', until, now_ns)
         if not 0 < until_ns - since_ns <= MOST_COVERED_NS:
             raise BadUsage(
-                f'--since {since} --until {until} is no span of time',
+                f'--since {since} --until {until} is not a span of time',
                 f'--since before --until, up to {MOST_COVERED_NS // DAY_NS} days',
             )
         left_out = quietly()

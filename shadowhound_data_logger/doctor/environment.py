@@ -23,7 +23,7 @@ SHARED: Final = ('AWS_ENDPOINT_URL', *KEYS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_EN
 PLACEHOLDERS: Final = ('<', 'TOWER_IP', 'from Tower', '...')
 """What is in the variables of somebody who pasted the guide as it is."""
 _BARE: Final = re.compile(r'[\w.-]+:\d{2,5}/?')
-"""A host and its port, which are no URL."""
+"""A host and its port, which are not a URL."""
 
 
 def check(context: Context) -> Iterator[Result]:
@@ -120,7 +120,7 @@ def _tracking(context: Context) -> Iterator[Result]:
     elif uri.startswith('http') and services.mlflow(context) is None:
         yield error(
             'environment.tracking',
-            f'MLFLOW_TRACKING_URI is {services.shown(uri)}, which is no address',
+            f'MLFLOW_TRACKING_URI is {services.shown(uri)}, which is not an address',
             'its host or its port is none',
             'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
         )

@@ -197,7 +197,7 @@ def _judge(one: Heard, sensor: SensorSettings, stream: Stream, expected_hz: floa
 
 def _other_types(one: Heard, sensor: SensorSettings, others: Sequence[str]) -> Result:
     by = sorted({publisher.node for publisher in one.publishers if publisher.type in others} - {''})
-    whose = ', '.join(by[:MOST_NODES]) or 'a program that is no ROS node'
+    whose = ', '.join(by[:MOST_NODES]) or 'a program that is not a ROS node'
     own = f'{sensor.name}.types: [{others[0]}]'
     return error(
         'ros.type',

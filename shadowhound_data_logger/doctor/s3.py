@@ -88,7 +88,7 @@ def _away(problem: StoreError) -> Result:
     if problem.data.get('code') in {'RequestTimeTooSkewed', 'RequestExpired'}:
         return of_error('s3.clock', problem, 'the server refuses signatures that are more than 15 minutes off')
     if problem.data.get('status', 0) >= 500:
-        return of_error('s3.answer', problem, 'the server fails (a full disk, its storage away), or it is no S3 server')
+        return of_error('s3.answer', problem, 'the server fails (a full disk, its storage away), or it is not an S3 server')
     if 'like an S3 server' in str(problem):
         return of_error('s3.answer', problem, 'another program answers on this port, or a proxy or login page on the way')
     return of_error('s3.answer', problem, 'the connection is bad, or the server is overloaded')

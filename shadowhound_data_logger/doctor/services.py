@@ -11,7 +11,7 @@ from shadowhound_data_logger.doctor.model import Context
 
 CONNECT_S: Final = 3.0
 ANSWER_S: Final = 4.0
-"""A Tower that needs longer for an answer is no Tower to work with; the sum of all waits has to fit into the run."""
+"""A Tower that needs longer for an answer is not a Tower to work with; the sum of all waits has to fit into the run."""
 LOCAL: Final = frozenset({'localhost', '127.0.0.1', '::1'})
 
 

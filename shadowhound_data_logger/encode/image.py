@@ -85,7 +85,7 @@ def encode_png(job: Job, sample: Sample) -> Payload:
 
 def _encode(job: Job, sample: Sample, *, lossless: bool) -> Payload:
     if job.batch.type not in (COMPRESSED_IMAGE, IMAGE):
-        raise Rejected('wrong_type', f'{job.batch.type} is no image')
+        raise Rejected('wrong_type', f'{job.batch.type} is not an image')
     message = job.types.deserialize(job.batch.type, memoryview(sample.cdr))
     if job.batch.type == COMPRESSED_IMAGE:
         return _published(sample, message)
@@ -124,7 +124,7 @@ def _depth(message: Any) -> tuple[Any, dict[str, Fact]]:
     """
     encoding, _, rest = message.format.partition(';')
     if encoding not in ('16UC1', 'mono16', '32FC1') or rest.strip() not in (_DEPTH, f'{_DEPTH} png'):
-        raise Rejected('unsupported_encoding', f'{message.format[:40]!r} is no depth image as PNG')
+        raise Rejected('unsupported_encoding', f'{message.format[:40]!r} is not a depth image as PNG')
     data = message.data
     if data.size <= _CONFIG_HEADER.size or data[_CONFIG_HEADER.size :][: len(PNG_MAGIC)].tobytes() != PNG_MAGIC:
         raise Rejected('malformed', f'no PNG behind the header of {message.format[:40]!r}')

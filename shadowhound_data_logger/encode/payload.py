@@ -80,5 +80,5 @@ def one_message(encode: OneMessage) -> Encoder:
 def encode_cdr(job: Job, sample: Sample) -> Payload:  # noqa: ARG001 - as every encoder of one message
     """The bytes of one message; its definition is not needed. Raises Rejected ``malformed`` where there are too few for CDR."""
     if len(sample.cdr) < ENCAPSULATION_BYTES:
-        raise Rejected('malformed', f'{len(sample.cdr)} bytes are no CDR')
+        raise Rejected('malformed', f'{len(sample.cdr)} bytes are not CDR')
     return Payload(sample.cdr, (sample,), 'cdr', 'application/octet-stream')

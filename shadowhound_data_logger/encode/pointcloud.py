@@ -56,7 +56,7 @@ def encode_cloud(job: Job, sample: Sample) -> Payload:
     name or type), ``empty`` (no points), ``size_mismatch`` (width, height, steps and data contradict each other).
     """
     if job.batch.type != POINT_CLOUD:
-        raise Rejected('wrong_type', f'{job.batch.type} is no point cloud')
+        raise Rejected('wrong_type', f'{job.batch.type} is not a point cloud')
     cloud = job.types.deserialize(POINT_CLOUD, memoryview(sample.cdr))
     if not cloud.width or not cloud.height:
         raise Rejected('empty', f'{cloud.width} x {cloud.height} points')

@@ -57,7 +57,7 @@ def header_stamp_ns(cdr: bytes | memoryview) -> int:
 
 
 def header_frame_id(cdr: bytes) -> str:
-    """``header.frame_id`` of such a message; empty where the bytes are too few, U+FFFD where they are no UTF-8."""
+    """``header.frame_id`` of such a message; empty where the bytes are too few, U+FFFD where they are not UTF-8."""
     start = ENCAPSULATION_BYTES + _STAMP_LE.size + _LENGTH_LE.size
     if len(cdr) < start:
         return ''
@@ -103,7 +103,7 @@ class MessageTypes:
     def deserialize(self, type_name: str, cdr: bytes | memoryview) -> Any:
         """The message as a ``rosbags`` dataclass: numbers, str, lists, numpy arrays that may be views of ``cdr``.
 
-        Text that is no UTF-8 is kept with U+FFFD in place of the bad bytes, as rclpy does.
+        Text that is not UTF-8 is kept with U+FFFD in place of the bad bytes, as rclpy does.
         Raises Rejected: ``unknown_type``, or ``malformed`` (truncated, too long, lengths that lie, no CDR at all).
         """
         self.fields(type_name)
@@ -152,7 +152,7 @@ class MessageTypes:
             else:
                 break
         if not kind:
-            raise Rejected('unknown_field', f'{field!r} is no field of {type_name} with a whole number')
+            raise Rejected('unknown_field', f'{field!r} is not a field of {type_name} with a whole number')
         size = struct.calcsize(_WHOLE[kind])
         place += -place % size
         return CounterField(place + ENCAPSULATION_BYTES, struct.Struct(f'<{_WHOLE[kind]}'), struct.Struct(f'>{_WHOLE[kind]}'))
@@ -205,7 +205,7 @@ class MessageTypes:
 
     def _find(self, type_name: str) -> Typesdict:
         if not _TYPE_NAME.fullmatch(type_name):
-            raise LookupError(f'{type_name!r} is no message type')
+            raise LookupError(f'{type_name!r} is not a message type')
         with suppress(FileNotFoundError):
             return get_types_from_msg(find(self._prefixes, type_name).read_text(encoding='utf-8'), type_name)
         if type_name not in self._shipped.fielddefs:

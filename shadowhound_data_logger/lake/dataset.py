@@ -66,7 +66,7 @@ class MissionDataset:
         self.aligned = {name: how if isinstance(how, (Near, Window)) else Near(float(how)) for name, how in (align or {}).items()}
         self._place, asked = selecting.place(source)
         self.left_out = Findings()
-        """What of the catalogue is not in it, since it is no part of one; a child that was forked or spawned has none of it."""
+        """What of the catalogue is not in it, since it is not part of one; a child that was forked or spawned has none of it."""
         self._selection = selecting.select(asked, anchor, self.aligned, size, flags, self.left_out)
         self._drop_incomplete = drop_incomplete
         self._chosen = [self._complete(track) for track in self._selection.anchors]

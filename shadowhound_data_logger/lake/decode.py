@@ -88,7 +88,7 @@ def image(body: bytes, size: tuple[int, int] | None = None) -> NDArray[Any]:
     try:
         return _jpeg(body, size) if body.startswith(_JPEG) else _pillow(body, size)
     except _BROKEN as error:
-        raise LakeError(f'this is no image that can be read: {error}') from error
+        raise LakeError(f'this is not an image that can be read: {error}') from error
 
 
 def _jpeg(body: bytes, size: tuple[int, int] | None) -> NDArray[Any]:
@@ -128,7 +128,7 @@ def cloud(body: bytes) -> NDArray[np.float32]:
     try:
         return _cloud(body)
     except _BROKEN as error:
-        raise LakeError(f'this is no PCD that can be read: {error}') from error
+        raise LakeError(f'this is not a PCD that can be read: {error}') from error
 
 
 def _cloud(body: bytes) -> NDArray[np.float32]:
@@ -164,7 +164,7 @@ def records(body: bytes) -> list[dict[str, Any]]:
             raise ValueError('a sample has no stamp')
         return list(found)
     except (*_BROKEN, AttributeError) as error:
-        raise LakeError(f'this is no JSON of a sensor: {error}') from error
+        raise LakeError(f'this is not JSON of a sensor: {error}') from error
 
 
 def members(body: bytes, extension: str) -> list[ArchiveMember]:
@@ -233,7 +233,7 @@ class Table:
 
 
 def table(samples: Sequence[Mapping[str, Any]], kind: str, fields: Sequence[str], offset_ns: int) -> Table:
-    """The numbers of these messages of a type, of JSON. Raises LakeError where one does not have a field, or it is no number."""
+    """The numbers of these messages of a type, of JSON. Raises LakeError where a field is missing or not a number."""
     asked = tuple(fields)
     stamps = np.array([sample['stamp_ns'] for sample in samples], np.int64) + offset_ns
     try:
@@ -253,7 +253,7 @@ def _of_type(samples: Sequence[Mapping[str, Any]], kind: str) -> tuple[str, ...]
 
 
 def _numbers(path: str, value: Any) -> Iterator[str]:
-    """The paths of all numbers of a message, in its order; of texts, and of lists that are no numbers, none."""
+    """The paths of all numbers of a message, in its order; of texts, and of lists that are not numbers, none."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
             if not (path or name not in {'stamp_ns', 'header', 'robot', 'non_finite'}):

@@ -227,7 +227,7 @@ class _Fetch:
 def _refusal(wish: Wish) -> str:
     """Why an object can be no file below the folder; empty when it can. Anybody may have written to the bucket."""
     if not is_path(wish.key):
-        return 'its key is no path'
+        return 'its key is not a path'
     return 'its key is ours' if wish.key.split('/', maxsplit=1)[0] == FOLDER else ''
 
 

@@ -152,7 +152,7 @@ def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
     Rows that two fetches brought are shown once, because these files count as backfilled parts.
 
-    A row whose robot is no name is left out: anybody may have written it, and the name becomes a folder's.
+    A row whose robot is not a name is left out: anybody may have written it, and the name becomes a folder's.
     """
     plain = [
         {**{name: row[name] for name in COLUMNS}, **{name: _micros(row, name) for name in ('t_start', 't_end')}} for row in rows

@@ -43,7 +43,7 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Bucket
     """
     images = [(number, row) for number, row in enumerate(rows, 1) if str(row['key']).lower().endswith(IMAGES)]
     if not images:
-        raise LakeError('no image is among what was found', remedy='ask with --sensor camera')
+        raise LakeError('no image was found', remedy='query with --sensor camera')
     chosen = [
         images[round(place * (len(images) - 1) / max(1, min(MOST, len(images)) - 1))] for place in range(min(MOST, len(images)))
     ]
@@ -82,7 +82,7 @@ def ground(
     placed = [row for row in rows if _is_place(row.get('x'), row.get('y'))]
     path = [pair for pair in path if _is_place(*pair)]
     if not placed:
-        raise LakeError('nothing that was found has a place', remedy='was there odometry when it was taken?')
+        raise LakeError('no object that was found has a place', remedy='was there odometry when it was recorded?')
     with rc_context(plots.STYLE):
         figure = Figure(dpi=plots.DPI, layout='constrained')
         axes = figure.add_subplot()
@@ -126,7 +126,7 @@ def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
     from shadowhound_data_logger.missions import plots  # noqa: PLC0415
 
     if len(found) > MOST_LINES:
-        raise LakeError(f'{len(found):,} topics do not fit into a picture', remedy='ask with --robot or --topic')
+        raise LakeError(f'{len(found):,} topics do not fit into a picture', remedy='select with --robot or --topic')
     spans: dict[str, dict[int, list[tuple[int, int]]]] = {STORED: {}, DOWNSAMPLED: {}}
     for line, each in enumerate(found):
         for begin_ns, end_ns, word in named(each.known, each.thinned):
@@ -137,7 +137,7 @@ def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
                NOT_KNOWN: PALE}  # fmt: skip
     begin_ns, end_ns = found[0].known.begin_ns, found[0].known.end_ns
     least_ns = (end_ns - begin_ns) // LINE_DOTS
-    with rc_context({**plots.STYLE, 'text.parse_math': False}):  # a topic's name is no formula
+    with rc_context({**plots.STYLE, 'text.parse_math': False}):  # a topic's name is not a formula
         figure = Figure(figsize=(plots.WIDTH_IN, 1.8 + 0.42 * len(found)), dpi=plots.DPI, layout='constrained')
         axes = figure.add_subplot()
         for word, lines in {**spans, NOT_KNOWN: open_}.items():

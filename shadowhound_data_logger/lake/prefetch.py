@@ -143,7 +143,7 @@ class Prefetch:
             body = self._read(wanted.bucket, wanted.key, wanted.size)
             if not wanted.sha256 or hashlib.sha256(body).hexdigest() == wanted.sha256:
                 return body
-            raise damaged(wanted.bucket, wanted.key, 'its SHA-256 is another')
+            raise damaged(wanted.bucket, wanted.key, 'its SHA-256 differs')
 
         try:
             return twice(once)

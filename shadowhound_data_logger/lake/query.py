@@ -88,7 +88,7 @@ def objects(source: Bucket | None = None, *, findings: Findings | None = None, *
 
     ``flags`` are those of ``select.wanted``: ``sensor topic robot since until near mission mission_type success where``.
     Without a source, of the store that the environment names. Parts that are none are left out: ``findings`` has them once
-    the frame is computed, in this process; without it the log warns. Raises SettingError, LakeError for what is no question.
+    the frame is computed, in this process; without it the log warns. Raises SettingError, LakeError for what is not a question.
     """
     return _objects(_Asked.of(source, findings), wanted(time.time_ns(), **flags))
 
@@ -104,7 +104,7 @@ def topics(source: Bucket | None = None, *, findings: Findings | None = None, **
 
 
 def sql(query: str, source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
-    """SQL over the views, each restricted by the flags. Raises LakeError for what is no SQL or names no column."""
+    """SQL over the views, each restricted by the flags. Raises LakeError for what is not SQL or names no column."""
     chosen, asked = _Asked.of(source, findings), wanted(time.time_ns(), **flags)
     rows = _objects(chosen, asked)
     views = {'objects': rows, 'topics': _topics(rows)}
@@ -201,8 +201,8 @@ def _missions(lake: _Asked, asked: Wanted) -> DataFrame:
 def _gaps(lake: _Asked, asked: Wanted) -> dict[str, DataFrame]:
     """The newest statements about gaps that reach into the time, and how far they are complete. Reads the journal at once."""
     if refused := [name for name in _OF_OBJECTS if getattr(asked, name) is not None]:
-        raise LakeError(f'gaps and watermarks cannot be asked for by {" ".join(refused)}',
-                        remedy='ask by robot, sensor, topic, since, until or mission, or join them with objects')  # fmt: skip
+        raise LakeError(f'gaps and watermarks cannot be selected by {" ".join(refused)}',
+                        remedy='select by robot, sensor, topic, since, until or mission, or join them with objects')  # fmt: skip
     rows = newest(lake.source, robot=asked.robot, topic=asked.topic, since_ns=asked.since_ns, findings=lake.findings)
     if asked.sensor is not None:
         with answering():
@@ -244,6 +244,6 @@ def _value(value: Any, kind: pa.DataType) -> Any:
     """Null for what is not of its kind: a summary may be of another version."""
     if kind == pa.float64():
         return float(value) if isinstance(value, (int, float)) and abs(value) <= sys.float_info.max else None
-    if kind == pa.string():  # half a surrogate pair is no text
+    if kind == pa.string():  # half a surrogate pair is not text
         return value.encode(errors='replace').decode() if isinstance(value, str) else None
     return value if isinstance(value, bool) else None

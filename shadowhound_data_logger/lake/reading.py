@@ -2,7 +2,7 @@
 
 A part of ours is flat: columns of known types, in pages that are plain or by a dictionary, gzip or zstd. Its footer says where
 the pages are, each page's header how large it is; both are read first, and what is something else, or far larger than its file,
-is no part. Only rows of the robot in whose folder it lies count. What is left out is in the ``Findings``; all else is answered.
+is not a part. Only rows of the robot in whose folder it lies count. What is left out is in the ``Findings``; the rest counts.
 
 The format: https://github.com/apache/parquet-format (Encodings.md, src/main/thrift/parquet.thrift). The headers of pages are in
 Thrift's compact protocol: https://github.com/apache/thrift/blob/master/doc/specs/thrift-compact-protocol.md
@@ -66,7 +66,7 @@ _TIMES: Final = ('t_start', 't_end', 't_from', 't_to')
 _YEARS_US: Final = (-62_135_596_800_000_000, 253_402_300_799_999_999)
 """1 to 9999, those of a date."""
 UNREADABLE: Final = (pa.ArrowException, OSError, MemoryError, ValueError, LookupError, TypeError, OverflowError)
-"""What comes of a file that is no part."""
+"""What comes of a file that is not a part."""
 
 
 def tables(source: Bucket, entries: Sequence[ObjectInfo], columns: Sequence[str], findings: Findings,
@@ -119,9 +119,9 @@ def narrow(columns: Sequence[str], of: TableSchema = OBJECTS) -> pa.Schema:
 
 
 def footer(source: Bucket, entry: ObjectInfo) -> Mapping[bytes, bytes]:
-    """What a part says of itself beside its rows. Raises ValueError and its kind for a file that is no part, StoreError."""
+    """What a part says of itself beside its rows. Raises ValueError and its kind for a file that is not a part, StoreError."""
     if not is_path(entry.key):
-        raise ValueError('its name is no path')
+        raise ValueError('its name is not a path')
     return _opened(_tail(source, entry)).metadata.metadata or {}
 
 
@@ -157,7 +157,7 @@ def _contents(source: Bucket, entry: ObjectInfo, body: bytes | ObjectRefused | N
     done, part = 0, None
     try:
         if isinstance(body, ObjectRefused) or not is_path(entry.key):
-            raise ValueError('its name is no path, or it is larger than its listing says')
+            raise ValueError('its name is not a path, or it is larger than its listing says')
         part = _Part(source, entry, body, of)
         for table, size in part.tables(schema, wanted):
             yield table, size
@@ -169,7 +169,7 @@ def _contents(source: Bucket, entry: ObjectInfo, body: bytes | ObjectRefused | N
 def _why(error: BaseException) -> str:
     if isinstance(error, MemoryError):
         return 'there is not enough memory for it'
-    return f'it is no part of a catalogue ({" ".join(str(error).split())[:200] or type(error).__name__})'
+    return f'it is not part of a catalogue ({" ".join(str(error).split())[:200] or type(error).__name__})'
 
 
 class _Rows:
@@ -198,7 +198,7 @@ class _Rows:
         yield self._only(table, _is_sane(table, self._of), 'make no sense').select(columns)
 
     def _readable(self, table: pa.Table) -> pa.Table:
-        """Without parts whose texts are none: what is no UTF-8 would be an error wherever it is read."""
+        """Without parts whose texts are none: what is not UTF-8 would be an error wherever it is read."""
         try:
             table.validate(full=True)
         except pa.ArrowInvalid:

@@ -28,7 +28,7 @@ def place(source: Bucket | Path | str | None) -> tuple[Place, Bucket]:
         if not any(Path(source).glob(f'*/{SENSOR}')):
             raise LakeError(
                 f'{source} has no catalogue',
-                remedy='fetch by a question, such as --since yesterday: a prefix alone brings no rows',
+                remedy='fetch by a query, such as --since yesterday: a prefix alone brings no rows',
             )
         return Place(StoreSettings(), Path(source).absolute()), fetched(Path(source))
     found = source or query.default_source()
@@ -43,7 +43,7 @@ def fetched(folder: Path) -> Bucket:
 
 def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], size: tuple[int, int] | None,
            flags: Mapping[str, Any], findings: Findings) -> Selection:  # fmt: skip
-    """Raises SettingError for what is no question, LakeError where nothing is known of an aligned sensor, StoreError."""
+    """Raises SettingError for what is not a question, LakeError where nothing is known of an aligned sensor, StoreError."""
     for name, how in aligned.items():
         if min(how.reach_ns) < 0 or not sum(how.reach_ns):
             raise SettingError(f'align[{name!r}]', how, 'a time of more than 0 s')
@@ -68,7 +68,7 @@ def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Wi
         kinds = {row['type'] for row in found if row['sensor'] == name}
         if not kinds:
             raise LakeError(f'{name} has no object about the time of the {anchors[0].sensor}',
-                            remedy='is it fetched too, is it the name of a sensor? Else leave it out of align')  # fmt: skip
+                            remedy='was it fetched, and is it the name of a sensor? Otherwise remove it from align')  # fmt: skip
         if len(kinds) > 1:
             raise LakeError(f'{name} has messages of {" and of ".join(sorted(map(str, kinds)))}', remedy='restrict the time')
     return {key: _near(track, anchors, reach) for key, track in _tracks(found).items()}

@@ -36,7 +36,7 @@ def record(op: int, *parts: bytes) -> bytes:
 
 
 def text(value: str) -> bytes:
-    """A string, its length in front. What is no UTF-8 (a lone surrogate) is replaced."""
+    """A string, its length in front. What is not UTF-8 (a lone surrogate) is replaced."""
     encoded = value.encode(errors='replace')
     return struct.pack('<I', len(encoded)) + encoded
 

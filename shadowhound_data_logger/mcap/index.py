@@ -116,10 +116,10 @@ class Schemas:
 
 
 def read_index(source: Ranged) -> McapIndex:
-    """Raises BagDamaged for what is no whole MCAP file."""
+    """Raises BagDamaged for what is not a whole MCAP file."""
     tail_length = min(source.size, FIRST_READ)
     if tail_length < len(MAGIC) + TAIL_BYTES:
-        raise BagDamaged(f'{source.name} is no MCAP file: it has {source.size} bytes', path=source.name)
+        raise BagDamaged(f'{source.name} is not an MCAP file: it has {source.size} bytes', path=source.name)
     tail_start = source.size - tail_length
     tail = source.read(tail_start, tail_length)
     if not tail.endswith(MAGIC):

@@ -87,7 +87,7 @@ def unpack(content: memoryview, name: str) -> memoryview:
     except (*UNREADABLE, ValueError) as error:
         raise BagDamaged(f'{name} cannot be unpacked: {error}', path=name) from error
     if len(found) != size or (crc and zlib.crc32(found) != crc):
-        raise BagDamaged(f'{name} is not what was written: its CRC-32 or its length is another', path=name)
+        raise BagDamaged(f'{name} is damaged: its CRC-32 or its length does not match', path=name)
     return memoryview(found)
 
 

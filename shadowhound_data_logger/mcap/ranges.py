@@ -98,7 +98,7 @@ def check_document(name: str, size: int) -> None:
     try:
         check_size(size, MOST_DOCUMENT_BYTES)
     except ValueError as error:
-        raise BagDamaged(f'{name} is no manifest and no metadata: {error}', path=name) from error
+        raise BagDamaged(f'{name} is neither a manifest nor metadata: {error}', path=name) from error
 
 
 def whole(found: bytes, length: int, name: str, start: int) -> bytes:

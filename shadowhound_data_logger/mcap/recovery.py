@@ -279,7 +279,7 @@ def recover(path: Path, *, ros_distro: str = '') -> SliceInfo:
 def read_info(path: Path, *, digest: bool = False) -> SliceInfo:
     """Of a whole MCAP file, ours or another's, by its summary; by all its messages where it has none.
 
-    ``sha256`` is computed when ``digest`` is set. Raises BagDamaged for what is no whole MCAP file.
+    ``sha256`` is computed when ``digest`` is set. Raises BagDamaged for what is not a whole MCAP file.
     """
     source = LocalFile(path)
     index = read_index(source)

@@ -69,7 +69,7 @@ class MissionFinder:
         except OSError as error:
             if str(error) != self._told:
                 self._told = str(error)
-                log.warning('missions cannot be looked for: %s', error)
+                log.warning('cannot look for missions: %s', error)
             return None
         return max(found, key=lambda active: active.start_ns, default=None)
 

@@ -56,7 +56,7 @@ class Replayer:
                     cwd=folder, start_new_session=True,
                 )  # fmt: skip
         except OSError as error:
-            log.warning('missions are not sent now, the replayer cannot be started: %s', error)
+            log.warning('missions are not sent: the sender cannot be started: %s', error)
         else:
             assert self._process.stdin is not None
             os.set_blocking(self._process.stdin.fileno(), False)
@@ -72,7 +72,7 @@ class Replayer:
         """Start it again when it ended by itself, with a pause that doubles."""
         if self._process is None or self._process.poll() is not None:
             if self._process is not None and self._next_s == 0.0:
-                log.warning('the replayer ended with %s; it is started again', self._process.returncode)
+                log.warning("the missions' sender ended with %s; restarting it", self._process.returncode)
             if self._next_s == 0.0:
                 self._next_s = time.monotonic() + self._pause_s
             elif time.monotonic() >= self._next_s:

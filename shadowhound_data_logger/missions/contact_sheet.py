@@ -36,7 +36,7 @@ class _Thumb(NamedTuple):
 
 
 def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, target: Path) -> str:
-    """Write the JPEG; what there is to say about it: '' or how many frames are no pictures. Raises ValueError for none."""
+    """Write the JPEG; what there is to say about it: '' or how many frames are not pictures. Raises ValueError for none."""
     if not frames:
         raise ValueError('no camera frame was sampled')
     count = min(MOST, len(frames))
@@ -61,7 +61,7 @@ def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, targ
         sheet.paste(thumb.image, (x, y))
         _caption(pen, (x, y + thumb.image.height + 3), width, thumb.frame, start_ns)
     sheet.save(target, 'JPEG', quality=QUALITY, optimize=True)
-    return f'{broken} of {len(chosen)} frames are no pictures' if broken else ''
+    return f'{broken} of {len(chosen)} frames are not pictures' if broken else ''
 
 
 def _columns(count: int) -> int:

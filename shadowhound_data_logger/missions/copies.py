@@ -96,10 +96,10 @@ def _write(target: Path, descriptor: int, data: memoryview) -> None:
 
 
 def copy(source: str | os.PathLike[str], target: Path) -> None:
-    """Raises Rejected for what is no file that can be read, OSError when there is no room; then nothing is there."""
+    """Raises Rejected for what is not a file that can be read, OSError when there is no room; then nothing is there."""
     try:
         if not os.path.isfile(source):  # noqa: PTH113 - a text or a Path; a pipe would never end
-            raise FileNotFoundError(f'{source!s:.200} is no file')
+            raise FileNotFoundError(f'{source!s:.200} is not a file')
         opened = open(source, 'rb')  # noqa: PTH123, SIM115 - closed below
     except (OSError, TypeError, ValueError) as error:
         raise Rejected('no_file', str(error)) from error

@@ -158,7 +158,7 @@ class MissionDataLogger:
         What is not sent yet is sent by the process that goes on without us, or at the next start.
         """
         if mission := self._mission:
-            log.warning('mission %s is active while its logger is closed: it ends as KILLED', mission.id)
+            log.warning('mission %s is still active while its logger is closed: it ends as KILLED', mission.id)
             mission.end(success=False, status=KILLED, error='the logger was closed')
             self._leave(mission)
         found = self.flush(0.0 if self._closed else deadline_s)

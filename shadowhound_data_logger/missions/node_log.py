@@ -222,7 +222,7 @@ class NodeLog:
     def _lose(self, error: OSError) -> None:
         if not self._told:
             self._told = True
-            log.warning('mission %s loses what the node logs while the disk takes nothing: %s', self.mission.id, error)
+            log.warning('mission %s loses what the node logs while the disk accepts no writes: %s', self.mission.id, error)
 
     def _step(self, stamp_ns: int) -> int:
         """Whole seconds since the start: what MLflow draws the points over."""

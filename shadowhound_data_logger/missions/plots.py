@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 def trajectory(path: Array, floor: Array | None, title: str, target: Path) -> None:
     """The path (rows of time in s, x and y in m) over the floor (rows of x, y in m). Raises ValueError for no path."""
     if len(path) < 2:
-        raise ValueError(f'{len(path)} poses are no path')
+        raise ValueError(f'{len(path)} poses are not a path')
     time, xy = path[:, 0], path[:, 1:3]
     length = float(np.hypot(*np.diff(xy, axis=0).T).sum())
     speed = _speed(time, xy)

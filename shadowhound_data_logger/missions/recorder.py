@@ -259,7 +259,7 @@ class Beginning:
         """A new one; None when the disk does not take it, which is said."""
         time_ns, given = now_ns(self.clock), values.text(mission_type, values.MAX_PARAM)
         if safe_type(given) != given:
-            log.warning('the mission type %.80r cannot stand in names: %s stands there', given, safe_type(given))
+            log.warning('the mission type %.80r cannot be part of a name: using %s there', given, safe_type(given))
         start = {'k': 'start', 't': time_ns, 'type': given, 'command': values.text(mission_command), 'robot': self.robot,
                  'pid': os.getpid()}  # fmt: skip
         if time_ns < EARLIEST_SANE_NS:  # of which boot the clock is that this time is of

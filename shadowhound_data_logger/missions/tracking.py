@@ -227,7 +227,7 @@ class MlflowTracking:
                 raise TrackingRefused(text, code=code) from error
             self._raise_distrust(error)
             raise TrackingUnavailable(text, remedy=remedy_for(code), code=code) from error
-        except Exception as error:  # what a client, or a store of artifacts, raises besides (a portal's page is no JSON)
+        except Exception as error:  # what a client, or a store of artifacts, raises besides (a portal's page is not JSON)
             self._raise_distrust(error)
             text = f'{self.where} {what}: {type(error).__name__}: {_USER.sub("//", str(error))[:500]}'
             status = getattr(getattr(error, 'response', None), 'status_code', 0)

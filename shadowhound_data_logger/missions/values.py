@@ -21,7 +21,7 @@ MAX_PARAM: Final = 6000
 MAX_TAG: Final = 5000
 """What 2.14 takes; 3.17 takes 8,000."""
 MAX_TEXT: Final = 1 << 20
-"""Of anything that is journalled: a mission's command is no film."""
+"""Of anything that is journalled: a mission's command is not a film."""
 MAX_STEP: Final = (1 << 63) - 1
 MAX_BITS: Final = 1024
 """Of a number in an event: far larger ones Python does not even write."""
@@ -82,7 +82,7 @@ def artifact_folder(path: object) -> str:
     if path is None or path == '':
         return ''
     if not isinstance(path, str) or not _is_plain(path) or '\0' in path or len(path) > MAX_KEY:
-        raise Rejected('bad_name', f'{text(path, 80)!r} is no folder below the artifacts of a run')
+        raise Rejected('bad_name', f'{text(path, 80)!r} is not a folder below the artifacts of a run')
     return path
 
 
@@ -101,7 +101,7 @@ def plain(value: Any, depth: int = 4) -> Any:
 
 
 def bounded(value: Any) -> Any:
-    """The value unchanged; raises Rejected for what is no record any more but a file."""
+    """The value unchanged; raises Rejected for what is not a record any more but a file."""
     size = len(json.dumps(value))
     if size > MAX_TEXT:
         raise Rejected('too_large', f'an event of {size} characters: log_artifact takes a file')

@@ -148,7 +148,7 @@ class Uploader:
         end = self._monotonic() + deadline_s
         hung = [worker.name for worker in self._threads if not worker.join(end - self._monotonic())]
         if hung and not self._ended.is_set():
-            log.warning('%d uploads did not end within %g s; what they send is sent again next time', len(hung), deadline_s)
+            log.warning('%d uploads did not end within %g s; their objects will be sent again next time', len(hung), deadline_s)
         self._ended.set()
         self._store.pace.abandon()  # a body that waits for the cap would go on for minutes
         self._keeper.join(max(end - self._monotonic(), 0.1))
@@ -250,7 +250,7 @@ class Uploader:
 
 @contextmanager
 def delivering(spool: Spool, settings: Settings, close_s: float) -> Iterator[tuple[Uploader, SpoolWriter]]:
-    """Delivery for a while by a process that is no node: store, writer and uploader, opened and closed together.
+    """Delivery for a while by a process that is not a node: store, writer and uploader, opened and closed together.
 
     What waits in an open spool goes to the store of the settings, unless another process has the drain lock.
 

@@ -55,7 +55,7 @@ SOURCES: Final = r'\A(runs|models|mlflow-artifacts):/[^\r\n]*\Z'
 BODY_BYTES: Final = 32 << 20
 """The longest body of a request that MLflow keeps in memory whole; the inputs of a run
 may have 17 MB. Artifacts are streamed."""
-NO_USER: Final = 'MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD are no user of this Tower'
+NO_USER: Final = 'MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD are not a user of this Tower'
 ANSWER_S: Final = 30.0
 START_S: Final = 180.0
 POLL_S: Final = 0.5

@@ -152,7 +152,7 @@ def main(args: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if args is None else args)
     rest = remove_ros_args(argv)
     if rest:
-        _say(f'{rest[0]!r} is no argument of it; parameters are given as --ros-args -p name:=value')
+        _say(f'{rest[0]!r} is not an argument of it; parameters are given as --ros-args -p name:=value')
         return 2
     rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     # Nothing is spun, so no services; parameters are judged here and not by rclpy, which would ignore unknown ones.

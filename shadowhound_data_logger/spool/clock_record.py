@@ -1,6 +1,6 @@
 """What outlives a process of what it knew of the clock: ``spool/clock-<robot>.json``, steps and the offsets of the last boots.
 
-It is no promise: without the file the steps begin at 0 again, and what an earlier boot left goes without a date.
+It is not a promise: without the file the steps begin at 0 again, and what an earlier boot left goes without a date.
 """
 
 from __future__ import annotations

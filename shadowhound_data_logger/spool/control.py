@@ -80,7 +80,7 @@ class Connection:
         except (OSError, ValueError) as error:
             raise self._lost(error) from error
         if not isinstance(answer, dict) or 'ok' not in answer:
-            raise self._lost(ValueError('what it says is no answer'))
+            raise self._lost(ValueError('what it says is not an answer'))
         return answer
 
     def _line(self) -> bytes:

@@ -229,7 +229,7 @@ UPDATE accounts SET accounting = 'received-only' WHERE accounting <> 'exact';
 UPDATE publishers SET published = 0, received = 0, missed = '{}'
   WHERE (session, topic) IN (SELECT session, topic FROM estimates);
 """
-"""What a middleware reported to have lost was no account: those sessions know what was received."""
+"""What a middleware reported to have lost was not an account: those sessions know what was received."""
 SCHEMA: Final = f"""
 CREATE TABLE objects (
   id INTEGER PRIMARY KEY AUTOINCREMENT,

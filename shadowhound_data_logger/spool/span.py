@@ -95,7 +95,7 @@ class Span:
     changed: bool = False
     """Since the last snapshot."""
     _late: int = 0
-    """Messages after the inherited ``last`` that are counted already: they are no part of the gap that follows."""
+    """Messages after the inherited ``last`` that are counted already: they are not part of the gap that follows."""
 
     def __post_init__(self) -> None:
         self._base = self.first

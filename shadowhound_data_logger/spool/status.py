@@ -26,7 +26,7 @@ FRESH_NS: Final = 5 * SECOND
 RUNNING, NOT_ANSWERING, NOT_RUNNING = 'running', 'not_answering', 'not_running'
 NOT_RUNNING_TEXT: Final = 'the node is not running'
 FINE_STORE: Final = frozenset({'idle', 'shipping', 'not_draining'})
-"""States of delivery that are no finding; ``not_draining``: another process delivers."""
+"""States of delivery that are not a finding; ``not_draining``: another process delivers."""
 NAMED: Final = 3
 """Topics that a finding names; the figures of the others stand in the table."""
 _TOPIC: Final[dict[str, Any]] = {
@@ -215,7 +215,7 @@ def _other_types(found: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _other_type(topic: str, row: Mapping[str, Any], name: str, other: Mapping[str, Any]) -> str:
-    by = ', '.join(other['publishers']) or 'a program that is no ROS node'
+    by = ', '.join(other['publishers']) or 'a program that is not a ROS node'
     count = other['messages']
     what = 'nobody listened to it: how many messages is not known' if count is None else f'{count:,} messages were refused'
     return f'{topic} was published as {name} too, by {by}, and is logged as {row["type"] or "nothing"} alone; {what}'

@@ -50,7 +50,7 @@ class ObjectStore(Protocol):
         """What its puts send: counted, and over a network kept to the cap."""
 
     def open(self) -> None:
-        """Acquire clients and sockets. Does not talk to the network: a store that is away is no error yet."""
+        """Acquire clients and sockets. Does not talk to the network: a store that is away is not an error yet."""
 
     def close(self) -> None:
         """Release everything; idempotent."""
@@ -85,7 +85,7 @@ class ObjectStore(Protocol):
         """The names of the folders right below a prefix that ends with ``/`` or is empty, sorted."""
 
     def delete(self, bucket: str, key: str) -> None:
-        """For good; one that is gone already is no error. No stage of the robot deletes."""
+        """For good; one that is gone already is not an error. No stage of the robot deletes."""
 
     def probe(self) -> None:
         """One cheap authenticated request; raises what a put would raise for the store as a whole."""

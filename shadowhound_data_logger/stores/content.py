@@ -45,7 +45,7 @@ def check_read(bucket: str, key: str) -> None:
     except NameRefused as error:
         raise ObjectRefused(str(error), reason='name', bucket=bucket, key=key) from error
     if not is_path(key):
-        raise ObjectRefused(f'the key {key[:200]!r} is no path below a folder', reason='name', bucket=bucket, key=key)
+        raise ObjectRefused(f'the key {key[:200]!r} is not a path below a folder', reason='name', bucket=bucket, key=key)
 
 
 def chunks(item: SpooledObject) -> Iterator[bytes]:
@@ -70,9 +70,9 @@ def chunks(item: SpooledObject) -> Iterator[bytes]:
 def check_content(item: SpooledObject, size: int, sha256: str) -> None:
     """Raises ObjectRefused where what was read is not the item's content."""
     if size != item.size:
-        raise _damaged(item, f'it has not {item.size} bytes')
+        raise _damaged(item, f'its size is not {item.size} bytes')
     if sha256 != item.sha256:
-        raise _damaged(item, 'its SHA-256 is another')
+        raise _damaged(item, 'its SHA-256 differs')
 
 
 @contextmanager

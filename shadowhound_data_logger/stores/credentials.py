@@ -86,7 +86,7 @@ class Keys(Credentials):
         self._found = found
         self._generation += 1
         if before:
-            _log.info('the keys were refused and other ones have been put there since: those are used now')
+            _log.info('the keys were refused, and the file has other keys now: using those')
 
     def _read(self) -> Credentials | None:
         given = self._settings

@@ -1,7 +1,7 @@
 """A folder laid out as a bucket store: ``<folder>/<bucket>/<key>``, every object whole, durable and never overwritten.
 
 What S3 keeps as metadata lies beside the buckets in ``<folder>/.metadata/<bucket>/<key>.json``: unlike extended attributes it
-survives ``cp``, ``tar`` and any file system, and unlike a file next to the object it is no object to ``aws s3 sync`` or a glob.
+survives ``cp``, ``tar`` and any file system, and unlike a file beside the object it is no object to ``aws s3 sync`` or a glob.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class DirectoryStore:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self.pace = Pace()
-        """It only counts: a disk is no radio."""
+        """It only counts: a disk is not a radio."""
 
     def __repr__(self) -> str:
         return f'DirectoryStore({str(self._directory)!r})'

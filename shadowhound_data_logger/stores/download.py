@@ -84,7 +84,7 @@ def twice(fetch: Callable[[], _Found]) -> _Found:
 
 def damaged(bucket: str, key: str, why: str, **data: Any) -> ObjectRefused:
     """The error for content that is not what was stored."""
-    return ObjectRefused(f'{bucket}/{key} has not the content that its metadata name', remedy='was it damaged in the store?',
+    return ObjectRefused(f'the content of {bucket}/{key} does not match its metadata', remedy='was it damaged in the store?',
                          reason='damaged', why=why, bucket=bucket, key=key, **data)  # fmt: skip
 
 

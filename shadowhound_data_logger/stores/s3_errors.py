@@ -121,7 +121,7 @@ _FAILURES: Final[tuple[tuple[type[BaseException] | tuple[type[BaseException], ..
     (_NO_KEYS, (CredentialsRejected, 'there are no credentials for Tower at {endpoint}',
                 'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SHARED_CREDENTIALS_FILE to a file with them')),
     (boto.ParamValidationError, (ObjectRefused,
-                                 'no S3 request can carry {bucket}/{key}: its metadata or type is no plain text', '')),
+                                 'no S3 request can carry {bucket}/{key}: its metadata or type is not plain text', '')),
     (ResponseParserError, (StoreUnavailable, '{endpoint} does not answer like an S3 server', _NOT_S3)),
     (boto.SSLError, (StoreUnavailable, 'no TLS connection to Tower at {endpoint}',
                      'does the server speak TLS there? else use http:// in AWS_ENDPOINT_URL')),

@@ -68,7 +68,7 @@ class ContentRequests:
 
     def __init__(self, keys: Keys, trust: str | bool, settings: StoreSettings, upload: UploadSettings, pace: Pace) -> None:
         url = urlsplit(settings.endpoint_url or '')
-        self._host = url.netloc.rpartition('@')[2]  # a user name in the URL is no host's
+        self._host = url.netloc.rpartition('@')[2]  # a user name in the URL is not a host's
         self._server = f'{url.scheme}://{self._host}'
         self._root = url.path.rstrip('/')
         self._region = settings.region
@@ -86,11 +86,11 @@ class ContentRequests:
         self._session.close()
 
     def put(self, item: SpooledObject, body: bytes | Body, crc32: str, *, conditional: bool) -> Mapping[str, str]:
-        """One request; ``crc32`` in base64. Returns the headers of an answer that is no error."""
+        """One request; ``crc32`` in base64. Returns the headers of an answer that is not an error."""
         return self._send(item, '', self._headers(item, crc32, conditional), item.sha256, self._pace.pieces(body, item.priority))
 
     def put_part(self, item: SpooledObject, upload: str, number: int, part: Part) -> Mapping[str, str]:
-        """One request for one part of an upload; returns the headers of an answer that is no error."""
+        """One request for one part of an upload; returns the headers of an answer that is not an error."""
         headers = {
             'host': self._host, 'content-length': str(part.size), 'content-md5': base64.b64encode(part.md5).decode('ascii'),
         }  # fmt: skip
@@ -98,7 +98,7 @@ class ContentRequests:
         return self._send(item, query, headers, UNSIGNED, self._pace.pieces(part, item.priority, stands_back=True))
 
     def get(self, bucket: str, key: str, wanted: str = '') -> tuple[Mapping[str, str], StreamingBody]:
-        """One request, of all bytes or of a range (``bytes=0-9``): the headers of an answer that is no error; a body to close."""
+        """One request, of all bytes or of a range (``bytes=0-9``): the headers of a successful answer, and a body to close."""
         target = f'{self._root}/{bucket}/{quote(key)}'
         headers = self._signed('GET', target, {'host': self._host}, EMPTY)
         sent = {**headers, 'user-agent': AGENT, 'accept-encoding': 'identity', **({'range': wanted} if wanted else {})}
@@ -138,7 +138,7 @@ class ContentRequests:
             headers['if-none-match'] = '*'
         for name, value in headers.items():
             if not (value.isascii() and value.isprintable()):
-                raise ParamValidationError(report=f'{name} is no printable ASCII')
+                raise ParamValidationError(report=f'{name} is not printable ASCII')
         return headers
 
 

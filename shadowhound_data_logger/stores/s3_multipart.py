@@ -72,7 +72,7 @@ class Multipart:
         for upload in self._under_way(item):
             held = {} if found else self._held(item, upload)
             if held and _is_of(held, file, item.size):
-                _log.debug('the upload of %s/%s goes on: %d parts are there', item.bucket, item.key, len(held))
+                _log.debug('continuing the upload of %s/%s: %d parts are there', item.bucket, item.key, len(held))
                 found = upload, held
             else:
                 self._give_up(item, upload)

@@ -166,7 +166,7 @@ class ObstoreStore:
             return {'common_prefixes': [], 'objects': []}
 
     def _all(self, bucket: str, folder: str) -> Sequence[ObjectInfo]:
-        """A page that fails is no reason to ask for those before it once more: after them it goes on."""
+        """A page that fails is not a reason to ask for those before it once more: after them it goes on."""
         found: list[ObjectInfo] = []
 
         def read(client: Client) -> None:

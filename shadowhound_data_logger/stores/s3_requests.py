@@ -36,7 +36,7 @@ _Asked = TypeVar('_Asked')
 
 
 class Sent(Enum):
-    """How a PUT was answered, where that is no error yet."""
+    """How a PUT was answered, where that is not an error yet."""
 
     CREATED = 'created'
     TAKEN = 'taken'

@@ -147,7 +147,7 @@ def test_a_cut_of_nothing_leaves_nothing(
 
 
 def test_others_may_read_a_piece_as_they_may_any_file(origin: Path, tmp_path: Path) -> None:
-    """Its slice is no private file of a spool: the umask alone decides."""
+    """Its slice is not a private file of a spool: the umask alone decides."""
     before = os.umask(0o027)
     try:
         found = cut_folder(origin, tmp_path / 'piece', Choice('1', '2'))

@@ -111,6 +111,6 @@ def test_a_later_version_may_say_more() -> None:
     st.none() | st.integers() | st.text(), lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=5,
 ).map(lambda value: json.dumps(value).encode()))  # fmt: skip
 def test_anything_else_is_refused(content: bytes) -> None:
-    """Whatever is no manifest is BagDamaged, never another error."""
+    """Whatever is not a manifest is BagDamaged, never another error."""
     with pytest.raises(BagDamaged):
         Manifest.from_json(content)

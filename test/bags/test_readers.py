@@ -114,7 +114,7 @@ def test_as_a_folder(bag: tuple[Path, list[Recorded]]) -> None:
 
 
 def test_with_the_types_of_the_bag(bag: tuple[Path, list[Recorded]]) -> None:
-    """Messages are decoded by the definitions in the slices alone; a type that nobody knows is no obstacle."""
+    """Messages are decoded by the definitions in the slices alone; a type that nobody knows is not an obstacle."""
     folder, _ = bag
     with AnyReader([folder]) as reader:
         wanted = [one for one in reader.connections if one.topic == '/odom']

@@ -25,7 +25,7 @@ def test_a_metadata_that_is_none_is_refused(tmp_path: Path, content: bytes) -> N
     """In a moment, and as what it is."""
     write_ours(tmp_path / NAME, slices=1, each=5)
     (tmp_path / NAME / 'metadata.yaml').write_bytes(content)
-    with pytest.raises(BagDamaged, match='is no metadata of a rosbag2 bag'):
+    with pytest.raises(BagDamaged, match='is not metadata of a rosbag2 bag'):
         finished(tmp_path / NAME)
 
 
@@ -38,5 +38,5 @@ def test_a_metadata_with_a_wrong_value_is_refused(tmp_path: Path, what: str, val
     write_ours(tmp_path / NAME, slices=1, each=5)
     path = tmp_path / NAME / 'metadata.yaml'
     path.write_text(re.sub(rf'( +)({what}:).*', rf'\1\2 {value}\n\1other_{what}:', path.read_text(), count=1))
-    with pytest.raises(BagDamaged, match='is no metadata of a rosbag2 bag'):
+    with pytest.raises(BagDamaged, match='is not metadata of a rosbag2 bag'):
         finished(tmp_path / NAME)

@@ -121,7 +121,7 @@ def test_a_flush_goes_along_the_way_of_the_data(spooled: tuple[int, int], words:
 
 @pytest.mark.parametrize('stuck', STAGES)
 def test_a_flush_that_does_not_finish_says_where(stuck: str) -> None:
-    """It is no success, the stage is named, and those after it are not waited for."""
+    """It is not a success, the stage is named, and those after it are not waited for."""
     stages = Stages(stuck)
     success, words = ask(stages.commands(), 'flush')
     assert (success, stages.asked[-1]) == (False, stuck)
@@ -150,7 +150,7 @@ def test_a_pause_on_a_slow_disk_is_a_pause() -> None:
 
 @pytest.mark.parametrize('paused', [True, False])
 def test_an_intake_that_hangs_neither_pauses_nor_resumes(*, paused: bool) -> None:
-    """It is no success, and the state stays what it was."""
+    """It is not a success, and the state stays what it was."""
     stages = Stages('pause' if paused else 'resume')
     stages.paused = not paused
     success, words = ask(stages.commands(), 'pause' if paused else 'resume')
@@ -159,7 +159,7 @@ def test_an_intake_that_hangs_neither_pauses_nor_resumes(*, paused: bool) -> Non
 
 
 def test_a_pause_ends() -> None:
-    """Messages are stored again, without another flush; ending none is no failure."""
+    """Messages are stored again, without another flush; ending none is not a failure."""
     stages = Stages()
     stages.paused = True
     commands = stages.commands()

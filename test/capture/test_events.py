@@ -81,7 +81,7 @@ def test_it_wants_what_is_kept_and_what_conditions_look_at() -> None:
 
 
 def test_the_graph_is_asked_once_for_each_publisher() -> None:
-    """A poll of the intake is no place for questions."""
+    """A poll of the intake is not a place for questions."""
     ear = Ear(topics=('/talk',))
     for _ in range(5):
         ear.take('/talk', messages(range(3)))

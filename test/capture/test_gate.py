@@ -48,7 +48,7 @@ def test_a_clock_that_is_set_back_does_not_stop_the_sampling() -> None:
 
 @pytest.mark.parametrize('has_header', [True, False])
 def test_a_message_is_kept_when_its_content_changes(*, has_header: bool) -> None:
-    """The stamp of a header is no content; where there is no header those bytes are."""
+    """The stamp of a header is not content; where there is no header those bytes are."""
     gate = OnChange(has_header=has_header)
     cdr = b'\x00\x01\x00\x00' + b'STAMPSTA' + b'content'
     assert gate.keep(0, cdr)

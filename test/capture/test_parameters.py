@@ -52,7 +52,7 @@ def sensor(settings: Settings | None, name: str = 'camera') -> SensorSettings:
 
 @pytest.mark.parametrize(('section', 'given'), [('/**', True), ('sensor_logger_node', True), ('sensor_loger_node', False)])
 def test_a_file_for_another_node_gives_nothing(tmp_path: Path, section: str, *, given: bool) -> None:
-    """A misspelt section is no error to rcl: that nothing came is all that there is to know it by."""
+    """A misspelt section is not an error to rcl: that nothing came is all that there is to know it by."""
     file = tmp_path / 'mine.yaml'
     file.write_text(f'{section}:\n  ros__parameters:\n    camera:\n      rate_hz: 2.0\n')
     context = Context()

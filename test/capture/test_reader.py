@@ -25,7 +25,7 @@ class IMU(metaclass=Meta):
 
 
 def test_a_package_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is unavailable, as one that is not installed is; what rosidl raises is no ImportError and would end the intake."""
+    """It is unavailable, as one that is not installed is; what rosidl raises is not an ImportError and would end the intake."""
     (tmp_path / 'broken_interfaces').mkdir()
     (tmp_path / 'broken_interfaces/msg.py').write_text(BROKEN)
     monkeypatch.syspath_prepend(str(tmp_path))

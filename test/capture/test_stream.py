@@ -226,7 +226,7 @@ def test_a_counter_that_cannot_be_read_is_told(caplog: pytest.LogCaptureFixture)
     talk.senders.look(['a'])
     spoken(talk, 300, **UNNUMBERED)
     assert talk.account.accounting == ESTIMATED
-    assert 'talk.counter is not used' in caplog.text
+    assert 'talk.counter cannot be used' in caplog.text
 
 
 def test_what_another_publisher_did_not_publish_is_not_lost() -> None:
@@ -319,7 +319,7 @@ def test_a_consumer_that_raises_keeps_no_other_from_its_messages(where: str, sai
     assert (broken.failures, broken.last_error) == (3, said)
     assert (talk.sampler.failures, last.failures) == (0, 0)
     (record,) = caplog.records
-    assert 'Broken fails to take messages of /talk (1 times so far)' in record.message
+    assert 'Broken failed to take messages of /talk (1 times so far)' in record.message
 
 
 def test_what_a_sampler_fails_to_choose_is_dropped_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,7 +44,7 @@ def test_what_is_no_number_tells_nothing() -> None:
 
 
 def test_what_an_agent_logs_is_told_once(tmp_path: Path) -> None:
-    """Only what is new, with its age and data; other records, and what is half written, are no events."""
+    """Only what is new, with its age and data; other records, and what is half written, are not events."""
     journal = Journal(tmp_path / 'journal')
     tail = JournalTail(tmp_path / 'journal')
     assert list(tail.new(NOW_NS)) == []

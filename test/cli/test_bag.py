@@ -127,7 +127,7 @@ def test_an_away_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> Non
     (('cut', NAME, '--topic', '/imv', '-o', 'new'), BagError, 'is it /imu?'),
     (('cut', NAME, '--start', 'noon', '-o', 'new'), SettingError, 'seconds since the start'),
     (('list', '--since', 'tomorrow'), SettingError, 'yesterday'),
-    (('upload', '/nowhere'), BagError, 'is no folder'),
+    (('upload', '/nowhere'), BagError, 'is not a folder'),
     (('verify', './nowhere'), Exception, 'there is no folder'),
     (('info', 'a b'), Exception, 'cannot be part of an object key'),
 ])  # fmt: skip

@@ -111,7 +111,7 @@ def test_a_parameter_file_that_is_none(found: list[model.Result], tmp_path: Path
     (tmp_path / 'a.yaml').write_text('- no mapping')
     error = run(tmp_path, '--params-file', str(tmp_path / 'a.yaml')).exception
     assert isinstance(error, click.UsageError)
-    assert 'a.yaml is no parameter file' in error.format_message()
+    assert 'a.yaml is not a parameter file' in error.format_message()
 
 
 def test_a_setting_that_the_node_would_refuse(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_every_verb_has_examples_that_parse(name: str) -> None:
 
 
 def test_an_example_with_a_wrong_option_would_be_found() -> None:
-    """The parser above is no rubber stamp."""
+    """The parser above is not a rubber stamp."""
     for wrong in ('bag fetch x', 'bag fetch --to y', 'bag list --sinc yesterday', 'missions export x --format xml', 'bag lst'):
         with pytest.raises((click.UsageError, AssertionError)):
             parsed(wrong.split())

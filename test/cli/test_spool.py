@@ -210,7 +210,7 @@ def test_all_is_delivered_without_a_node(home: Path, seaweed: Tower, monkeypatch
         assert db.execute('SELECT count(*) FROM uncatalogued').fetchone() == (0,)
         assert db.execute("SELECT count(*) FROM sessions WHERE robot = 'thor'").fetchone() == (1,)
     assert run('retry').return_value == 0
-    assert said('drain')['delivered'] == 3  # the object, its part of the catalogue, and that it is no gap any more
+    assert said('drain')['delivered'] == 3  # the object, its part of the catalogue, and that it is not a gap any more
 
 
 def test_a_store_that_is_away_is_told(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -99,7 +99,7 @@ def test_what_the_index_forgot_is_said(home: Path) -> None:
 
 
 def test_the_catalogue_is_not_called_forgotten(home: Path) -> None:
-    """Its parts are not asked for, others stand for them in time; but they are no objects that the index forgot."""
+    """Its parts are not asked for, others stand for them in time; but they are not objects that the index forgot."""
     with closing(sqlite3.connect(home / 'spool/index.db')) as index:
         index.execute("UPDATE objects SET sensor = '_catalog' WHERE key = 'thor/a'")
         index.commit()

@@ -67,7 +67,7 @@ def test_what_is_refused_is_told_and_left_out(scene: Scene) -> None:
 
 
 def test_sensors_that_exclude_each_other(scene: Scene) -> None:
-    """Where it is no single parameter that is wrong, the defaults are taken: it ends."""
+    """Where it is not a single parameter that is wrong, the defaults are taken: it ends."""
     scene.parameters = {'sensors': ['imu', 'imu'], 'imu.topics': ['a']}
     scene.environ['SHADOWHOUND_ROBOT'] = 'tachi'
     assert scene.context().refused[0].data['name'] == 'sensors'
@@ -82,7 +82,7 @@ def test_a_parameter_file(tmp_path: Path) -> None:
                     'other:\n  ros__parameters: {x: 1}\n')  # fmt: skip
     assert read_parameters(path) == {'robot': 'tachi', 'imu.batch_s': 2.0}
     path.write_text('sensor_logger_node: {}')
-    with pytest.raises(ParametersUnreadable, match='is no parameter file'):
+    with pytest.raises(ParametersUnreadable, match='is not a parameter file'):
         read_parameters(path)
 
 

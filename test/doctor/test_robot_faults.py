@@ -129,7 +129,7 @@ def damaged(scene: Scene) -> None:
 
 
 def locked(scene: Scene) -> None:
-    """By a process that is no node."""
+    """By a process that is not a node."""
     path = scene.spool / 'drain.lock'
     path.touch()
     program = 'import fcntl, sys; f = open(sys.argv[1]); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); sys.stdin.read()'
@@ -290,7 +290,7 @@ def test_a_distribution_without_tests_is_told(robot: Scene, distro: str, told: l
 
 
 def test_a_parameter_file_for_another_node(robot: Scene, tmp_path: Path) -> None:
-    """A misspelt section is no error to ROS: the node runs with its defaults, and only here somebody says so."""
+    """A misspelt section is not an error to ROS: the node runs with its defaults, and only here somebody says so."""
     path = tmp_path / 'mine.yaml'
     path.write_text('sensor_loger_node:\n  ros__parameters: {camera: {rate_hz: 2.0}}\n')
     context = make_context(robot.environ, role=robot.role, parameter_file=path, root=robot.root)

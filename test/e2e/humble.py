@@ -4,7 +4,7 @@ What there is in Humble is in ``rclpy_humble.json``, which ``rclpy_names.py`` ma
 function, class or member of a class raises AttributeError (ImportError) for whoever is of our package; rclpy goes on using it.
 ``HUMBLE_RMW`` is the RMW to stand in for: rmw_cyclonedds_cpp tells less than rmw_fastrtps_cpp.
 
-Sources of what is no name: rmw 6.1 (RMW_GID_STORAGE_SIZE), rmw_cyclonedds_cpp 1.3 (received_timestamp).
+Sources of what is not a name: rmw 6.1 (RMW_GID_STORAGE_SIZE), rmw_cyclonedds_cpp 1.3 (received_timestamp).
 """
 
 from __future__ import annotations

@@ -251,7 +251,7 @@ def test_malformed_messages(processes: Processes, seaweed: Tower, stored: Callab
 
 
 def test_a_message_that_is_cut_short(processes: Processes) -> None:
-    """Bytes that are no message of the topic's type are rejected as malformed."""
+    """Bytes that are not a message of the topic's type are rejected as malformed."""
     node, publisher = processes.node(None, {**TALK, 'talk.batch_s': 0.0}), processes.publisher()
     publisher.create('/talk', STRING)
     publisher.matched('/talk')

@@ -56,7 +56,7 @@ def test_idl_where_there_is_no_msg(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_the_hash_is_the_installed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The hash is that of the type itself, from its .json; a broken or missing one is no hash."""
+    """The hash is that of the type itself, from its .json; a broken or missing one is not a hash."""
     told = {
         'type_hashes': [
             {'type_name': 'zoo/msg/Other', 'hash_string': 'no'},

@@ -89,7 +89,7 @@ def test_an_older_definition_of_a_nested_message(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('type_name', ['nobody_msgs/msg/Nothing', '../../etc/msg/passwd', 'std_msgs/String', '', 'a/srv/B'])
 def test_unknown_types(ros: Any, type_name: str) -> None:
-    """A type without a definition, or that is no message type's name, is rejected every time and has no header."""
+    """A type without a definition, or that is not a message type's name, is rejected every time and has no header."""
     assert [reason_of(ros.types, type_name, b'\0\1\0\0') for _ in range(2)] == ['unknown_type'] * 2
     assert not ros.types.has_header(type_name)
 
@@ -97,7 +97,7 @@ def test_unknown_types(ros: Any, type_name: str) -> None:
 @pytest.mark.parametrize(
     'texts',
     [
-        {'A': 'this is no definition'},
+        {'A': 'this is not a definition'},
         {'A': 'other_msgs/Missing x\n'},
         {'A': 'B b\n', 'B': 'A a\n'},
         {'A': 'wstring text\n'},
@@ -113,7 +113,7 @@ def test_unusable_definitions(tmp_path: Path, texts: dict[str, str]) -> None:
 
 
 def test_a_definition_that_is_no_text(tmp_path: Path) -> None:
-    """A definition file that is no UTF-8 makes its type unknown."""
+    """A definition file that is not UTF-8 makes its type unknown."""
     (define(tmp_path, 'bad_msgs', A='') / 'share/bad_msgs/msg/A.msg').write_bytes(b'\xff\xfe\0')
     assert reason_of(MessageTypes([tmp_path]), 'bad_msgs/msg/A', b'\0\1\0\0') == 'unknown_type'
 
@@ -127,7 +127,7 @@ def test_a_nested_type_is_usable_by_itself(ros: Any) -> None:
 
 
 def test_bad_text_does_not_lose_the_message(ros: Any) -> None:
-    """Bytes that are no UTF-8 become U+FFFD; the rest of the message, arrays too, is what it was."""
+    """Bytes that are not UTF-8 become U+FFFD; the rest of the message, arrays too, is what it was."""
     names = ['ankle', 'knee']
     cdr = ros.cdr('sensor_msgs/msg/JointState', header=HEADER, name=names, position=np.array([1.5, 2.5]))
     message = ros.types.deserialize('sensor_msgs/msg/JointState', cdr.replace(b'ankle', b'an\xff\xc3e'))

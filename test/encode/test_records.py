@@ -51,7 +51,7 @@ def document(encoding: Any) -> Any:
     """The object's content, read by Python's own strict reader."""
 
     def refuse(word: str) -> None:
-        raise AssertionError(f'{word} is no JSON')
+        raise AssertionError(f'{word} is not JSON')
 
     return json.loads(encoding.object.body, parse_constant=refuse)
 

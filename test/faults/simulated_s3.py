@@ -149,7 +149,7 @@ class Line:
         elif fault is Fault.HUNG and self._rng.random() < 0.5:  # it is on its way still, somewhere
             self._time.after(self._rng.uniform(1.0, LATEST_S), lambda: self._land(reach))
         self._fail(fault, where)
-        raise AssertionError(f'{fault} is no failure')
+        raise AssertionError(f'{fault} is not a failure')
 
     def _land(self, reach: Callable[[Fault], object]) -> None:
         """It reaches the server, and nobody learns what the server says."""

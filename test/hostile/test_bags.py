@@ -124,7 +124,7 @@ FINE = {'storage': 'mcap', 'duration': '5', 'start': '7', 'name': '/a', 'qos': '
 def test_metadata_that_are_none_are_damaged(changed: dict[str, str]) -> None:
     """Aliases that stand for more than there is memory, depth, dates that no clock shows, lists for texts."""
     assert of_metadata(YAML.format(**FINE).encode(), 'x').messages == 1
-    with pytest.raises(BagDamaged, match='no metadata'):
+    with pytest.raises(BagDamaged, match='metadata'):
         of_metadata(YAML.format(**{**FINE, **changed}).encode(), 'x')
 
 

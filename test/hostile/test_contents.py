@@ -87,7 +87,7 @@ def test_a_picture_that_is_too_large_is_refused_by_its_header(tmp_path: Path, ma
     assert 'it claims 12,000 x 12,000 pixels' in ran.stdout, ran.stderr
     with pytest.raises(ValueError, match='none of 1 frames'):
         contact_sheet([LoggedFrame(NOON_NS, 1, tmp_path / 'evil')], '', NOON_NS, tmp_path / 'sheet.jpg')
-    assert MOST_PIXELS >= 7680 * 4320, '8K is no bomb'
+    assert MOST_PIXELS >= 7680 * 4320, '8K is not a bomb'
 
 
 def test_only_formats_of_ours_are_tried() -> None:
@@ -95,7 +95,7 @@ def test_only_formats_of_ours_are_tried() -> None:
     for kind in ('GIF', 'BMP', 'EPS', 'PDF', 'ICO'):
         file = io.BytesIO()
         Image.new('RGB', (8, 8)).save(file, kind)
-        with pytest.raises(LakeError, match='no image'):
+        with pytest.raises(LakeError, match='not an image'):
             decode.image(file.getvalue())
 
 
@@ -122,7 +122,7 @@ def pcd(**changed: str) -> bytes:
 def test_a_cloud_has_the_points_that_are_there(changed: dict[str, str]) -> None:
     """What its header claims beyond that is an error."""
     assert decode.cloud(pcd()).shape == (2, 4)
-    with pytest.raises(LakeError, match='no PCD'):
+    with pytest.raises(LakeError, match='not a PCD'):
         decode.cloud(pcd(**changed))
 
 
@@ -259,5 +259,5 @@ def test_documents_have_an_end() -> None:
     for text in ('[' * 200_000, '- ' * 100_000, ' ' * (5 << 20), 'a: &b [1]\nc: *b', '[' + 'a,' * 300 + ']' * 50):
         with pytest.raises(ValueError, match=r'.'):
             from_yaml(text)
-    with pytest.raises(ValueError, match='nobody here knows'):
+    with pytest.raises(ValueError, match='is not supported'):
         unpacked('brotli', b'', 5)

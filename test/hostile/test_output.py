@@ -1,4 +1,4 @@
-"""What a robot wrote is printed as text: it moves no cursor, is no formula, and stays on its line, whatever it is read by."""
+"""What a robot wrote is printed as text: it moves no cursor, is not a formula, and stays on its line, whatever it is read by."""
 
 from __future__ import annotations
 

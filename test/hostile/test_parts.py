@@ -177,7 +177,7 @@ def test_a_compacted_part_that_lies_about_its_sources_costs_itself_alone(home: P
 
 
 def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None:
-    """Folders that are no dates, and names that are no robots, are no part of the catalogue."""
+    """Folders that are not dates, and names that are not robots, are not part of the catalogue."""
     before = good(home)
     root = home / 'store' / schema.BUCKET
     for folder in (

@@ -54,7 +54,7 @@ def test_a_data_set_reads_nothing_outside(tmp_path: Path, key: str, is_fetched: 
     bad_parts.put(folder_store(tmp_path), parts.encode([told]))
     frames = lake.MissionDataset(root if is_fetched else Bucket(folder_store(tmp_path), schema.BUCKET))
     assert len(frames) == 1
-    with pytest.raises((StoreError, LakeError), match='no path'):
+    with pytest.raises((StoreError, LakeError), match='not a path'):
         frames[0]
 
 

@@ -248,7 +248,7 @@ def test_sql_sees_gaps_and_watermarks(store: StoreSettings, tmp_path: Path) -> N
 
 
 def test_the_catalogue_does_not_see_the_journal(store: StoreSettings, tmp_path: Path) -> None:
-    """Its parts are no part of the catalogue, and no object that lacks a row."""
+    """Its parts are not part of the catalogue, and no object that lacks a row."""
     tell(store, tmp_path, mark(60))
     source = Bucket(store, BUCKET)
     assert lake.objects(source).count_rows() == 0

@@ -229,7 +229,7 @@ def test_a_real_kill(tmp_path: Path, after: int) -> None:
 
 
 def test_names_are_kept_apart(tmp_path: Path, opened: bytes) -> None:
-    """A file that is no open slice is refused, and a whole slice is never written over."""
+    """A file that is not an open slice is refused, and a whole slice is never written over."""
     (tmp_path / 'bag_0.mcap.open').write_bytes(opened)
     (tmp_path / 'bag_0.mcap').write_bytes(b'whole')
     with pytest.raises(FileExistsError):

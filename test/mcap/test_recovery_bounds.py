@@ -73,7 +73,7 @@ def test_records_of_any_kind(tmp_path: Path, records: list[tuple[int, int, bytes
 @HOSTILE
 @given(st.binary(max_size=200), NUMBERS, st.sampled_from(['', 'zstd', 'lz4', 'x']), st.booleans())
 def test_chunks_of_any_kind(tmp_path: Path, data: bytes, size: int, compression: str, packs: bool) -> None:
-    """A chunk with a checksum that holds, but whose content is no messages, is left out."""
+    """A chunk with a checksum that holds, but whose content is not messages, is left out."""
     packed = zstd.compress(data) if packs else data
     content = chunk(packed, size=len(data) if size == 1 else size, compression=compression, crc=zlib.crc32(data))
     info = recovered(tmp_path, head() + declared() + content)

@@ -113,7 +113,7 @@ IN_WORDS = """- history: unknown
 
 
 def test_qos_in_words_becomes_numbers() -> None:
-    """Those of rmw/types.h, with all else as it was; numbers stay, and so does what is no QoS at all."""
+    """Those of rmw/types.h, with all else as it was; numbers stay, and so does what is not a QoS at all."""
     first, second = yaml.safe_load(in_numbers(IN_WORDS))
     assert first == yaml.safe_load(IN_WORDS)[0] | {'history': 3, 'reliability': 1, 'durability': 1, 'liveliness': 3}
     assert second == {'history': 1, 'depth': 7, 'reliability': 2, 'durability': 2, 'liveliness': 1}

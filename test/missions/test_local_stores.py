@@ -56,7 +56,7 @@ def test_a_mission_sent_twice_is_there_once(tracking: MlflowTracking, tmp_path: 
 
 @pytest.mark.parametrize('uri', ['nosuch://tower', 'tower:5001'])
 def test_an_address_that_this_mlflow_cannot_do_with_is_waited_for(uri: str) -> None:
-    """As sqlite: is for mlflow-skinny. It is no refusal of a mission: the sender lives, and says what is to be set."""
+    """As sqlite: is for mlflow-skinny. It is not a refusal of a mission: the sender lives, and says what is to be set."""
     with pytest.raises(TrackingUnavailable, match='set MLFLOW_TRACKING_URI to a server'):
         MlflowTracking(uri, 'thor_missions').open()
 

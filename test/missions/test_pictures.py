@@ -68,7 +68,7 @@ def test_a_picture_that_cannot_be_made_costs_only_itself(tmp_path: Path) -> None
     folder.floor.write_bytes(b'no array')
     notes = make(folder, 'patrol_1')
     assert notes == {
-        'camera_summary.jpg': '1 of 3 frames are no pictures', 'trajectory.png': notes['trajectory.png'], 'battery.png': '',
+        'camera_summary.jpg': '1 of 3 frames are not pictures', 'trajectory.png': notes['trajectory.png'], 'battery.png': '',
     }  # fmt: skip
     assert notes['trajectory.png'].startswith('not made: ')
     assert sorted(path.name for path in folder.files.iterdir() if path.name in NAMES) == ['battery.png', 'camera_summary.jpg']

@@ -228,7 +228,7 @@ def test_a_second_one_waits_and_ends_with_its_agent(tmp_path: Path) -> None:
 
 
 def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sender that dies is replaced after a pause, it is no zombie meanwhile, and none is left after its logger."""
+    """A sender that dies is replaced after a pause, it is not a zombie meanwhile, and none is left after its logger."""
     monkeypatch.setattr('shadowhound_data_logger.missions.child.AGAIN_S', 0.1)
     monkeypatch.setattr('shadowhound_data_logger.missions.child.sys.executable', '/bin/false')
     logger = MissionDataLogger(home=tmp_path, start_timeout_s=0.0)

@@ -271,7 +271,7 @@ def test_close_does_not_wait_longer_than_its_deadline_for_a_put_that_hangs(
 
 
 def test_drain_gives_up_at_its_deadline(spool: FakeSpool, start: Start) -> None:
-    """A put that hangs is no outage yet."""
+    """A put that hangs is not an outage yet."""
     spool.add()
     store = Hanging()
     uploader = start(store)

@@ -92,7 +92,7 @@ def good(scene: Scene) -> Scene:
 
 
 def test_an_audit_of_what_is_well_has_no_problems(good: Scene) -> None:
-    """Objects and samples are counted, messages before the match are told apart, an unlogged topic is no problem."""
+    """Objects and samples are counted, messages before the match are told apart, an unlogged topic is not a problem."""
     found = good.audit()
     assert found.problems == ()
     assert (found.read_back, found.samples, found.rows) == (4, 5, 3)

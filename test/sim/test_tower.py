@@ -123,7 +123,7 @@ def test_two_run_side_by_side(seaweed: Tower, tmp_path: Path) -> None:
 @pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
 def test_it_leaves_nothing_but_its_folder(tmp_path: Path) -> None:
-    """After stop there is no process and no socket of it; stopping twice and starting twice is no error."""
+    """After stop there is no process and no socket of it; stopping twice and starting twice is not an error."""
     tower = Tower(tmp_path)
     tower.start()
     tower.start()

@@ -145,7 +145,7 @@ def test_a_node_that_stands_still() -> None:
 
 
 def test_what_the_network_held_for_a_node_that_stood_still() -> None:
-    """It comes in several drains. The gap may be longer than the time between these, and is no step of a clock."""
+    """It comes in several drains. The gap may be longer than the time between these, and is not a step of a clock."""
     sent = even(1000)
     ear = Ear().hear(sent[:500])
     held, later = sent[500:550], sent[650:]

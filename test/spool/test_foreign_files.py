@@ -46,7 +46,7 @@ def test_names_that_cannot_be_keys(opened: Open, root: Path, used: dict[str, byt
 
 
 def test_files_outside_the_buckets_are_left_alone(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """What lies beside the buckets, in incoming under a foreign name or is no file is nobody's object."""
+    """What lies beside the buckets, in incoming under a foreign name or is not a file is nobody's object."""
     (root / 'ready/README').write_text('mine')
     (root / 'held/clock.txt').write_text('mine')
     (root / 'incoming/notes.txt').write_text('mine')

@@ -123,7 +123,7 @@ def test_what_came_with_numbers_in_between_is_not_missed(opened: Open, root: Pat
 
 
 def test_another_declaration_is_another_rhythm(opened: Open, root: Path) -> None:
-    """A counter's value is no stamp."""
+    """A counter's value is not a stamp."""
     session(opened, 300, at=0)
     spool = opened()
     with spool.accounts.entry(TOPIC) as account:

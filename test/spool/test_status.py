@@ -87,7 +87,7 @@ class Ahead(SystemClock):
 
 @pytest.mark.parametrize('content', ['', '{"robot": "th', '[]', '{"topics": 3}', '{"store": null, "queue": []}', '\x00\x00'])
 def test_half_a_file_is_none(tmp_path: Path, content: str) -> None:
-    """A power cut may leave anything of a file that is never synced: that is no error."""
+    """A power cut may leave anything of a file that is never synced: that is not an error."""
     file(tmp_path, 'thor').write_text(content)
     assert state(tmp_path) == 'not_running'
 
@@ -182,7 +182,7 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
         (
             {'bag': {'topics': {'/map': {'type': 'A', 'other_types': {'B': {'publishers': [], 'messages': None}}}}}},
             (
-                '/map was published as B too, by a program that is no ROS node, and is logged as A alone; '
+                '/map was published as B too, by a program that is not a ROS node, and is logged as A alone; '
                 'nobody listened to it: how many messages is not known'
             ),
         ),

@@ -88,7 +88,7 @@ def test_what_was_delivered_is_there(store: ObjectStore, spooled: Spool, bucket:
 
 
 def test_the_catalogues_parts_are_not_asked_for(spooled: Spool) -> None:
-    """They go once a larger part stands for them: one that is gone is no finding, and none is counted."""
+    """They go once a larger part stands for them: one that is gone is not a finding, and none is counted."""
     store = MemoryStore()
     part = replace(make('thor/_catalog/date=2026-11-21/a.parquet'), sensor='_catalog', topic=None, samples=0)
     settle(spooled, *put(spooled, part), State.DELIVERED)
@@ -143,7 +143,7 @@ def paged(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures('paged')
 @pytest.mark.parametrize('error', [StoreUnavailable('away'), CredentialsRejected('wrong key')])
 def test_an_audit_that_was_cut_short_goes_on(spooled: Spool, error: StoreError) -> None:
-    """A store that goes away is no finding; the next run asks for the rest, for what came since, and for what was found."""
+    """A store that goes away is not a finding; the next run asks for the rest, for what came since, and for what was found."""
     store = MemoryStore()
     items = deliver(spooled, store, 'bucket', *(f'{number:02d}' for number in range(45)))
     remove(store, items[3])
@@ -172,7 +172,7 @@ def test_another_audit_begins_anew(spooled: Spool) -> None:
 
 
 def test_a_store_that_fails_in_passing_is_asked_again(spooled: Spool) -> None:
-    """A request that is throttled now and then is no reason to end."""
+    """A request that is throttled now and then is not a reason to end."""
     store = MemoryStore()
     deliver(spooled, store, 'bucket', *(f'{number:02d}' for number in range(30)))
     asked = iter(range(1000))

@@ -74,7 +74,7 @@ def test_list_is_in_key_order_and_under_the_prefix(store: ObjectStore, spool: Sp
 
 
 def test_list_below_an_object_is_empty(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """It is no folder."""
+    """It is not a folder."""
     store.put(spool('thor/a', b'x'))
     assert list(store.list(bucket, 'thor/a/')) == []
 
@@ -104,7 +104,7 @@ def test_folders_are_the_names_right_below(store: ObjectStore, spool: Spool, buc
 
 
 def test_deleted_is_gone(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """With what was said of it; twice is no error, and the key is free again."""
+    """With what was said of it; twice is not an error, and the key is free again."""
     store.put(spool('a/b', b'x'))
     for _ in range(2):
         store.delete(bucket, 'a/b')
@@ -230,7 +230,7 @@ def test_a_probe_of_a_store_that_is_there_is_no_error(store: ObjectStore, spool:
 
 
 def test_open_and_close_may_be_repeated(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Opening twice is one opening, closing twice is no error, and what was stored is there at the next opening."""
+    """Opening twice is one opening, closing twice is not an error, and what was stored is there at the next opening."""
     store.open()
     store.put(spool('a', b'x'))
     store.close()

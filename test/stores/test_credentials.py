@@ -157,7 +157,7 @@ def test_a_put_goes_on_with_new_keys(
     file: File, opened: Callable[..., S3Store], spool: Spool, seaweed: Tower, monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    """A refusal, of a whole object or of one in parts, is no failure where other keys are in the file by now."""
+    """A refusal, of a whole object or of one in parts, is not a failure where other keys are in the file by now."""
     caplog.set_level(logging.DEBUG)
     good = seaweed.store_settings()
     store = opened(dataclasses.replace(good, access_key_id=None, secret_access_key=None))

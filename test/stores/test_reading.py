@@ -114,7 +114,7 @@ def test_what_is_not_what_was_asked_for_is_no_file(
     """Of another size or content than the caller knows: refused the second time, and nothing stays."""
     store.put(spool(KEY, CONTENT))
     told: list[int] = []
-    with pytest.raises(ObjectRefused, match='has not the content') as caught:
+    with pytest.raises(ObjectRefused, match='does not match its metadata') as caught:
         download(store, wanted(bucket, **how), tmp_path / 'a.mcap', tell=told.append)
     assert caught.value.data['reason'] == 'damaged'
     assert list(tmp_path.glob('*.mcap*')) == []

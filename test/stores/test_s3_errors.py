@@ -86,7 +86,7 @@ FAILURES: tuple[tuple[Exception, type[StoreError], str], ...] = (
     (boto.HTTPClientError(error='x'), StoreUnavailable, 'HTTPClientError'),
     (boto.NoCredentialsError(), CredentialsRejected, 'there are no credentials'),
     (boto.PartialCredentialsError(provider='env', cred_var='x'), CredentialsRejected, 'there are no credentials'),
-    (boto.ParamValidationError(report='Non ascii characters found in S3 metadata'), ObjectRefused, 'no plain text'),
+    (boto.ParamValidationError(report='Non ascii characters found in S3 metadata'), ObjectRefused, 'not plain text'),
     (boto.ParamValidationError(report='Invalid bucket name "A"'), BucketMissing, 'lower-case'),
     (ResponseParserError('x'), StoreUnavailable, 'like an S3 server'),
     (ValueError("invalid literal for int() with base 10: ''"), StoreUnavailable, 'like an S3 server'),

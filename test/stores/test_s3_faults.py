@@ -60,7 +60,7 @@ def test_no_more_after_leave_to_send(opened: Callable[..., S3Store], spool: Spoo
 
 
 def test_an_unknown_name(opened: Callable[..., S3Store], spool: Spool) -> None:
-    """A host name that does not resolve is no outage of the server."""
+    """A host name that does not resolve is not an outage of the server."""
     said = error_of(StoreUnavailable, opened('http://tower.invalid:9000', IMPATIENT).probe)
     assert 'the name of Tower at http://tower.invalid:9000 cannot be resolved' in said
 

@@ -38,7 +38,7 @@ class Wire(ThreadingHTTPServer):
         self.keys: set[str] = set()
 
     def handle_error(self, *_: object) -> None:
-        """A client that went away is no error of ours."""
+        """A client that went away is not an error of ours."""
 
 
 class _Handler(BaseHTTPRequestHandler):

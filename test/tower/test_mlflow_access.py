@@ -266,7 +266,7 @@ def test_no_other_spelling_of_a_run_passes(users: dict[str, User], run: dict[str
 
 
 def test_a_model_of_another_is_not_deleted_by_a_body_that_is_not_checked(users: dict[str, User]) -> None:
-    """MLflow's check reads the address of a DELETE whose body says that it is no JSON; its handler reads the body."""
+    """MLflow's check reads the address of a DELETE whose body says that it is not JSON; its handler reads the body."""
     spark, api = users['spark'], '/api/2.0/mlflow/registered-models'
     spark.send('POST', f'{api}/create', {'name': 'decoy'})
     users['tower'].send('POST', f'{api}/create', {'name': 'kept'})
