@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -81,6 +82,7 @@ class Desk:
         with self.spool.accounts.entry(f'{BAG}{topic}') as account:
             for message in heard.messages:
                 assert account.receive(message.publisher, message.number)
+            account.gaps.heard_ns = heard.messages[-1].source_ns
         dropped = self.queue.put(heard)
         if dropped:
             self.spool.accounts.drop(f'{BAG}{topic}', 'queue_full', dropped)
@@ -144,6 +146,27 @@ def numbers(path: Path) -> list[int]:
         return [
             int(message.data[4:12]) for *_, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False)
         ]
+
+
+def missing(said: Mapping[str, Any]) -> Counter[tuple[str, str]]:
+    """By topic and reason, the messages that a manifest counts as missing."""
+    found = Counter[tuple[str, str]]()
+    for each in said['missing']:
+        if each['messages'] is not None:
+            found[each['topic'], each['reason']] += each['messages']
+    return found
+
+
+def journaled(root: Path, sink: str, robot: str = ROBOT) -> Counter[tuple[str, str]]:
+    """By topic and cause, the messages that the gap journal of a spool has of a sink; each row has its times."""
+    found = Counter[tuple[str, str]]()
+    for row in ledger.journal(root, robot):
+        if row.sink == sink:
+            assert row.from_ns is not None
+            assert row.to_ns is not None
+            assert row.kind == 'dropped'
+            found[row.topic, row.cause] += row.count or 0
+    return found
 
 
 def manifest(found: dict[str, Path], bag: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from bags.eventing import Buffer, buffer, in_bag, only_bag, until
-from bags.recording import WAIT_S, manifest
+from bags.recording import WAIT_S, journaled, manifest, missing
 from bags.test_recorder import kill
 from clocks import Clocks
 
@@ -48,7 +48,7 @@ def test_what_had_to_go_before_it_was_written_is_dropped(tmp_path: Path, monkeyp
         assert (row['received'], row['stored'], row['dropped'], row['missed']) == (35, 25, {'ring_full': 10}, 0)
         assert in_bag(it, only_bag(it)) == [*range(5), *range(15, 35)]
         said = manifest(it.objects(), only_bag(it))
-        assert sum(lost['messages'] for lost in said['missing']) == 10
+        assert missing(said) == journaled(it.spool.root, 'events') == {('/talk', 'ring_full'): 10}
 
 
 def test_it_takes_from_the_ring_what_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,7 +84,7 @@ def test_a_disk_without_room_costs_the_event_and_nothing_else(tmp_path: Path) ->
         it.written(2)
         kept, lost = it.bags()
         assert in_bag(it, kept) == list(range(5, 10))
-        assert [one['messages'] for one in manifest(it.objects(), lost)['missing']] == [5]
+        assert missing(manifest(it.objects(), lost)) == journaled(it.spool.root, 'events') == {('/talk', 'no_room'): 5}
 
 
 def test_a_folder_that_cannot_be_made_costs_the_event(tmp_path: Path) -> None:
@@ -134,6 +134,8 @@ def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path) -> N
         assert [one['name'] for one in said['event']['triggers']] == ['fall', 'low_battery']
         row = it.rows()['/talk']
         assert (row['received'], row['stored'], row['open'], row['dropped']) == (15, 10, 0, {'restart': 5})
+        assert said['missing'][-1]['messages'] is None  # how many is known of all its topics, not of the bag
+        assert journaled(it.spool.root, 'events') == {('/talk', 'restart'): 5}
         assert not list(it.root.iterdir())
         it.hear(range(20, 25))
         it.events.trigger('after', 'service')

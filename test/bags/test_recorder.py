@@ -11,7 +11,7 @@ from unittest.mock import Mock
 
 import pytest
 from bags.eventing import until
-from bags.recording import ROBOT, STRING, desk, lot, manifest, mission, numbers, start, write_out
+from bags.recording import ROBOT, STRING, desk, journaled, lot, manifest, mission, numbers, start, write_out
 from clocks import Clocks
 from mcap.reader import make_reader
 
@@ -255,6 +255,7 @@ def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path, sync
         assert said['missing'][-1]['what'].startswith('what was in memory')
         row = it.row()
         assert (row['stored'], row['open'], row['dropped']) == ((30, 0, {}) if synced else (10, 0, {'restart': 20}))
+        assert journaled(it.spool.root, 'bags') == ({} if synced else {('/talk', 'restart'): 20})
         assert not list(it.root.iterdir())
 
 

@@ -10,7 +10,7 @@ from io import BytesIO
 from pathlib import Path
 
 import pytest
-from bags.recording import ROBOT, Desk, desk, manifest, numbers, start, write_out
+from bags.recording import ROBOT, Desk, desk, journaled, manifest, missing, numbers, start, write_out
 from clocks import Clocks
 from pyarrow.parquet import read_table
 
@@ -59,9 +59,6 @@ def test_the_manifest_and_what_the_store_is_told_of_gaps_agree(tmp_path: Path) -
         it.recorder.stop()
         it.row()
         bag = manifest(it.objects(), name)
-        said = Counter[tuple[str, str]]()
-        for missing in bag['missing']:
-            said[missing['topic'], missing['reason']] += missing['messages']
         told = Counter[tuple[str, str]]()
         for part in CatalogueWriter(it.spool.root, CatalogueSettings(), ROBOT, Clocks()).parts():
             assert isinstance(part.body, bytes)
@@ -69,7 +66,7 @@ def test_the_manifest_and_what_the_store_is_told_of_gaps_agree(tmp_path: Path) -
                 if row['what'] == 'gap':
                     assert (row['sink'], row['kind']) == ('bags', 'dropped')
                     told[row['topic'], row['cause']] += row['count']
-        assert told == said == {('/talk', 'no_room'): 5, ('/other', 'no_room'): 3}
+        assert told == missing(bag) == {('/talk', 'no_room'): 5, ('/other', 'no_room'): 3}
 
 
 def _retry(it: Desk) -> None:
@@ -121,6 +118,7 @@ def test_a_disk_that_refuses_costs_what_it_did_not_take(
         assert said['state'] == ('gaps' if said['missing'] else 'complete')
         assert sum(each['messages'] for each in said['missing']) == 20 - len(kept)
         assert all((each['topic'], each['reason']) == ('/talk', reason) for each in said['missing'])
+        assert journaled(it.spool.root, 'bags') == missing(said)
         assert ledger.imbalances(ledger.read(it.spool.root, ROBOT)) == []
 
 

@@ -6,6 +6,7 @@ import sqlite3
 from typing import Any
 
 import pytest
+from bags.recording import journaled, missing
 from e2e.bag_reading import BUCKET, bags
 from e2e.processes import Processes, until
 from e2e.reading import STRING, TYPES, decode, texts
@@ -107,6 +108,7 @@ def test_the_services_begin_pause_split_and_end_a_bag(
     assert [int(decode(STRING, message.cdr).data) for message in bag.messages()] == [*range(20), *range(30, 40)]
     assert [said['messages'] for said in bag.manifest['slices']] == [20, 10]
     assert ledger['bags']['/b_one']['dropped'] == {'paused': 10}
+    assert missing(bag.manifest) == journaled(node.home / 'spool', 'bags') == {('/b_one', 'paused'): 10}
     assert '/b_one' not in ledger['topics']
     assert not list((processes.folder / 'home' / 'bags' / processes.robot).iterdir())
 
