@@ -17,7 +17,7 @@ from _report import Bar, Report, main, progress
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import missions
-from shadowhound_data_logger.missions.objects import Shelf
+from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.tracking import ENVIRONMENT, MlflowTracking
 from shadowhound_data_logger.sim.tower import Tower
 
@@ -50,7 +50,7 @@ def replayed(uri: str, home: Path, points: int) -> float:
     logger.close()
     tracking = MlflowTracking(uri, 'thor_missions')
     tracking.open()
-    delivery = Delivery(next(missions(home)), tracking, Shelf.__new__(Shelf))
+    delivery = Delivery(next(missions(home)), tracking, Spooler.__new__(Spooler))
     began = time.perf_counter()
     while delivery.track():
         pass

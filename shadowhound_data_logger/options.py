@@ -213,7 +213,7 @@ class EventSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoreSettings:
-    """Where objects go: an S3 server, or without an endpoint a folder of the same layout (D13)."""
+    """Where objects go: an S3 server, or without an endpoint a folder of the same layout."""
 
     endpoint_url: str | None = None
     access_key_id: str | None = field(default=None, repr=False)

@@ -19,7 +19,7 @@ import pytest
 from bags.eventing import until
 from bags.recording import desk, manifest, numbers
 from clocks import Clocks
-from missions.fakes import FakeShelf, FakeTracking
+from missions.fakes import FakeSpooler, FakeTracking
 from spool.making import assert_whole, make, new_spool, put, rows
 
 from shadowhound_data_logger.errors import SpoolError
@@ -114,26 +114,26 @@ def test_missions_go_on(tmp_path: Path, version: int) -> None:
     """One that was half sent gets the rest and nothing twice; one whose agent died is sent whole, and ended as KILLED."""
     restored(version, tmp_path)
     half, dead = sorted(missions(tmp_path), key=lambda folder: folder.run() is None)
-    tracking, shelf = sent(half)
+    tracking, spooler = sent(half)
     points = Counter(point.key for point in tracking.points)
     assert (points['a'], points['late'], points['success']) == (0, 1, 1)
     assert (tracking.runs, [run[:2] for run in tracking.finished]) == ({}, [('run0', 'FINISHED')])
-    assert {name.rpartition('/')[2] for name in shelf.names()} == {'frame_000001.jpg', 'summary.json'}
+    assert {name.rpartition('/')[2] for name in spooler.names()} == {'frame_000001.jpg', 'summary.json'}
     assert tracking.artifacts['camera/frame_000001.jpg'] == b'\xff\xd8 frame \xff\xd9'
-    tracking, shelf = sent(dead)
+    tracking, spooler = sent(dead)
     assert [point.value for point in tracking.points if point.key == 'b'] == [0.0, 1.0, 2.0]
     assert [status for _, status, _ in tracking.finished] == ['KILLED']
     for folder in (half, dead):
         assert sent(folder)[0] == FakeTracking(), 'nothing is sent again'
 
 
-def sent(folder: MissionFolder) -> tuple[FakeTracking, FakeShelf]:
+def sent(folder: MissionFolder) -> tuple[FakeTracking, FakeSpooler]:
     """What a sender of today sends of it, to the end."""
-    tracking, shelf = FakeTracking(), FakeShelf()
-    delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
+    tracking, spooler = FakeTracking(), FakeSpooler()
+    delivery = Delivery(folder, tracking, spooler)  # type: ignore[arg-type]
     for _ in range(50):
-        if folder.sent().complete or ([delivery.track(), delivery.attach(), delivery.shelve()] and delivery.complete()):
-            return tracking, shelf
+        if folder.sent().complete or ([delivery.track(), delivery.attach(), delivery.spool()] and delivery.complete()):
+            return tracking, spooler
     raise AssertionError(f'{folder.path} is not sent')
 
 

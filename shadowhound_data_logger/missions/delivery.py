@@ -25,7 +25,7 @@ from shadowhound_data_logger.missions.batch import send
 from shadowhound_data_logger.missions.drawing import Pictures, nothing
 from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, Run, stamped, write_json
 from shadowhound_data_logger.missions.journal_delivery import JournalDelivery
-from shadowhound_data_logger.missions.objects import Shelf
+from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.story import FRAMES, KILLED, Point, Story, summary_of
 from shadowhound_data_logger.missions.tracking import Tracking
 from shadowhound_data_logger.missions.values import MAX_TAG
@@ -40,12 +40,14 @@ NODE_S: Final = 30.0
 
 
 class Delivery:
-    """Life: New; ``track``, ``attach`` and ``shelve`` in turns, until ``sent.complete``. Not thread-safe.
+    """Sends one mission: points and state to MLflow, artifacts, and objects to the spool.
+
+    Life: New; ``track``, ``attach`` and ``spool`` in turns, until ``sent.complete``. Not thread-safe.
 
     The three do a bounded piece of work and say whether there was any. They raise TrackingError, SpoolError or OSError.
     """
 
-    def __init__(self, folder: MissionFolder, tracking: Tracking, shelf: Shelf, pictures: Pictures = nothing,
+    def __init__(self, folder: MissionFolder, tracking: Tracking, spooler: Spooler, pictures: Pictures = nothing,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
         self.folder = folder
         self.run: Run | None = folder.run()
@@ -54,7 +56,7 @@ class Delivery:
         self._story = self._agent.story
         self._story.node = self._node.story
         self._tracking = tracking
-        self._shelf = shelf
+        self._spooler = spooler
         self._pictures = pictures
         self._monotonic = monotonic
         self._asked_s: float | None = None
@@ -95,11 +97,11 @@ class Delivery:
         self._node.attach(rest, send, ARTIFACTS_A_STEP - done)
         return (self._agent.sent, self._node.sent) != before
 
-    def shelve(self, *, hold: bool = False) -> bool:
+    def spool(self, *, hold: bool = False) -> bool:
         """Hand the next frames, trajectories and the summary to the spool; without a run only with ``hold``, to be held there."""
         self._recall()
         if self.run is not None and self.sent.held:
-            if not self._shelf.bind(self.folder.mission_id, self.run.run_id):
+            if not self._spooler.bind(self.folder.mission_id, self.run.run_id):
                 self._agent.move(held=False)
             return True
         if self.run is None and not (hold and self._story.start):
@@ -112,7 +114,7 @@ class Delivery:
         rest = self._node.lines(self._node.sent.objects, self._node.sent.metrics if self.run else 0)
         left = OBJECTS_A_STEP - len(own.items), BYTES_A_STEP - own.bytes
         nodes = self._node.objects(rest, self._story.start, self.run, *left)
-        self._shelf.add([item.content for item in (*own.items, *nodes.items)])
+        self._spooler.add([item.content for item in (*own.items, *nodes.items)])
         for part, batch in ((self._node, nodes), (self._agent, own)):
             part.move(objects=batch.end, missing=part.sent.missing + batch.missing)
         for item in own.items:

@@ -58,7 +58,7 @@ def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: Miss
     """What a record of the journal gives to the store; a file that is gone gives nothing. Raises OSError.
 
     ``files`` is where those of the journal lie, if not in the mission's own ``files/``. Without a run it is held under the
-    mission's id, which ``Shelf.bind`` replaces.
+    mission's id, which ``Spooler.bind`` replaces.
     """
     kind, robot, files = record.get('k'), start['robot'], files or folder.files
     home = f'{robot}/missions/{run.run_id if run else folder.mission_id}'
@@ -98,8 +98,11 @@ def _item(path: Path, bucket: str, key: str, time_ns: int, metadata: Mapping[str
     yield Item(content, path, is_done_with)
 
 
-class Shelf:
-    """The spool as missions use it. Life: New; add and drain any number; close once. Opened by the first ``add``; one thread."""
+class Spooler:
+    """Puts the objects of missions into the spool, and delivers them where no node does.
+
+    Life: New; add and drain any number of times; close once. Opened by the first ``add``; one thread.
+    """
 
     def __init__(self, settings: Settings, clock: Clock, *, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._settings = settings

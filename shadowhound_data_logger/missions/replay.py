@@ -30,7 +30,7 @@ from shadowhound_data_logger.missions.dating import give_date
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.drawing import Drawing
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, write_json
-from shadowhound_data_logger.missions.objects import Shelf
+from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.overview import LOCK, STATE
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
 from shadowhound_data_logger.retry import backoff
@@ -82,13 +82,13 @@ TRACKING, ARTIFACTS, OBJECTS, STORE = 'tracking', 'artifacts', 'objects', 'store
 class Replay:
     """All missions of one home. Life: New; step any number; close once. Not thread-safe."""
 
-    def __init__(self, home: Path, tracking: Tracking, shelf: Shelf, drawing: Drawing, *,
+    def __init__(self, home: Path, tracking: Tracking, spooler: Spooler, drawing: Drawing, *,
                  settle: Callable[[MissionFolder], bool] = lambda _: True, monotonic: Callable[[], float] = time.monotonic,
                  rng: random.Random | None = None) -> None:  # fmt: skip
         """``settle`` says whether the times of a mission are final."""
         self._home = home
         self._tracking = tracking
-        self._shelf = shelf
+        self._spooler = spooler
         self._drawing = drawing
         self._monotonic = monotonic
         self._progress = False
@@ -129,7 +129,7 @@ class Replay:
         try:
             self._try(TRACKING, delivery.track, mission_id)
             self._try(ARTIFACTS, delivery.attach, mission_id)
-            self._try(OBJECTS, lambda: delivery.shelve(hold=self.gates[TRACKING].error is not None), mission_id)
+            self._try(OBJECTS, lambda: delivery.spool(hold=self.gates[TRACKING].error is not None), mission_id)
             return delivery.complete()
         except TrackingRefused as error:
             log.error('mission %s is not sent on: %s', mission_id, error)  # noqa: TRY400 - no defect
@@ -144,14 +144,14 @@ class Replay:
     @property
     def owes(self) -> bool:
         """Whether something could not be sent yet."""
-        return any(gate.error for gate in self.gates.values()) or self._shelf.owes or self._drawing.busy or bool(self._waiting)
+        return any(gate.error for gate in self.gates.values()) or self._spooler.owes or self._drawing.busy or bool(self._waiting)
 
     def hurry(self) -> None:
         for gate in self.gates.values():
             gate.hurry()
 
     def close(self) -> None:
-        self._shelf.close()
+        self._spooler.close()
         self._drawing.close()
         self._tell(ended=True)
 
@@ -171,7 +171,7 @@ class Replay:
             if folder.age_s() > KEEP_S:
                 shutil.rmtree(folder.path, ignore_errors=True)
         elif self._settle(folder):
-            self._deliveries[folder.mission_id] = Delivery(folder, self._tracking, self._shelf, self._drawing.of)
+            self._deliveries[folder.mission_id] = Delivery(folder, self._tracking, self._spooler, self._drawing.of)
             self._waiting.discard(folder.mission_id)
             self.gates[TRACKING].hurry()  # its agent waits for the run's id
         else:
@@ -209,9 +209,9 @@ class Replay:
 
     def _drain(self) -> bool:
         """True while there is more to deliver."""
-        before = self._shelf.pending()
-        self._shelf.drain()
-        return self._shelf.pending() < before
+        before = self._spooler.pending()
+        self._spooler.drain()
+        return self._spooler.pending() < before
 
     def _tell(self, *, ended: bool = False) -> None:
         """The state for whoever asks; written when it changes."""
@@ -291,7 +291,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         tracking = open_tracking(options.home, options.experiment)
         dating = Dating(clock, settings.clock.hold_s, lambda: clock_record.read(settings.spool_path, settings.robot)['offsets'])
         replay = Replay(
-            options.home, tracking, Shelf(settings, clock), Drawing(), settle=lambda folder: give_date(folder, dating)
+            options.home, tracking, Spooler(settings, clock), Drawing(), settle=lambda folder: give_date(folder, dating)
         )
         opened.callback(replay.close)
         run(replay, parent, lambda: bool(asked))

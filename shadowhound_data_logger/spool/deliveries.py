@@ -30,7 +30,10 @@ _Answer = TypeVar('_Answer')
 
 
 class Deliveries:
-    """Life: New; open once; use from one thread; close once. Errors are SpoolError, naming the file and what to do."""
+    """What the store confirmed, for an audit, and how far the audit came.
+
+    Life: New; open once; use from one thread; close once. Errors are SpoolError, naming the file and what to do.
+    """
 
     def __init__(self, spool: Path) -> None:
         self._index_path = spool / 'index.db'

@@ -85,7 +85,10 @@ class UncataloguedObject(NamedTuple):
 
 
 class Index:
-    """New; open once; close once. Methods that write belong to the owner of the spool's lock."""
+    """The spool's SQLite database.
+
+    New; open once; close once. Methods that write belong to the owner of the spool's lock.
+    """
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self._path = path

@@ -38,7 +38,10 @@ _TIMES: Final = (words.T_START_NS, words.T_END_NS)
 
 
 class Redating:
-    """New; ``date`` every object on its way to the spool, on any thread; ``step`` once a second, on one."""
+    """Holds objects while the clock is not set, and gives them their dates once it is.
+
+    New; ``date`` every object on its way to the spool, on any thread; ``step`` once a second, on one.
+    """
 
     def __init__(self, spool: Spool, watch: ClockWatch, record: ClockRecord, robot: str) -> None:
         self._spool = spool

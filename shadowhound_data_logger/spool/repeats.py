@@ -41,7 +41,10 @@ class Holder:
 
 
 class Repeats:
-    """Guarded by the spool's lock. It knows what this process stored: the first object after a start is always stored."""
+    """Finds content that a sensor has just stored, so that it is kept once.
+
+    Guarded by the spool's lock. It knows only what this process stored: the first object after a start is always stored.
+    """
 
     def __init__(self) -> None:
         self._last: dict[tuple[str, str, str | None], _Last] = {}

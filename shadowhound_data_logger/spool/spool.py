@@ -53,7 +53,9 @@ _LEFT: Final = frozenset({State.DELIVERED, State.DEDUPLICATED, State.EVICTED})
 
 
 class Spool:
-    """Life: New; open once; commit, pending, ... from any thread; close once.
+    """The durable queue on disk: objects, their states and the accounts, in one transaction.
+
+    Life: New; open once; commit, pending, ... from any thread; close once.
 
     ``_lock`` guards the writing connection and makes a commit and its renames one step for ``pending``.
     """

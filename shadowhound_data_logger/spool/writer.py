@@ -37,7 +37,10 @@ _Group = tuple[Sequence[DataObject], Sequence[Outcome]]
 
 
 class SpoolWriter:
-    """New; ``on_commit``; open once; put, settle, flush from any thread; close once. ``_changed`` guards the lists."""
+    """Collects objects and outcomes, and commits them on one thread.
+
+    New; ``on_commit``; open once; put, settle, flush from any thread; close once. ``_changed`` guards the lists.
+    """
 
     def __init__(self, spool: Spool, commit_s: float = COMMIT_S) -> None:
         self.spool = spool

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
-from missions.fakes import FakeShelf, FakeTracking, journalling
+from missions.fakes import FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.missions import missions
@@ -48,11 +48,11 @@ def see(home: Path, mission_id: str) -> None:
 
 
 def deliver(home: Path, mission_id: str) -> None:
-    delivery = Delivery(MissionFolder(home / MISSIONS / mission_id), FakeTracking(), FakeShelf())  # type: ignore[arg-type]
+    delivery = Delivery(MissionFolder(home / MISSIONS / mission_id), FakeTracking(), FakeSpooler())  # type: ignore[arg-type]
     while not delivery.complete():
         delivery.track()
         delivery.attach()
-        delivery.shelve()
+        delivery.spool()
 
 
 def test_without_a_mission_it_says_where_it_looked(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A tracking server and a shelf in memory that fail when they are told to."""
+"""A tracking server and a spooler in memory that fail when they are told to."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class FakeTracking:
 
 
 @dataclass
-class FakeShelf:
+class FakeSpooler:
     """What was spooled, each content once, as the spool's index sees to it."""
 
     objects: list[DataObject] = field(default_factory=list)

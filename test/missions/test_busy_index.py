@@ -18,7 +18,7 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.missions.folder import missions
-from shadowhound_data_logger.missions.objects import Shelf
+from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.replay import OBJECTS, Replay
 from shadowhound_data_logger.spool.spool import Spool
 
@@ -57,7 +57,7 @@ def test_a_busy_index_delays_the_delivery_and_no_call(tmp_path: Path, monkeypatc
     with closing(Spool(settings.spool_path, settings.spool, clock, 'thor')) as spool:
         spool.open()
     now_s = [0.0]
-    replay = Replay(tmp_path, FakeTracking(), Shelf(settings, clock), FakeDrawing(), monotonic=lambda: now_s[0],
+    replay = Replay(tmp_path, FakeTracking(), Spooler(settings, clock), FakeDrawing(), monotonic=lambda: now_s[0],
                     rng=random.Random(1))  # type: ignore[arg-type]  # fmt: skip
     with closing(MissionDataLogger(home=tmp_path, replay=False, start_timeout_s=0.0)) as logger:
         logger.start_mission('patrol', '')

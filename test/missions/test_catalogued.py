@@ -12,7 +12,7 @@ from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.missions.folder import Run, missions
 from shadowhound_data_logger.missions.journal import read
-from shadowhound_data_logger.missions.objects import Shelf, objects_of
+from shadowhound_data_logger.missions.objects import Spooler, objects_of
 
 
 def test_an_agent_alone_writes_the_catalogue(tmp_path: Path) -> None:
@@ -24,15 +24,15 @@ def test_an_agent_alone_writes_the_catalogue(tmp_path: Path) -> None:
     records = [line.record or {} for line in read(folder.journal)]
     (frame,) = (record for record in records if record['k'] == 'frame')
     marked = {**frame, 'marks': {'pose': '1.000 2.000 0.5000 odom'}}
-    shelf = Shelf(Settings.load({'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path)}), SystemClock('boot'))
+    spooler = Spooler(Settings.load({'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path)}), SystemClock('boot'))
     try:
-        shelf.add([item.content for item in objects_of(marked, records[0], folder, Run('abc', '1', 'x'))])
-        shelf.drain()
-        assert shelf.pending() == 1, 'the part'
-        shelf.drain()
-        assert shelf.pending() == 0
+        spooler.add([item.content for item in objects_of(marked, records[0], folder, Run('abc', '1', 'x'))])
+        spooler.drain()
+        assert spooler.pending() == 1, 'the part'
+        spooler.drain()
+        assert spooler.pending() == 0
     finally:
-        shelf.close()
+        spooler.close()
     (part,) = (tmp_path / 'store').rglob('thor/_catalog/date=*/*.parquet')
     (row,) = pyarrow.parquet.read_table(io.BytesIO(part.read_bytes())).to_pylist()
     assert row['key'] == 'thor/missions/abc/camera/frame_000007.jpg'

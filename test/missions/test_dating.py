@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from clocks import NOON_NS, Clocks
-from missions.fakes import FakeDrawing, FakeShelf, FakeTracking, journalling
+from missions.fakes import FakeDrawing, FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.dating import Dating
@@ -48,12 +48,12 @@ def fly(home: Path, clocks: Clocks, *, is_set_meanwhile: bool = False) -> Missio
     return next(missions(home))
 
 
-def sender(home: Path, clocks: Clocks, tracking: FakeTracking, shelf: FakeShelf, **offsets: int) -> Replay:
+def sender(home: Path, clocks: Clocks, tracking: FakeTracking, spooler: FakeSpooler, **offsets: int) -> Replay:
     dating = Dating(clocks, 600.0, lambda: {name.replace('_', '-'): offset for name, offset in offsets.items()})
-    return Replay(home, tracking, shelf, FakeDrawing(), settle=lambda folder: give_date(folder, dating), rng=random.Random(1))  # type: ignore[arg-type]
+    return Replay(home, tracking, spooler, FakeDrawing(), settle=lambda folder: give_date(folder, dating), rng=random.Random(1))  # type: ignore[arg-type]
 
 
-def check(tracking: FakeTracking, shelf: FakeShelf, folder: MissionFolder) -> None:
+def check(tracking: FakeTracking, spooler: FakeSpooler, folder: MissionFolder) -> None:
     """All of it has the date that it should have."""
     noon_ms = NOON_NS // MS
     assert tracking.names[folder.mission_id] == f'{NAME} {noon_ms - 10_000}'
@@ -61,21 +61,21 @@ def check(tracking: FakeTracking, shelf: FakeShelf, folder: MissionFolder) -> No
     assert [point.time_ms for point in tracking.points if point.key == 'a'] == [noon_ms - 5000]
     assert tracking.finished == [('run0', 'FINISHED', noon_ms)]
     assert tracking.params['duration_s'] == '10.000'
-    assert f'trajectories/thor/{NAME}.csv' in shelf.names()
-    assert all(NOON_NS - 10 * SECOND <= item.t_start_ns <= NOON_NS for item in shelf.objects)
+    assert f'trajectories/thor/{NAME}.csv' in spooler.names()
+    assert all(NOON_NS - 10 * SECOND <= item.t_start_ns <= NOON_NS for item in spooler.objects)
 
 
 def test_a_mission_waits_for_its_date(tmp_path: Path, clocks: Clocks) -> None:
     """Nothing of it is sent while the clock is in 1970, which the report says; then run, points and keys have the right time."""
-    folder, tracking, shelf = fly(tmp_path, clocks), FakeTracking(), FakeShelf()
-    replay = sender(tmp_path, clocks, tracking, shelf)
+    folder, tracking, spooler = fly(tmp_path, clocks), FakeTracking(), FakeSpooler()
+    replay = sender(tmp_path, clocks, tracking, spooler)
     assert not replay.step()
     assert replay.owes
     assert (tracking.runs, report(folder).last_error) == ({}, WAITS)
     clocks.set(NOON_NS)
     while replay.step():
         pass
-    check(tracking, shelf, folder)
+    check(tracking, spooler, folder)
     assert not replay.owes
     found = overview(folder)
     assert found
@@ -84,11 +84,11 @@ def test_a_mission_waits_for_its_date(tmp_path: Path, clocks: Clocks) -> None:
 
 def test_the_clock_is_set_in_the_middle(tmp_path: Path, clocks: Clocks) -> None:
     """What was logged before is dated like what was logged after, and the duration is what it was."""
-    folder, tracking, shelf = fly(tmp_path, clocks, is_set_meanwhile=True), FakeTracking(), FakeShelf()
-    replay = sender(tmp_path, clocks, tracking, shelf)
+    folder, tracking, spooler = fly(tmp_path, clocks, is_set_meanwhile=True), FakeTracking(), FakeSpooler()
+    replay = sender(tmp_path, clocks, tracking, spooler)
     while replay.step():
         pass
-    check(tracking, shelf, folder)
+    check(tracking, spooler, folder)
 
 
 def test_a_date_is_given_once(tmp_path: Path, clocks: Clocks) -> None:
@@ -96,10 +96,10 @@ def test_a_date_is_given_once(tmp_path: Path, clocks: Clocks) -> None:
     fly(tmp_path, clocks)
     clocks.set(NOON_NS)
     away = FakeTracking(fail=lambda name: name == 'finish')
-    sender(tmp_path, clocks, away, FakeShelf()).step()
+    sender(tmp_path, clocks, away, FakeSpooler()).step()
     clocks.set(NOON_NS + SECOND)
-    tracking, shelf = FakeTracking(), FakeShelf()
-    replay = sender(tmp_path, clocks, tracking, shelf)
+    tracking, spooler = FakeTracking(), FakeSpooler()
+    replay = sender(tmp_path, clocks, tracking, spooler)
     while replay.step():
         pass
     assert tracking.finished == [('run0', 'FINISHED', NOON_NS // MS)]
@@ -110,15 +110,15 @@ def test_a_boot_that_is_over(tmp_path: Path, clocks: Clocks) -> None:
     folder = fly(tmp_path, clocks)
     later = Clocks(boot_id='later')
     later.set(NOON_NS + 3600 * SECOND)
-    tracking, shelf = FakeTracking(), FakeShelf()
-    replay = sender(tmp_path, later, tracking, shelf, this_boot=NOON_NS - clocks.up_ns)
+    tracking, spooler = FakeTracking(), FakeSpooler()
+    replay = sender(tmp_path, later, tracking, spooler, this_boot=NOON_NS - clocks.up_ns)
     while replay.step():
         pass
-    check(tracking, shelf, folder)
+    check(tracking, spooler, folder)
     (tmp_path / 'other').mkdir()
     fly(tmp_path / 'other', Clocks())
     unknown = FakeTracking()
-    replay = sender(tmp_path / 'other', later, unknown, FakeShelf())
+    replay = sender(tmp_path / 'other', later, unknown, FakeSpooler())
     while replay.step():
         pass
     assert unknown.params['timestamp'].startswith('1970-01-01T00:01')
@@ -128,7 +128,7 @@ def test_a_clock_that_is_never_set(tmp_path: Path, clocks: Clocks) -> None:
     """After ``clock.hold_s`` the mission goes with the times that it has."""
     fly(tmp_path, clocks)
     tracking = FakeTracking()
-    replay = sender(tmp_path, clocks, tracking, FakeShelf())
+    replay = sender(tmp_path, clocks, tracking, FakeSpooler())
     assert not replay.step()
     clocks.wait(601)
     while replay.step():
@@ -157,8 +157,8 @@ def test_the_node_s_part_is_dated_as_well(tmp_path: Path, clocks: Clocks) -> Non
         logger.end_mission(True, 0.0, 0.0)
         logger.flush(0.0)
         node_log.close(ended(mission))
-    tracking, shelf = FakeTracking(), FakeShelf()
-    replay = sender(tmp_path, clocks, tracking, shelf)
+    tracking, spooler = FakeTracking(), FakeSpooler()
+    replay = sender(tmp_path, clocks, tracking, spooler)
     while replay.step():
         pass
     points = [(point.time_ms, point.step, point.value) for point in tracking.points if point.key == 'pose_x']

@@ -7,7 +7,7 @@ import random
 from pathlib import Path
 
 import pytest
-from missions.fakes import FakeShelf, FakeTracking, journalling
+from missions.fakes import FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger.errors import TrackingError, TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
@@ -40,12 +40,12 @@ def fly(home: Path, points: int = 3, frames: int = 2, *, command: str = 'go roun
 
 def work(delivery: Delivery) -> bool:
     """One round; whether all of it is done."""
-    worked = [delivery.track(), delivery.attach(), delivery.shelve()]
+    worked = [delivery.track(), delivery.attach(), delivery.spool()]
     return delivery.complete() or not any(worked)
 
 
-def deliver(folder: MissionFolder, tracking: FakeTracking, shelf: FakeShelf, pictures: Pictures = nothing) -> Delivery:
-    delivery = Delivery(folder, tracking, shelf, pictures)  # type: ignore[arg-type]
+def deliver(folder: MissionFolder, tracking: FakeTracking, spooler: FakeSpooler, pictures: Pictures = nothing) -> Delivery:
+    delivery = Delivery(folder, tracking, spooler, pictures)  # type: ignore[arg-type]
     for _ in range(1000):
         if work(delivery) and (delivery.sent.complete or not delivery.sent.ended):
             break
@@ -60,8 +60,8 @@ def test_everything_arrives_in_order(tmp_path: Path) -> None:
     """Params, points with their own times, artifacts, objects and the end."""
     folder = fly(tmp_path)
     journal = [line.record or {} for line in read(folder.journal)]
-    tracking, shelf = FakeTracking(), FakeShelf()
-    deliver(folder, tracking, shelf)
+    tracking, spooler = FakeTracking(), FakeSpooler()
+    deliver(folder, tracking, spooler)
     states = [point for point in tracking.points if point.key == 'battery_pct']
     assert states == [Point('battery_pct', 90.0 - n, journal[n + 1]['t'] // 1_000_000, n) for n in range(3)]
     assert tracking.params == {'mission_type': 'patrol', 'mission_command': 'go round', 'robot': 'thor',
@@ -75,21 +75,21 @@ def test_everything_arrives_in_order(tmp_path: Path) -> None:
     frames = ['camera/frame_000000.jpg', 'camera/frame_000001.jpg']
     assert names(tracking) == [*frames, 'events.jsonl', 'notes/t.csv', 'summary.json', 'trajectories/trajectory.csv']
     run_name = folder.mission_id.rpartition('_')[0]
-    assert shelf.names() == [
+    assert spooler.names() == [
         'sensor-data/thor/missions/run0/camera/frame_000000.jpg', 'sensor-data/thor/missions/run0/camera/frame_000001.jpg',
         'sensor-data/thor/missions/run0/trajectory.csv', f'trajectories/thor/{run_name}.csv',
         'sensor-data/thor/missions/run0/summary.json',
     ]  # fmt: skip
-    assert [item.protected for item in shelf.objects] == [False, False, True, True, True]
+    assert [item.protected for item in spooler.objects] == [False, False, True, True, True]
     assert not folder.files.exists()
 
 
 def test_the_summary_tells_the_mission(tmp_path: Path) -> None:
     """Its times, result, errors, counts and where its data are; the same in the run and in the store."""
     folder = fly(tmp_path)
-    tracking, shelf = FakeTracking(), FakeShelf()
-    deliver(folder, tracking, shelf)
-    assert tracking.artifacts['summary.json'] == shelf.objects[-1].body
+    tracking, spooler = FakeTracking(), FakeSpooler()
+    deliver(folder, tracking, spooler)
+    assert tracking.artifacts['summary.json'] == spooler.objects[-1].body
     summary = json.loads(tracking.artifacts['summary.json'])
     assert (summary['mission_id'], summary['run_id'], summary['result']) == (folder.mission_id, 'run0', 'FINISHED')
     assert summary['errors'][0]['text'] == 'a wheel fell off'
@@ -108,7 +108,7 @@ def test_the_summary_tells_the_mission(tmp_path: Path) -> None:
 def test_a_long_command_is_whole_as_an_artifact(tmp_path: Path) -> None:
     """The param is cut where MLflow would cut it."""
     tracking = FakeTracking()
-    deliver(fly(tmp_path, command='x' * 7000), tracking, FakeShelf())
+    deliver(fly(tmp_path, command='x' * 7000), tracking, FakeSpooler())
     assert tracking.params['mission_command'] == 'x' * 6000
     assert tracking.artifacts['mission_command.txt'] == b'x' * 7000
 
@@ -116,7 +116,7 @@ def test_a_long_command_is_whole_as_an_artifact(tmp_path: Path) -> None:
 def test_batches_are_large_and_never_too_large(tmp_path: Path) -> None:
     """A backlog goes in batches of nearly a thousand points, none above."""
     tracking = FakeTracking()
-    deliver(fly(tmp_path, points=3000), tracking, FakeShelf())
+    deliver(fly(tmp_path, points=3000), tracking, FakeSpooler())
     assert max(tracking.batches) <= 1000
     assert len(tracking.batches) <= 10
     assert len([point for point in tracking.points if point.key == 'battery_pct']) == 3000
@@ -132,13 +132,13 @@ def test_any_failure_changes_nothing(tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)
     folder = fly(tmp_path, points=1200, frames=9)
     tracking = FakeTracking(fail=lambda _: rng.random() < 0.3)
-    shelf, delivery = FakeShelf(), None
+    spooler, delivery = FakeSpooler(), None
     for _ in range(2000):
         if delivery is None or rng.random() < 0.2:
-            delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]  # as after a kill
+            delivery = Delivery(folder, tracking, spooler)  # type: ignore[arg-type]  # as after a kill
         try:
             if delivery.run is None and rng.random() < 0.5:
-                delivery.shelve(hold=True)
+                delivery.spool(hold=True)
             if work(delivery):
                 break
         except TrackingError:
@@ -147,10 +147,10 @@ def test_any_failure_changes_nothing(tmp_path: Path, seed: int) -> None:
     assert len(tracking.runs) == 1
     quiet = FakeTracking()
     (tmp_path / 'other').mkdir()
-    deliver(fly(tmp_path / 'other', points=1200, frames=9), quiet, FakeShelf())
+    deliver(fly(tmp_path / 'other', points=1200, frames=9), quiet, FakeSpooler())
     assert sorted({(p.key, p.step, p.value) for p in tracking.points}) == sorted({(p.key, p.step, p.value) for p in quiet.points})
     assert names(tracking) == names(quiet)
-    assert len(shelf.names()) == len(set(shelf.names())) == 9 + 3
+    assert len(spooler.names()) == len(set(spooler.names())) == 9 + 3
     assert tracking.finished[-1][1] == 'FINISHED'
 
 
@@ -158,7 +158,7 @@ def test_the_run_is_looked_up_after_a_lost_answer(tmp_path: Path) -> None:
     """A run that was made although the answer got lost is the mission's, and no second one is made."""
     folder, answers = fly(tmp_path), iter([False, True])
     tracking = FakeTracking(fail=lambda _: next(answers, False))
-    delivery = Delivery(folder, tracking, FakeShelf())  # type: ignore[arg-type]
+    delivery = Delivery(folder, tracking, FakeSpooler())  # type: ignore[arg-type]
     with pytest.raises(TrackingUnavailable):
         delivery.track()
     while not work(delivery):
@@ -170,7 +170,7 @@ def test_what_the_server_refuses_is_left_out_and_counted(tmp_path: Path) -> None
     """One bad point does not keep the others of its batch."""
     folder = fly(tmp_path, points=50)
     tracking = FakeTracking(refuses=lambda point: point.key == 'battery_pct' and point.step == 33)
-    deliver(folder, tracking, FakeShelf())
+    deliver(folder, tracking, FakeSpooler())
     assert sorted(point.step for point in tracking.points if point.key == 'battery_pct') == [n for n in range(50) if n != 33]
     assert (folder.sent().refused, folder.sent().complete) == (1, True)
     assert tracking.params['duration_s'] == '60.000'
@@ -179,7 +179,7 @@ def test_what_the_server_refuses_is_left_out_and_counted(tmp_path: Path) -> None
 def test_a_deleted_run_is_not_made_again(tmp_path: Path) -> None:
     """Whoever deletes a run does not want it: the mission stops, and says so."""
     tracking = FakeTracking(gone=True)
-    delivery = Delivery(fly(tmp_path), tracking, FakeShelf())  # type: ignore[arg-type]
+    delivery = Delivery(fly(tmp_path), tracking, FakeSpooler())  # type: ignore[arg-type]
     with pytest.raises(TrackingRefused):
         delivery.track()
     assert tracking.points == []
@@ -189,16 +189,16 @@ def test_artifacts_that_do_not_arrive_hold_up_no_metric(tmp_path: Path) -> None:
     """The run is whole and ended while its artifacts wait, and the mission is not complete."""
     folder = fly(tmp_path)
     tracking = FakeTracking(fail=lambda name: name == 'artifact')
-    shelf = FakeShelf()
-    delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
+    spooler = FakeSpooler()
+    delivery = Delivery(folder, tracking, spooler)  # type: ignore[arg-type]
     while delivery.track():
         pass
     with pytest.raises(TrackingUnavailable):
         delivery.attach()
-    while delivery.shelve():
+    while delivery.spool():
         pass
     assert tracking.finished
-    assert len(shelf.objects) == 5
+    assert len(spooler.objects) == 5
     assert not delivery.complete()
     tracking.fail = lambda _: False
     while not work(delivery):
@@ -218,8 +218,8 @@ def test_a_mission_of_a_dead_agent_ends_as_killed(tmp_path: Path) -> None:
     """It ends at its last record, with its last known state, and what was torn is cut off."""
     folder = abandon(tmp_path)
     last_ns = [line.record['t'] for line in read(folder.journal) if line.record][-1]
-    tracking, shelf = FakeTracking(), FakeShelf()
-    deliver(folder, tracking, shelf)
+    tracking, spooler = FakeTracking(), FakeSpooler()
+    deliver(folder, tracking, spooler)
     assert tracking.finished == [('run0', 'KILLED', last_ns // 1_000_000)]
     last = {point.key: point.value for point in tracking.points}
     assert (last['success'], last['battery_consumed_pct'], last['distance_traveled_m']) == (0.0, 4.0, 0.0)
@@ -238,7 +238,7 @@ def test_a_mission_of_a_living_agent_goes_on(tmp_path: Path) -> None:
     with folder.journal.open('ab') as file:
         file.write(content)
     tracking = FakeTracking()
-    delivery = deliver(folder, tracking, FakeShelf())
+    delivery = deliver(folder, tracking, FakeSpooler())
     assert not delivery.complete()
     assert tracking.finished == []
     journal.append({'k': 'end', 't': 10**18, 'status': 'FINISHED', 'success': True, 'distance_m': 1.0, 'duration_s': 2.0})
@@ -257,7 +257,7 @@ def test_a_measured_distance_stands_where_zero_is_stated(tmp_path: Path) -> None
             logger.log_metric('distance_traveled_m', 7.5, step=4)
             logger.end_mission(False, stated, 0.0)
         tracking = FakeTracking()
-        deliver(next(missions(home)), tracking, FakeShelf())
+        deliver(next(missions(home)), tracking, FakeSpooler())
         distance = max((point for point in tracking.points if point.key == 'distance_traveled_m'), key=lambda point: point.step)
         assert distance.value == expected
         summary = json.loads(tracking.artifacts['summary.json'])
@@ -273,12 +273,12 @@ def test_a_frame_that_is_gone_is_counted(tmp_path: Path) -> None:
     """In the report, in the summary's ledger, and nowhere as an object; what is not gone arrives."""
     folder = fly(tmp_path, frames=3)
     (folder.files / '00000002.jpg').unlink()
-    tracking, shelf = FakeTracking(), FakeShelf()
-    deliver(folder, tracking, shelf)
+    tracking, spooler = FakeTracking(), FakeSpooler()
+    deliver(folder, tracking, spooler)
     assert report(folder).missing == 1
     assert json.loads(tracking.artifacts['summary.json'])['ledger']['files'] == {'logged': 4, 'spooled': 3, 'missing': 1}
     assert folder.sent().unattached == 1
-    assert [key for key in shelf.names() if 'frame' in key] == [
+    assert [key for key in spooler.names() if 'frame' in key] == [
         f'sensor-data/thor/missions/run0/camera/frame_{number:06d}.jpg' for number in (0, 2)
     ]
 
@@ -286,16 +286,16 @@ def test_a_frame_that_is_gone_is_counted(tmp_path: Path) -> None:
 def test_frames_do_not_wait_for_a_run(tmp_path: Path) -> None:
     """While Tower is away they are held in the spool, out of the mission's folder; with the run they get their names."""
     folder = fly(tmp_path)
-    tracking, shelf = FakeTracking(fail=lambda name: name == 'run_of'), FakeShelf()
-    delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
+    tracking, spooler = FakeTracking(fail=lambda name: name == 'run_of'), FakeSpooler()
+    delivery = Delivery(folder, tracking, spooler)  # type: ignore[arg-type]
     with pytest.raises(TrackingUnavailable):
         delivery.track()
-    while delivery.shelve(hold=True):
+    while delivery.spool(hold=True):
         pass
-    assert {item.held for item in shelf.objects} == {f'mission-{folder.mission_id}'}
-    assert len(shelf.objects) == 4
+    assert {item.held for item in spooler.objects} == {f'mission-{folder.mission_id}'}
+    assert len(spooler.objects) == 4
     tracking.fail = lambda _: False
-    deliver(folder, tracking, shelf)
-    assert not any(item.held for item in shelf.objects)
-    assert len(shelf.objects) == len(set(shelf.names())) == 5
-    assert all('/missions/run0/' in key or key.startswith('trajectories/') for key in shelf.names())
+    deliver(folder, tracking, spooler)
+    assert not any(item.held for item in spooler.objects)
+    assert len(spooler.objects) == len(set(spooler.names())) == 5
+    assert all('/missions/run0/' in key or key.startswith('trajectories/') for key in spooler.names())

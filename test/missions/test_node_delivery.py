@@ -6,7 +6,7 @@ import json
 import random
 from pathlib import Path
 
-from missions.fakes import FakeShelf, FakeTracking, journalling
+from missions.fakes import FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.errors import TrackingError
@@ -40,12 +40,12 @@ def leave(node_log: NodeLog) -> None:
 
 
 def work(delivery: Delivery) -> bool:
-    return bool([delivery.track(), delivery.attach(), delivery.shelve()]) and delivery.complete()
+    return bool([delivery.track(), delivery.attach(), delivery.spool()]) and delivery.complete()
 
 
-def deliver(folder: MissionFolder, tracking: FakeTracking, shelf: FakeShelf, rounds: int = 50) -> bool:
+def deliver(folder: MissionFolder, tracking: FakeTracking, spooler: FakeSpooler, rounds: int = 50) -> bool:
     """Whether all of it arrives."""
-    delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
+    delivery = Delivery(folder, tracking, spooler)  # type: ignore[arg-type]
     return any(work(delivery) for _ in range(rounds))
 
 
@@ -67,8 +67,8 @@ def flown(home: Path, distance_m: float = 0.0) -> Active:
 
 def test_an_agent_that_only_starts_and_ends_has_a_whole_run(tmp_path: Path) -> None:
     """Battery, distance, pose, trajectory and frames are there, in the run and in the store."""
-    mission, tracking, shelf = flown(tmp_path), FakeTracking(), FakeShelf()
-    assert deliver(mission.folder, tracking, shelf)
+    mission, tracking, spooler = flown(tmp_path), FakeTracking(), FakeSpooler()
+    assert deliver(mission.folder, tracking, spooler)
     last = newest(tracking)
     assert {key: last[key] for key in ('battery_pct', 'pose_x', 'distance_traveled_m', 'distance_m', 'battery_consumed_pct')} == {
         'battery_pct': 86.0, 'pose_x': 4.0, 'distance_traveled_m': 4.0, 'distance_m': 4.0, 'battery_consumed_pct': 4.0,
@@ -78,8 +78,8 @@ def test_an_agent_that_only_starts_and_ends_has_a_whole_run(tmp_path: Path) -> N
     assert tracking.artifacts['camera/frame_900000.jpg'] == JPEG
     run_name = mission.id.rpartition('_')[0]
     assert {f'trajectories/thor/{run_name}.csv', 'sensor-data/thor/missions/run0/trajectory.csv',
-            'sensor-data/thor/missions/run0/camera/frame_900000.jpg'} <= set(shelf.names())  # fmt: skip
-    assert {item.metadata['mission_id'] for item in shelf.objects} == {mission.id}
+            'sensor-data/thor/missions/run0/camera/frame_900000.jpg'} <= set(spooler.names())  # fmt: skip
+    assert {item.metadata['mission_id'] for item in spooler.objects} == {mission.id}
     assert not mission.folder.node.files.exists()
 
 
@@ -87,7 +87,7 @@ def test_what_is_stated_wins_when_it_is_positive(tmp_path: Path) -> None:
     """Where 0 is stated the measured value stands; the summary has both."""
     for stated, stands in ((0.0, 4.0), (7.0, 7.0)):
         mission, tracking = flown(tmp_path / str(stated), stated), FakeTracking()
-        assert deliver(mission.folder, tracking, FakeShelf())
+        assert deliver(mission.folder, tracking, FakeSpooler())
         summary = json.loads(tracking.artifacts['summary.json'])
         figures = summary['distance_m'], summary['stated']['distance_m'], summary['measured']['distance_m']
         assert figures == (stands, stated, 4.0)
@@ -96,15 +96,15 @@ def test_what_is_stated_wins_when_it_is_positive(tmp_path: Path) -> None:
 
 def test_the_end_waits_for_the_node(tmp_path: Path) -> None:
     """The run is ended, and the mission complete, after the node let go of its journal."""
-    tracking, shelf = FakeTracking(), FakeShelf()
+    tracking, spooler = FakeTracking(), FakeSpooler()
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         node_log = join(tmp_path)
         logger.end_mission(True, 0.0, 0.0)
-    assert not deliver(node_log.mission.folder, tracking, shelf)
+    assert not deliver(node_log.mission.folder, tracking, spooler)
     assert tracking.finished == []
     leave(node_log)
-    assert deliver(node_log.mission.folder, tracking, shelf)
+    assert deliver(node_log.mission.folder, tracking, spooler)
     assert [status for _, status, _ in tracking.finished] == ['FINISHED']
 
 
@@ -116,7 +116,7 @@ def test_a_node_that_hangs_does_not_hold_the_end(tmp_path: Path) -> None:
         node_log = join(tmp_path)
         logger.end_mission(True, 0.0, 0.0)
     tracking = FakeTracking()
-    delivery = Delivery(node_log.mission.folder, tracking, FakeShelf(), monotonic=lambda: now[0])  # type: ignore[arg-type]
+    delivery = Delivery(node_log.mission.folder, tracking, FakeSpooler(), monotonic=lambda: now[0])  # type: ignore[arg-type]
     assert not any(work(delivery) for _ in range(20))
     now[0] = NODE_S + 1
     assert not any(work(delivery) for _ in range(20))
@@ -129,7 +129,7 @@ def test_a_node_that_hangs_does_not_hold_the_end(tmp_path: Path) -> None:
 
 def test_the_agents_own_values_win(tmp_path: Path) -> None:
     """Of a metric that both log the agent's is the newest; frames of both are kept, under numbers of their own."""
-    tracking, shelf = FakeTracking(), FakeShelf()
+    tracking, spooler = FakeTracking(), FakeSpooler()
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         logger.log_robot_state(55.0, 30.0, 0)
@@ -138,9 +138,9 @@ def test_the_agents_own_values_win(tmp_path: Path) -> None:
         logger.end_mission(True, 0.0, 0.0)
         logger.flush(0.0)
         leave(node_log)
-    assert deliver(node_log.mission.folder, tracking, shelf)
+    assert deliver(node_log.mission.folder, tracking, spooler)
     assert newest(tracking)['battery_pct'] == 55.0
-    frames = {item.key.rpartition('/')[2]: item.body for item in shelf.objects if item.key.endswith('.jpg')}
+    frames = {item.key.rpartition('/')[2]: item.body for item in spooler.objects if item.key.endswith('.jpg')}
     assert frames == {'frame_000000.jpg': b'\xff\xd8 of the agent \xff\xd9', 'frame_900000.jpg': JPEG}
     assert tracking.artifacts['camera/frame_900000.jpg'] == JPEG
     assert json.loads(tracking.artifacts['summary.json'])['counts']['camera_frames'] == 2
@@ -155,7 +155,7 @@ def test_a_dead_agents_mission_ends_with_the_nodes_last_word(tmp_path: Path) -> 
     logger._mission._journal.close()  # type: ignore[union-attr]  # as a death does
     node_log.close()
     tracking = FakeTracking()
-    assert deliver(node_log.mission.folder, tracking, FakeShelf())
+    assert deliver(node_log.mission.folder, tracking, FakeSpooler())
     assert tracking.finished == [('run0', 'KILLED', (node_log.mission.start_ns + 3 * SECOND) // 10**6)]
     logger.close()
 
@@ -166,11 +166,11 @@ def test_any_failure_changes_nothing(tmp_path: Path) -> None:
         rng = random.Random(seed)
         home = tmp_path / str(seed)
         mission = flown(home)
-        tracking, shelf = FakeTracking(fail=lambda _: rng.random() < 0.3), FakeShelf()  # noqa: B023 - called in this round
+        tracking, spooler = FakeTracking(fail=lambda _: rng.random() < 0.3), FakeSpooler()  # noqa: B023 - called in this round
         delivery = None
         for _ in range(2000):
             if delivery is None or rng.random() < 0.2:
-                delivery = Delivery(mission.folder, tracking, shelf)  # type: ignore[arg-type]
+                delivery = Delivery(mission.folder, tracking, spooler)  # type: ignore[arg-type]
             try:
                 if work(delivery):
                     break
@@ -178,5 +178,5 @@ def test_any_failure_changes_nothing(tmp_path: Path) -> None:
                 continue
         assert mission.folder.sent().complete
         assert {point.value for point in tracking.points if point.key == 'pose_x'} == {0.0, 1.0, 2.0, 3.0, 4.0}
-        assert len(shelf.names()) == len(set(shelf.names())) == 4
+        assert len(spooler.names()) == len(set(spooler.names())) == 4
         assert newest(tracking)['distance_traveled_m'] == 4.0

@@ -16,7 +16,7 @@ from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
 from shadowhound_data_logger.missions.journal import read
-from shadowhound_data_logger.missions.objects import Shelf, objects_of
+from shadowhound_data_logger.missions.objects import Spooler, objects_of
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.spool.status import file
 
@@ -24,9 +24,9 @@ RUN = Run('abc', '1', 'x')
 
 
 @pytest.fixture
-def shelf(tmp_path: Path) -> Iterator[Shelf]:
+def spooler(tmp_path: Path) -> Iterator[Spooler]:
     settings = Settings.load({'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path)})
-    made = Shelf(settings, SystemClock('boot'))
+    made = Spooler(settings, SystemClock('boot'))
     yield made
     made.close()
 
@@ -53,11 +53,11 @@ def spooled(home: Path) -> dict[str, str]:
     return {row['key']: row['state'] for row in rows(home / 'spool') if row['sensor'] != '_catalog'}
 
 
-def test_what_is_handed_over_twice_is_spooled_once(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+def test_what_is_handed_over_twice_is_spooled_once(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
     """A replayer that was killed before it noted its progress adds nothing again, frames of one id included."""
     prefix = 'thor/missions/abc'
     for _ in range(3):
-        shelf.add(objects(folder, RUN))
+        spooler.add(objects(folder, RUN))
     name = folder.mission_id.rpartition('_')[0]
     assert set(spooled(tmp_path)) == {
         f'{prefix}/camera/frame_000007.jpg', f'{prefix}/camera/frame_000007_1.jpg', f'{prefix}/trajectory.csv',
@@ -65,20 +65,20 @@ def test_what_is_handed_over_twice_is_spooled_once(tmp_path: Path, shelf: Shelf,
     }  # fmt: skip
 
 
-def test_a_frame_of_a_longer_number_is_another_one(tmp_path: Path, shelf: Shelf) -> None:
+def test_a_frame_of_a_longer_number_is_another_one(tmp_path: Path, spooler: Spooler) -> None:
     """Though its picture is the same, and its name begins as the other's."""
     for number in (100_000, 1_000_000):
-        shelf.add([make(f'thor/missions/abc/camera/frame_{number:06d}.jpg', topic=None)])
+        spooler.add([make(f'thor/missions/abc/camera/frame_{number:06d}.jpg', topic=None)])
     assert len(spooled(tmp_path)) == 2
 
 
-def test_what_is_held_gets_the_run_s_name(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+def test_what_is_held_gets_the_run_s_name(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
     """Under the run's id, with it in the metadata; handed over again afterwards it is still there once."""
-    shelf.add(objects(folder, None))
+    spooler.add(objects(folder, None))
     assert set(spooled(tmp_path).values()) == {'held'}
-    assert shelf.bind(folder.mission_id, 'abc')
-    assert not shelf.bind(folder.mission_id, 'abc')
-    shelf.add(objects(folder, RUN))
+    assert spooler.bind(folder.mission_id, 'abc')
+    assert not spooler.bind(folder.mission_id, 'abc')
+    spooler.add(objects(folder, RUN))
     assert set(spooled(tmp_path).values()) == {'pending'}
     assert len(spooled(tmp_path)) == 4
     assert all(f'"run_id": "{RUN.run_id}"' in row['metadata'] for row in rows(tmp_path / 'spool'))
@@ -88,34 +88,34 @@ def test_what_is_held_gets_the_run_s_name(tmp_path: Path, shelf: Shelf, folder: 
     ]
 
 
-def test_without_a_node_it_is_delivered(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+def test_without_a_node_it_is_delivered(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
     """The folder store has all of it, and the drain is free again afterwards."""
-    shelf.add(objects(folder, RUN))
-    assert shelf.owes
-    shelf.drain()
+    spooler.add(objects(folder, RUN))
+    assert spooler.owes
+    spooler.drain()
     assert set(spooled(tmp_path).values()) == {'delivered'}
-    assert shelf.owes, 'their rows of the catalogue'
-    shelf.drain()
+    assert spooler.owes, 'their rows of the catalogue'
+    spooler.drain()
     assert (tmp_path / 'store/sensor-data/thor/missions/abc/camera/frame_000007.jpg').read_bytes() == b'one'
-    assert not shelf.owes
+    assert not spooler.owes
     with flock(tmp_path / 'spool' / 'drain.lock', wait=False) as free:
         assert free
 
 
-def test_beside_a_node_it_is_the_node_s(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+def test_beside_a_node_it_is_the_node_s(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
     """Whoever drains already delivers it."""
-    shelf.add(objects(folder, RUN))
+    spooler.add(objects(folder, RUN))
     with flock(tmp_path / 'spool' / 'drain.lock', wait=False):
-        shelf.drain()
+        spooler.drain()
     assert set(spooled(tmp_path).values()) == {'pending'}
-    assert not shelf.owes
+    assert not spooler.owes
 
 
-def test_what_an_earlier_process_left_is_delivered(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+def test_what_an_earlier_process_left_is_delivered(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
     """A new replayer without a mission of its own empties the spool."""
-    shelf.add(objects(folder, RUN))
-    shelf.close()
-    later = Shelf(Settings.load({}, {'SHADOWHOUND_HOME': str(tmp_path)}), SystemClock('boot'))
+    spooler.add(objects(folder, RUN))
+    spooler.close()
+    later = Spooler(Settings.load({}, {'SHADOWHOUND_HOME': str(tmp_path)}), SystemClock('boot'))
     try:
         later.drain()
         later.drain()
@@ -132,19 +132,19 @@ def test_a_node_s_larger_spool_is_left_to_it(tmp_path: Path, folder: MissionFold
     put(node, *(make(f'thor/lidar/{number}.pcd', bytes(100_000), priority=7) for number in range(20)))
     file(root, 'thor').write_text(json.dumps({'spool': {'max_bytes': 64 << 20, 'min_free_bytes': 0}}))
     settings = Settings.load({'spool.max_bytes': 1 << 20}, {'SHADOWHOUND_HOME': str(tmp_path)})
-    shelf = Shelf(settings, SystemClock('boot'))
+    spooler = Spooler(settings, SystemClock('boot'))
     try:
-        shelf.add(objects(folder, RUN))
+        spooler.add(objects(folder, RUN))
     finally:
-        shelf.close()
+        spooler.close()
         node.close()
     assert set(spooled(tmp_path).values()) == {'pending'}
 
 
-def test_an_index_that_is_lost_meanwhile(tmp_path: Path, shelf: Shelf, folder: MissionFolder) -> None:
+def test_an_index_that_is_lost_meanwhile(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
     """The objects that come then are refused once, and taken when they are handed over again."""
     first, *others = objects(folder, RUN)
-    shelf.add([first])
+    spooler.add([first])
     index = tmp_path / 'spool' / 'index.db'
     index.rename(index.with_name('index.db.damaged-1'))
     index.touch()
@@ -152,7 +152,7 @@ def test_an_index_that_is_lost_meanwhile(tmp_path: Path, shelf: Shelf, folder: M
     other.open()
     other.close()
     with pytest.raises(SpoolError, match='was lost'):
-        shelf.add(others)
-    shelf.add(others)
+        spooler.add(others)
+    spooler.add(others)
     prefix = 'thor/missions/abc/camera/'
     assert set(spooled(tmp_path)) == {item.key for item in (first, *others)} | {f'{prefix}frame_000007_1.jpg'}

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import simplejpeg
-from missions.fakes import FakeShelf, FakeTracking, journalling
+from missions.fakes import FakeSpooler, FakeTracking, journalling
 from missions.server import until
 from missions.test_delivery import deliver
 from PIL import Image
@@ -166,11 +166,11 @@ def test_a_mission_waits_for_its_pictures(tmp_path: Path) -> None:
         (folder.files / 'battery.png').write_bytes(b'a plot')
         return {'battery.png': '', 'trajectory.png': 'not made: nobody walked'}
 
-    tracking, shelf = FakeTracking(), FakeShelf()
-    deliver(folder, tracking, shelf, pictures)
+    tracking, spooler = FakeTracking(), FakeSpooler()
+    deliver(folder, tracking, spooler, pictures)
     assert tracking.artifacts['battery.png'] == b'a plot'
     assert 'trajectory.png' not in tracking.artifacts
-    assert tracking.artifacts['summary.json'] == shelf.objects[-1].body
-    summary = json.loads(shelf.objects[-1].body)
+    assert tracking.artifacts['summary.json'] == spooler.objects[-1].body
+    summary = json.loads(spooler.objects[-1].body)
     assert summary['pictures'] == {'battery.png': '', 'trajectory.png': 'not made: nobody walked'}
     assert read_json(folder.summary) == summary

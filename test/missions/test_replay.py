@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from missions.fakes import FakeDrawing, FakeShelf, FakeTracking, journalling
+from missions.fakes import FakeDrawing, FakeSpooler, FakeTracking, journalling
 from missions.server import until
 
 from shadowhound_data_logger import MissionDataLogger
@@ -35,7 +35,7 @@ class Now:
 
 def new_replay(home: Path, tracking: FakeTracking, now: Now | None = None) -> Replay:
     (home / MISSIONS).mkdir(parents=True, exist_ok=True)
-    return Replay(home, tracking, FakeShelf(), FakeDrawing(), monotonic=now or Now(), rng=random.Random(1))  # type: ignore[arg-type]
+    return Replay(home, tracking, FakeSpooler(), FakeDrawing(), monotonic=now or Now(), rng=random.Random(1))  # type: ignore[arg-type]
 
 
 def fly(home: Path, mission_type: str = 'patrol') -> str:
@@ -304,7 +304,7 @@ def test_a_mission_that_cannot_be_looked_at_stops_no_other(tmp_path: Path) -> No
         return True
 
     (tmp_path / MISSIONS).mkdir(exist_ok=True)
-    replay = Replay(tmp_path, FakeTracking(), FakeShelf(), FakeDrawing(), settle=settle)  # type: ignore[arg-type]
+    replay = Replay(tmp_path, FakeTracking(), FakeSpooler(), FakeDrawing(), settle=settle)  # type: ignore[arg-type]
     while replay.step():
         pass
     assert {folder.mission_id: folder.sent().complete for folder in missions(tmp_path)} == {rotten: False, whole: True}

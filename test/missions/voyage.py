@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from missions.fakes import FakeShelf, journalling
+from missions.fakes import FakeSpooler, journalling
 
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MissionSent, missions
@@ -33,10 +33,10 @@ def fly(home: Path) -> None:
 def send(home: Path) -> Delivery:
     """All of it, twice: the second time as by a sender that was killed before it noted how far it was."""
     (folder,) = missions(home)
-    tracking, shelf = open_tracking(home, 'thor_missions'), FakeShelf()
+    tracking, spooler = open_tracking(home, 'thor_missions'), FakeSpooler()
     for _ in range(2):
-        delivery = Delivery(folder, tracking, shelf)  # type: ignore[arg-type]
-        while any([delivery.track(), delivery.attach(), delivery.shelve()]):
+        delivery = Delivery(folder, tracking, spooler)  # type: ignore[arg-type]
+        while any([delivery.track(), delivery.attach(), delivery.spool()]):
             pass
         folder.set_sent(MissionSent())
     return delivery
