@@ -148,6 +148,47 @@ class Binding:
     t_end_ns: int
 
 
+class SliceRow(NamedTuple):
+    """A closed slice of a recording, as the index and each later slice know it."""
+
+    number: int
+    bytes: int
+    sha256: str
+    t_start_ns: int
+    t_end_ns: int
+    messages: int
+    counts: str
+    """JSON: a list of its messages by topic, in the order of the recording's channels; null for a topic that it has not."""
+
+
+class MissingRow(NamedTuple):
+    """Something that should have been in a recording (``bags.manifest.Missing``)."""
+
+    place: int
+    """Among all that is missing in it, from 0."""
+    file: str
+    what: str
+    messages: int | None
+    topic: str | None
+    reason: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingRows:
+    """What the index keeps of a bag that is not whole in the spool yet, or what one commit adds to that."""
+
+    folder: str
+    """The name of its folder: no other recording of its owner has it."""
+    said: str = ''
+    """JSON: what is known of it (``bags.state``)."""
+    channels: str = ''
+    """JSON: a list of its channels without definitions, as they first appeared."""
+    slices: tuple[SliceRow, ...] = ()
+    missing: tuple[MissingRow, ...] = ()
+    is_whole: bool = False
+    """All that is known of it goes."""
+
+
 @dataclass(frozen=True, slots=True)
 class ObjectInfo:
     """What a store says of one object that it holds."""

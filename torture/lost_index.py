@@ -34,7 +34,7 @@ from missions.server import Server, complete
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.bags.local import RECORDS
-from shadowhound_data_logger.bags.naming import FOLDER as BAGS
+from shadowhound_data_logger.bags.naming import BAGS
 from shadowhound_data_logger.bags.record import PROGRAM
 from shadowhound_data_logger.catalogue.gaps import GAP
 from shadowhound_data_logger.clock import SECOND, utc

@@ -18,12 +18,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, MissionOf, TriggerOf
-from shadowhound_data_logger.bags.notes import Notes, discard
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.recorder import SYNC_S, Answer
 from shadowhound_data_logger.bags.recording import UNWRITABLE, Recording
+from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.ring import Claims, Ring
-from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.missions.folder import safe_type
 from shadowhound_data_logger.options import BagSettings, EventSettings
@@ -88,7 +88,7 @@ class Events:
     ``_lock`` guards which event goes on and what is asked of it; the writing belongs to the thread ``event-writer``.
     """
 
-    def __init__(self, settings: EventSettings, bag: BagSettings, place: BagPlace, ring: Ring, salvage: Salvage,
+    def __init__(self, settings: EventSettings, bag: BagSettings, place: BagPlace, ring: Ring, recovery: BagRecovery,
                  poll_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
         """``poll_s``: how late the intake may take a message."""
         self._settings = settings
@@ -96,7 +96,7 @@ class Events:
         self._place = place
         self._ring = ring
         self.claims = Claims(place.spool.accounts)
-        self._salvage = salvage
+        self._recovery = recovery
         self._poll_s = poll_s
         self._monotonic = monotonic
         self._lock = threading.Lock()
@@ -239,16 +239,15 @@ class Events:
         if now_s < event.again_s:
             return False
         try:
-            notes = Notes.begin(self._place.root / event.bag, self._place.robot, self._mission, event.of, event.unset)
+            state = BagState.begin(self._place.root / event.bag, self._place.robot, self._mission, event.of, event.unset)
         except OSError as error:
             event.again_s = now_s + RETRY_S
-            discard(self._place.root / event.bag)
             if not event.refused:
                 log.error('%s is not written while the disk accepts no writes: %s', event.bag, error)  # noqa: TRY400 - an operator's
             event.refused = UNWRITABLE
             return False
         event.refused = ''
-        event.recording = Recording(notes, self._bag, self._place, self._salvage)
+        event.recording = Recording(state, self._bag, self._place, self._recovery)
         self._due_s = now_s + SYNC_S
         return True
 
@@ -256,7 +255,7 @@ class Events:
         """All that the ring has of the event until now."""
         recording = event.recording
         assert recording is not None
-        self._tell_triggers(event, recording.notes)
+        self._tell_triggers(event, recording)
         while held := self._ring.next(event.until_s + self._poll_s):
             fresh = self.claims.receive(held)
             if fresh:
@@ -270,19 +269,16 @@ class Events:
             recording.tick()
             self._due_s = self._monotonic() + SYNC_S
 
-    def _tell_triggers(self, event: _Event, notes: Notes) -> None:
-        if notes.event is not event.of:
-            try:
-                notes.set_event(event.of)
-            except OSError as error:
-                log.warning('bag %s: %s', event.bag, error)
+    def _tell_triggers(self, event: _Event, recording: Recording) -> None:
+        if recording.state.event is not event.of:
+            recording.set_event(event.of)
 
     def _close_bag(self, event: _Event) -> None:
         recording = event.recording
         assert recording is not None
-        notes, mission = recording.notes, self._mission
-        self._tell_triggers(event, notes)
-        if mission is not None and notes.mission is not None and notes.mission.mission_id == mission.mission_id:
+        before, mission = recording.state.mission, self._mission
+        self._tell_triggers(event, recording)
+        if mission is not None and before is not None and before.mission_id == mission.mission_id:
             recording.set_mission(mission)
         is_whole = recording.close(FLUSH_S)
         self._written += 1

@@ -48,6 +48,12 @@ class JsonObject:
         except OverflowError:
             raise self.wrong(name, 'a number of 64 bits') from None
 
+    def flag(self, name: str) -> bool:
+        found = self._fields.get(name)
+        if not isinstance(found, bool):
+            raise self.wrong(name, 'true or false')
+        return found
+
     def counts(self, name: str) -> dict[str, int]:
         inner = JsonObject(self._fields.get(name), self._file, self._at(name))
         return {key: inner.count(key) for key in inner._fields}

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, RECOVERED, Manifest, Missing, SliceEntry, topics_of
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, slice_number
-from shadowhound_data_logger.bags.notes import Notes
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, prefix_of, slice_number
+from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.retention import NO_ROOM
+from shadowhound_data_logger.spool.writer import SpoolWriter
 
 SENSOR: Final = 'bag'
 ENDING_PRIORITY: Final = 1
@@ -30,93 +31,112 @@ def ros_distro() -> str:
     return os.environ.get('ROS_DISTRO', '')
 
 
-def slice_object(notes: Notes, info: SliceInfo, priority: int) -> DataObject:
+def slice_object(state: BagState, info: SliceInfo, priority: int) -> DataObject:
     """A closed slice; its messages count in the accounts of the bags, or of the events, whose own priority goes first."""
-    is_event = notes.event is not None
-    file, (start_ns, end_ns) = notes.final(info.path.name), _times(notes, info.t_start_ns, info.t_end_ns)
+    is_event = state.event is not None
+    file, (start_ns, end_ns) = state.final(info.path.name), _times(state, info.t_start_ns, info.t_end_ns)
     metadata = {
-        **_marks(notes), words.SLICE: str(slice_number(notes.bag, file)), words.MESSAGES: str(info.messages),
-        **({words.T_START_NS: str(start_ns), words.T_END_NS: str(end_ns)} if _is_dated(notes) else {}),
-        **_clock_marks(notes, info.t_start_ns, info.t_end_ns),
+        **_marks(state), words.SLICE: str(slice_number(state.bag, file)), words.MESSAGES: str(info.messages),
+        **({words.T_START_NS: str(start_ns), words.T_END_NS: str(end_ns)} if _is_dated(state) else {}),
+        **_clock_marks(state, info.t_start_ns, info.t_end_ns),
     }  # fmt: skip
     return DataObject(
-        bucket=BUCKET, key=key_of(notes.robot, notes.bag, file), body=FileBody(info.path, info.bytes, info.sha256),
+        bucket=BUCKET, key=key_of(state.robot, state.bag, file), body=FileBody(info.path, info.bytes, info.sha256),
         content_type='application/octet-stream', sensor=SENSOR, topic=None, type='', samples=info.messages,
         t_start_ns=start_ns, t_end_ns=end_ns, priority=EVENT_PRIORITY if is_event else priority,
         protected=is_event, metadata=metadata,
-        counts={f'{notes.sink}{topic}': count for topic, count in info.counts.items() if count},
+        counts={f'{state.sink}{topic}': count for topic, count in info.counts.items() if count},
     )  # fmt: skip
 
 
-def note_evicted(notes: Notes, states: Mapping[str, State]) -> None:
-    """Before the ending: slices that the full spool gave up are missing. Raises OSError.
+def finish(state: BagState, writer: SpoolWriter, deadline_s: float) -> bool:
+    """Have the spool take what makes the bag whole, in one transaction with the end of its rows; the folder is gone then.
 
-    ``states`` are those of all that is or was of the bag in the spool. What is given up after the manifest was made is not in it.
+    False where the spool did not within so many seconds. Raises OSError or sqlite3.Error.
     """
-    if key_of(notes.robot, notes.bag, MANIFEST) in states:
-        return
-    known = _evicted(notes)
-    gone = [info for file, info in notes.slices.items()
-            if file not in known and states.get(key_of(notes.robot, notes.bag, notes.final(file))) is State.EVICTED]  # fmt: skip
-    notes.add_missing(*(Missing(info.path.name, EVICTED, info.messages, None, NO_ROOM) for info in gone))
+    if not writer.flush(deadline_s):
+        return False
+    if not state.is_ending:
+        states = writer.spool.states(BUCKET, prefix_of(state.robot, state.bag))
+        ending: Iterable[DataObject] = ()
+        if (state.slices or (state.ended and state.missing)) and key_of(state.robot, state.bag, MANIFEST) not in states:
+            _note_evicted(state, states)
+            ending = ending_objects(state)
+        writer.put(*ending, rows=[state.whole()], wait=False)
+        state.is_ending = True
+    if not writer.flush(deadline_s):
+        return False
+    state.remove()
+    return True
 
 
-def ending_objects(notes: Notes) -> Iterator[DataObject]:
-    """What makes the bag whole; ``notes`` know all slices. The same notes give the same bytes."""
-    gone = _evicted(notes)
-    found = [replace(info, path=Path(notes.final(file))) for file, info in notes.slices.items() if file not in gone]
-    slices = sorted(found, key=lambda info: slice_number(notes.bag, info.path.name) or 0)
-    entries = tuple(SliceEntry.of(info, key_of(notes.robot, notes.bag, info.path.name)) for info in slices)
-    state = RECOVERED if not notes.ended else GAPS if notes.missing else COMPLETE
+def _note_evicted(state: BagState, states: Mapping[str, State]) -> None:
+    """Slices that the full spool gave up are missing. What is given up after the manifest was made is not in it.
+
+    ``states`` are those of all that is or was of the bag in the spool.
+    """
+    known = _evicted(state)
+    gone = [info for file, info in state.slices.items()
+            if file not in known and states.get(key_of(state.robot, state.bag, state.final(file))) is State.EVICTED]  # fmt: skip
+    state.add_missing(*(Missing(info.path.name, EVICTED, info.messages, None, NO_ROOM) for info in gone))
+
+
+def ending_objects(state: BagState) -> Iterator[DataObject]:
+    """What makes the bag whole; ``state`` knows all slices. The same state gives the same bytes."""
+    gone = _evicted(state)
+    found = [replace(info, path=Path(state.final(file))) for file, info in state.slices.items() if file not in gone]
+    slices = sorted(found, key=lambda info: slice_number(state.bag, info.path.name) or 0)
+    entries = tuple(SliceEntry.of(info, key_of(state.robot, state.bag, info.path.name)) for info in slices)
+    how = RECOVERED if not state.ended else GAPS if state.missing else COMPLETE
     manifest = Manifest(
-        bag=notes.bag, robot=notes.robot, mission=notes.mission, state=state,
-        missing=tuple(replace(one, file=notes.final(one.file)) for one in notes.missing),
-        topics=topics_of(slices), slices=entries, event=notes.event, clock=notes.clock,
+        bag=state.bag, robot=state.robot, mission=state.mission, state=how,
+        missing=tuple(replace(one, file=state.final(one.file)) for one in state.missing),
+        topics=topics_of(slices), slices=entries, event=state.event, clock=state.clock,
     )  # fmt: skip
-    span = _times(notes, min((one.t_start_ns for one in slices), default=0), max((one.t_end_ns for one in slices), default=0))
-    said = metadata_yaml(slices, ros_distro=ros_distro(), custom_data=_clock_marks(notes))
-    yield _small(notes, METADATA, said, 'application/yaml', span)
-    yield _small(notes, MANIFEST, manifest.to_json(), 'application/json', span)
+    span = _times(state, min((one.t_start_ns for one in slices), default=0), max((one.t_end_ns for one in slices), default=0))
+    said = metadata_yaml(slices, ros_distro=ros_distro(), custom_data=_clock_marks(state))
+    yield _small(state, METADATA, said, 'application/yaml', span)
+    yield _small(state, MANIFEST, manifest.to_json(), 'application/json', span)
 
 
-def _small(notes: Notes, file: str, body: bytes, content_type: str, span: tuple[int, int]) -> DataObject:
+def _small(state: BagState, file: str, body: bytes, content_type: str, span: tuple[int, int]) -> DataObject:
     return DataObject(
-        bucket=BUCKET, key=key_of(notes.robot, notes.bag, file), body=body, content_type=content_type, sensor=SENSOR, topic=None,
+        bucket=BUCKET, key=key_of(state.robot, state.bag, file), body=body, content_type=content_type, sensor=SENSOR, topic=None,
         type='', samples=0, t_start_ns=span[0], t_end_ns=span[1], priority=ENDING_PRIORITY, protected=True,
-        metadata={**_marks(notes), **_clock_marks(notes)},
+        metadata={**_marks(state), **_clock_marks(state)},
     )  # fmt: skip
 
 
-def _marks(notes: Notes) -> dict[str, str]:
-    marks = {words.ROBOT: notes.robot, words.BAG: notes.bag}
-    if notes.event is not None:
-        marks[words.EVENT] = notes.event.name
-    if notes.mission is not None:
-        ids = {words.MISSION_ID: notes.mission.mission_id, words.RUN_ID: notes.mission.run_id}
+def _marks(state: BagState) -> dict[str, str]:
+    marks = {words.ROBOT: state.robot, words.BAG: state.bag}
+    if state.event is not None:
+        marks[words.EVENT] = state.event.name
+    if state.mission is not None:
+        ids = {words.MISSION_ID: state.mission.mission_id, words.RUN_ID: state.mission.run_id}
         marks |= {word: value for word, value in ids.items() if value}
     return marks
 
 
-def _evicted(notes: Notes) -> set[str]:
-    return {one.file for one in notes.missing if one.what == EVICTED}
+def _evicted(state: BagState) -> set[str]:
+    return {one.file for one in state.missing if one.what == EVICTED}
 
 
-def _is_dated(notes: Notes) -> bool:
-    return notes.clock is None or notes.clock.offset_ns is not None
+def _is_dated(state: BagState) -> bool:
+    return state.clock is None or state.clock.offset_ns is not None
 
 
-def _times(notes: Notes, start_ns: int, end_ns: int) -> tuple[int, int]:
+def _times(state: BagState, start_ns: int, end_ns: int) -> tuple[int, int]:
     """Log times as UTC; where nobody knows that, by the boot clock, as those of objects are (``clock.stamp_of``)."""
-    clock = notes.clock
+    clock = state.clock
     if clock is None:
         return start_ns, end_ns
     step_ns = clock.boot_ns - clock.wall_ns if clock.offset_ns is None else clock.offset_ns
     return max(0, start_ns + step_ns), max(0, end_ns + step_ns)
 
 
-def _clock_marks(notes: Notes, *times_ns: int) -> dict[str, str]:
+def _clock_marks(state: BagState, *times_ns: int) -> dict[str, str]:
     """How the date of a bag is known whose clock was not set, as spool/redating.py tells it of objects; log times since boot."""
-    clock = notes.clock
+    clock = state.clock
     if clock is None:
         return {}
     marks = {words.CLOCK: clock.known, words.BOOT_ID: clock.boot_id}

@@ -16,8 +16,8 @@ from typing import Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import ClockOf
 from shadowhound_data_logger.bags.naming import BUCKET, UNSYNCED, bag_name, key_of, slice_file, unsynced_name
-from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock
 from shadowhound_data_logger.dating import Dating
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -59,32 +59,33 @@ class BagPlace:
         """What the clock of a bag shows, in ns since 1970."""
         return self.clock.wall_ns() if unset is None else unset.wall_ns + self.clock.boot_ns() - unset.boot_ns
 
-    def is_due(self, notes: Notes) -> bool:
+    def is_due(self, state: BagState) -> bool:
         """Whether more of what a bag waits for is known than when it began."""
-        return not notes.is_named and self._offset_ns(notes) is not None
+        return not state.is_named and self._offset_ns(state) is not None
 
-    def settle(self, notes: Notes) -> bool:
-        """Whether a bag has its name for good; it gets it as soon as that is known. Raises OSError."""
-        clock = notes.clock
-        if notes.is_named or clock is None:
+    def settle(self, state: BagState) -> bool:
+        """Whether a bag has its name for good; it gets it as soon as that is known, before anything of it leaves."""
+        clock = state.clock
+        if state.is_named or clock is None:
             return True
-        offset_ns = self._offset_ns(notes)
+        offset_ns = self._offset_ns(state)
         if offset_ns is None:
             return False
         if offset_ns:
             began_ns = clock.boot_ns + offset_ns
             clock = replace(clock, known=words.SET_LATER, offset_ns=began_ns - clock.wall_ns)
-            notes.set_name(bag_name(notes.bag.rpartition(UNSYNCED)[0], began_ns, self._is_taken), clock)
+            name = bag_name(state.bag.rpartition(UNSYNCED)[0], began_ns, lambda name: self._is_taken(name, state))
         else:
-            notes.set_name(notes.bag, clock)
+            name = state.bag
+        self.writer.put(rows=[state.set_name(name, clock)], wait=False)
         return True
 
-    def by_clock_of(self, notes: Notes, lot: Lot) -> Lot:
+    def by_clock_of(self, state: BagState, lot: Lot) -> Lot:
         """Messages with the time at which they came by the clock of the bag: it may have been set meanwhile, or just before.
 
         Else a bag with that moment in it would last for fifty years.
         """
-        clock = notes.clock
+        clock = state.clock
         low_ns, high_ns = (EARLIEST_SANE_NS, _LATEST) if clock is None else (0, EARLIEST_SANE_NS)
         if all(low_ns <= message.received_ns < high_ns for message in lot.messages):
             return lot
@@ -96,9 +97,14 @@ class BagPlace:
             for each in lot.messages
         ])  # fmt: skip
 
-    def _offset_ns(self, notes: Notes) -> int | None:
-        assert notes.clock is not None
-        return self._dating.offset_ns(notes.clock.boot_id, notes.clock.boot_ns)
+    def _offset_ns(self, state: BagState) -> int | None:
+        assert state.clock is not None
+        return self._dating.offset_ns(state.clock.boot_id, state.clock.boot_ns)
 
-    def _is_taken(self, bag: str) -> bool:
-        return (self.root / bag).exists() or self.spool.has(BUCKET, key_of(self.robot, bag, slice_file(bag, 0)))
+    def _is_taken(self, bag: str, by: BagState | None = None) -> bool:
+        """Whether another bag than ``by`` has the name: a start may find one again that had left already."""
+        first = key_of(self.robot, bag, slice_file(bag, 0))
+        own = by.slices.get(slice_file(by.folder.name, 0)) if by is not None else None
+        if own is not None and self.spool.knows(BUCKET, first, own.sha256):
+            return False
+        return (self.root / bag).exists() or self.spool.has(BUCKET, first)

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.manifest import MissionOf
-from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue, Lot
 from shadowhound_data_logger.bags.recording import Recording
-from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.bags.recovery import BagRecovery
+from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.options import BagSettings
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.worker import Worker
@@ -74,13 +74,13 @@ class Recorder:
     ``_control`` makes each of these one step; the recording itself belongs to the thread ``bag-writer``.
     """
 
-    def __init__(self, settings: BagSettings, place: BagPlace, queue: BagQueue, salvage: Salvage,
+    def __init__(self, settings: BagSettings, place: BagPlace, queue: BagQueue, recovery: BagRecovery,
                  listen: Callable[[bool, float], bool]) -> None:  # fmt: skip
         """``listen`` has the intake begin (True) or end, and says whether that was done within so many seconds."""
         self._settings = settings
         self._place = place
         self._queue = queue
-        self._salvage = salvage
+        self._recovery = recovery
         self._listen = listen
         self._control = threading.Lock()
         self._current: _Current | None = None
@@ -93,11 +93,11 @@ class Recorder:
     @property
     def workers(self) -> Sequence[Worker]:
         """Those that have something to do."""
-        return *([self._worker] if self._started else []), *([self._salvage.worker] if self._salvage.is_busy else [])
+        return *([self._worker] if self._started else []), *([self._recovery.worker] if self._recovery.is_busy else [])
 
     def open(self) -> None:
         """After the intake: make whole what was cut off, and begin if that is wanted."""
-        self._salvage.open()
+        self._recovery.open()
         if self._settings.record == ALWAYS:
             self._begin_by(ALWAYS)
 
@@ -106,7 +106,7 @@ class Recorder:
         end_s = time.monotonic() + deadline_s
         with self._control:
             ended = self._current is None or self._stop(deadline_s)[0]
-            self._salvage.close(max(0.0, end_s - time.monotonic()))
+            self._recovery.close(max(0.0, end_s - time.monotonic()))
             self._worker.stop()
             self._queue.mark(lambda: None)
             return self._worker.join(max(0.1, end_s - time.monotonic())) and ended
@@ -118,7 +118,7 @@ class Recorder:
             return BagStatus(recording=False)
         recording = current.recording
         return BagStatus(
-            recording=True, paused=self._queue.paused, bag=recording.notes.bag, slice=max(0, recording.number),
+            recording=True, paused=self._queue.paused, bag=recording.state.bag, slice=max(0, recording.number),
             messages=recording.messages, bytes=recording.bytes,
             dropped=recording.dropped + self._queue.dropped - current.dropped_before,
             duration_s=round(time.monotonic() - current.began_s, 1), queue_bytes=self._queue.bytes, refused=recording.refused,
@@ -130,7 +130,7 @@ class Recorder:
         """Begin a bag, of the mission where one is active."""
         with self._control:
             if self._current is not None:
-                return False, f'{self._current.recording.notes.bag} is recorded already'
+                return False, f'{self._current.recording.state.bag} is recorded already'
             return self._start(SERVICE, self._mission)
 
     def stop(self, deadline_s: float = STOP_S) -> Answer:
@@ -154,7 +154,7 @@ class Recorder:
             self._queue.mark(split)
             if not done.wait(deadline_s):
                 return False, f'the slice was not closed within {deadline_s:g} s; it is as soon as that is possible'
-            return True, f'{recording.notes.bag} has {recording.number + 1} slices that are closed'
+            return True, f'{recording.state.bag} has {len(recording.state.slices)} slices that are closed'
 
     def pause(self, *, paused: bool) -> Answer:
         """Begin or end a pause: what comes meanwhile is counted, and dropped."""
@@ -162,7 +162,7 @@ class Recorder:
             if self._current is None:
                 return False, 'nothing is recorded'
             self._queue.paused = paused
-            return True, f'{self._current.recording.notes.bag} is {"paused" if paused else "recorded"}'
+            return True, f'{self._current.recording.state.bag} is {"paused" if paused else "recorded"}'
 
     def on_mission(self, told: Mapping[str, Any]) -> None:
         """Which mission is active now (``MissionWatch.status``); empty for none."""
@@ -173,7 +173,7 @@ class Recorder:
             if mission is None and before is None:
                 return
             if mission is not None and before is not None and before.mission_id == mission.mission_id:
-                if current is not None and current.recording.notes.mission is not None:
+                if current is not None and current.recording.state.mission is not None:
                     recording = current.recording
                     self._queue.mark(lambda: recording.set_mission(mission))
             elif self._settings.record != SERVICE and (current is None or current.by != SERVICE):
@@ -185,8 +185,8 @@ class Recorder:
             return  # somebody begins or ends one now
         try:
             current = self._current
-            if current is not None and self._place.is_due(current.recording.notes):
-                self._start(current.by, current.recording.notes.mission, after=current)
+            if current is not None and self._place.is_due(current.recording.state):
+                self._start(current.by, current.recording.state.mission, after=current)
         finally:
             self._control.release()
 
@@ -213,16 +213,16 @@ class Recorder:
         unset = place.unset()
         name = place.name(mission.type if mission is not None else '', unset)
         try:
-            notes = Notes.begin(place.root / name, place.robot, mission, clock=unset)
+            state = BagState.begin(place.root / name, place.robot, mission, clock=unset)
         except OSError as error:
             log.error('no bag is recorded: %s', error)  # noqa: TRY400 - an operator's matter
             if after is not None:
                 self._stop(STOP_S)
             return False, f'no bag can be made in {place.root}: {error.strerror}'
-        goes_on = by == ALWAYS or after is not None or (mission is not None and mission.mission_id in self._salvage.missions)
+        goes_on = by == ALWAYS or after is not None or (mission is not None and mission.mission_id in self._recovery.missions)
         if not goes_on:
             self._place.spool.accounts.rebase_all(BAG)
-        recording = Recording(notes, self._settings, place, self._salvage)
+        recording = Recording(state, self._settings, place, self._recovery)
         self._current = _Current(recording, by, time.monotonic(), self._queue.dropped)
         self._queue.paused = self._queue.paused and after is not None
         if after is None:
@@ -248,9 +248,9 @@ class Recorder:
         self._current = None
         recording = current.recording
         if not done.wait(max(0.0, end_s - time.monotonic())):
-            return False, f'{recording.notes.bag} is not whole within {deadline_s:g} s; it is as soon as that is possible'
-        text = f'{recording.notes.bag}: {recording.messages:,} messages in {len(recording.notes.slices)} slices'
-        if not recording.notes.is_named:
+            return False, f'{recording.state.bag} is not whole within {deadline_s:g} s; it is as soon as that is possible'
+        text = f'{recording.state.bag}: {recording.messages:,} messages in {len(recording.state.slices)} slices'
+        if not recording.state.is_named:
             text += '; it waits for the clock of this machine to be set'
         log.info('%s', text)
         return True, text

@@ -15,17 +15,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.manifest import Missing, MissionOf
-from shadowhound_data_logger.bags.naming import BUCKET, prefix_of, slice_file
-from shadowhound_data_logger.bags.notes import Notes
-from shadowhound_data_logger.bags.objects import ending_objects, note_evicted, ros_distro, slice_object
+from shadowhound_data_logger.bags.manifest import EventOf, Missing, MissionOf
+from shadowhound_data_logger.bags.naming import slice_file
+from shadowhound_data_logger.bags.objects import finish, ros_distro, slice_object
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
-from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.bags.recovery import BagRecovery
+from shadowhound_data_logger.bags.state import ENDED, RECORD, BagState
 from shadowhound_data_logger.encode.definitions import describe
 from shadowhound_data_logger.mcap.recovery import recover
 from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
 from shadowhound_data_logger.mcap.writer import OPEN, SliceWriter
+from shadowhound_data_logger.model import RecordingRows
 from shadowhound_data_logger.options import BagSettings
 from shadowhound_data_logger.spool.retention import NO_ROOM
 
@@ -41,10 +42,10 @@ _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 class Recording:
     """New; ``write``, ``tick`` and ``split`` any number of times; ``close`` once. Owned by the thread that writes bags."""
 
-    def __init__(self, notes: Notes, settings: BagSettings, place: BagPlace, salvage: Salvage,
+    def __init__(self, state: BagState, settings: BagSettings, place: BagPlace, recovery: BagRecovery,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
-        """``salvage`` gets a bag that waits for its date."""
-        self.notes = notes
+        """``recovery`` gets a bag that waits for its date."""
+        self.state = state
         self._place = place
         self.number = -1
         """Of the newest slice."""
@@ -52,7 +53,7 @@ class Recording:
         self.refused = ''
         """Why nothing is written now; empty while all is well."""
         self._settings = settings
-        self._salvage = salvage
+        self._recovery = recovery
         self._monotonic = monotonic
         self._writer: SliceWriter | None = None
         self._channels: dict[tuple[str, str], Channel] = {}
@@ -64,6 +65,7 @@ class Recording:
         """Slices that the disk refused to go on with, what was written into them, and why it refused."""
         self._closed_bytes = 0
         self._began_s = self._again_s = 0.0
+        place.writer.put(rows=[state.rows()], wait=False)
 
     @property
     def bytes(self) -> int:
@@ -78,11 +80,13 @@ class Recording:
             return
         writer = self._writer
         assert writer is not None
+        if not self._written:
+            self._began_s = self._monotonic()
         self._written[lot.topic] += len(lot.messages)
         self.messages += len(lot.messages)
         channel, places = self._channel(lot), self._unnumbered.setdefault(lot.topic, itertools.count(1))
         try:
-            for cdr, source_ns, _, number, received_ns in self._place.by_clock_of(self.notes, lot).messages:
+            for cdr, source_ns, _, number, received_ns in self._place.by_clock_of(self.state, lot).messages:
                 writer.write(channel, received_ns, source_ns, next(places) if number is None else number, cdr)
         except OSError as error:
             self._break(error)
@@ -104,58 +108,67 @@ class Recording:
             self._break(error)
             return
         if not self._place.spool.has_room():
-            self.split()
-            self._refuse(NO_ROOM, 'there is no room')
+            self.split()  # the next one is refused
         elif self._monotonic() - self._began_s >= self._settings.slice_s:
             self.split()
 
     def split(self) -> None:
-        """End the slice, if one is open; the next message begins another."""
-        writer, self._writer = self._writer, None
-        if writer is None:
-            return
-        try:
-            info = writer.close()
-        except OSError as error:
-            self._writer = writer
-            self._break(error)
-        else:
-            self._written.clear()
-            self._hand_over(info)
-            self._note_lost()
+        """End the slice, if it has messages, and begin the next one."""
+        if self._end_slice():
+            self._begin()
 
     def close(self, deadline_s: float) -> bool:
         """End the bag; False when it is left to the next start to make it whole. Without a date it waits for one."""
-        self.split()
         self._again_s = 0.0
+        has_slice = self._end_slice()
         if not self._mend():
             return False
         self._note_lost()
-        notes = self.notes
+        state, place = self.state, self._place
+        state.ended = True
+        is_waiting = not state.is_named
+        if has_slice:
+            self._begin()  # until the bag is whole it says what is known of it
+        self._tell()
         try:
-            if notes.slices or notes.missing:
-                notes.end()
-                if not self._name():
-                    return True
-                if not self._place.writer.flush(deadline_s):
-                    return False
-                note_evicted(notes, self._place.spool.states(BUCKET, prefix_of(notes.robot, notes.bag)))
-                for item in ending_objects(notes):
-                    self._place.writer.put(item, wait=False)
-                if not self._place.writer.flush(deadline_s):
-                    return False
-            notes.remove()
+            self._leave()
+            if (state.slices or state.missing) and not place.settle(state):
+                self._recovery.add(state)
+                return True
+            if is_waiting:
+                for info in state.slices.values():
+                    self._put_slice(info)
+            return finish(state, place.writer, deadline_s)
         except OSError as error:
-            log.warning('the folder of bag %s is left to the next start: %s', notes.bag, error)
+            log.warning('the folder of bag %s is left to the next start: %s', state.bag, error)
             return False
-        return True
 
     def set_mission(self, mission: MissionOf) -> None:
         """More is known of the mission that it is recorded in."""
-        try:
-            self.notes.set_mission(mission)
-        except OSError as error:
-            log.warning('bag %s: %s', self.notes.bag, error)
+        self.state.mission = mission
+        self._tell()
+
+    def set_event(self, event: EventOf) -> None:
+        """There are more triggers."""
+        self.state.event = event
+        self._tell()
+
+    def _tell(self) -> None:
+        """The index and the open slice what is known of the bag now."""
+        self._place.writer.put(rows=[self.state.rows()], wait=False)
+        if self._writer is not None:
+            try:
+                self._writer.add_metadata(RECORD, self.state.news())
+                self._writer.sync()
+            except OSError as error:
+                self._break(error)
+
+    def _leave(self) -> None:
+        """Let go of the open slice, which has no messages, under a name that says so. Raises OSError."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.abort()
+            writer.path.with_name(writer.path.name + OPEN).replace(writer.path.with_name(writer.path.name + ENDED))
 
     # -- slices ----------------------------------------------------------------------------------------------------
 
@@ -177,18 +190,24 @@ class Recording:
             return False
         if not self._mend():
             return False
-        path = self.notes.folder / slice_file(self.notes.folder.name, self.number + 1)
+        path = self.state.folder / slice_file(self.state.folder.name, self.number + 1)
         try:
             path.with_name(path.name + OPEN).unlink(missing_ok=True)  # what a try that failed has left
-            self._writer = SliceWriter(path, compression=self._settings.compression, ros_distro=ros_distro())
+            writer = SliceWriter(path, compression=self._settings.compression, ros_distro=ros_distro())
+            try:
+                writer.add_metadata(RECORD, self.state.record(self._place.spool.owner, self.number + 1))
+                writer.sync()
+            except OSError:
+                writer.abort()
+                raise
         except OSError as error:
             self._refuse(_reason(error), str(error))
             return False
+        self._writer = writer
         self._note_lost()
         self.number += 1
-        self._began_s = now_s
         if self.refused:
-            log.info('bag %s goes on', self.notes.bag)
+            log.info('bag %s goes on', self.state.bag)
         self.refused = ''
         return True
 
@@ -222,43 +241,44 @@ class Recording:
                 info.path.unlink(missing_ok=True)
         return True
 
-    def _hand_over(self, info: SliceInfo) -> None:
-        """A whole slice to the spool, which takes the file."""
-        self._closed_bytes += info.bytes
-        try:
-            self.notes.add_slice(info)
-        except OSError as error:
-            log.warning('bag %s: %s', self.notes.bag, error)
-        if self.notes.is_named:
-            self._put_slice(info)
-
-    def _put_slice(self, info: SliceInfo) -> None:
-        self._place.writer.put(slice_object(self.notes, info, self._settings.priority), wait=False)
-
-    def _name(self) -> bool:
-        """Whether the bag has a name to leave by; one that gets it now lets go of its slices. Raises OSError."""
-        notes = self.notes
-        if notes.is_named:
-            return True
-        if not self._place.settle(notes):
-            self._salvage.add(notes.folder)
+    def _end_slice(self) -> bool:
+        """Close the open slice and hand it over; whether there was one with messages."""
+        writer = self._writer
+        if writer is None or not self._written:
             return False
-        for info in notes.slices.values():
-            self._put_slice(info)
+        try:
+            info = writer.close()
+        except OSError as error:
+            self._break(error)
+            return True
+        self._writer = None
+        self._written.clear()
+        self._hand_over(info)
+        self._note_lost()
         return True
+
+    def _hand_over(self, info: SliceInfo) -> None:
+        """A whole slice to the spool, which takes the file; that of a bag without a name waits in the folder."""
+        self._closed_bytes += info.bytes
+        rows = self.state.add_slice(info)
+        if self.state.is_named:
+            self._put_slice(info, rows)
+        else:
+            self._place.writer.put(rows=[rows], wait=False)
+
+    def _put_slice(self, info: SliceInfo, *rows: RecordingRows) -> None:
+        self._place.writer.put(slice_object(self.state, info, self._settings.priority), rows=rows, wait=False)
 
     def _note_lost(self) -> None:
         """The manifest names what was dropped since the slice before, all of it in or after the newest slice."""
         lost, self._lost = self._lost, Counter()
-        file = slice_file(self.notes.folder.name, max(0, self.number))
+        file = slice_file(self.state.folder.name, max(0, self.number))
         found = sorted(lost.items())
         self._note(*(Missing(file, f'dropped: {reason}', count, topic, reason) for (topic, reason), count in found))
 
     def _note(self, *missing: Missing) -> None:
-        try:
-            self.notes.add_missing(*missing)
-        except OSError as error:
-            log.warning('bag %s: %s', self.notes.bag, error)
+        if missing:
+            self._place.writer.put(rows=[self.state.add_missing(*missing)], wait=False)
 
     def _drop(self, lot: Lot) -> None:
         reason, messages = self.refused or UNWRITABLE, lot.messages
@@ -267,12 +287,12 @@ class Recording:
 
     def _count(self, topic: str, reason: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
         self.dropped += count
-        self._place.spool.accounts.drop(f'{self.notes.sink}{topic}', reason, count, from_ns, to_ns)
+        self._place.spool.accounts.drop(f'{self.state.sink}{topic}', reason, count, from_ns, to_ns)
 
     def _refuse(self, reason: str, text: str) -> None:
         self._again_s = self._monotonic() + RETRY_S
         if not self.refused:
-            log.error('bag %s: nothing is recorded while the disk takes nothing: %s', self.notes.bag, text)
+            log.error('bag %s: nothing is recorded while the disk takes nothing: %s', self.state.bag, text)
         self.refused = reason
 
 

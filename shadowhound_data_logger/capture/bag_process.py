@@ -30,7 +30,7 @@ from shadowhound_data_logger.bags.naming import MANIFEST, unsynced_mark
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
-from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.capture.bags import BagConsumer
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.node import StopSignals
@@ -40,7 +40,7 @@ from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import BagError, DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import check_name
-from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.model import DataObject, RecordingRows
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -88,10 +88,11 @@ class ManifestWriter(SpoolWriter):
         super().__init__(spool)
         self._manifests: list[Manifest] = []
 
-    def put(self, item: DataObject, *, wait: bool = True) -> None:
-        if item.key.endswith(f'/{MANIFEST}') and isinstance(item.body, bytes):
-            self._manifests.append(Manifest.from_json(item.body))
-        super().put(item, wait=wait)
+    def put(self, *items: DataObject, rows: Sequence[RecordingRows] = (), wait: bool = True) -> None:
+        for item in items:
+            if item.key.endswith(f'/{MANIFEST}') and isinstance(item.body, bytes):
+                self._manifests.append(Manifest.from_json(item.body))
+        super().put(*items, rows=rows, wait=wait)
 
     def manifest_of(self, began_as: str) -> Manifest | None:
         """That of the bag which began under this name; it has another one where the clock was set meanwhile."""
@@ -191,8 +192,8 @@ def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: Sp
     bags = BagConsumer(node, settings.bag, accounts, queue)
     intake = Intake(node, {}, accounts, MessageTypes(), [bags])
     place = BagPlace(settings.home / RECORDS / settings.robot, settings.robot, clock, writer)
-    salvage = Salvage(place, settings.bag.priority)
-    recorder = Recorder(settings.bag, place, queue, salvage, partial(intake.listen, bags))
+    recovery = BagRecovery(place, settings.bag.priority)
+    recorder = Recorder(settings.bag, place, queue, recovery, partial(intake.listen, bags))
     writer.open()
     opened.callback(writer.close, CLOSE_S)
     intake.open()

@@ -16,8 +16,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.ring import Claims, Held, Ring
-from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.capture.bags import profiles_offered
 from shadowhound_data_logger.capture.consumers import Consumer, Drained, TopicChoice
 from shadowhound_data_logger.capture.endpoints import POLL_S
@@ -90,11 +90,11 @@ class EventBuffer:
     Life: New; open once; ``close`` after the intake.
     """
 
-    def __init__(self, node: Node, settings: Settings, place: BagPlace, salvage: Salvage,
+    def __init__(self, node: Node, settings: Settings, place: BagPlace, recovery: BagRecovery,
                  types: MessageTypes) -> None:  # fmt: skip
         options, home = settings.events, settings.home
         ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
-        self.events = Events(options, settings.bag, place, ring, salvage, POLL_S)
+        self.events = Events(options, settings.bag, place, ring, recovery, POLL_S)
         self.consumer = EventConsumer(node, options, ring, self.events.claims) if options.enabled else None
         self._watch = self._make_watch(options, home, place, types)
 

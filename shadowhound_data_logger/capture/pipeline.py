@@ -20,7 +20,7 @@ from shadowhound_data_logger.bags.naming import BAGS
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
-from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.capture.bags import BagConsumer
 from shadowhound_data_logger.capture.commands import Commands
 from shadowhound_data_logger.capture.control import ControlSocket
@@ -128,8 +128,8 @@ class Pipeline:
         accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         place = BagPlace(settings.home / BAGS / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
                       self._record.offsets)  # fmt: skip
-        salvage = Salvage(place, settings.bag.priority)
-        self.event_buffer = EventBuffer(node, settings, place, salvage, types)
+        recovery = BagRecovery(place, settings.bag.priority)
+        self.event_buffer = EventBuffer(node, settings, place, recovery, types)
         # Who listens to the robot; what is wanted besides the sensors' topics is shared with those further down.
         queue, bag_queue = BatchQueue(settings.queue), BagQueue()
         sensors = {sensor.name: sensor for sensor in settings.sensors}
@@ -139,7 +139,7 @@ class Pipeline:
         bags = BagConsumer(node, settings.bag, accounts, bag_queue)
         consumers = (track, sampler, *self.event_buffer.consumers, bags)
         self.intake = Intake(node, sensors, accounts, types, consumers, first=[track.odometry])
-        self.recorder = Recorder(settings.bag, place, bag_queue, salvage, partial(self.intake.listen, bags))
+        self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
         self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)
         marks = self.mission.mark, track.mark, self._redating.date

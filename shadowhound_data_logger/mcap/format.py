@@ -87,6 +87,8 @@ class Contents:
     """Record of each channel."""
     chunks: list[bytes] = field(default_factory=list)
     """Chunk index records, in the order of the file."""
+    metadata: list[bytes] = field(default_factory=list)
+    """Metadata index records, the same."""
     messages: int = 0
     t_start_ns: int = 0
     t_end_ns: int = 0
@@ -126,6 +128,10 @@ class Contents:
         ))  # fmt: skip
         return bytes(indexes)
 
+    def add_metadata(self, at: int, length: int, name: str) -> None:
+        """Take in a metadata record that begins at the offset ``at``; ``length`` is that of the whole record."""
+        self.metadata.append(record(Opcode.METADATA_INDEX, struct.pack('<QQ', at, length), text(name)))
+
     def info(self, path: Path, size: int = 0, sha256: str = '', damage: Damage | None = None) -> SliceInfo:
         """What is known of the slice, its channels in the order in which they were declared."""
         counts: dict[str, int] = {}
@@ -138,12 +144,13 @@ class Contents:
         """All that follows the last chunk, which ends at the offset ``at``: rosbag2's metadata, the summary, the footer."""
         said = record(Opcode.METADATA, text('rosbag2'), mapping({'serialized_metadata': metadata}))
         data = said + record(Opcode.DATA_END, struct.pack('<I', 0))
+        self.add_metadata(at, len(said), 'rosbag2')
         groups = {
             Opcode.SCHEMA: b''.join(self.schemas.values()),
             Opcode.CHANNEL: b''.join(self.declared.values()),
             Opcode.STATISTICS: self._statistics(),
             Opcode.CHUNK_INDEX: b''.join(self.chunks),
-            Opcode.METADATA_INDEX: record(Opcode.METADATA_INDEX, struct.pack('<QQ', at, len(said)), text('rosbag2')),
+            Opcode.METADATA_INDEX: b''.join(self.metadata),
         }
         start = position = at + len(data)
         summary, offsets = b'', b''
@@ -157,7 +164,6 @@ class Contents:
 
     def _statistics(self) -> bytes:
         counted = b''.join(_PLACE.pack(number, track.count) for number, track in self.tracks.items())
-        body = _STATISTICS.pack(
-            self.messages, len(self.schemas), len(self.tracks), 0, 1, len(self.chunks), self.t_start_ns, self.t_end_ns
-        )
+        numbers = self.messages, len(self.schemas), len(self.tracks), 0, len(self.metadata), len(self.chunks)
+        body = _STATISTICS.pack(*numbers, self.t_start_ns, self.t_end_ns)
         return record(Opcode.STATISTICS, body, struct.pack('<I', len(counted)), counted)

@@ -6,16 +6,19 @@ The format: https://mcap.dev/spec. Two short reads tell all of it, so a file in 
 from __future__ import annotations
 
 import io
+import os
 import struct
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final, Protocol, TypeVar
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
-from mcap.records import ChunkIndex, Footer, Schema, Statistics
+from mcap.records import ChunkIndex, Footer, Metadata, Schema, Statistics
 
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.format import MAGIC, RECORD
@@ -154,6 +157,25 @@ def records(content: memoryview, name: str) -> Iterator[tuple[int, int, memoryvi
             raise BagDamaged(f'{name} has a torn record at {place}', path=name)
         yield kind, place, content[place + RECORD.size : end]
         place = end
+
+
+def read_metadata(path: Path, name: str) -> Iterator[Mapping[str, str]]:
+    """The metadata records of this name in a file, as far as it goes: it may still be written, or be torn. Raises OSError."""
+    file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        size, at = os.fstat(file).st_size, len(MAGIC)
+        while len(start := os.pread(file, RECORD.size, at)) == RECORD.size:
+            kind, length = RECORD.unpack(start)
+            if kind in {0, Opcode.DATA_END} or at + RECORD.size + length > size:
+                return
+            if kind == Opcode.METADATA and length <= MOST_SUMMARY_BYTES:
+                with suppress(*UNREADABLE):
+                    found = parsed(Metadata, os.pread(file, length, at + RECORD.size))
+                    if found.name == name:
+                        yield found.metadata
+            at += RECORD.size + length
+    finally:
+        os.close(file)
 
 
 def _index(summary: memoryview, data_end: int, source: Ranged) -> McapIndex:

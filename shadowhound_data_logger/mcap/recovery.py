@@ -6,7 +6,7 @@ large slice takes neither memory nor a second copy. Every step can be interrupte
 recovery takes the memory of one chunk, packed and unpacked, each at most ``MOST_CHUNK_BYTES``, and of the summary's content, at
 most ``MOST_SUMMARY_BYTES`` before Python's overhead.
 
-This repairs the bytes of a slice; ``bags/salvage.py`` decides about a bag, ``spool/recovery.py`` repairs a spool.
+This repairs the bytes of a slice; ``bags/recovery.py`` decides about a bag, ``spool/recovery.py`` repairs a spool.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final
 
 from mcap.opcode import Opcode
-from mcap.records import Chunk
+from mcap.records import Chunk, Metadata
 
 from shadowhound_data_logger.disk import fingerprint, sync
 from shadowhound_data_logger.mcap.format import (
@@ -49,7 +49,7 @@ MOST_CHUNK_BYTES: Final = 256 << 20
 MOST_SUMMARY_BYTES: Final = 64 << 20
 RETIRED: Final = 0x80
 """Added to the first byte of a record that is damaged: what begins with 0x80 or more is skipped by every reader."""
-_DATA: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE_INDEX})
+_DATA: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.METADATA})
 _ENDING: Final = text('rosbag2')
 """What the metadata record begins with that follows the last chunk of a slice that was being closed; it is written anew."""
 _SUSPECT_BYTES: Final = 200
@@ -132,6 +132,8 @@ class _Scanner:
                 after = self._chunk(at, length)
             elif op in {Opcode.SCHEMA, Opcode.CHANNEL}:
                 self._declare(op, at, length)
+            elif op == Opcode.METADATA:
+                self._metadata(at, length)
             else:  # retired by a recovery before this one, or the index of a chunk that is not whole
                 self._suspect(op, at, length)
                 return after
@@ -174,6 +176,16 @@ class _Scanner:
         known[number] = record(op, content)
         if op == Opcode.CHANNEL:
             self._tracks[number] = ChannelTrack(number, self._schemas.channels[number])
+
+    def _metadata(self, at: int, length: int) -> None:
+        if length > MOST_SUMMARY_BYTES:
+            raise _Damaged
+        try:
+            name = parsed(Metadata, self._read(at + RECORD.size, length)).name
+        except UNREADABLE as error:
+            raise _Damaged from error
+        self._found.contents.add_metadata(at, RECORD.size + length, name)
+        self._held_bytes += len(self._found.contents.metadata[-1])
 
     def _chunk(self, at: int, length: int) -> int:
         """A chunk with the message indexes behind it; where they end."""

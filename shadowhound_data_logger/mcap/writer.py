@@ -6,7 +6,7 @@ import hashlib
 import os
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +22,8 @@ from shadowhound_data_logger.mcap.format import (
     ChunkPacking,
     Contents,
     head,
+    mapping,
+    record,
     span,
     text,
 )
@@ -102,6 +104,13 @@ class SliceWriter:
         track.index.append(log_ns)
         track.index.append(at)
         self._used = after
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Add a metadata record after all that was written; on disk with the next ``sync``."""
+        self._end_chunk()
+        said = record(Opcode.METADATA, text(name), mapping(values))
+        self._contents.add_metadata(self._written, len(said), name)
+        self._append(said)
 
     def sync(self) -> None:
         """End the chunk and wait until the disk has it."""

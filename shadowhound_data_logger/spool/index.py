@@ -25,7 +25,17 @@ from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import Binding, DataObject, HeldObject, ObjectInfo, SpooledObject, State
+from shadowhound_data_logger.model import (
+    Binding,
+    DataObject,
+    HeldObject,
+    MissingRow,
+    ObjectInfo,
+    RecordingRows,
+    SliceRow,
+    SpooledObject,
+    State,
+)
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.schema import (
@@ -560,6 +570,32 @@ class Index:
         ever = self._db.execute("SELECT ifnull(sum(objects), 0) FROM tally WHERE state = 'delivered'").fetchone()[0]
         full = self._db.execute("SELECT count(*) FROM objects WHERE state = 'delivered'").fetchone()[0]
         return int(ever) - int(full) - int(self._db.execute('SELECT count(*) FROM compact_objects WHERE state = 0').fetchone()[0])
+
+    # -- recordings ------------------------------------------------------------------------------------------------
+
+    def record(self, owner: str, rows: RecordingRows) -> None:
+        """Add to what is known of a recording, or forget it, in a transaction."""
+        place = owner, rows.folder
+        if rows.is_whole:
+            for table in ('recordings', 'slices', 'missing'):
+                self._db.execute(f'DELETE FROM {table} WHERE owner = ? AND folder = ?', place)  # noqa: S608 - own constants only
+            return
+        self._db.execute('INSERT OR REPLACE INTO recordings VALUES (?,?,?,?)', (*place, rows.said, rows.channels))
+        self._db.executemany('INSERT OR REPLACE INTO slices VALUES (?,?,?,?,?,?,?,?,?)', ((*place, *row) for row in rows.slices))
+        self._db.executemany('INSERT OR REPLACE INTO missing VALUES (?,?,?,?,?,?,?,?)', ((*place, *row) for row in rows.missing))
+
+    def recordings(self, owner: str) -> list[RecordingRows]:
+        """What is known of an owner's recordings that are not whole yet."""
+        found = self._db.execute('SELECT folder, said, channels FROM recordings WHERE owner = ?', (owner,)).fetchall()
+        return [RecordingRows(
+            folder, said, channels,
+            tuple(SliceRow(*one) for one in self._db.execute(
+                'SELECT number, bytes, sha256, t_start_ns, t_end_ns, messages, counts FROM slices'
+                ' WHERE owner = ? AND folder = ? ORDER BY number', (owner, folder))),
+            tuple(MissingRow(*one) for one in self._db.execute(
+                'SELECT place, file, what, messages, topic, reason FROM missing WHERE owner = ? AND folder = ? ORDER BY place',
+                (owner, folder))),
+        ) for folder, said, channels in found]  # fmt: skip
 
     # -- accounts --------------------------------------------------------------------------------------------------
 

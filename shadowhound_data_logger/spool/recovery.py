@@ -9,7 +9,7 @@ removes that at a clean stop only). Then a part that is whole by its own descrip
 names. Where it had not been committed after all its samples are stored as well as lost at the restart: rather that than the
 other way round. A log that is there but damaged does not show; with it, what was being renamed in that instant is lost.
 
-This mends a spool; ``bags/salvage.py`` decides about a bag, ``mcap/recovery.py`` repairs the bytes of a slice.
+This mends a spool; ``bags/recovery.py`` decides about a bag, ``mcap/recovery.py`` repairs the bytes of a slice.
 """
 
 from __future__ import annotations

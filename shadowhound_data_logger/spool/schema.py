@@ -97,6 +97,22 @@ CREATE TABLE publishers (
   published INTEGER NOT NULL, received INTEGER NOT NULL, missed TEXT NOT NULL, heard_ns INTEGER NOT NULL,
   PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
 """
+_RECORDINGS: Final = """
+CREATE TABLE recordings (
+  owner TEXT NOT NULL, folder TEXT NOT NULL, said TEXT NOT NULL, channels TEXT NOT NULL,
+  PRIMARY KEY (owner, folder)) WITHOUT ROWID;
+CREATE TABLE slices (
+  owner TEXT NOT NULL, folder TEXT NOT NULL, number INTEGER NOT NULL, bytes INTEGER NOT NULL, sha256 TEXT NOT NULL,
+  t_start_ns INTEGER NOT NULL, t_end_ns INTEGER NOT NULL, messages INTEGER NOT NULL, counts TEXT NOT NULL,
+  PRIMARY KEY (owner, folder, number)) WITHOUT ROWID;
+CREATE TABLE missing (
+  owner TEXT NOT NULL, folder TEXT NOT NULL, place INTEGER NOT NULL, file TEXT NOT NULL, what TEXT NOT NULL,
+  messages INTEGER, topic TEXT, reason TEXT, PRIMARY KEY (owner, folder, place)) WITHOUT ROWID;
+"""
+"""Bags that are not whole in the spool yet, with their closed slices and what is missing in them (``model.RecordingRows``).
+
+``owner`` is the robot's name, of the node, or that of ``bag record``.
+"""
 _LOST: Final = f"('{State.EVICTED.value}', '{State.QUARANTINED.value}')"
 
 
@@ -274,6 +290,7 @@ CREATE TABLE sessions (
 {_GAP_TABLE}
 {_COMPACT_OBJECTS}
 {_GAPS_TOLD}
+{_RECORDINGS}
 PRAGMA user_version = {SCHEMA_VERSION};
 """  # noqa: S608 - own constants only
 MIGRATIONS: Final = {
@@ -282,7 +299,7 @@ MIGRATIONS: Final = {
     3: _OTHER_TYPES,
     4: f'{_ESTIMATES} {_REGRADED}',
     5: _JOURNALED,
-    6: _COMPACTED,
+    6: f'{_COMPACTED} {_RECORDINGS}',
 }
 """Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
 _AS_NOW: Final = """
@@ -357,10 +374,14 @@ _NUMBERS: Final = {
     'folders': ('id',),
     'compact_objects': ('folder', 'id', 'state', 'bytes', 'settled_s'),
     'gaps_told': ('version', 'again'),
+    'recordings': (),
+    'slices': ('number', 'bytes', 't_start_ns', 't_end_ns', 'messages'),
+    'missing': ('place', 'messages'),
     'sqlite_sequence': ('seq',),
 }
 _COUNTS: Final = frozenset({'id', 'samples', 'bytes', 'received', 'skipped', 'stored', 'published', 'objects', 'seq', 'session',
-                            'messages', 'estimated', 'unknown', 'count', 'merged', 'version', 'folder', 'again'})  # fmt: skip
+                            'messages', 'estimated', 'unknown', 'count', 'merged', 'version', 'folder', 'again', 'number',
+                            'place'})  # fmt: skip
 """Never below 0, and no more than can be counted. Times and the numbers of messages are whatever a publisher says."""
 _MOST: Final = 1 << 53
 _TEXTS: Final = {
@@ -377,6 +398,9 @@ _TEXTS: Final = {
     'folders': ('bucket', 'path', 'sensor'),
     'compact_objects': ('name',),
     'gaps_told': ('robot',),
+    'recordings': ('owner', 'folder', 'said', 'channels'),
+    'slices': ('owner', 'folder', 'sha256', 'counts'),
+    'missing': ('owner', 'folder', 'file', 'what', 'topic', 'reason'),
     'sqlite_sequence': ('name',),
 }
 _JSON: Final = {

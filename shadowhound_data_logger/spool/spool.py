@@ -22,7 +22,7 @@ from shadowhound_data_logger.clock import SECOND, Clock
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, SpooledObject, State
+from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, RecordingRows, SpooledObject, State
 from shadowhound_data_logger.spool import binding
 from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
@@ -116,7 +116,8 @@ class Spool:
                                  remedy='start again: it is rebuilt from the files then') from error  # fmt: skip
             self._leave(session)
 
-    def commit(self, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (), *,
+    def commit(self, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (),
+               rows: Sequence[RecordingRows] = (), *,
                durable: Callable[[list[SpooledObject]], None] = lambda _: None) -> list[SpooledObject]:  # fmt: skip
         """One group commit. Returns the objects that may be shipped now, under their final keys.
 
@@ -127,7 +128,7 @@ class Spool:
         self._keep_index()
         with staged(self._tree, self._session.number if self._session else 0, objects) as ready:
             with self._lock:
-                placed = self._ballast.work(lambda: self._commit(ready, outcomes))
+                placed = self._ballast.work(lambda: self._commit(ready, outcomes, rows))
                 self._ballast.keep(self._tree.free_bytes, self._settings.min_free_bytes)
             durable(placed)
             self._settle(outcomes)
@@ -187,6 +188,15 @@ class Spool:
             index.open()
             with index.snapshot():
                 return index.gaps.changed(version, limit, offsets), index.gaps.watermarks()
+
+    @property
+    def owner(self) -> str:
+        """Whose sessions and recordings are its own."""
+        return self._robot
+
+    def recordings(self) -> list[RecordingRows]:
+        """Bags of this owner that are not whole yet. Waits for no commit; raises sqlite3.Error."""
+        return self._view.recordings(self._robot)
 
     def free_bytes(self) -> int:
         """What this user may still write to the spool's file system. Raises OSError."""
@@ -311,7 +321,8 @@ class Spool:
         while not (self.root / 'index.db').exists() and any_alive(self._tree) and time.monotonic() < end_s:
             time.sleep(PUT_BACK_S / 50)
 
-    def _commit(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> list[SpooledObject]:
+    def _commit(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome],
+                rows: Sequence[RecordingRows]) -> list[SpooledObject]:  # fmt: skip
         now_ns = self._clock.wall_ns()
         leaving = sum(outcome.item.size + OVERHEAD_BYTES for outcome in outcomes if outcome.state is not State.QUARANTINED)
         room = make_room(self._index, self._tree, self._settings, objects, leaving, now_ns)
@@ -327,6 +338,8 @@ class Spool:
                 adding.sync()
                 for outcome in outcomes:
                     self._index.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
+                for each in rows:
+                    self._index.record(self._robot, each)
                 if snapshot is not None and self._session is not None:
                     self._index.write(self._session.number, snapshot)
                 self._tidy(now_ns)

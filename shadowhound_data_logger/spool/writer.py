@@ -11,10 +11,10 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.model import DataObject, FileBody, Outcome, SpooledObject
+from shadowhound_data_logger.model import DataObject, FileBody, Outcome, RecordingRows, SpooledObject
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.worker import Worker
 
@@ -33,7 +33,14 @@ HANGING_S: Final = 10.0
 """A commit that takes longer hangs in the disk: usual is a hundredth of a second, a slow card at its worst takes a few."""
 
 
-_Group = tuple[Sequence[DataObject], Sequence[Outcome]]
+class _Unit(NamedTuple):
+    """What one commit takes, all of it."""
+
+    objects: tuple[DataObject, ...]
+    rows: tuple[RecordingRows, ...]
+
+
+_Group = tuple[Sequence[_Unit], Sequence[Outcome]]
 
 
 class SpoolWriter:
@@ -48,7 +55,7 @@ class SpoolWriter:
         self._spooled: Callable[[Sequence[SpooledObject]], None] = lambda _: None
         self._settled: Callable[[Collection[int]], None] = lambda _: None
         self._changed = threading.Condition()
-        self._objects: deque[DataObject] = deque()
+        self._units: deque[_Unit] = deque()
         self._outcomes: deque[Outcome] = deque()
         self._bytes = 0
         self._added = self._done = 0
@@ -70,14 +77,18 @@ class SpoolWriter:
     def open(self) -> None:
         self.worker.start()
 
-    def put(self, item: DataObject, *, wait: bool = True) -> None:
-        """Queue an object for the next commit; waits while too many bytes wait. Raises NameRefused for a bad key."""
-        check_key(item.key)
+    def put(self, *items: DataObject, rows: Sequence[RecordingRows] = (), wait: bool = True) -> None:
+        """Queue objects for the next commit, and what it writes of recordings; waits while too many bytes wait.
+
+        Raises NameRefused for a bad key.
+        """
+        for item in items:
+            check_key(item.key)
         with self._changed:
             if wait:
                 self._changed.wait_for(lambda: self._bytes < MAX_WAITING_BYTES or self.worker.stopping)
-            self._objects.append(item)
-            self._bytes += _in_memory(item)
+            self._units.append(_Unit(items, tuple(rows)))
+            self._bytes += sum(map(_in_memory, items))
             self._added += 1
             self._changed.notify_all()
 
@@ -119,10 +130,10 @@ class SpoolWriter:
             pause_s = self._last_commit + self._commit_s - time.monotonic()
             if pause_s > 0 and not self._urgent:
                 self._changed.wait_for(lambda: self._urgent or self.worker.stopping, pause_s)
-            objects, outcomes = list(self._objects), list(self._outcomes)
+            units, outcomes = list(self._units), list(self._outcomes)
         self._last_commit = time.monotonic()
         try:
-            groups = self._groups(objects, outcomes)
+            groups = self._groups(units, outcomes)
             for group in groups:
                 if len(groups) > 1:
                     self.spool.accounts.unsettle()
@@ -135,38 +146,41 @@ class SpoolWriter:
                 self._changed.notify_all()
             raise
 
-    def _groups(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> list[_Group]:
+    def _groups(self, units: Sequence[_Unit], outcomes: Sequence[Outcome]) -> list[_Group]:
         """One commit of all, or several of a burst; also where the disk has no room, since files leave only after a commit.
 
         Then first what was delivered, then the files, which lie there already and of which some may be given up, last what is
         written.
         """
+        objects = [item for unit in units for item in unit.objects]
         if not objects or self.spool.fits(objects):
-            first, *more = list(_parted(objects)) or [[]]
+            first, *more = list(_parted(units)) or [[]]
             return [(first, outcomes), *((part, []) for part in more)]
-        files = [item for item in objects if isinstance(item.body, FileBody)]
-        rest = [item for item in objects if not isinstance(item.body, FileBody)]
+        files = [unit for unit in units if all(isinstance(item.body, FileBody) for item in unit.objects)]
+        rest = [unit for unit in units if not all(isinstance(item.body, FileBody) for item in unit.objects)]
         groups: list[_Group] = [([], outcomes), (files, []), (rest, [])]
         return [group for group in groups if any(group)]
 
-    def _commit(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome]) -> None:
-        self.spool.commit(objects, outcomes, durable=lambda spooled: self._committed(objects, outcomes, spooled))
+    def _commit(self, units: Sequence[_Unit], outcomes: Sequence[Outcome]) -> None:
+        objects, rows = [item for unit in units for item in unit.objects], [each for unit in units for each in unit.rows]
+        self.spool.commit(objects, outcomes, rows, durable=lambda spooled: self._committed(units, outcomes, spooled))
 
     def _due(self) -> bool:
         """Whether there is something that waits for a commit; the caller holds the lock."""
-        return bool(self._objects) or self._urgent or len(self._outcomes) >= (1 if self.prompt else MANY_OUTCOMES)
+        return bool(self._units) or self._urgent or len(self._outcomes) >= (1 if self.prompt else MANY_OUTCOMES)
 
-    def _committed(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome], spooled: Sequence[SpooledObject]) -> None:
+    def _committed(self, units: Sequence[_Unit], outcomes: Sequence[Outcome], spooled: Sequence[SpooledObject]) -> None:
         """All of it is durable: let it go and tell who waits for that."""
+        objects = [item for unit in units for item in unit.objects]
         with self._changed:
-            done = {id(item) for item in objects}
-            self._objects = deque(item for item in self._objects if id(item) not in done)
+            done = {id(unit) for unit in units}
+            self._units = deque(unit for unit in self._units if id(unit) not in done)
             self._bytes -= sum(map(_in_memory, objects))
             for _ in outcomes:
                 self._outcomes.popleft()
-            self._done += len(objects) + len(outcomes)
+            self._done += len(units) + len(outcomes)
             self._written.update(objects=len(objects), messages=sum(item.samples for item in objects))
-            self._urgent = self._urgent and bool(self._objects or self._outcomes)
+            self._urgent = self._urgent and bool(self._units or self._outcomes)
             self._changed.notify_all()
         if outcomes:
             self._settled({outcome.item.id for outcome in outcomes})
@@ -174,16 +188,18 @@ class SpoolWriter:
             self._spooled(spooled)
 
 
-def _parted(objects: Sequence[DataObject]) -> Iterator[list[DataObject]]:
+def _parted(units: Sequence[_Unit]) -> Iterator[list[_Unit]]:
     """The same in their order, as many at a time as one commit takes."""
-    part: list[DataObject] = []
-    size = 0
-    for item in objects:
-        if part and (len(part) >= MOST_OBJECTS or size + _in_memory(item) > MOST_BYTES):
+    part: list[_Unit] = []
+    count = size = 0
+    for unit in units:
+        more = sum(map(_in_memory, unit.objects))
+        if part and (count + len(unit.objects) > MOST_OBJECTS or size + more > MOST_BYTES):
             yield part
-            part, size = [], 0
-        part.append(item)
-        size += _in_memory(item)
+            part, count, size = [], 0, 0
+        part.append(unit)
+        count += len(unit.objects)
+        size += more
     if part:
         yield part
 

@@ -15,8 +15,8 @@ from clocks import Clocks
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.ring import Ring
-from shadowhound_data_logger.bags.salvage import Salvage
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.options import BagSettings, EventSettings
 from shadowhound_data_logger.spool import ledger
@@ -101,17 +101,17 @@ def buffer(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator
     now_s, made = [1000.0], list[Buffer]()
     place = BagPlace(home / 'bags' / ROBOT, ROBOT, clocks, writer, 600.0)
     ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
-    salvage = Salvage(place, 8)
-    events = Events(options, bag, place, ring, salvage, POLL_S, lambda: now_s[0])
+    recovery = BagRecovery(place, 8)
+    events = Events(options, bag, place, ring, recovery, POLL_S, lambda: now_s[0])
     made.append(Buffer(spool, writer, ring, events, home, now_s))
     try:
-        salvage.open()
-        until(lambda: not salvage.is_busy, 'what was cut off is whole')
+        recovery.open()
+        until(lambda: not recovery.is_busy, 'what was cut off is whole')
         events.open()
         yield made[0]
     finally:
         events.close(WAIT_S)
-        salvage.close(WAIT_S)
+        recovery.close(WAIT_S)
         writer.close(WAIT_S)
         spool.close()
 

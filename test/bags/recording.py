@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import MAX_BYTES, BagQueue, Lot
 from shadowhound_data_logger.bags.recorder import Recorder
-from shadowhound_data_logger.bags.salvage import Salvage
+from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.options import BagSettings
@@ -124,7 +124,7 @@ def desk(home: Path, clock: Clocks | None = None, *, offsets: Mapping[str, int] 
         return True
 
     place = BagPlace(root, ROBOT, time, writer, HOLD_S, lambda: offsets or {})
-    recorder = Recorder(bag, place, queue, Salvage(place, bag.priority), listen)
+    recorder = Recorder(bag, place, queue, BagRecovery(place, bag.priority), listen)
     made.append(Desk(spool, writer, queue, recorder, home))
     try:
         recorder.open()
@@ -186,6 +186,7 @@ def write_out(it: Desk) -> None:
 
     def sync() -> None:
         assert it.recorder._writing is not None
+        it.recorder._writing.leave_out(it.queue.take_lost())
         it.recorder._writing.tick()
         done.set()
 

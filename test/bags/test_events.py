@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from bags.recording import ROBOT, STRING, WAIT_S, manifest, messages, mission
 
 from shadowhound_data_logger.bags.events import EventStatus
 from shadowhound_data_logger.bags.queue import Lot
-from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.model import DataObject, RecordingRows
 from shadowhound_data_logger.options import EventSettings
 
 
@@ -153,9 +154,9 @@ def test_it_ships_first_and_is_never_evicted(tmp_path: Path, monkeypatch: pytest
         given: list[DataObject] = []
         put = it.writer.put
 
-        def noting(item: DataObject, *, wait: bool = True) -> None:
-            given.append(item)
-            put(item, wait=wait)
+        def noting(*items: DataObject, rows: Sequence[RecordingRows] = (), wait: bool = True) -> None:
+            given.extend(items)
+            put(*items, rows=rows, wait=wait)
 
         monkeypatch.setattr(it.writer, 'put', noting)
         it.hear(range(5))

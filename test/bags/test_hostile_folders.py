@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 from bags.recording import ROBOT, desk, manifest
 from bags.slices import closed, fill, messages
+from bags.test_state import old_lines, write_lines
 
-from shadowhound_data_logger.bags.notes import FILE, MOST_BYTES, Notes
+from shadowhound_data_logger.bags.state import LINES, MOST_BYTES, BagState
 from shadowhound_data_logger.mcap.writer import SliceWriter
 
 BAG = 'patrol_20251018_120000'
@@ -22,8 +23,8 @@ BAG = 'patrol_20251018_120000'
 def folder(tmp_path: Path) -> Path:
     """Of a bag that was cut off: a slice that is whole, and one that is open, each with ten messages."""
     made = tmp_path / 'home' / 'bags' / ROBOT / BAG
-    notes = Notes.begin(made, ROBOT, None)
-    notes.add_slice(closed(made / f'{BAG}_0.mcap', 10)[0])
+    made.mkdir(parents=True)
+    write_lines(made, old_lines(made, closed(made / f'{BAG}_0.mcap', 10)[0]))
     writer = SliceWriter(made / f'{BAG}_1.mcap')
     fill(writer, messages(10))
     writer.sync()
@@ -34,8 +35,8 @@ def folder(tmp_path: Path) -> Path:
 def recovered(home: Path) -> dict[str, Path]:
     """What is in the spool after a start."""
     with desk(home) as it:
-        it.recorder._salvage.worker.join(60)
-        assert it.recorder._salvage.worker.failures == 0
+        it.recorder._recovery.worker.join(60)
+        assert it.recorder._recovery.worker.failures == 0
         return dict(it.objects())
 
 
@@ -64,12 +65,12 @@ def test_links_are_not_followed(folder: Path, tmp_path: Path) -> None:
     assert all(path.is_symlink() for path in aside.iterdir())
 
 
-def test_notes_that_are_a_link_are_not_followed(folder: Path, tmp_path: Path) -> None:
+def test_lines_that_are_a_link_are_not_followed(folder: Path, tmp_path: Path) -> None:
     """Nothing is written where they lead to, and the slices tell of themselves."""
     precious = tmp_path / 'precious'
     precious.write_text('precious')
-    (folder / FILE).unlink()
-    (folder / FILE).symlink_to(precious)
+    (folder / LINES).unlink()
+    (folder / LINES).symlink_to(precious)
     assert counts(recovered(tmp_path / 'home'), tmp_path / 'home') == WHOLE
     assert precious.read_text() == 'precious'
 
@@ -102,11 +103,11 @@ SLICE: dict[str, Any] = {'file': f'{BAG}_0.mcap', 'bytes': 1, 'sha256': 'ab' * 3
     json.dumps({'slice': {**SLICE, 'channels': [{'topic': 7}]}}).encode(), b'{"missing": {"file": 1}}\n{"mission": "patrol"}',
     b'{"event": {"name": "x", "triggers": 5}}', b'{"named": {"bag": "../../x", "clock": null}}', b'{"clock": {"boot_id": 1}}',
 ])  # fmt: skip
-def test_notes_that_make_no_sense(folder: Path, tmp_path: Path, content: bytes) -> None:
+def test_lines_that_make_no_sense(folder: Path, tmp_path: Path, content: bytes) -> None:
     """They cost what they would have told: what is in the folder is recovered by what it is."""
     precious = tmp_path / 'home' / 'precious'
     precious.write_text('precious')
-    (folder / FILE).write_bytes(content)
+    (folder / LINES).write_bytes(content)
     home = tmp_path / 'home'
     found = recovered(home)
     assert counts(found, home) == WHOLE
@@ -117,20 +118,20 @@ def test_notes_that_make_no_sense(folder: Path, tmp_path: Path, content: bytes) 
 
 def test_what_follows_a_line_that_makes_no_sense_counts(folder: Path) -> None:
     """Also after one that is longer than any line may be."""
-    with (folder / FILE).open('ab') as file:
+    with (folder / LINES).open('ab') as file:
         file.write(b'{"slice": "' + b'x' * (5 << 20) + b'"}\n\xff\xfe\n{"ended": true}\n')
-    notes = Notes.read(folder, ROBOT)
-    assert (list(notes.slices), notes.ended) == ([f'{BAG}_0.mcap'], True)
+    state = BagState.of_lines(folder, ROBOT)
+    assert (list(state.slices), state.ended) == ([f'{BAG}_0.mcap'], True)
 
 
-def test_notes_of_any_size_take_little_memory(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_lines_of_any_size_take_little_memory(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A file that has grown to gigabytes, in one line or none."""
-    os.truncate(folder / FILE, 4 * MOST_BYTES)
+    os.truncate(folder / LINES, 4 * MOST_BYTES)
     tracemalloc.start()
-    notes = Notes.read(folder, ROBOT)
+    state = BagState.of_lines(folder, ROBOT)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert list(notes.slices) == [f'{BAG}_0.mcap']
+    assert list(state.slices) == [f'{BAG}_0.mcap']
     assert peak < 20 << 20
     assert 'the rest of it is not read' in caplog.text
 
@@ -138,15 +139,16 @@ def test_notes_of_any_size_take_little_memory(folder: Path, caplog: pytest.LogCa
 def test_a_bag_that_cannot_be_made_whole_keeps_none_of_the_others(folder: Path, tmp_path: Path) -> None:
     """It is tried again; those after it are whole meanwhile, and the node records."""
     later = folder.with_name('patrol_20251018_130000')
-    Notes.begin(later, ROBOT, None).add_slice(closed(later / f'{later.name}_0.mcap', 7)[0])
+    later.mkdir()
+    closed(later / f'{later.name}_0.mcap', 7)
     (folder / f'{BAG}_1.mcap').write_bytes(b'in the way of the open slice')
     with desk(tmp_path / 'home') as it:
         for _ in range(200):
             if f'{later.name}/manifest.json' in it.objects():
                 break
-            it.recorder._salvage.worker.join(0.05)
+            it.recorder._recovery.worker.join(0.05)
         assert numbers_of(it.objects(), later.name) == 7
-        assert it.recorder._salvage.is_busy
+        assert it.recorder._recovery.is_busy
         assert it.recorder.start()[0]
 
 

@@ -1,16 +1,11 @@
-"""What a bag is called, and what its notes remember."""
+"""What a bag is called."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from shadowhound_data_logger.bags.manifest import Missing, MissionOf
 from shadowhound_data_logger.bags.naming import bag_name, key_of, slice_file, slice_number, unsynced_name
-from shadowhound_data_logger.bags.notes import FILE, Notes
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_key, check_name
-from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
 
 NOON_NS = 1_760_788_800 * 10**9
 BOOT = '3e2c1f6a-8a4e-4d0e-9d0a-0f6a5b7c9d11'
@@ -34,37 +29,3 @@ def test_a_bag_of_any_mission_has_a_name_that_can_be_asked_for(what: str) -> Non
         assert check_name(name, 'the bag', MAX_BAG_BYTES) == name
         assert check_key(key_of('thor', name, slice_file(name, 100_000))).count('/') == 3
         assert not name.startswith('recording')
-
-
-def info(folder: Path, number: int) -> SliceInfo:
-    channel = Channel('/imu', 'x/msg/Y', 'ros2msg', 'float32 x', 'RIHS01_0', '- history: 1')
-    return SliceInfo(folder / slice_file(folder.name, number), 10, 'ab' * 32, 1, 2, 3, {'/imu': 3}, (channel,))
-
-
-def test_notes_are_read_as_they_were_written(tmp_path: Path) -> None:
-    """After a death, a torn last line included; what does not make sense is left out."""
-    notes = Notes.begin(tmp_path / 'thor' / 'b', 'thor', MissionOf('patrol', 'patrol_1', None))
-    notes.add_slice(info(notes.folder, 0))
-    notes.add_missing(Missing('b_0.mcap', 'why', None))
-    notes.set_mission(MissionOf('patrol', 'patrol_1', 'r'))
-    with (notes.folder / FILE).open('ab') as file:
-        file.write(b'{"slice": {"file": "b_1.m')
-    found = Notes.read(notes.folder, 'thor')
-    assert found == notes
-    found.add_slice(info(notes.folder, 1))
-    found.end()
-    again = Notes.read(notes.folder, 'thor')
-    assert (list(again.slices), again.ended, again.mission) == (
-        ['b_0.mcap', 'b_1.mcap'],
-        True,
-        MissionOf('patrol', 'patrol_1', 'r'),
-    )
-    assert again.slices['b_1.mcap'].counts == {'/imu': 3}
-    again.remove()
-    assert not notes.folder.exists()
-
-
-def test_a_folder_without_notes_is_a_bag_of_which_nothing_is_known(tmp_path: Path) -> None:
-    """Its slices tell the rest."""
-    (tmp_path / 'b').mkdir()
-    assert Notes.read(tmp_path / 'b', 'thor') == Notes(tmp_path / 'b', 'b', 'thor', None)

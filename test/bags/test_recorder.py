@@ -11,12 +11,13 @@ from unittest.mock import Mock
 
 import pytest
 from bags.eventing import until
-from bags.recording import ROBOT, STRING, desk, journaled, lot, manifest, mission, numbers, start, write_out
+from bags.recording import ROBOT, STRING, Desk, desk, journaled, lot, manifest, mission, numbers, start, write_out
 from clocks import Clocks
 from mcap.reader import make_reader
 
-from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.recording import Recording
+from shadowhound_data_logger.bags.state import BagState
+from shadowhound_data_logger.model import Outcome, State
 
 
 def test_a_bag_from_start_to_stop(tmp_path: Path) -> None:
@@ -157,15 +158,15 @@ def test_one_bag_follows_the_other_without_a_gap(tmp_path: Path) -> None:
 
 def test_what_comes_while_the_next_bag_is_made_is_in_one_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its folder is synced to a disk that may be slow, and the intake goes on meanwhile."""
-    begin = Notes.begin
+    begin = BagState.begin
     with desk(tmp_path, record='always') as it:
 
-        def slowly(*given: Any, **named: Any) -> Notes:
+        def slowly(*given: Any, **named: Any) -> BagState:
             it.hear(range(10, 20))
             until(lambda: not it.queue.bytes, 'the thread has taken it')
             return begin(*given, **named)
 
-        monkeypatch.setattr(Notes, 'begin', slowly)
+        monkeypatch.setattr(BagState, 'begin', slowly)
         names = [it.recorder.status().bag]
         it.hear(range(10))
         it.recorder.on_mission(mission())
@@ -214,9 +215,9 @@ def test_a_stop_of_the_node_ends_the_bag(tmp_path: Path) -> None:
         assert it.row()['stored'] == 100
 
 
-def kill(home: Path) -> Path:
+def kill(home: Path, number: int = 0) -> Path:
     """What the next start would find had the node been killed now."""
-    copy = home.with_name(f'{home.name}-after')
+    copy = home.with_name(f'{home.name}-after-{number}')
     shutil.copytree(home, copy, copy_function=_copy)
     return copy
 
@@ -244,7 +245,7 @@ def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path, sync
     clock.set()
     clock.wait(60.0)
     with desk(left, clock) as it:
-        it.recorder._salvage.worker.join(60)
+        it.recorder._recovery.worker.join(60)
         found = it.objects()
         slices = 2 if synced else 1
         assert sorted(found) == [f'{name}/{file}' for file in ('manifest.json', 'metadata.yaml')] + [
@@ -269,7 +270,7 @@ def test_a_start_that_is_cut_short_is_done_again(tmp_path: Path) -> None:
         assert it.row()['open'] == 10
         left = kill(home)
     with desk(left) as it:
-        it.recorder._salvage.worker.join(60)
+        it.recorder._recovery.worker.join(60)
         shutil.copytree(home / 'bags', tmp_path / 'again')  # the folder as it was, beside a spool that has the bag
         again = kill(left)
     shutil.rmtree(again / 'bags', ignore_errors=True)
@@ -277,6 +278,55 @@ def test_a_start_that_is_cut_short_is_done_again(tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     shutil.copy(next(again.glob('spool/ready/*/*/rosbags/*/*_0.mcap')), folder / f'{name}_0.mcap')
     with desk(again) as it:
-        it.recorder._salvage.worker.join(60)
+        it.recorder._recovery.worker.join(60)
         assert sorted(path for path in it.objects() if path.endswith('.mcap')) == [f'{name}/{name}_0.mcap']
         assert (it.row()['stored'], it.row()['received']) == (10, 10)
+
+
+def deliver(it: Desk) -> None:
+    """All that waits, as the uploader has it."""
+    assert it.writer.flush(60)
+    it.writer.settle([Outcome(item, State.DELIVERED) for item in it.spool.pending(1000)])
+    assert it.writer.flush(60)
+
+
+def lose_index(home: Path) -> None:
+    for path in (home / 'spool').glob('index.db*'):
+        path.unlink()
+
+
+@pytest.mark.parametrize('delivered', [0, 1, 2])
+def test_what_is_known_of_a_bag_outlives_the_index(tmp_path: Path, delivered: int) -> None:
+    """Its manifest is the same, whether the slices of before are still on this robot, some of them, or none."""
+    home, ends = tmp_path / 'home', []
+    with desk(home, record='mission', queue_bytes=1000) as it:
+        it.recorder.on_mission(mission())
+        name = it.recorder.status().bag
+        for number in range(2):
+            it.hear(range(10 * number, 10 * number + 10))
+            it.hear(range(5 * number, 5 * number + 5), topic='/large', size=1000)
+            write_out(it)
+            if number:
+                it.hear(range(3), topic='/late')
+            assert it.recorder.split()[0]
+            if number < delivered:
+                deliver(it)
+        it.hear(range(20, 25))
+        it.recorder.on_mission(mission(run_id='r1'))
+        write_out(it)
+        assert it.writer.flush(60)
+        left = [kill(home, number) for number in range(2)]
+    lose_index(left[1])
+    for copy in left:
+        with desk(copy) as it:
+            it.recorder._recovery.worker.join(60)
+            found = it.objects()
+            ends.append((manifest(found, name), found[f'{name}/metadata.yaml'].read_text()))
+            assert not list(it.root.iterdir())
+    (said, _), (again, _) = ends
+    assert [(entry['file'], entry['counts']) for entry in said['slices']] == [
+        (f'{name}_0.mcap', {'/talk': 10}), (f'{name}_1.mcap', {'/talk': 10, '/late': 3}), (f'{name}_2.mcap', {'/talk': 5}),
+    ]  # fmt: skip
+    assert (said['mission']['run_id'], said['state'], len(said['missing'])) == ('r1', 'recovered', 3)
+    assert said == again
+    assert ends[0] == ends[1]

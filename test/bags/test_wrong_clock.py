@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from bags.eventing import buffer, until
 from bags.recording import ROBOT, STRING, Desk, desk, manifest, mission, numbers, start
-from bags.test_recorder import kill
+from bags.test_recorder import kill, lose_index
 from clocks import NOON_NS, Clocks
 from mcap.reader import make_reader
 
 from shadowhound_data_logger.bags.naming import slice_number
-from shadowhound_data_logger.bags.notes import Notes
 from shadowhound_data_logger.bags.overview import bag_overview
-from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.keys import unsynced
 from shadowhound_data_logger.model import Taken
@@ -51,8 +50,8 @@ def bags_of(found: dict[str, Path]) -> dict[str, list[int]]:
 
 
 def is_whole(it: Desk) -> None:
-    it.recorder._salvage.worker.join(60)
-    assert not it.recorder._salvage.is_busy
+    it.recorder._recovery.worker.join(60)
+    assert not it.recorder._recovery.is_busy
 
 
 def test_a_bag_never_spans_the_moment_in_which_the_clock_is_set(tmp_path: Path) -> None:
@@ -113,7 +112,7 @@ def test_a_bag_that_ends_before_the_clock_is_set_waits_for_it(tmp_path: Path) ->
         hear(it, clock, range(3))
         done, text = it.recorder.stop()
         assert (done, text) == (True, f'{name}: 3 messages in 1 slices; it waits for the clock of this machine to be set')
-        assert it.recorder._salvage.is_busy
+        assert it.recorder._recovery.is_busy
         assert it.objects() == {}
         assert it.row()['open'] == 3
         (row,) = bag_overview(MemoryStore(), ROBOT, it.home)
@@ -164,12 +163,15 @@ def left_in_1970(home: Path, boot_id: str = 'this-boot') -> Path:
         return kill(home)
 
 
-def test_a_start_in_the_same_boot_waits_as_well(tmp_path: Path) -> None:
+@pytest.mark.parametrize('index', ['there', 'lost'])
+def test_a_start_in_the_same_boot_waits_as_well(tmp_path: Path, index: str) -> None:
     """What a dead node left is dated once the clock is set, and says that it was cut off."""
     left = left_in_1970(tmp_path / 'home')
+    if index == 'lost':
+        lose_index(left)
     clock = Clocks()
     with desk(left, clock) as it:
-        assert it.recorder._salvage.is_busy
+        assert it.recorder._recovery.is_busy
         assert it.objects() == {}
         clock.set(NOON_NS)
         is_whole(it)
@@ -193,18 +195,40 @@ def test_a_start_in_another_boot(tmp_path: Path, offset_ns: int | None) -> None:
         assert it.recorder.status().bag == 'recording_unsynced_next-boot_00000060'
 
 
-def test_a_name_that_was_decided_stays(tmp_path: Path) -> None:
+def test_a_name_that_was_decided_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever becomes of the clock after a death between two slices: a bag has one name."""
     left = left_in_1970(tmp_path / 'home')
-    (folder,) = (left / 'bags' / ROBOT).iterdir()
-    nothing_known: Any = SimpleNamespace(spool=SimpleNamespace(has=lambda *_: False))
     for hour in range(2):
         clock = Clocks()
         clock.set(NOON_NS + hour * 3600 * SECOND)
-        notes = Notes.read(folder, ROBOT)
-        assert notes.is_named is bool(hour)
-        assert BagPlace(folder.parent, ROBOT, clock, nothing_known).settle(notes)
-        assert notes.bag == 'recording_20251018_120000'
+        broken = Mock(side_effect=OSError('the disk refuses'))
+        with monkeypatch.context() as patch, desk(left, clock) as it:
+            if not hour:
+                patch.setattr(BagRecovery, '_hand_over', broken)
+                until(partial(getattr, broken, 'called'), 'the bag is named')
+            else:
+                is_whole(it)
+                assert bags_of(it.objects()) == {'recording_20251018_120000': [*range(5)]}
+
+
+def test_a_bag_that_ended_and_waits_outlives_the_index(tmp_path: Path) -> None:
+    """It is complete, under its date, with the mission that it was recorded in."""
+    clock = Clocks()
+    with desk(tmp_path / 'home', clock) as it:
+        it.recorder.on_mission(mission(run_id='r'))
+        start(it.recorder)
+        hear(it, clock, range(3))
+        it.recorder.stop()
+        left = kill(tmp_path / 'home')
+    lose_index(left)
+    clock = Clocks()
+    clock.set(NOON_NS)
+    with desk(left, clock) as it:
+        is_whole(it)
+        said = manifest(it.objects(), 'patrol_20251018_120000')
+        assert (said['state'], said['missing'], said['mission']['run_id']) == ('complete', [], 'r')
+        assert said['clock']['offset_ns'] == NOON_NS - 70 * SECOND
+        assert not list(it.root.iterdir())
 
 
 def test_an_event_before_the_clock_is_set(tmp_path: Path) -> None:

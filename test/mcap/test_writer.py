@@ -12,8 +12,9 @@ import pytest
 from bags.slices import BLOB, ECHO, TALK, Recorded, check, closed, fill, in_order, indexed, messages
 from mcap.reader import make_reader
 
+from shadowhound_data_logger.mcap.index import read_metadata
 from shadowhound_data_logger.mcap.recovery import recover
-from shadowhound_data_logger.mcap.slice_info import Channel
+from shadowhound_data_logger.mcap.slice_info import Channel, Damage
 from shadowhound_data_logger.mcap.writer import SliceWriter
 
 
@@ -183,3 +184,32 @@ def test_an_unknown_compression_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match='lz4'):
         SliceWriter(tmp_path / 'bag_0.mcap', compression='lz4')
     assert not list(tmp_path.iterdir())
+
+
+def test_metadata_among_the_messages(tmp_path: Path) -> None:
+    """Other readers list the records and read the messages; so does recovery, of a slice that was not closed."""
+    for name in ('closed', 'killed'):
+        writer = SliceWriter(tmp_path / f'{name}.mcap', compression='none')
+        writer.add_metadata('of_mine', {'number': '0'})
+        written = fill(writer, messages(10))
+        writer.add_metadata('of_mine', {'number': '1', 'text': 'ü' * 1000})
+        written += fill(writer, list(messages(20))[10:])
+        writer.sync()
+        assert [said['number'] for said in read_metadata(tmp_path / f'{name}.mcap.open', 'of_mine')] == ['0', '1']
+        if name == 'closed':
+            writer.close()
+        else:
+            writer.abort()
+            assert recover(tmp_path / 'killed.mcap.open').damage == Damage(0, 0, 0)
+        path = tmp_path / f'{name}.mcap'
+        assert in_order(path) == indexed(path) == written
+        check(path)
+        with path.open('rb') as file:
+            reader = make_reader(file)
+            assert [one.name for one in reader.iter_metadata()] == ['of_mine', 'of_mine', 'rosbag2']
+            assert reader.get_summary().statistics.metadata_count == 3  # type: ignore[union-attr]
+        assert [said['number'] for said in read_metadata(path, 'of_mine')] == ['0', '1']
+    assert (tmp_path / 'closed.mcap').stat().st_size == (tmp_path / 'killed.mcap').stat().st_size
+    torn = (tmp_path / 'closed.mcap').read_bytes()[:100]
+    (tmp_path / 'torn').write_bytes(torn)
+    assert len(list(read_metadata(tmp_path / 'torn', 'of_mine'))) == 1

@@ -23,6 +23,7 @@ BUCKET = 'sensor-data'
 READY = f'ready/{BUCKET}'
 KEY = 'thor/camera/20251018/120000_front.jpg'
 WITHOUT_SHORT_ROWS = """
+DROP TABLE recordings; DROP TABLE slices; DROP TABLE missing;
 DROP TABLE folders; DROP TABLE compact_objects; DROP TABLE gaps_told;
 PRAGMA user_version = 6;
 """

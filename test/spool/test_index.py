@@ -5,15 +5,19 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from spool.conftest import Open
-from spool.making import NOON_NS, WITHOUT_GAPS, assert_whole, files, make, put, reopened, rows
+from spool.making import NOON_NS, WITHOUT_GAPS, FakeClock, assert_whole, files, make, put, reopened, rows
 
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.config import SpoolSettings
+from shadowhound_data_logger.model import MissingRow, RecordingRows, SliceRow, State
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.schema import SCHEMA_VERSION
+from shadowhound_data_logger.spool.spool import Spool
 
 FEW, MANY = 300, 15_000
 STEP = 20
@@ -114,3 +118,36 @@ def test_an_index_of_version_1_can_be_read_as_it_is(opened: Open, root: Path) ->
     assert len(view.pending(9, oldest=True)) == 2
     assert view.oldest_pending_ns() == NOON_NS
     view.close()
+
+
+SLICE = SliceRow(0, 10, 'ab', 1, 2, 3, '[3]')
+MISSING = MissingRow(0, 'b_0.mcap', 'why', None, None, None)
+
+
+def test_recordings_are_kept_by_owner(root: Path) -> None:
+    """What is told twice is there once; the end of one bag leaves the others, of this owner and of another, as they are."""
+    node, by_hand = (Spool(root, SpoolSettings(min_free_bytes=0), FakeClock(), owner) for owner in ('thor', 'thor records'))
+    node.open()
+    by_hand.open()
+    one = RecordingRows('a', '{}', '[]', (SLICE,), (MISSING,))
+    node.commit(rows=[RecordingRows('a', '{}', '[]'), one, one, replace(one, folder='b')])
+    by_hand.commit(rows=[replace(one, said='{"by": "hand"}')])
+    node.commit(rows=[RecordingRows('b', is_whole=True)])
+    assert node.recordings() == [one]
+    assert by_hand.recordings() == [replace(one, said='{"by": "hand"}')]
+    node.commit(rows=[RecordingRows('a', is_whole=True)])
+    assert (node.recordings(), len(by_hand.recordings())) == ([], 1)
+    node.close()
+    by_hand.close()
+
+
+def test_a_slice_and_its_row_are_one_transaction(opened: Open, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the one cannot be written, the other is not there either."""
+    spool = opened()
+    with monkeypatch.context() as patch:
+        patch.setattr(Index, 'record', Mock(side_effect=sqlite3.OperationalError('disk I/O error')))
+        with pytest.raises(sqlite3.OperationalError):
+            spool.commit([make('one')], rows=[RecordingRows('a', '{}', '[]', (SLICE,))])
+    assert (spool.pending(1), spool.recordings()) == ([], [])
+    spool.commit([make('one')], rows=[RecordingRows('a', '{}', '[]', (SLICE,))])
+    assert (len(spool.pending(1)), len(spool.recordings())) == (1, 1)

@@ -29,10 +29,10 @@ def commits(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     counts: list[int] = []
     commit = spool.commit
 
-    def counted(objects: list[DataObject], outcomes: list[Outcome], **told: Callable[..., None]) -> list[SpooledObject]:
+    def counted(objects: list[DataObject], *more: Any, **told: Callable[..., None]) -> list[SpooledObject]:
         if objects:
             counts.append(len(objects))
-        return commit(objects, outcomes, **told)
+        return commit(objects, *more, **told)
 
     monkeypatch.setattr(spool, 'commit', counted)
     return counts

@@ -1,0 +1,135 @@
+"""What is known of a bag until it is whole: read as it was told, by the index, by a slice, and by what an older version wrote."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bags.slices import fill, messages
+
+from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, Missing, MissionOf, TriggerOf
+from shadowhound_data_logger.bags.naming import slice_file
+from shadowhound_data_logger.bags.state import LEAST_ROWS_BYTES, LINES, RECORD, BagState
+from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.mcap.index import read_metadata
+from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.mcap.writer import SliceWriter
+
+IMU = Channel('/imu', 'x/msg/Y', 'ros2msg', 'float32 x', 'RIHS01_0', '- history: 1')
+POSE = Channel('/pose', 'x/msg/Z', 'ros2msg', 'float32 z', 'RIHS01_1', '')
+EVENT = EventOf('fall', 5.0, 4.5, 2.0, (TriggerOf('fall', 'service', 7, None), TriggerOf('again', 'condition', 9, 'x > 1')))
+CLOCK = ClockOf('unset', 'boot', 60, 70, None)
+
+
+def info(folder: Path, number: int, size: int = 10, channels: tuple[Channel, ...] = (IMU,)) -> SliceInfo:
+    counts = {channel.topic: 3 * place for place, channel in enumerate(channels)}
+    return SliceInfo(folder / slice_file(folder.name, number), size, 'ab' * 32, 1, 2, sum(counts.values()), counts, channels)
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> BagState:
+    """With all that there can be."""
+    made = BagState.begin(tmp_path / 'thor' / 'b', 'thor', MissionOf('patrol', 'patrol_1', None), EVENT, CLOCK)
+    made.add_slice(info(made.folder, 0))
+    made.add_slice(info(made.folder, 1, channels=(POSE, IMU)))
+    made.add_missing(Missing('b_0.mcap', 'why', None), Missing('b_1.mcap', 'dropped: no_room', 7, '/imu', 'no_room'))
+    made.mission, made.ended = MissionOf('patrol', 'patrol_1', 'r'), True
+    return made
+
+
+def test_it_is_read_as_it_was_told(state: BagState) -> None:
+    """By the index, and by the slice that follows; definitions are in the slices, and not told again."""
+    (_, rows) = state.all_rows()
+    assert BagState.of_rows(state.folder, 'thor', rows) == state
+    assert BagState.of_record(state.folder, 'thor', state.record('thor', 2)) == state
+    assert state.slices['b_1.mcap'].channels == (replace(IMU, definition=''), replace(POSE, definition=''))
+    assert state.slices['b_1.mcap'].counts == {'/pose': 0, '/imu': 3}
+
+
+def test_each_change_is_told_alone(state: BagState) -> None:
+    """With its own place among what is missing, so that what is told twice is there once."""
+    rows = state.add_missing(Missing('b_1.mcap', 'more', 1))
+    assert ([one.place for one in rows.missing], rows.slices) == ([2], ())
+    rows = state.add_slice(info(state.folder, 2))
+    assert ([one.number for one in rows.slices], rows.missing) == ([2], ())
+
+
+@pytest.mark.parametrize('size', [1 << 20, 64 << 20])
+def test_a_record_takes_a_hundredth_of_a_slice(tmp_path: Path, size: int) -> None:
+    """However many slices a bag has: the newest are in it, and so is what was lost last."""
+    topics = tuple(replace(IMU, topic=f'/robot/topic_{number}', qos='q' * 400) for number in range(20))
+    state = BagState(tmp_path / 'patrol_20251018_120000', 'patrol_20251018_120000', 'thor')
+    for number in range(2000):
+        state.add_slice(info(state.folder, number, size, topics))
+        state.add_missing(Missing(slice_file(state.folder.name, number), 'dropped: queue_full', 7, '/imu', 'queue_full'))
+    said = state.record('thor', 2000)
+    assert sum(map(len, said.values())) < size // 100 + LEAST_ROWS_BYTES
+    found = BagState.of_record(state.folder, 'thor', said)
+    assert list(found.slices) == list(state.slices)[-len(found.slices) :]
+    assert len(found.slices) >= (1500 if size > 1 << 20 else 10)
+    assert found.missing[1:] == state.missing[1 - len(found.missing) :]
+    left_out = 4000 - len(found.slices) - len(found.missing[1:])
+    assert found.missing[0].what == f'the index was lost: {left_out} slices or losses of before are not listed here'
+
+
+def test_what_a_slice_says_later_counts(tmp_path: Path) -> None:
+    """A trigger or a mission's run that became known while it was written."""
+    state = BagState.begin(tmp_path / 'b', 'thor', MissionOf('patrol', 'patrol_1', None))
+    writer = SliceWriter(tmp_path / 'b' / 'b_0.mcap')
+    writer.add_metadata(RECORD, state.record('thor', 0))
+    fill(writer, messages(10))
+    state.mission = MissionOf('patrol', 'patrol_1', 'r')
+    writer.add_metadata(RECORD, state.news())
+    path = writer.close().path
+    first, second = read_metadata(path, RECORD)
+    assert BagState.of_record(state.folder, 'thor', {**first, **second}) == state
+
+
+@pytest.mark.parametrize('change', [
+    {'said': ''}, {'said': '[]'}, {'said': '{"bag": "../x"}'}, {'channels': '{}'}, {'channels': '[[1, 2, 3, 4, 5]]'},
+    {'channels': '[["a"]]'}, {'slices': '[[1]]'}, {'slices': '[["0", 1, "", 1, 2, 3, "[]"]]'},
+    {'slices': '[[0, 1, "", 1, 2, 3, "[-1]"]]'}, {'slices': '[[0, 1, 7, 1, 2, 3, "[]"]]'}, {'slices': '[[0, 1, "", 1, 2, 3, 7]]'},
+    {'missing': '[[0, 7, "what", null, null, null]]'}, {'missing': '[' * 100_000}, {'slices': 'x'},
+])  # fmt: skip
+def test_what_makes_no_sense_is_refused(state: BagState, change: dict[str, str]) -> None:
+    """Whatever a flipped bit or somebody else made of it."""
+    with pytest.raises(BagDamaged):
+        BagState.of_record(state.folder, 'thor', {**state.record('thor', 2), **change})
+
+
+def old_lines(folder: Path, *slices: SliceInfo) -> list[dict[str, Any]]:
+    """What version 6 wrote of a bag."""
+    said: list[dict[str, Any]] = [
+        {'bag': folder.name, 'robot': 'thor', 'mission': {'type': 'patrol', 'mission_id': 'patrol_1', 'run_id': None}}
+    ]
+    for one in slices:
+        bare = tuple(replace(channel, definition='') for channel in one.channels)
+        fields = asdict(replace(one, path=Path(one.path.name), channels=bare))
+        fields['file'] = fields.pop('path').name
+        del fields['damage']
+        said.append({'slice': fields})
+    return said
+
+
+def write_lines(folder: Path, lines: list[dict[str, Any]]) -> None:
+    (folder / LINES).write_text(''.join(f'\n{json.dumps(line)}\n' for line in lines))
+
+
+def test_what_an_older_version_wrote(tmp_path: Path) -> None:
+    """A torn last line included."""
+    folder = tmp_path / 'b'
+    folder.mkdir()
+    more = [{'missing': asdict(Missing('b_0.mcap', 'why', None))}, {'event': asdict(EVENT)}, {'clock': asdict(CLOCK)}]
+    more += [{'named': {'bag': 'c', 'clock': asdict(replace(CLOCK, known='set_later', offset_ns=5))}}, {'ended': True}]
+    write_lines(folder, [*old_lines(folder, info(folder, 0), info(folder, 1, channels=(POSE, IMU))), *more])
+    with (folder / LINES).open('ab') as file:
+        file.write(b'{"slice": {"file": "b_2.m')
+    found = BagState.of_lines(folder, 'thor')
+    assert (list(found.slices), found.ended, found.event, found.bag) == (['b_0.mcap', 'b_1.mcap'], True, EVENT, 'c')
+    assert (found.mission, found.missing) == (MissionOf('patrol', 'patrol_1', None), [Missing('b_0.mcap', 'why', None)])
+    assert (found.is_named, found.clock) == (True, replace(CLOCK, known='set_later', offset_ns=5))
+    assert found.slices['b_1.mcap'].counts == {'/pose': 0, '/imu': 3}
+    assert BagState.of_rows(folder, 'thor', found.all_rows()[1]) == found
