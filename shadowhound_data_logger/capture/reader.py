@@ -1,7 +1,7 @@
 """One subscription, drained instead of called back. The seam to what rclpy of each distribution offers.
 
-Where rclpy tells less of a message than its RMW knows (Humble: neither number nor publisher; Jazzy: not the publisher), messages
-are taken through librcl, if that proves right for messages of the node's own.
+Where rclpy tells less of a message than its RMW knows (Humble: neither number nor publisher; Jazzy and the first Kilted: not the
+publisher), messages are taken through librcl, if that proves right for messages of the node's own.
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ MAX_TAKES: Final = 20_000
 """Takes of one drain: beyond it the other topics have their turn first."""
 FAST_DDS: Final = ('rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp')
 """The RMWs that know the number and the publisher of each message (the number since rmw_fastrtps 6.2.1)."""
-TELLS_PUBLISHERS: Final = (8, 0)
-"""The first rclpy that tells all that is wanted of a message; numbers came with 4.0."""
+TELLS_PUBLISHERS: Final = (9, 1, 1)
+"""The first rclpy that tells all that is wanted of a message, weeks after Kilted's 9.1.0; numbers came with 4.0. Source: rclpy,
+pull requests 1466 (10.0.0) and 1468. Rolling's 9.2.0, older than 9.1.1, is the exception."""
 PROOF_S: Final = 3.0
 """For messages of the node to itself to arrive; it takes milliseconds."""
 _PROVED: Final[dict[str, bool]] = {}

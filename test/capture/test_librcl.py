@@ -117,6 +117,32 @@ def test_takes_through_librcl_are_proved_once(node: Any, caplog: pytest.LogCaptu
 
 
 @needs_fast_dds
+@pytest.mark.parametrize(
+    ('version', 'needs_librcl'),
+    [((3, 3, 15), True), ((7, 1, 6), True), ((9, 1, 0), True), ((9, 1, 1), False), ((9, 1, 2), False), ((10, 0, 0), False)],
+)
+def test_who_needs_librcl(node: Any, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...], *, needs_librcl: bool) -> None:
+    """Humble, Jazzy, and the Kilted of its first weeks: their rclpy does not tell whose a message is."""
+    monkeypatch.setattr(reader, 'rclpy_version', lambda: version)
+    monkeypatch.setattr(reader, '_PROVED', {})
+    assert reader.takes_through_librcl(node) is needs_librcl
+
+
+@needs_fast_dds
+def test_this_rclpy_tells_what_its_version_says(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether a take through it names the publisher, which the bound rests on."""
+    with monkeypatch.context() as patch:
+        patch.setattr(reader, 'TELLS_PUBLISHERS', ())
+        found = read(node, '/told')
+    publisher = node.create_publisher(String, '/told', 10)
+    until(lambda: found.matched() == 1, 'it is matched')
+    publisher.publish(String(data='x'))
+    (told,) = drained(found, 1)
+    assert (told.publisher is not None) is (reader.rclpy_version() >= reader.TELLS_PUBLISHERS)
+    found.close()
+
+
+@needs_fast_dds
 @pytest.mark.parametrize('version', [(), (99,)])
 def test_an_empty_message_is_none(
     node: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, version: tuple[int, ...]
