@@ -1,4 +1,4 @@
-"""How fast payload leaves: one bucket of tokens for all puts of a store, so that the radio stays free for the robot.
+"""How fast payload is sent: one token bucket for all puts of a store, so that the radio stays free for the robot.
 
 Under a cap a body leaves in small pieces, each when its time has come: never at line rate with silence afterwards. The most
 important body goes first, but each fourth piece is of the one that waited longest: none starves, and no server gives up on one.

@@ -1,4 +1,4 @@
-"""What files are asked beyond ``pathlib``: to be on the disk, replaced as a whole, locked. Everything raises OSError."""
+"""What ``pathlib`` does not do: sync files, replace them as a whole, lock them. Everything raises OSError."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The words of an object's S3 metadata, each defined here alone. What they mean stands in docs/formats.md.
+"""The words of an object's S3 metadata, each defined only here; docs/formats.md explains them.
 
 Beside them an encoder's facts of the content (``width``, ``points``, ...) become metadata, under the names that it gives them.
 """

@@ -1,4 +1,4 @@
-"""When a request that failed is made again: how long to wait, and for how often."""
+"""When a failed request is repeated: how long to wait, and how often."""
 
 from __future__ import annotations
 

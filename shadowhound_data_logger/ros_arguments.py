@@ -1,4 +1,4 @@
-"""What the command line and the parameter files of a node say, read without ROS: before it is loaded, or where there is none.
+"""What the command line and the parameter files of a node say, read without ROS.
 
 https://docs.ros.org/en/humble/How-To-Guides/Node-arguments.html
 """

@@ -1,4 +1,4 @@
-"""Why a server's certificate is not believed, in words for the operator: by whom it is signed, until when, and for which name."""
+"""Why a server's certificate is not trusted, in words for the operator: who signed it, until when, and for which name."""
 
 from __future__ import annotations
 

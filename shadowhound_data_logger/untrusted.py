@@ -1,4 +1,4 @@
-"""Names and files that a robot wrote, for machines that ask: nothing in them is believed before it was looked at.
+"""Checks names and files that a robot wrote: nothing in them is trusted before it was checked.
 
 Whoever has a robot's keys can put anything below its prefix. So a key becomes a path, a text is printed, and a file takes
 memory only as far as this module allows. What it refuses is a NameRefused or a ValueError that says why; the caller adds whose.

@@ -1,4 +1,4 @@
-"""Supervised threads: a loop that fails is seen, counted and started again; it never ends silently.
+"""Supervised threads: a loop that fails is noticed, counted and restarted; it never ends silently.
 
 Whatever a round raises, SystemExit included, costs that round and a pause. Should the thread itself end all the same (no
 memory for its own bookkeeping, say), whoever supervises it finds out in ``look`` and starts another one.

@@ -1,4 +1,4 @@
-"""A piece of a bag as a bag of its own: a span of time and some of the topics, message by message as they were recorded.
+"""A piece of a bag as a new bag: a span of time and some of the topics, message by message as they were recorded.
 
 Of an MCAP slice in a store only the summary and the chunks that are needed are read. What is not plain MCAP (SQLite, or
 compressed outside the storage) is downloaded first.

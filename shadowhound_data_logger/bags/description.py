@@ -1,4 +1,4 @@
-"""What a bag holds: its topics, times and files, from its metadata.yaml or, of MCAP, from the summaries of its slices."""
+"""What a bag holds: its topics, times and files, from its metadata.yaml or, for MCAP, from the summaries of its slices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events: a trigger makes a bag of the seconds before it and after it, from the ring, written by a thread of its own.
+"""Events: a trigger makes a bag of the seconds before and after it, from the ring, written by a separate thread.
 
 A trigger while an event goes on makes it last longer, and is told in its manifest; what would be longer than an event may be
 follows in one of its own, without a message between them or in both. The writer takes from the ring piece by piece what it

@@ -1,4 +1,4 @@
-"""A bag out of the store into a folder: several files at a time, each verified, each under its name only once it is whole.
+"""Fetches a bag from the store into a folder: several files at a time, each verified and named only once it is whole.
 
 What is there already and right is not asked for again; a file that a kill cut off goes on where it ended.
 """

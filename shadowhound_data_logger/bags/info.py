@@ -1,4 +1,4 @@
-"""All there is to know of one bag without its messages: from a few short reads, also where its slices lie in a store."""
+"""Everything about one bag except its messages: from a few short reads, also where its slices are in a store."""
 
 from __future__ import annotations
 

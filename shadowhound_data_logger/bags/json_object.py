@@ -1,4 +1,4 @@
-"""A JSON object whose writer may have been anybody: read field by field, each as it must be."""
+"""Reads a JSON object that anybody may have written, field by field, each with its type checked."""
 
 from __future__ import annotations
 

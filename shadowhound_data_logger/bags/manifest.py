@@ -1,4 +1,4 @@
-"""``manifest.json``: what a bag's writer says of the whole bag. Written once, when it ended: a bag without one still grows.
+"""``manifest.json``: what a bag's writer says of the whole bag. Written once, at its end: a bag without one is still growing.
 
     {"version": 1, "bag": "patrol_20261121_120000", "robot": "thor", "state": "complete",
      "mission": {"type": "patrol", "mission_id": "...", "run_id": null}, "event": null, "clock": null,

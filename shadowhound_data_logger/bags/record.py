@@ -1,4 +1,4 @@
-"""Record a bag for some time and have it in the store: the integration guide's ``record_and_upload_rosbag``, without its holes.
+"""Records a bag for some time and delivers it to the store: the integration guide's ``record_and_upload_rosbag``.
 
     from shadowhound_data_logger.bags import record_and_upload_rosbag
     record_and_upload_rosbag('patrol', 60)

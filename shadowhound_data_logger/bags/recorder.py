@@ -1,4 +1,4 @@
-"""Which bag is recorded, and the one thread that writes it: started and stopped by service, by missions, or with the node.
+"""Decides which bag is recorded, and owns its writing thread: started and stopped by service, by missions, or with the node.
 
 What the intake hands over lies in a bounded queue; starts, splits and stops lie in it as well, so that each comes between the
 very messages where it was asked for. Nothing runs before the first recording.

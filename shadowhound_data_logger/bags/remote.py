@@ -1,4 +1,4 @@
-"""Bags in a store: which there are, what files each has, and how far each has come.
+"""Bags in a store: which there are, which files each has, and how complete each is.
 
 A bag is a folder ``<robot>/rosbags/<bag>/`` of slices; its ``manifest.json`` is written last, so one without is still growing. An
 archive ``<robot>/rosbags/<bag>.tar.gz`` is a bag of that name as well, of which nothing is known but its size.

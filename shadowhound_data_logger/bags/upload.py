@@ -1,4 +1,4 @@
-"""A finished bag from a folder into the store: through the spool, where it is safe until it is delivered, or past it."""
+"""Uploads a finished bag from a folder to the store: through the spool, where it is safe until delivered, or past it."""
 
 from __future__ import annotations
 

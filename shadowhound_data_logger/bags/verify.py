@@ -1,4 +1,4 @@
-"""Whether a bag is what its writer says: every promised file, its size and checksum; every chunk on request.
+"""Checks whether a bag is what its writer says: every promised file, its size and checksum; every chunk on request.
 
 Without a manifest there is nobody to compare with: what the metadata.yaml names must be there, and open.
 """

@@ -1,4 +1,4 @@
-"""Bags that ``ros2 bag record`` writes into a folder, shipped once they are finished, each once.
+"""Ships bags that ``ros2 bag record`` writes into a folder, once each, when they are finished.
 
 Finished is a bag with its metadata.yaml and all that it names, of which nothing has changed for a while. What was shipped
 stands in ``.shadowhound-bags.json`` beside the bags, so that a restart sends nothing twice. A bag is removed only when asked for,

@@ -1,4 +1,4 @@
-"""One bag, by hand: records some topics for some time beside whatever else runs, and delivers it. A process of its own.
+"""Records one bag by hand, beside whatever else runs, and delivers it. A separate process.
 
     python -m shadowhound_data_logger.capture.bag_process NAME --duration 60 [--topic /imu ...] [--regex ...]
 

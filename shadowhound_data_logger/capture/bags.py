@@ -1,4 +1,4 @@
-"""What the bags get of what was taken: counted in their own accounts and handed on as it came. Owned by the intake thread.
+"""Hands the messages of a bag to its queue, as they came, and counts them in the bag's accounts. Owned by the intake thread.
 
 A topic of a sensor comes from its one subscription, any other from one of the bag's own. While nothing is recorded it costs a
 look at an empty set for each drain.

@@ -1,4 +1,4 @@
-"""What a running node can be asked to do, each thing once: services, parameters and the control socket all stand on it.
+"""What a running node can be asked to do, each defined once: services, parameters and the control socket all use it.
 
 A request and its answer are plain values, as JSON has them: ``{"do": "flush"}`` is answered by ``{"ok": true, "robot": "thor",
 "message": "..."}`` or ``{"ok": false, "robot": "thor", "error": "..."}``.

@@ -1,4 +1,4 @@
-"""What every listener to the robot's messages derives from, and what it is handed: all that the intake knows of its listeners."""
+"""The base class of every listener to the robot's messages, and what it is handed: all that the intake knows of its listeners."""
 
 from __future__ import annotations
 

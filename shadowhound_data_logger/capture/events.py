@@ -1,4 +1,4 @@
-"""The events' part of the node: what the intake hands to the ring and to the conditions, and who makes bags of it.
+"""The events' part of the node: hands messages to the ring and to the conditions, and makes bags of them.
 
 Messages come from the one subscription that serves objects and bags as well.
 """

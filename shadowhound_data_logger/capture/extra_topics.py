@@ -1,4 +1,4 @@
-"""The subscriptions for the topics that a consumer wants besides those of the sensors. Owned by the intake thread."""
+"""The subscriptions to topics that a consumer wants and no sensor has. Owned by the intake thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the node offers to ROS besides its parameters: services, ``~/mission`` and ``/diagnostics``, each by asking ``commands``.
+"""What the node offers to ROS besides its parameters: services, ``~/mission`` and ``/diagnostics``, all through ``commands``.
 
 The ROS node may be the logger's own, which asks at once, or that of the front in another process, which asks through a socket.
 """

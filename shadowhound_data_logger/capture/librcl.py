@@ -1,4 +1,4 @@
-"""What librcl knows and rclpy of this distribution does not tell: asked by ctypes, on rclpy's own handle of a subscription.
+"""Asks librcl, by ctypes on rclpy's handle of a subscription, for what this distribution's rclpy does not tell.
 
 Whoever calls holds the handle (``with handle``) and hands in its address (``handle.pointer``). Sources: rcl/subscription.h,
 rmw/types.h (``rmw_message_info_t``), rcutils/types/uint8_array.h and rcutils/allocator.h, the same from Humble to Kilted in all

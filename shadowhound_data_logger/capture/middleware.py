@@ -1,4 +1,4 @@
-"""By which RMW the node listens, decided from the robot's environment before ROS is loaded, and what that RMW is told.
+"""Chooses the RMW by which the node listens, from the robot's environment and before ROS is loaded, and configures it.
 
 RTPS numbers every sample, and Fast DDS hands the number on whoever sent it; Cyclone DDS keeps it to itself. So a robot with
 Cyclone DDS is listened to through Fast DDS, where that hears at least as much (docs/decisions/0017).

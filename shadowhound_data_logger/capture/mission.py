@@ -1,4 +1,4 @@
-"""The node's part in a mission: finds the one that is active, logs the robot's state to it, and marks what is stored meanwhile.
+"""The node's part in a mission: finds the active one, logs the robot's state to it, and marks objects with it.
 
 It learns of missions from the disk alone. While none is active an encoder asks one attribute, and the thread one folder's time.
 """

@@ -1,4 +1,4 @@
-"""What the node sees of the robot while a mission is active: read from batches that were just encoded, by the encoders' threads.
+"""What the node sees of the robot during a mission: read from batches that were just encoded, by the encoders' threads.
 
 It is not a listener: those get each message from the intake (``consumers.py``).
 Only what is logged is deserialized: one message a period of the battery's and the thermometer's topic, every pose that is kept.

@@ -1,4 +1,4 @@
-"""The node's life: its arguments, its signals, its main loop. To import this loads rclpy, and with it the middleware."""
+"""The node's life: its arguments, its signals, its main loop. Importing this loads rclpy, and with it the middleware."""
 
 from __future__ import annotations
 

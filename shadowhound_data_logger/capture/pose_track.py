@@ -1,4 +1,4 @@
-"""Where the robot was, and how full its battery, at the time of an object: read from what was received in the last minute.
+"""Where the robot was, and how full its battery was, at the time of an object: read from the messages of the last minute.
 
 Some messages of the two topics are kept as they came; only those around an object's time are ever deserialized, by the encoder
 that asks.

@@ -1,4 +1,4 @@
-"""What is kept of the sensors' topics, and what becomes one object: the first decisions after the take.
+"""Decides which messages of the sensors' topics are kept, and which become one object: the first decisions after the take.
 
 Plain Python, owned by the intake thread. A rule keeps messages or skips them, a ``Batcher`` puts together what becomes one
 object, the ``Sampler`` does both for each sensor and hands the batches to the encoders.

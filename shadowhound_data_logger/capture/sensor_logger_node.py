@@ -1,4 +1,4 @@
-"""``sensor_logger_node``: what the robot publishes goes to the store, and the ledger says what became of it.
+"""``sensor_logger_node``: stores what the robot publishes, and accounts for every message in the ledger.
 
     ros2 run shadowhound_data_logger sensor_logger_node --ros-args --params-file go2.yaml -r __ns:=/tachi
 

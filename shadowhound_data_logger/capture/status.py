@@ -1,4 +1,4 @@
-"""What goes on, once a second: one dict, built on the main thread from what the stages tell of themselves.
+"""The status of the node: one dict, built once a second on the main thread from what the stages report.
 
 ``shadowhound-data status`` reads it from ``spool/status-<robot>.json``; ``diagnostics`` makes a message of it.
 """

@@ -1,4 +1,4 @@
-"""Who listens to a topic: which topic, under which type, by which subscriptions. Owned by the intake thread.
+"""Listens to a topic: decides under which type and by which subscriptions. Owned by the intake thread.
 
 One type of a topic is logged: the one that the settings name. Where they name none it is the first one in the graph, and it
 stays while it has a publisher. Whatever else is published there is counted where that is possible, told, and never logged.

@@ -1,4 +1,4 @@
-"""What triggers events by itself: a number that crosses a threshold, or what the active mission's agent logs.
+"""Finds triggers of events: a number that crosses a threshold, or what the active mission's agent logs.
 
 Messages are deserialized here, off the intake, some of them only (``Inbox``). Of missions it reads the disk.
 """

@@ -1,4 +1,4 @@
-"""Publishers that the robot's own RMW finds and ours does not: the front's graph, compared with that of the node.
+"""Publishers that the robot's own RMW finds and the node's does not: the front's graph, compared with that of the node.
 
 What is known is who was discovered, no more: whether messages of a publisher that both have found arrive is another question
 (``ros`` of the doctor, and the ledger). It is about the topics of the sensors that are enabled.

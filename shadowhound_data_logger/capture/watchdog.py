@@ -1,4 +1,4 @@
-"""Notices what stands still though it should not: topics, threads, encoding, commits, delivery. It only reads the status.
+"""Notices what makes no progress though it should: topics, threads, encoding, commits, delivery. It only reads the status.
 
 Each stall is one sentence that an operator understands: what stands still, for how long, why, what to do. It is logged when
 it begins and when it is over.

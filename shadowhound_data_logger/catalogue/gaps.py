@@ -1,4 +1,4 @@
-"""The gap journal as it leaves the robot: statements of what was lost and of how far that is known, in Parquet parts.
+"""The gap journal as it is delivered: statements of what was lost and of how far that is known, in Parquet parts.
 
 A row is a statement, and nothing is ever changed in the store: a later statement about the same thing has the same ``id`` and a
 higher ``revision``. The newest counts; ``withdrawn`` says that there is no such gap any more (a late message filled it, an object

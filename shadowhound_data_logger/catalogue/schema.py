@@ -1,4 +1,4 @@
-"""The catalogue: one row for each object in the store, its columns, and how a row is made of what an object says of itself.
+"""The catalogue: one row for each object in the store, its columns, and how a row is made from an object's metadata.
 
 A row holds nothing that is not in the object's S3 metadata and in a listing: a catalogue that is lost is made again from those.
 Every object of a robot is a row but the files of the catalogue itself. Parts lie at

@@ -1,4 +1,4 @@
-"""The robot's side of the catalogue and the gap journal: what is new since the last time becomes parts, spooled like all else.
+"""The robot's side of the catalogue and the gap journal: makes parts of what is new, and spools them like any object.
 
 Every delivered object is in exactly one part, whoever delivered it and whenever a process died: the list of what is in none
 yet is the spool index's, and a part takes its rows off it in the transaction that makes the part durable.

@@ -1,4 +1,4 @@
-"""The context of a run: role, environment and settings, as far as they can be read. A refused setting stops nothing here."""
+"""The context of a run: role, environment and settings, as far as they can be read. Refused settings do not stop the doctor."""
 
 from __future__ import annotations
 

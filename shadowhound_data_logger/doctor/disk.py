@@ -1,4 +1,4 @@
-"""The disk under the spool: room, whether it may be written, and how long a commit has to wait for it. In a child process."""
+"""The disk under the spool: free space, permission to write, and how long a commit takes. In a child process."""
 
 from __future__ import annotations
 

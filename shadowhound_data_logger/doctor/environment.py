@@ -1,4 +1,4 @@
-"""What the shell says: who is asked with which keys, which settings are refused, and whether the node was told the same."""
+"""What the shell says: which servers and keys, which settings are refused, and whether the running node was told the same."""
 
 from __future__ import annotations
 

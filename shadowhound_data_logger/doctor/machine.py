@@ -1,4 +1,4 @@
-"""What the kernel tells of this machine: processes and their variables, sockets, locks. All of it from ``/proc``, see proc(5)."""
+"""What the kernel tells of this machine: processes and their variables, sockets, locks. All from ``/proc``, see proc(5)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The way to Tower: its name, its ports, whether its certificate can be trusted, and on Tower itself who can reach what listens.
+"""The way to Tower: its name, its ports, whether its certificate can be trusted, and on Tower itself who can reach its servers.
 
 Nothing is sent but the TLS greeting.
 """

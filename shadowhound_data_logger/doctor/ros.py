@@ -1,4 +1,4 @@
-"""The robot's topics: published, by whom and how, at the rate that is expected, and decodable here. Runs in a child process."""
+"""The robot's topics: who publishes them and how, at the expected rate or not, and decodable here or not. In a child process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What decides who hears whom in ROS, from the variables of this shell and of the robot's driver; nothing of ROS is loaded."""
+"""What decides which ROS processes hear each other, from the variables of this shell and of the robot's driver. Loads no ROS."""
 
 from __future__ import annotations
 

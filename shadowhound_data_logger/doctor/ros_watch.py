@@ -1,4 +1,4 @@
-"""What is to be seen and heard of the configured topics, by a node of our own. The one module of the doctor that loads rclpy.
+"""What a node of our own sees and hears of the configured topics. The only module of the doctor that loads rclpy.
 
 It subscribes as the logger does, takes what comes without decoding it, and publishes nothing.
 """

@@ -1,4 +1,4 @@
-"""Runs checks side by side, and mends what ``--fix`` may: modes of files with keys, and buckets that are missing.
+"""Runs checks side by side, and repairs what ``--fix`` may: modes of files with keys, and missing buckets.
 
 It ends in time; what hangs, crashes or is not reached is in the answer as well.
 """

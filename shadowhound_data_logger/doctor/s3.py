@@ -1,4 +1,4 @@
-"""The S3 server: who it is, whether it takes our signature and our objects, and whether it keeps the two promises of a put.
+"""The S3 server: what it is, whether it accepts our signature and our objects, and whether it keeps the two promises of a put.
 
 What it leaves behind: ``<robot>/_doctor/probe`` in each bucket that this machine writes to, 64 bytes that are always the
 same, because the robot's keys may delete nothing. On Tower a second object is written and deleted.

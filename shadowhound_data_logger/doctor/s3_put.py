@@ -1,4 +1,4 @@
-"""Probe objects: that a put is taken, comes back the same, never overwrites, is refused when damaged, and how fast it is."""
+"""Probe objects: whether a put is accepted, reads back equal, never overwrites and is refused when damaged, and its speed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SeaweedFS's own servers beside S3, which serve everybody unless they were given keys: whether one answers us, who have none.
+"""SeaweedFS's own servers beside S3, which serve everybody unless they have keys: whether one answers us without keys.
 
 Each is asked one question that changes nothing. Only an answer carries data: gRPC refuses with headers alone
 (https://github.com/grpc/grpc/blob/master/doc/PROTOCOL-HTTP2.md), so nothing of what comes back has to be decoded.

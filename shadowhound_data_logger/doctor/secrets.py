@@ -1,4 +1,4 @@
-"""Who can read the secrets: modes of files that hold keys, keys in URLs and parameter files, and keys that everybody knows."""
+"""Who can read the secrets: modes of files with keys, keys in URLs and parameter files, and well-known keys."""
 
 from __future__ import annotations
 

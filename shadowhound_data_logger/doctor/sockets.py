@@ -1,4 +1,4 @@
-"""How large messages cross from the driver to the logger: shared memory that holds them, or socket buffers that do."""
+"""How large messages get from the driver to the logger: through shared memory or socket buffers that are large enough."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is installed: old enough Pythons and libraries, and whether the node that runs is of this version."""
+"""What is installed: Pythons and libraries that are too old, and whether the running node has this version."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that are read in pieces, wherever they lie: on the disk or in a store. What was read is counted."""
+"""Files that are read in pieces, on the disk or in a store. Counts what was read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which mission is active: a folder whose journal its agent holds locked. Read from the disk; no topic and no process is asked.
+"""Which mission is active: a folder whose journal its agent holds locked. Read from the disk, not from topics or processes.
 
 Costs a stat of the folder and a lock's probe of what is active at each look.
 """

@@ -1,4 +1,4 @@
-"""What goes to MLflow's run in one request, and how what a server refuses is found in it."""
+"""What one request to MLflow's run contains, and how the value that a server refuses is found in it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The replayer as the agent sees it: a child process that is started, woken, started again when it dies, and let go."""
+"""The missions' sender as the agent sees it: a child process that is started, woken, restarted when it dies, and released."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one mission still owes to its receivers: MLflow's run, its artifacts, and the objects of the store.
+"""What has not yet been sent of one mission: to MLflow's run, its artifacts, and the objects of the store.
 
 Two journals tell of it, the agent's and the node's, each on its way by itself (journal_delivery.py); the agent's makes the run
 and ends it. What the agent logs itself wins: points of a metric that it has logged are not sent for the node. Frames of both are

@@ -1,4 +1,4 @@
-"""The pictures of a mission as the sender sees them: a process of their own makes them, one mission at a time.
+"""The pictures of a mission as the sender sees them: a separate process makes them, one mission at a time.
 
 matplotlib's second and 60 MB, and whatever a hostile file does to a decoder, are that process's alone: the sender goes on with
 other missions and looks now and then whether it is done.

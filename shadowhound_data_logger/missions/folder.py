@@ -1,4 +1,4 @@
-"""The folder of a mission, ``$SHADOWHOUND_HOME/missions/<mission id>/``: where everything about it lies.
+"""The folder of a mission, ``$SHADOWHOUND_HOME/missions/<mission id>/``, which has everything about it.
 
     journal        what the agent logged (journal.py)
     files/         copies of frames, trajectories and artifacts, until they are sent

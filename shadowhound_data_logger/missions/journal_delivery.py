@@ -1,4 +1,4 @@
-"""One journal of a mission, the agent's or the node's, on its way: what it tells so far, and a place in it for each receiver.
+"""One journal of a mission, the agent's or the node's, being sent: what it says so far, and a position for each receiver.
 
 Each receiver has its own place, so that artifacts that cannot be stored hold up no metric. A place moves on after what lies
 before it has arrived; whatever is sent again after a crash changes nothing. The places lie beside the journal (``sent.json``).

@@ -1,4 +1,4 @@
-"""What the node logs of the mission that is active: a journal of its own in the mission's folder, ``node/journal``.
+"""What the node logs of the active mission: a separate journal in the mission's folder, ``node/journal``.
 
 Its records are those of the agent's journal (``metrics``, ``frame``), and ``poses`` (p: [ns, x, y, yaw, z] each), of which the
 sender makes trajectory.csv. Nothing here is deserialized, and nothing waits but for the disk.

@@ -1,4 +1,4 @@
-"""A mission's objects of the store: its frames, its trajectory and its summary, handed to the spool and, without a node, on.
+"""A mission's objects for the store: its frames, trajectory and summary, handed to the spool and, without a node, delivered.
 
 sensor-data/<robot>/missions/<run id>/camera/frame_NNNNNN.jpg, trajectory.csv, summary.json
 trajectories/<robot>/<mission type>_YYYYMMDD_HHMMSS.csv

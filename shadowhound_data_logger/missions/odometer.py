@@ -1,4 +1,4 @@
-"""How far a robot went, from where it says that it is: whatever jumps, noise at rest and new frames its odometry has."""
+"""How far a robot went, from its odometry, despite jumps, noise at rest and new frames."""
 
 from __future__ import annotations
 

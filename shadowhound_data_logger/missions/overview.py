@@ -1,4 +1,4 @@
-"""What a mission is and how far it is sent, read from its folder by whoever asks, without MLflow and without ROS."""
+"""What a mission is and how far it is sent, read from its folder, without MLflow and without ROS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pictures of a mission that is over, made of what its folder has, by a process of their own.
+"""Makes the pictures of a mission that has ended, from its folder, in a separate process.
 
     camera_summary.jpg   trajectory.png   battery.png
 

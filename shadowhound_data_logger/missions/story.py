@@ -1,4 +1,4 @@
-"""What a mission's journal tells as a whole: its first and last values, its counts, and what the run ends with.
+"""What a mission's journal says as a whole: its first and last values, its counts, and how the run ends.
 
 The records of a journal, by their ``k``: ``start`` (type, command, robot), ``metrics`` (m: key -> value, s: step), ``frame``,
 ``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``refused`` (reason), ``end`` (status, what the agent

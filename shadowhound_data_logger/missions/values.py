@@ -1,4 +1,4 @@
-"""What the tracking server can take: names, numbers and texts, checked or cut before they are journalled.
+"""What the tracking server accepts: names, numbers and texts, checked or cut before they are journalled.
 
 The limits are MLflow's own (``mlflow/utils/validation.py`` of 2.14.0 and 3.17.2, the smaller of both; the colon in names, which
 2.14 refuses, is left out). A request holds at most 1,000 points, params and tags together, and a million characters.

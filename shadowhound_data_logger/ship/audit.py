@@ -1,4 +1,4 @@
-"""Does the store still hold what it confirmed? Each delivered object is asked for by name; no right to list is needed.
+"""Checks whether the store still holds what it confirmed: asks for each delivered object by name; no right to list is needed.
 
 A finding is what the store itself says of an object. A store that does not answer is none: the audit then ends early, says
 so, and goes on from there the next time.

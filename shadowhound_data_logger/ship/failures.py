@@ -1,4 +1,4 @@
-"""What a failed put means, in one table; whose fault it is; and when the object, its bucket or the store is tried again.
+"""What a failed put means, in one table: what caused it, and when the object, its bucket or the store is tried again.
 
 A store, or one bucket of it, that takes nothing for a while is an Outage, with one probe at a time; an object that fails alone
 waits for its own next try.

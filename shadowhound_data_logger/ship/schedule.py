@@ -1,4 +1,4 @@
-"""Which object is sent next, and what a failure means for the others: every decision of delivery, and no I/O.
+"""Decides which object is sent next, and what a failure means for the others: every decision of delivery, and no I/O.
 
 A thread asks ``step`` what to do, does it outside the lock, and reports back with ``found``, ``delivered``, ``failed`` or
 ``crashed``. A failure is held against the store, or the bucket, unless a delivery since tells that it is the object's

@@ -1,4 +1,4 @@
-"""Spooled objects to the store, for as long as it takes: threads that do what the Schedule decides.
+"""Sends spooled objects to the store: threads that do what the Schedule decides.
 
 An object leaves the spool only after the store confirmed it, or with the reason why it never will. What is logged is the
 beginning and the end of an outage, never its every object.

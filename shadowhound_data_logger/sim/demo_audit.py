@@ -1,4 +1,4 @@
-"""The demo's own audit: every object read back from the S3 server, and all figures held against one another.
+"""The demo's own audit: reads every object back from the S3 server, and compares all figures with one another.
 
 It trusts nobody's sums: messages come from the simulated robot's own account, content from the server, hashes and numbers of
 publishers from the spool's index, and samples are counted in the objects themselves.

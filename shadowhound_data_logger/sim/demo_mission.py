@@ -1,4 +1,4 @@
-"""The demo's patrol as a mission: the agent that logs it, a process of its own, and what came of it.
+"""The demo's patrol as a mission: the agent that logs it, in a separate process, and the result.
 
 The agent states no distance, so that what the node measured stands (docs/missions.md). Run as a program, this is the agent.
 """

@@ -1,4 +1,4 @@
-"""What the demo says: a line of progress while it runs, then what became of everything."""
+"""What the demo prints: a line of progress while it runs, then what became of everything."""
 
 from __future__ import annotations
 

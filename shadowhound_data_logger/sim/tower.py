@@ -1,4 +1,4 @@
-"""A Tower of one's own, on 127.0.0.1: SeaweedFS as a real S3 server with credentials, and MLflow on SQLite.
+"""A private Tower on 127.0.0.1: SeaweedFS as a real S3 server with credentials, and MLflow on SQLite.
 
 Both keep what they hold in one folder and leave no process behind, however their owner ends. ``python -m
 shadowhound_data_logger.sim.tower --folder DIR`` runs one in the foreground.

@@ -1,4 +1,4 @@
-"""The accounts at one instant: what a group commit writes of them, and what is told of them while they go on."""
+"""The accounts at one instant: what a group commit writes of them, and what the status shows of them."""
 
 from __future__ import annotations
 

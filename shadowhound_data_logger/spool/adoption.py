@@ -1,4 +1,4 @@
-"""Files that have no row get one: those of a lost index, what came back, and what somebody copied into the spool.
+"""Gives rows to files that have none: those of a lost index, files that came back, and files that somebody copied into the spool.
 
 What a file says of itself is believed only as far as it makes sense; a file that cannot be an object is set aside in
 ``foreign/``, and nothing is ever deleted but the file of an object that had left the spool already.

@@ -1,4 +1,4 @@
-"""Space that is the spool's own on a disk that somebody else fills: without any, not even an eviction could be written down."""
+"""Space reserved for the spool on a disk that others fill: without it, not even an eviction could be recorded."""
 
 from __future__ import annotations
 

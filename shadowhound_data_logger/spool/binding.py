@@ -1,4 +1,4 @@
-"""Binding: what is held gets its final name, and may be shipped from then on.
+"""Binding: gives held objects their final names; from then on they may be shipped.
 
 All of it is one step in the index. Before its transaction ends the files lie as ``incoming/<id>.part`` and describe themselves as
 what they become, so that a death leaves them where recovery looks for the file of any row: it puts back what was not

@@ -1,4 +1,4 @@
-"""What outlives a process of what it knew of the clock: ``spool/clock-<robot>.json``, steps and the offsets of the last boots.
+"""What is known of the clock beyond one process: ``spool/clock-<robot>.json``, with steps and the offsets of the last boots.
 
 It is not a promise: without the file the steps begin at 0 again, and what an earlier boot left goes without a date.
 """

@@ -1,4 +1,4 @@
-"""The control socket of a node that runs: where it lies, and how to ask something of it.
+"""The client of a running node's control socket: where the socket is, and how to ask.
 
 It is a Unix stream socket in the spool, for its owner alone (mode 0600). A request is a line of JSON, ``{"do": "flush"}``, and so
 is its answer: ``{"ok": true, "robot": "thor", ...}``, or ``{"ok": false, "robot": "thor", "error": "..."}``. One connection takes

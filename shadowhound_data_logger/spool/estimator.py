@@ -1,4 +1,4 @@
-"""How many messages were lost of a publisher that does not number them, from the rhythm of what was received.
+"""Estimates how many messages of a publisher without numbers were lost, from the rhythm of those received.
 
 A stamp is when a message was sent (ns), or the value of a counter in it. Stamps that come evenly have a period: declared, or
 learned from ``LEARN`` intervals between them. An interval of n periods then says that n - 1 messages were lost. A late message

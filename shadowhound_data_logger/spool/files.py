@@ -1,4 +1,4 @@
-"""The spool's tree: where a file lies says what it is. ``ready/<bucket>/<key>`` can be rescued with ``aws s3 sync``.
+"""The spool's tree: a file's folder says what it is. ``ready/<bucket>/<key>`` can be rescued with ``aws s3 sync``.
 
     incoming/<id>.part                 written and synced, its row not yet committed or its rename not yet done
     incoming/<session>-<any>.body      a whole file that is about to become a part (staging.py)

@@ -1,4 +1,4 @@
-"""What lies in a spool, object by object or in heaps, as its index says; and the way back for what was quarantined."""
+"""What is in a spool, object by object or summed up, as its index says; and how to retry what was quarantined."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happens before a spool is used again: index and tree are made to agree, in both directions (docs/decisions/0001).
+"""Recovery before a spool is used again: makes index and tree agree, in both directions (docs/decisions/0001).
 
 After it every pending, held or quarantined row has its file, every file has its row, and sessions whose process died
 are settled: what they had received without an outcome is dropped with the reason ``restart``.

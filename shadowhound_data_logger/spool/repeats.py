@@ -1,4 +1,4 @@
-"""Content that follows itself is kept once: a camera that shows the same picture for minutes.
+"""Content equal to what was stored just before is kept once: a camera that shows the same picture for minutes.
 
 Equal are the same bytes. A repeat is a row of the index in state
 deduplicated, with its own time, and ``content_key`` in its metadata names the object that holds the content; so does its

@@ -1,4 +1,4 @@
-"""Room in the spool: what a full disk costs, decided object by object and written down as evicted.
+"""Makes room in the spool: what a full disk costs, decided object by object and recorded as evicted.
 
 This decides what is evicted; a disk that is full at once (ENOSPC) is ``ballast.py``, an open slice ``bags/recording.py``.
 """

@@ -1,4 +1,4 @@
-"""The life of one process with a spool: a row of the index, a locked file by which others see that it lives, and its inheritance.
+"""The life of one process with a spool: a row of the index, a locked file that shows that it lives, and what it carries over.
 
 What earlier sessions left open in files of their own becomes the next session's to account for. A message is open until its file
 is spooled, or known to be lost. The two rows change in one transaction, so that the sums stay.

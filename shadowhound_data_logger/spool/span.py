@@ -1,4 +1,4 @@
-"""The numbers of one publisher on one topic: what came, what is missing between, and why. Guarded by the Accounts' lock."""
+"""The numbers of one publisher on one topic: which came, which are missing between, and why. Guarded by the Accounts' lock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The durable spool: what ``commit`` returned has survived the death of the process and of the power (docs/decisions/0001).
+"""The durable spool: what ``commit`` returned survives the death of the process and a power cut (docs/decisions/0001).
 
 A group commit writes and syncs the payloads as ``incoming/<id>.part``, then commits one index transaction that holds
 the new objects, the outcomes of deliveries and the accounts, then renames the parts to their final names. The transaction

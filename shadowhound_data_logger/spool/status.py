@@ -1,4 +1,4 @@
-"""What goes on now: the status that a running node writes once a second; where none runs, what its spool tells.
+"""The status that a running node writes once a second; where none runs, what its spool says.
 
 ``read`` waits for nobody and changes nothing. That no node runs, and even that there is no spool, is an answer and no
 error. Whether a node runs is decided by the boot clock, because a robot's wall clock may step.

@@ -1,4 +1,4 @@
-"""How much lies in a spool, and for how long."""
+"""How much a spool holds, and how long its oldest object has waited."""
 
 from __future__ import annotations
 

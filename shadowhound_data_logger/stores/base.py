@@ -1,4 +1,4 @@
-"""What the node, the lake and the doctor ask of a place to keep objects. Every store passes the same tests (test/stores)."""
+"""The interface of a store, for the node, the lake and the doctor. Every store passes the same tests (test/stores)."""
 
 from __future__ import annotations
 

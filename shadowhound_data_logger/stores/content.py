@@ -1,4 +1,4 @@
-"""What every store needs for a put: a spooled file's content, whole or in parts, verified; does a taken key hold the same?
+"""What stores need for a put: a spooled file's content, whole or in parts, verified; and whether a taken key has the same.
 
 Nothing of a large file is held in memory: each of its parts is read twice, to know it and to send it.
 """

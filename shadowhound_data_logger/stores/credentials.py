@@ -1,4 +1,4 @@
-"""With which keys an S3 client signs, and whose certificates it trusts.
+"""The keys with which an S3 client signs, and the certificates that it trusts.
 
 Keys in the settings (``AWS_ACCESS_KEY_ID``, ``AWS_SECRET_ACCESS_KEY``) come first and stay: the environment of a process cannot
 change. Otherwise they are those of a profile, which botocore finds and parses as for every program of AWS

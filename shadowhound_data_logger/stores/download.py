@@ -1,4 +1,4 @@
-"""Objects of a store as files: in bounded memory, verified, taken up where they broke off, under their names only when whole."""
+"""Downloads objects of a store to files: in bounded memory, verified, resumed, and named only when whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Large objects to an S3 server, in parts: whatever ends a try, the next one sends the parts that the server has not.
+"""Puts large objects to an S3 server in parts: after an interruption the next try sends the parts that the server does not have.
 
 It keeps no state: which upload to take up, and what of it is there, is asked of the server. So it makes no difference
 whether a connection broke, the process was killed or the robot was without power. Each part is sent with its MD5, which the

@@ -1,4 +1,4 @@
-"""Single requests to an S3 server, through botocore: each one try, each with an end, each error one of ours.
+"""Single requests to an S3 server, through botocore: one try each, with a deadline, and with errors translated to ours.
 
 Stays inside the subset that MinIO, SeaweedFS and AWS share. An answer that did not come from an S3 server confirms nothing.
 """
