@@ -89,8 +89,8 @@ def find_bag(store: ObjectStore, robot: str, bag: str) -> RemoteBag:
     if not files:
         known = [each.name for each in find_bags(store, robot)]
         near = difflib.get_close_matches(bag, known, cutoff=0.4) or known[-3:]
-        remedy = f'there is {", ".join(near)}' if near else f'no bag of {robot} is there; --robot names another'
-        raise BagError(f'there is no bag {bag} of {robot} in {store.describe()}', remedy=remedy, bag=bag, robot=robot)
+        there = f'the store has {", ".join(near)}' if near else f'the store has no bag of {robot}; --robot names another robot'
+        raise BagError(f'there is no bag {bag} of {robot} in {store.describe()}', remedy=there, bag=bag, robot=robot)
     return RemoteBag(robot, bag, _ordered(files))
 
 

@@ -24,7 +24,17 @@ from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
 from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, planned, spool_upload, upload_now
 from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, verify_remote
 from shadowhound_data_logger.bags.watch import Watch, WatchStep
-from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, robot_name, the_home, the_store
+from shadowhound_data_logger.cli.common import (
+    BadUsage,
+    ExitCode,
+    as_json,
+    examples,
+    exit_code,
+    robot_name,
+    store_hint,
+    the_home,
+    the_store,
+)
 from shadowhound_data_logger.cli.output import (
     duration,
     number,
@@ -118,7 +128,8 @@ def bag_list(*, since: str, robot: str, as_json: bool) -> ExitCode:
     if as_json:
         print_json([with_dates(asdict(row)) for row in rows])
     elif not rows:
-        click.echo(f'There is no bag of {robot} in {where}, nor on this machine{" since then" if since else ""}.')
+        then = f' that began since {since}' if since else ''
+        click.echo(f'There is no bag of {robot}{then}, neither in {where} nor on this machine.{store_hint()}')
     else:
         print_page(_rows(rows), *_findings(rows))
     return exit_code(finding=away or any(row.finding and row.state != GROWING for row in rows))

@@ -85,6 +85,11 @@ def the_store_settings() -> StoreSettings:
     return store_settings(os.environ, the_home())
 
 
+def store_hint() -> str:
+    """To be said where nothing was found: which store it was, if nobody named one. Begins with a space, or is empty."""
+    return '' if the_store_settings().endpoint_url else ' AWS_ENDPOINT_URL is not set, so this folder is the store.'
+
+
 @contextmanager
 def the_store(threads: int = UploadSettings().threads) -> Iterator[ObjectStore]:
     """The one that the environment names, asked by so many threads at a time."""

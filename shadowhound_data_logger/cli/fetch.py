@@ -12,7 +12,7 @@ from typing import Any, Final
 import click
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store_settings
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, store_hint, the_store_settings
 from shadowhound_data_logger.cli.output import duration, number, plain, print_json, print_lines, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 from shadowhound_data_logger.stores import open_reader
@@ -94,10 +94,10 @@ def _asked(flags: Mapping[str, Any], limit: int | None, left_out: Any) -> list[d
 
 def _report(found: Any, asked: int, took_s: float, to: Path, where: str) -> Iterator[Text]:
     if not asked:
-        yield plain(f'There is nothing to fetch {where}.')
+        yield plain(f'There is nothing to fetch {where}.{store_hint()}')
         return
     rate = f', {volume(found.bytes / took_s)}/s' if found.moved and took_s else ''
-    yield plain(f'{number(found.moved)} objects ({volume(found.bytes)}) moved to {to} in {duration(took_s)}{rate}; '
+    yield plain(f'{number(found.moved)} objects ({volume(found.bytes)}) downloaded to {to} in {duration(took_s)}{rate}; '
                 f'{number(found.present)} were there already.')  # fmt: skip
     if found.unverified:
         yield plain(f'{number(found.unverified)} have no checksum in the store: their sizes are right.', 'yellow')

@@ -16,7 +16,16 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.cli.audit import finding_lines, findings
-from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
+from shadowhound_data_logger.cli.common import (
+    BadUsage,
+    ExitCode,
+    as_json,
+    examples,
+    exit_code,
+    store_hint,
+    the_store,
+    the_store_settings,
+)
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 from shadowhound_data_logger.clock import SECOND, SystemClock, utc
@@ -67,7 +76,7 @@ def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
         counts = (row.files, row.size, row.compacted, row.open_days, row.covered)
         table.add_row(plain(row.robot), number(row.days), row.first, row.last, number(counts[0]), volume(counts[1]),
                       *map(number, counts[2:]))  # fmt: skip
-    print_page(table if found else plain(f'There is no catalogue yet in {source.describe()}.'))
+    print_page(table if found else plain(f'There is no catalogue yet in {source.describe()}.{store_hint()}'))
     return tell_left_out(left_out)
 
 
@@ -310,7 +319,7 @@ def _verdict(said: Mapping[str, Any]) -> Text:
         left = plain(f': {said["unreachable"]}. {number(said["known"] - said["asked"])} objects are not asked for.')
         return Text.assemble(('The store is away', 'yellow'), left)
     if not said['known']:
-        return Text.assemble(('Nothing is verified', 'yellow'), ': the catalogue has no such objects.')
+        return Text.assemble(('Nothing is verified', 'yellow'), f': the catalogue has no such objects.{store_hint()}')
     if said['ok']:
         return Text.assemble(('All of them are there', 'green'), f', {how}.')
     if not said['findings']:

@@ -116,7 +116,7 @@ def _is_asked_for(gap: Gap, topic: str, begin_ns: int | None, end_ns: int | None
 def gaps_page(rows: Sequence[Gap]) -> list[RenderableType]:
     """A line a gap, the oldest first; what has no time comes first."""
     if not rows:
-        return [Text('No loss is known there.')]
+        return [Text('No gaps are known.')]
     columns = ['topic', 'sink', 'from', 'for', 'messages', 'gaps', 'what', 'cause', 'mission']
     shown = [name for name in columns if name != 'mission' or any(gap.mission_id for gap in rows)]
     table = plain_table('Gaps (UTC)', shown, left=('topic', 'sink', 'from', 'what', 'cause', 'mission'))

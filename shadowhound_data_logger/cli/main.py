@@ -40,6 +40,10 @@ GONE: Final = {
     ('bag watch', '--every'): 'it looks every 5 seconds',
 }
 """Options of earlier versions, by verb, and what does their job now."""
+NO_VERB: Final[tuple[type[click.ClickException], ...]] = (
+    (click.exceptions.NoArgsIsHelpError,) if hasattr(click.exceptions, 'NoArgsIsHelpError') else ()
+)
+"""A group of verbs without one: its help is the answer. Before click 8.2 that is no error."""
 CODES: Final = '\n'.join(('\b', 'Exit codes:', *(f'  {code.value:<4} {meaning}' for code, meaning in MEANINGS.items())))
 
 
@@ -80,6 +84,9 @@ def main() -> None:
         sys.exit(error.exit_code)
     except click.Abort:
         sys.exit(ExitCode.INTERRUPTED)
+    except NO_VERB as error:
+        click.echo(error.format_message(), err=True)
+        sys.exit(ExitCode.USAGE)
     except (click.ClickException, DataLoggerError, OSError, sqlite3.Error) as error:
         tell_error(*described(error, sys.argv[1:]))
         sys.exit(ExitCode.USAGE if isinstance(error, (click.ClickException, SettingError)) else ExitCode.FINDING)

@@ -76,7 +76,7 @@ def list_(*, as_json: bool) -> ExitCode:
     return exit_code(finding=_late(found))
 
 
-@missions.command(epilog=examples('missions show 20251018T120000'))
+@missions.command(epilog=examples('missions show patrol_20251018_120000'))
 @as_json
 @_mission
 def show(*, folder: MissionFolder, as_json: bool) -> ExitCode:
@@ -119,7 +119,7 @@ def resume(*, deadline: float, experiment: str | None) -> ExitCode:
     return exit_code(finding=left)
 
 
-@missions.command('export', epilog=examples('missions export 20251018T120000 --format csv --to mission.csv'))
+@missions.command('export', epilog=examples('missions export patrol_20251018_120000 --format csv --to mission.csv'))
 @click.option('--format', 'kind', type=click.Choice(['json', 'csv']), default='json', show_default=True, help='What to write.')
 @click.option('--to', type=click.File('w', encoding='utf-8', lazy=True), default='-', help='The file  [default: standard output]')
 @_mission

@@ -155,6 +155,11 @@ def number(value: int | None) -> str:
     return '-' if value is None else f'{value:,}'
 
 
+def counted(count: int, noun: str) -> str:
+    """``1 object``, ``2,400 objects``."""
+    return f'{number(count)} {noun}{"s" * (count != 1)}'
+
+
 def figure(row: Mapping[str, Any], name: str) -> str:
     """A figure of a ledger or a status: ``~12`` where it is estimated, a dash where it is not known."""
     about = row.get(f'{name}_estimated')

@@ -62,8 +62,8 @@ are UTC, and all of them are written alike: `yesterday`, `2h`, `2025-10-18`, `20
 
 An error names the verb, what is wrong and where, and on the next line what to do:
 
-    shadowhound-data bag info: no bag 'patrol' in the folder /home/hound/.shadowhound/store
-      -> shadowhound-data bag list shows the bags there are
+    shadowhound-data bag info: there is no bag patrol of thor in the folder /home/hound/.shadowhound/store
+      -> the store has no bag of thor; --robot names another robot
 
 ## Exit codes
 Of every verb; the node ends with 0, 1 or 2 in the same sense.

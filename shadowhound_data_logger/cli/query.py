@@ -13,7 +13,7 @@ from typing import Any, Final
 import click
 from rich.console import RenderableType
 
-from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, the_store_settings
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, store_hint, the_store_settings
 from shadowhound_data_logger.cli.output import number, plain, plain_table, print_json, print_page, volume
 from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, tell_left_out
 from shadowhound_data_logger.untrusted import csv_cell, visible
@@ -109,7 +109,7 @@ def _table(found: Any, where: str, *, is_objects: bool, is_limited: bool) -> Ite
 def _verdict(found: Any, shown: int, where: str, *, is_objects: bool) -> str:
     what = 'objects' if is_objects else 'rows'
     if not len(found):
-        return f'No {what} in {where}.'
+        return f'No {what} in {where}.{store_hint()}'
     text = f'{number(len(found))} {what}'
     if is_objects:
         text += f', {volume(sum(found["bytes"].to_pylist()))}'

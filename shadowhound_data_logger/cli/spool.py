@@ -20,6 +20,7 @@ from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, spool_folder, the_spool
 from shadowhound_data_logger.cli.output import (
     ProgressBar,
+    counted,
     duration,
     number,
     plain,
@@ -87,7 +88,8 @@ def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, l
         table = plain_table('', ('object', 'state', 'size', 'file'), left=('object', 'state', 'file'))
         for row in rows:
             table.add_row(plain(f'{row.bucket}/{row.key}'), _state(row.state, row.reason), volume(row.bytes), plain(row.path))
-        print_page(table if rows else Text('Nothing.'))
+        such = 'such ' if state or sensor or prefix else ''
+        print_page(table if rows else plain(f'There are no {such}objects in {folder}.'))
     if more:
         click.echo(f'... there are more than {number(limit)}: --limit', err=True)
     return ExitCode.FINE
@@ -129,9 +131,9 @@ def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bo
     if as_json:
         print_json(asdict(done))
     else:
-        click.echo(f'{number(done.objects)} objects ({volume(done.bytes)}) wait for delivery again')
+        click.echo(f'{counted(done.objects, "object")} ({volume(done.bytes)}) will be tried again')
         if done.gone:
-            click.echo(f'{number(done.gone)} are not there any more')
+            click.echo(f'{counted(done.gone, "file")} no longer there')
     return exit_code(finding=done.gone or (names and done.objects < len(frozenset(names))))
 
 
@@ -290,11 +292,11 @@ def _drained(folder: Path, spool: Spool, status: UploadStatus) -> dict[str, Any]
 
 
 def _told(said: dict[str, Any]) -> str:
-    lines = [f'{number(said["delivered"])} objects delivered and confirmed']
+    lines = [f'{counted(said["delivered"], "object")} delivered and confirmed']
     if said['pending']:
-        lines.append(f'{number(said["pending"])} still wait: {said["last_error"] or "ask again later"}')
+        lines.append(f'{counted(said["pending"], "object")} still waiting: {said["last_error"] or "try again later"}')
     if said['held']:
-        lines.append(f'{number(said["held"])} have no name yet (shadowhound-data spool)')
+        lines.append(f'{counted(said["held"], "object")} without a name yet (shadowhound-data spool)')
     if said['quarantined']:
-        lines.append(f'{number(said["quarantined"])} are quarantined (shadowhound-data spool)')
+        lines.append(f'{counted(said["quarantined"], "object")} quarantined (shadowhound-data spool)')
     return '\n'.join(lines)

@@ -19,7 +19,7 @@ from typing import Final
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import AccessDenied, BucketMissing, LakeError, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.fetched import FOLDER, Fetched, Verified
+from shadowhound_data_logger.lake.fetched import FOLDER, UNWRITABLE, Fetched, Verified
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -150,7 +150,7 @@ class _Fetch:
             self._fail(wish, str(error))
         except OSError as error:
             if error.errno in _NO_DISK:
-                raise LakeError(f'{self._fetched.folder} cannot be written: {error.strerror}') from error
+                raise LakeError(f'{self._fetched.folder} cannot be written: {error.strerror}', remedy=UNWRITABLE) from error
             self._fail(wish, error.strerror or type(error).__name__)
         if time.monotonic() - self._noted_s > NOTE_S:
             self._note()

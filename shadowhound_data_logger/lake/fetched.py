@@ -32,6 +32,7 @@ from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake.live_files import backfilled_key
 
 FOLDER: Final = '.fetch'
+UNWRITABLE: Final = 'name a folder of yours, on a disk that has room'
 PARTS: Final = f'{FOLDER}/parts'
 """Of files that are not whole yet."""
 _SCHEMA: Final = """
@@ -87,7 +88,11 @@ class Fetched:
             raise
         except (OSError, sqlite3.Error) as error:
             self._release()
-            raise LakeError(f'{self.folder} cannot be written: {error}', folder=str(self.folder)) from error
+            raise LakeError(
+                f'{self.folder} cannot be written: {getattr(error, "strerror", None) or error}',
+                remedy=UNWRITABLE,
+                folder=str(self.folder),
+            ) from error
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -171,7 +176,7 @@ def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             with replacing(path, part=part) as file:
                 file.write(parts.encode(ours))
         except OSError as error:
-            raise LakeError(f'{path} cannot be written: {error.strerror}', folder=str(folder)) from error
+            raise LakeError(f'{path} cannot be written: {error.strerror}', remedy=UNWRITABLE, folder=str(folder)) from error
 
 
 def _micros(row: Mapping[str, Any], name: str) -> int | None:

@@ -15,6 +15,7 @@ from typing import Any, Final
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.fetched import UNWRITABLE
 from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED, Coverage, named
 from shadowhound_data_logger.missions.contact_sheet import MOST, LoggedFrame, contact_sheet
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, visible
@@ -62,7 +63,9 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Bucket
         try:
             contact_sheet(frames, title, min((frame.time_ns for frame in frames), default=0), target)
         except (OSError, ValueError) as error:
-            raise LakeError(f'{target} cannot be made: {error}') from error
+            raise LakeError(
+                f'{target} cannot be written: {getattr(error, "strerror", None) or error}', remedy=UNWRITABLE
+            ) from error
 
 
 def ground(
@@ -110,7 +113,7 @@ def ground(
         try:
             figure.savefig(target, format='png')
         except OSError as error:
-            raise LakeError(f'{target} cannot be made: {error}') from error
+            raise LakeError(f'{target} cannot be written: {error.strerror or error}', remedy=UNWRITABLE) from error
 
 
 def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
@@ -157,7 +160,7 @@ def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
         try:
             figure.savefig(target, format='png')
         except OSError as error:
-            raise LakeError(f'{target} cannot be made: {error}') from error
+            raise LakeError(f'{target} cannot be written: {error.strerror or error}', remedy=UNWRITABLE) from error
 
 
 def _is_place(x: float | None, y: float | None) -> bool:

@@ -47,7 +47,7 @@ def test_list(home: Path) -> None:
     assert (row['bag'], row['state'], row['slices'], row['topics']) == (NAME, 'complete', 3, 2)
     assert row['t_start'] == '2025-10-18T12:00:00.000000000Z'
     empty = run(home, 'list', '--robot', 'tachi')
-    assert (empty.return_value, 'There is no bag of tachi in the folder' in empty.output) == (0, True)
+    assert (empty.return_value, 'There is no bag of tachi, neither in the folder' in empty.output) == (0, True)
     assert said(run(home, 'list', '--since', '2026-01-01', '--json')) == []
     for since in ('yesterday', '2w', '20260101'):
         assert said(run(home, 'list', '--since', since, '--json')) == []
@@ -123,7 +123,7 @@ def test_an_away_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(('arguments', 'error', 'text'), [
-    (('info', 'patrol_2025'), BagError, f'there is {NAME}'),
+    (('info', 'patrol_2025'), BagError, f'the store has {NAME}'),
     (('cut', NAME, '--topic', '/imv', '-o', 'new'), BagError, 'is it /imu?'),
     (('cut', NAME, '--start', 'noon', '-o', 'new'), SettingError, 'seconds since the start'),
     (('list', '--since', 'tomorrow'), SettingError, 'yesterday'),

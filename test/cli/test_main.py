@@ -204,6 +204,18 @@ def test_an_error_says_what_and_what_to_do(home: Path, monkeypatch: pytest.Monke
     assert remedy in lines[-1]
 
 
+@pytest.mark.parametrize('arguments', [(), ('missions',), ('node', 'bag')])
+def test_a_group_without_a_verb_helps(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]
+) -> None:
+    """It is no error with a remedy, but the help itself."""
+    code, lines = ended(monkeypatch, capsys, *arguments)
+    assert code == ExitCode.USAGE
+    assert lines[0].startswith(' '.join(('Usage:', PROGRAM, *arguments)))
+    assert lines[-1].startswith('  ')
+    assert '->' not in lines[-1]
+
+
 @pytest.mark.parametrize(('verb', 'option'), GONE)
 def test_an_option_that_is_gone(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: str, option: str

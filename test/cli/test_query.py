@@ -92,7 +92,7 @@ def test_pictures_of_the_answer(home: Path, tmp_path: Path) -> None:
     assert 'no image' in run(home, '--sensor', 'odom', '--sheet', str(sheet)).output
     for flag in ('--sheet', '--map'):
         refused = run(home, *asked, flag, str(tmp_path / 'nowhere' / 'x.png'))
-        assert (refused.exit_code, 'x.png cannot be made: ' in refused.output) == (2, True)
+        assert (refused.exit_code, 'x.png cannot be written: ' in refused.output) == (2, True)
 
 
 @pytest.mark.parametrize(

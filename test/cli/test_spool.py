@@ -128,7 +128,7 @@ def test_what_was_refused_waits_again(home: Path) -> None:
     assert said('retry', '--reason', 'foreign') == {'objects': 0, 'bytes': 0, 'gone': 0}
     assert states(home)['d.jpg'] == 'quarantined'
     answer = run('retry', '--reason', 'access_denied')
-    assert (answer.return_value, answer.stdout) == (0, '1 objects (1 B) wait for delivery again\n')
+    assert (answer.return_value, answer.stdout) == (0, '1 object (1 B) will be tried again\n')
     assert states(home) == {'a.jpg': 'pending', 'b.jpg': 'pending', 'c.jpg': 'pending', 'd.jpg': 'pending',
                             'thor/_unsynced/boot/e.jpg': 'held'}  # fmt: skip
 
@@ -152,7 +152,7 @@ def test_a_file_that_is_gone_does_not_wait(home: Path) -> None:
     (home / 'spool/quarantine/access_denied' / BUCKET / 'thor/camera/d.jpg').unlink()
     answer = run('retry')
     assert answer.return_value == 1
-    assert '1 are not there any more' in answer.stdout
+    assert '1 file no longer there' in answer.stdout
     assert states(home)['d.jpg'] == 'quarantined'
 
 
@@ -220,7 +220,7 @@ def test_a_store_that_is_away_is_told(home: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', 'SECRET')
     answer = run('drain', '--patience', '1')
     assert answer.return_value == 1
-    assert '3 still wait: Tower at http://127.0.0.1:9 refused the connection' in ' '.join(answer.stdout.split())
+    assert '3 objects still waiting: Tower at http://127.0.0.1:9 refused the connection' in ' '.join(answer.stdout.split())
     assert 'SECRET' not in answer.output
     assert states(home)['a.jpg'] == 'pending'
 
