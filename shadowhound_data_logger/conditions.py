@@ -50,7 +50,7 @@ class Condition:
 
 
 def conditions(texts: Iterable[str], setting: str = 'events.conditions') -> tuple[Condition, ...]:
-    """Of a list of texts, empty ones left out. Raises SettingError for one that is none, or a name that is there twice."""
+    """Of a list of texts, empty ones left out. Raises SettingError for an invalid one, or a name that is there twice."""
     found: dict[str, Condition] = {}
     for text in texts:
         if text:

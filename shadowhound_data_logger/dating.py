@@ -2,7 +2,7 @@
 
 A time before 2024 is one of the boot clock. What makes UTC of it is the difference of the two clocks, which is known as soon as
 the wall clock is set; of an earlier boot it is known where somebody noted it while that lasted. Until then whatever has no date
-waits, for a key, a name or a run cannot be given another date later. It does not wait for ever: where the clock is not set for
+waits, for a key, a name or a run cannot be given another date later. It does not wait forever: where the clock is not set for
 too long, or the boot ended before it was, it goes without a date.
 """
 

@@ -122,7 +122,7 @@ class KeyTemplate:
 
 
 def dated(pattern: str, stamp_ns: int) -> str:
-    """The key of a pattern at this time. Raises NameRefused where that is none."""
+    """The key of a pattern at this time. Raises NameRefused where that is not a valid key."""
     when = utc(stamp_ns)
     values = {
         '{date}': when.strftime('%Y%m%d'),

@@ -165,7 +165,7 @@ def _absent(source: CutSource, choice: Choice) -> tuple[str, ...]:
 
 
 def _chosen(choice: Choice) -> Callable[[Channel], bool]:
-    """Raises SettingError for a regular expression that is none."""
+    """Raises SettingError for an invalid regular expression."""
     names = {'/' + name.lstrip('/') for name in choice.topics}
     try:
         pattern = re.compile(choice.regex) if choice.regex else None

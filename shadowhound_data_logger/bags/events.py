@@ -1,6 +1,6 @@
 """Events: a trigger makes a bag of the seconds before and after it, from the ring, written by a separate thread.
 
-A trigger while an event goes on makes it last longer, and is told in its manifest; what would be longer than an event may be
+A trigger while an event goes on makes it last longer, and is listed in its manifest; what would be longer than an event may be
 follows in one of its own, without a message between them or in both. The writer takes from the ring piece by piece what it
 writes: there is no second copy of it, and the intake never waits.
 

@@ -40,7 +40,10 @@ _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 class Recording:
-    """New; ``write``, ``tick`` and ``split`` any number of times; ``close`` once. Owned by the thread that writes bags."""
+    """One bag while it records: writes messages to slices, and spools each slice.
+
+    New; ``write``, ``tick`` and ``split`` any number of times; ``close`` once. Owned by the thread that writes bags.
+    """
 
     def __init__(self, state: BagState, settings: BagSettings, place: BagPlace, recovery: BagRecovery,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip

@@ -5,7 +5,7 @@ whatever reached the disk is spooled, the manifest says what is missing, and the
 no slice is lost by the restart. Every step can be cut short and done again. What is no slice, whoever put it there, is set aside
 unopened.
 
-This decides about a bag; ``mcap/recovery.py`` repairs the bytes of a slice, ``spool/recovery.py`` mends a spool.
+This decides about a bag; ``mcap/recovery.py`` repairs the bytes of a slice, ``spool/recovery.py`` repairs a spool.
 """
 
 from __future__ import annotations

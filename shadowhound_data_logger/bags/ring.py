@@ -29,7 +29,7 @@ class Held(NamedTuple):
 
     lot: Lot
     lost: Losses
-    """What is estimated to have been lost before the last of it; None where nobody knows."""
+    """What is estimated to have been lost before the last of it; None where it is not known."""
     at_s: float
     """When it was drained, by the monotonic clock."""
     size: int

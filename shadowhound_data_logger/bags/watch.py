@@ -31,7 +31,7 @@ from shadowhound_data_logger.stores import open_store
 
 MARKS: Final = '.shadowhound-bags.json'
 UNFINISHED_S: Final = 600.0
-"""A bag without metadata.yaml of which nothing has changed for so long is told: its recorder may have died."""
+"""A bag without metadata.yaml that has not changed for so long is reported: its recorder may have died."""
 SPOOLED: Final = 'spooled'
 STORED: Final = 'stored'
 REMOVED: Final = 'removed'

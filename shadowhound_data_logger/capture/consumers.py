@@ -29,7 +29,7 @@ class Drained(NamedTuple):
     """The oldest first, each with its sender where that is known; none came before. Where ``sensor`` is empty, numbered messages
     may be repeats: whoever counts them leaves those out."""
     lost: Losses
-    """What is estimated to have been lost before these messages, where they have no numbers; None where nobody knows."""
+    """What is estimated to have been lost before these messages, where they have no numbers; None where it is not known."""
     now_s: float
     """When they were drained, by the monotonic clock."""
     paused: bool
@@ -62,7 +62,7 @@ class TopicChoice:
     def _matches(self, topic: str) -> bool:
         """As rosbag2: any part of the name has to match; hidden topics (a part begins with ``_``) are left out.
 
-        So are names that are none of ROS, which another DDS program may well have: nobody can subscribe to them in ROS.
+        So are names that are not valid in ROS, which another DDS program may well have: nobody can subscribe to them in ROS.
         """
         assert self._regex is not None
         if '/_' in topic or not _FULL_NAME.fullmatch(topic) or len(topic) > MAX_NAME or not self._regex.search(topic):

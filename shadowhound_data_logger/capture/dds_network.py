@@ -176,7 +176,7 @@ def _of(given: str, here: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def _resolve(host: str) -> list[str]:
-    """Its IPv4 addresses; none where nobody knows it."""
+    """Its IPv4 addresses; none where it is not known."""
     try:
         return list(dict.fromkeys(str(entry[4][0]) for entry in socket.getaddrinfo(host, None, socket.AF_INET)))
     except (OSError, UnicodeError):

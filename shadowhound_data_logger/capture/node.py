@@ -133,7 +133,7 @@ def give_back() -> None:
 
 
 def refuse(rest: list[str]) -> int:
-    """Answer arguments that are none of ROS; the exit code."""
+    """Answer arguments that are not for ROS; the exit code."""
     if rest[0] in {'-h', '--help'}:
         print(USAGE)  # noqa: T201
         return 0

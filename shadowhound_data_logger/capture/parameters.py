@@ -192,7 +192,7 @@ def _check_topics(node: Node, settings: Settings) -> None:
 
 
 def _resolve(node: Node, name: str, topic: str, given: object) -> str:
-    """The full name of a topic; raises SettingError for one that is none."""
+    """The full name of a topic; raises SettingError for an invalid one."""
     try:
         return str(node.resolve_topic_name(topic))
     except (RuntimeError, ValueError) as error:  # RCLError is the one, InvalidTopicNameException the other

@@ -219,7 +219,7 @@ class Pipeline:
     def tick(self) -> None:
         """Called several times a second: starts threads again that died, and once a second tells what goes on.
 
-        A failure of a thread is told at once. At the turn of each UTC day the ledger is shipped. Raises SpoolError when the
+        A failure of a thread is reported at once. At the turn of each UTC day the ledger is shipped. Raises SpoolError when the
         spool cannot be repaired while it is in use.
         """
         if self.writer.damaged:

@@ -69,7 +69,7 @@ class KeptMessages:
         self._kept: list[_Kept] = []
 
     def add(self, stamp_ns: int, cdr: bytes) -> None:
-        """A message, in the order of their times; after a step of the clock back the track begins anew."""
+        """A message, in the order of their times; after a step of the clock back the track starts again."""
         with self._lock:
             stamps, kept = self._stamps, self._kept
             if stamps and stamp_ns <= stamps[-1]:

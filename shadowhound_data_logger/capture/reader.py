@@ -61,7 +61,7 @@ class PolledGroup(CallbackGroup):  # type: ignore[misc]  # rclpy has no types
     """Keeps what is in it out of every wait set.
 
     That holds for event handlers too: in rmw_fastrtps a reader's events and its data share one condition, so a wait set
-    with an event of an undrained subscription returns at once, for ever (a whole core, measured on Kilted).
+    with an event of an undrained subscription returns at once, forever (a whole core, measured on Kilted).
     """
 
     def add_entity(self, entity: Any) -> None:

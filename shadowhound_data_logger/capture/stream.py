@@ -36,7 +36,7 @@ class Senders:
     """Who sent a message, where the middleware gives its number but not its sender's gid (Jazzy and older).
 
     With one publisher in the graph it is that one. Its successor is told from it before the graph shows the change: its
-    numbers begin anew while the time of sending goes on. When the old numbers go on as well, there are two of them.
+    numbers start again while the time of sending goes on. When the old numbers go on as well, there are two of them.
     """
 
     def __init__(self) -> None:

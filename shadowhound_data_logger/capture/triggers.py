@@ -90,7 +90,7 @@ class Judge:
         """Since when it is as it is now: true while armed, false else; None while it is the other way round."""
 
     def look(self, value: float, now_s: float) -> bool:
-        """Whether this number, of that time by the monotonic clock, triggers. One that is none (NaN) tells nothing."""
+        """Whether this number, of that time by the monotonic clock, triggers. NaN triggers nothing."""
         if not math.isfinite(value):
             return False
         if self.condition.holds(value) is not self._armed:

@@ -19,7 +19,7 @@ SETTLED_S: Final = 30.0
 """For how long the front must report a publisher before it is called unheard. One that was killed stays known for its lease (10 s
 by default with Cyclone DDS, 20 s with Fast DDS as ROS has it), and the two sides forget it at different moments."""
 SILENT_S: Final = 30.0
-"""After a longer silence of the front nothing is known, and what is reported then begins anew; it reports every other second, or
+"""After a longer silence of the front nothing is known, and what is reported then starts again; it reports every other second, or
 every 20 s in a crowd of publishers."""
 MOST_PUBLISHERS: Final = 8
 """Of a topic, in a report: a crowd of them costs no more."""
@@ -31,7 +31,7 @@ REMEDY: Final = (
     'CYCLONEDDS_URI, ROS_STATIC_PEERS (docs/thor.md, Middleware)'
 )
 _Report = Mapping[str, Any]
-"""{topic: [[gid, type, node], ...]}, as far as it is what the front sends; node is empty where nobody knows it."""
+"""{topic: [[gid, type, node], ...]}, as far as it is what the front sends; node is empty where it is not known."""
 
 
 class Unheard:

@@ -176,7 +176,7 @@ class _GapParts:
         return self._made(rows, self._version)
 
     def _row(self, gap: Gap, began_ns: int) -> Statement:
-        """Revisions go on where an index was damaged, and versions begin anew: the new one began later."""
+        """Revisions go on where an index was damaged, and versions start again: the new one began later."""
         is_dated = gap.boot_id is None or gap.from_ns is not None
         clock = None if gap.boot_id is None else words.SET_LATER if is_dated else words.UNSET
         name = name_of(

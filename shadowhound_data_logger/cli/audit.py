@@ -1,4 +1,4 @@
-"""Whether the store still holds what it confirmed: ``shadowhound-data ledger --verify``, and how findings are told."""
+"""Whether the store still holds what it confirmed: ``shadowhound-data ledger --verify``, and how findings are printed."""
 
 from __future__ import annotations
 

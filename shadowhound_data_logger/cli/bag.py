@@ -115,7 +115,7 @@ def bag_list(*, since: str, robot: str, as_json: bool) -> ExitCode:
     recovered  the same, after a crash or power cut: bag info says what is missing
     foreign    not from this package: nobody says what should be in it
 
-    Exit code 1 when something is wrong with one of them, or the store is away: then only what is on this machine is told.
+    Exit code 1 when something is wrong with one of them, or the store is away: then only what is on this machine is listed.
     """  # noqa: D301 - click's mark for lines that stay as they are
     begin_ns = moment('--since', since, SystemClock.of_this_machine().wall_ns()) if since else 0
     with the_store(STORE_THREADS) as store:

@@ -1,4 +1,4 @@
-"""``shadowhound-data lake``: the catalogue itself: how it lies in the store, made smaller, made anew, compared with the store."""
+"""``shadowhound-data lake``: the catalogue itself: its state in the store, compacted, restored, compared with the store."""
 
 from __future__ import annotations
 

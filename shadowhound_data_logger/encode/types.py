@@ -74,7 +74,7 @@ class CounterField(NamedTuple):
 
     @property
     def wrap(self) -> int:
-        """It begins anew after so many values."""
+        """It starts again after so many values."""
         return 1 << 8 * self.little.size
 
     def read(self, cdr: bytes) -> int:

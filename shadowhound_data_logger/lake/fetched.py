@@ -132,7 +132,7 @@ class Fetched:
             self._db.executemany('INSERT OR REPLACE INTO files VALUES (?, ?, ?, ?, ?, ?, ?)', rows)
 
     def _opened(self, path: Path) -> sqlite3.Connection:
-        """A file that is none of SQLite's is only a memory: it begins anew."""
+        """A file that SQLite cannot read is only a memory: it starts again."""
         for attempt in range(2):
             db = sqlite3.connect(path)
             try:

@@ -1,4 +1,4 @@
-"""What an answer leaves out: parts of the catalogue that are none, or speak of what is not their robot's."""
+"""What an answer leaves out: invalid parts of the catalogue, and rows of another robot."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Rows:
             yield list(enumerate(_infos(ordered.slice(start, PAGE)), start))
 
     def note(self, ids: Iterable[int]) -> None:
-        """Nowhere: an audit that was cut short begins anew, or asks for fewer days."""
+        """Nowhere: an audit that was cut short starts again, or asks for fewer days."""
 
     def unproved(self) -> int:
         """Of how many no SHA-256 is known: of these the size alone is compared."""

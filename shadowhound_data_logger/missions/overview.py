@@ -152,7 +152,7 @@ class Report:
     missing: int = 0
     """Frames and trajectories whose file was gone before it was handed on."""
     last_error: str = ''
-    """What holds it up now, or was refused for ever; empty when nothing."""
+    """What holds it up now, or was refused forever; empty when nothing."""
     remedy: str = ''
 
 

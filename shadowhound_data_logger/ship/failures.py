@@ -34,7 +34,7 @@ class Verdict(Enum):
     """What delivery does next with the object and with the others."""
 
     RETRY = 'retry'
-    """The store is away, or this object does not get through: wait, then try again, for ever."""
+    """The store is away, or this object does not get through: wait, then try again, forever."""
     PAUSE = 'pause'
     """No object's fault: nothing is sent until credentials and certificate are right, but for one probe at a time."""
     BUCKET = 'bucket'

@@ -37,7 +37,7 @@ class _Piece(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Patrol:
-    """A closed path, walked for ever; ``at`` depends on nothing but the time."""
+    """A closed path, walked forever; ``at`` depends on nothing but the time."""
 
     pieces: tuple[_Piece, ...]
     starts: tuple[float, ...]

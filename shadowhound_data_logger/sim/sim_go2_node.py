@@ -42,7 +42,7 @@ class SimSettings:
     """The parameters of the node."""
 
     duration_s: float = field(default=0.0, metadata={'low': 0.0, 'high': 1e7})
-    """Seconds to run; 0: for ever."""
+    """Seconds to run; 0: forever."""
     seed: int = field(default=1, metadata={'low': 0, 'high': (1 << 63) - 1})
     """Of all noise."""
     rate_scale: float = field(default=1.0, metadata={'low': 0.01, 'high': 100.0})
@@ -81,7 +81,7 @@ def count(rate_hz: float, duration_s: float) -> int:
 
 
 def schedule(rates_hz: Mapping[str, float], duration_s: float) -> Iterator[tuple[float, str]]:
-    """(seconds since the start, name) of every sample in the order of time, for ever where ``duration_s`` is 0."""
+    """(seconds since the start, name) of every sample in the order of time, forever where ``duration_s`` is 0."""
     order = list(rates_hz)
     last = {name: count(rates_hz[name], duration_s) if duration_s else math.inf for name in order}
     heap = [(0.0, place, 0) for place, name in enumerate(order) if last[name] > 0]

@@ -45,7 +45,7 @@ MORE_TYPES: Final = '(more)'
 MAX_NODES: Final = 3
 """Publishers of such a type, by name."""
 Losses = Mapping[str, int] | None
-"""What was lost before some messages, by cause, as far as it is estimated; None where nobody knows."""
+"""What was lost before some messages, by cause, as far as it is estimated; None where it is not known."""
 
 
 @dataclass(slots=True)

@@ -71,7 +71,7 @@ class Deliveries:
         self._index.close()
 
     def finish(self) -> None:
-        """The audit came to its end: the next one begins anew."""
+        """The audit came to its end: the next one starts again."""
         self.close()
         self._notes.unlink(missing_ok=True)
 
@@ -144,5 +144,7 @@ class Deliveries:
             busy = 'locked' in str(error)
             raise SpoolError(
                 f'{self._index_path} and {self._notes} cannot be used: {error}',
-                remedy='does another --verify run?' if busy else 'is the folder yours to write? --again begins anew',
+                remedy='does another --verify run?'
+                if busy
+                else 'is the folder yours to write? --again starts from the beginning',
             ) from error

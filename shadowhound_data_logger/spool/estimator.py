@@ -62,7 +62,7 @@ class Expectation(NamedTuple):
     period: float = 0.0
     """Declared, ns or counts; 0 where it is to be learned."""
     wrap: int = 0
-    """A counter begins anew after so many values."""
+    """A counter starts again after so many values."""
 
 
 UNDECLARED: Final = Expectation()
@@ -96,7 +96,7 @@ class Estimate(NamedTuple):
 
     @property
     def lost(self) -> Mapping[str, int] | None:
-        """What is missing before these messages, by cause; None where nobody knows, or only learns it now."""
+        """What is missing before these messages, by cause; None where it is not known, or only learns it now."""
         return self.missed if self.covered == self.messages else None
 
 

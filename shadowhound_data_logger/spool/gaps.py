@@ -52,7 +52,7 @@ class Gap:
     to_ns: int | None
     """UTC stamp of the first message after; of an object, of its last."""
     count: int | None
-    """Messages; 0 for a row that was true once, and is not any more. None where nobody knows."""
+    """Messages; 0 for a row that was true once, and is not any more. None where it is not known."""
     merged: int
     """How many gaps are in it."""
     grade: str
@@ -63,7 +63,7 @@ class Gap:
     from_boot_ns: int | None = None
     to_boot_ns: int | None = None
     began_ns: int | None = None
-    """When its session began: numbers of sessions begin anew with a new index."""
+    """When its session began: numbers of sessions start again with a new index."""
     begin_ns: int = UNTIMED
     """With sink, topic, publisher, session, kind, cause, grade and mission this names the row."""
     version: int = 0

@@ -94,7 +94,7 @@ def retry(root: Path, *, reason: str | None = None, names: Collection[str] = ())
 
 
 def tell_gaps_again(root: Path) -> int:
-    """Have the next part with gaps begin anew, with all that the journal remembers: the store lost parts. Returns how many rows.
+    """Have the next part with gaps start again, with all that the journal remembers: the store lost parts. Returns how many rows.
 
     A node that runs does so within a period of the catalogue. Raises SpoolError or sqlite3.Error.
     """

@@ -143,7 +143,7 @@ class ContentRequests:
 
 
 def _skip_headers(_: object, fp: IO[bytes]) -> None:
-    """What may follow ``100 Continue``; botocore's own reads for ever where the connection ends there."""
+    """What may follow ``100 Continue``; botocore's own reads forever where the connection ends there."""
     while fp.readline().strip():
         pass
 

@@ -164,7 +164,7 @@ def test_one_at_a_time(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
         other.execute('BEGIN EXCLUSIVE')
         assert 'does another --verify run' in str(run('--verify').exception)
     (home / 'spool/verify.db').write_bytes(b'garbage' * 1000)
-    assert '--again begins anew' in str(run('--verify').exception)
+    assert '--again starts from the beginning' in str(run('--verify').exception)
     assert as_json('--verify', '--again')['asked'] == 3
 
 
