@@ -29,8 +29,8 @@ _TOLD: Final = """version <= CASE session WHEN 0 THEN (SELECT ifnull(max(version
 """Whether the store is told of a row; those of objects have no session."""
 _FORGETTABLE: Final = f"""{_WHOLE_ROW} WHERE begin_ns BETWEEN ? AND ? AND ifnull(to_ns, begin_ns) <= ?
   AND kind <> 'quarantined' AND {_TOLD}"""
-_OF_OLD_SESSIONS: Final = f"""{_WHOLE_ROW} WHERE (begin_ns BETWEEN {UNTIMED} AND ?1 - 1 OR begin_ns > ?2)
-  AND session BETWEEN 1 AND (SELECT ifnull(max(id), 0) FROM sessions WHERE ended_ns BETWEEN ?1 AND ?3) AND {_TOLD}"""  # noqa: S608 - own constants only
+_OF_OLD_SESSIONS: Final = f"""{_WHOLE_ROW} WHERE (begin_ns BETWEEN {UNTIMED} AND ? - 1 OR begin_ns > ?)
+  AND session BETWEEN 1 AND (SELECT ifnull(max(id), 0) FROM sessions WHERE ended_ns BETWEEN ? AND ?) AND {_TOLD}"""  # noqa: S608 - own constants only
 _LONGEST_UNCHANGED: Final = f"{_WHOLE_ROW} WHERE begin_ns <> {FORGOTTEN} AND kind <> 'quarantined' ORDER BY version"
 _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
 
@@ -72,11 +72,11 @@ class GapTable:
             publisher, mission, begin_ns, count = row
             part = min(rest, count)
             self._db.execute(
-                f'UPDATE gaps SET version = {NEXT_VERSION}, count = count - ?1,'  # noqa: S608
-                ' merged = CASE WHEN count > ?1 THEN merged ELSE 0 END'
+                f'UPDATE gaps SET version = {NEXT_VERSION}, count = count - ?,'  # noqa: S608
+                ' merged = CASE WHEN count > ? THEN merged ELSE 0 END'
                 ' WHERE session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ? AND publisher = ? AND mission = ?'
                 ' AND begin_ns = ?',
-                (part, *named, publisher, mission, begin_ns),
+                (part, part, *named, publisher, mission, begin_ns),
             )
             rest -= part
 
@@ -89,7 +89,8 @@ class GapTable:
         """
         old = self._db.execute(f'{_FORGETTABLE} LIMIT ?', (EARLIEST_SANE_NS, before_ns, before_ns, limit)).fetchall()
         if len(old) < limit:
-            old += self._db.execute(f'{_OF_OLD_SESSIONS} LIMIT ?', (EARLIEST_SANE_NS, before_ns, before_ns, limit)).fetchall()
+            times = EARLIEST_SANE_NS, before_ns, EARLIEST_SANE_NS, before_ns
+            old += self._db.execute(f'{_OF_OLD_SESSIONS} LIMIT ?', (*times, limit)).fetchall()
         over = self._db.execute('SELECT count(*) FROM gaps').fetchone()[0] - MOST_ROWS - len(old)
         if over > 0:
             old = list(dict.fromkeys(old + self._db.execute(f'{_LONGEST_UNCHANGED} LIMIT ?', (min(over, limit),)).fetchall()))

@@ -609,8 +609,8 @@ class Index:
         """Give the next session and the next object greater numbers than these."""
         with self.transaction():
             for table, last in (('sessions', session), ('objects', number)):
-                self._db.execute('INSERT INTO sqlite_sequence SELECT ?1, 0 WHERE NOT EXISTS'
-                                 ' (SELECT 1 FROM sqlite_sequence WHERE name = ?1)', (table,))  # fmt: skip
+                self._db.execute('INSERT INTO sqlite_sequence SELECT ?, 0 WHERE NOT EXISTS'
+                                 ' (SELECT 1 FROM sqlite_sequence WHERE name = ?)', (table, table))  # fmt: skip
                 self._db.execute('UPDATE sqlite_sequence SET seq = max(seq, ?) WHERE name = ?', (last, table))
 
     def end_session(self, session: int, now_ns: int) -> None:
