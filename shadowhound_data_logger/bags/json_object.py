@@ -10,7 +10,10 @@ MOST: Final = 1 << 63
 
 
 class JsonObject:
-    """New with what ``json.loads`` gave; what is not as it must be raises BagDamaged with its place."""
+    """A JSON object from an untrusted file, with typed access to its fields.
+
+    New with what ``json.loads`` gave; what is not as it must be raises BagDamaged with its place.
+    """
 
     def __init__(self, value: object, file: str, place: str) -> None:
         self._file, self._place = file, place

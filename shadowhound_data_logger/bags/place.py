@@ -26,7 +26,10 @@ _LATEST: Final = 1 << 63
 
 
 class BagPlace:
-    """New before anything is received; from any thread."""
+    """The folder, the robot, the clock and the spool that bags are recorded with.
+
+    New before anything is received; from any thread.
+    """
 
     def __init__(self, root: Path, robot: str, clock: Clock, writer: SpoolWriter, hold_s: float = 0.0,
                  offsets: Callable[[], Mapping[str, int]] = dict) -> None:  # fmt: skip

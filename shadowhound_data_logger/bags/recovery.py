@@ -50,7 +50,9 @@ DAMAGED: Final = '.damaged'
 
 
 class BagRecovery:
-    """New with an open spool, before anything records; open once; ``add`` from any thread; close once.
+    """Completes the bags that an earlier process did not finish, and those that wait for their date.
+
+    New with an open spool, before anything records; open once; ``add`` from any thread; close once.
 
     Owns the thread ``bag-recovery``, which ends when nothing is left to do. ``_lock`` guards which bags there are and which
     thread.

@@ -44,7 +44,7 @@ CAP_S: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Uploaded:
-    """How far it came."""
+    """How much of a bag was delivered."""
 
     robot: str
     bag: str

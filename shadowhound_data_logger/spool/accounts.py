@@ -313,7 +313,10 @@ class _Entry:
 
 
 class Accounts:
-    """All topics of this session. Thread-safe: ``entry`` holds the lock, the other methods take it."""
+    """The accounts of all topics of this session.
+
+    Thread-safe: ``entry`` holds the lock, the other methods take it.
+    """
 
     def __init__(self, inherited: Iterable[PublisherRow] = (), last_kept: Mapping[str, int] | None = None,
                  rhythms: Iterable[RhythmRow] = (), grades: Mapping[str, str] | None = None,

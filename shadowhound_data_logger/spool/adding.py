@@ -86,7 +86,10 @@ def _link_or_copy(source: Path, target: Path) -> None:
 
 
 class Adding:
-    """New for each commit, under the spool's lock; ``add`` inside its transaction, then ``place``, or ``discard`` inside it."""
+    """The new objects of one commit: their rows and files.
+
+    New for each commit, under the spool's lock; ``add`` inside its transaction, then ``place``, or ``discard`` inside it.
+    """
 
     def __init__(self, index: Index, tree: Tree, repeats: Repeats, now_ns: int) -> None:
         self._index = index

@@ -39,7 +39,10 @@ def read(spool: Path, robot: str) -> dict[str, Any]:
 
 
 class ClockRecord:
-    """New when the spool is open; one thread. A disk that does not take it is said and forgotten."""
+    """Keeps the clock's steps and offsets in a file.
+
+    New when the spool is open; one thread. A failed write is logged, and has no other effect.
+    """
 
     def __init__(self, spool: Path, robot: str) -> None:
         self._path = file(spool, robot)

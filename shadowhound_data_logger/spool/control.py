@@ -47,7 +47,10 @@ def address(spool: Path, name: str) -> Iterator[str]:
 
 
 class Connection:
-    """To one node. Open from the start; ``ask`` any number of times, from one thread; close once."""
+    """A connection to a node's control socket.
+
+    Open from the start; ``ask`` any number of times, from one thread; close once.
+    """
 
     def __init__(self, spool: Path, name: str, deadline_s: float = PATIENCE_S) -> None:
         """Raises OSError where nobody listens there, or where it is not for us."""

@@ -36,7 +36,10 @@ _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade 
 
 
 class GapTable:
-    """Part of an open index, on its connection. Methods that write belong into one of its transactions."""
+    """The table of the gap journal.
+
+    Part of an open index, on its connection. Methods that write belong in one of its transactions.
+    """
 
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db

@@ -17,7 +17,10 @@ from shadowhound_data_logger.spool.index import Index
 
 
 class Session:
-    """``begin`` makes one; then ``end`` until it worked, and ``leave`` once. What never ends is settled by the next start."""
+    """The life of one process with a spool.
+
+    ``begin`` makes one; then ``end`` until it worked, and ``leave`` once. A session that never ends is settled by the next start.
+    """
 
     def __init__(self, number: int, tree: Tree) -> None:
         self.number = number
