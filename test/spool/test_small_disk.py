@@ -148,8 +148,8 @@ def test_a_disk_that_takes_nothing(
     writer.put(make('1', bytes(MEBI)))
     writer.put(make('2', bytes(MEBI)))
     assert not writer.flush(0.2)
+    until(lambda: writer.worker.failures > 3)
     assert writer.worker.failing
-    assert writer.worker.failures > 3
     assert rows(root)[0]['key'] == '0'
     if filler:
         filler.unlink()

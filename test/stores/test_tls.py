@@ -11,7 +11,7 @@ import pytest
 from stores.asking import error_of
 from stores.certificates import DAY, WRONG, Authority
 from stores.fake_s3 import FakeS3, served
-from stores.spooled import Spool, with_room
+from stores.spooled import QUICK, Spool, with_room
 from stores.tls_front import Secured, behind_tls
 
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
@@ -38,10 +38,11 @@ def trusting(request: pytest.FixtureRequest, authorities: dict[str, Authority], 
 
 @pytest.fixture
 def through(seaweed: Tower, opened: Callable[..., S3Store]) -> Callable[[str], S3Store]:
-    """A store over another way to the server."""
+    """A store over another way to the server; handshakes may take long on a busy machine."""
 
     def make(url: str) -> S3Store:
-        return opened(dataclasses.replace(seaweed.store_settings(), endpoint_url=url))
+        patient = dataclasses.replace(QUICK, connect_timeout_s=QUICK.read_timeout_s)
+        return opened(dataclasses.replace(seaweed.store_settings(), endpoint_url=url), patient)
 
     return make
 
