@@ -183,7 +183,7 @@ def _way(found: Mapping[str, Any], console: Console, *, live: bool) -> Table:
     if found['spool']:
         spool = found['spool']
         grid.add_row('spool', share_bar(_share(spool['bytes'], spool['max_bytes']), console), _disk(spool))
-        grid.add_row('', '', _piles(spool))
+        grid.add_row('', '', _usage(spool))
     if live:
         _add_store(grid, found)
         if found.get('mission'):
@@ -210,7 +210,7 @@ def _disk(spool: Mapping[str, Any]) -> str:
     return f'{volume(spool["bytes"])}{limit}{free}'
 
 
-def _piles(spool: Mapping[str, Any]) -> str:
+def _usage(spool: Mapping[str, Any]) -> str:
     """``3 objects wait (oldest 0.4 s), 1 quarantined``."""
     oldest = '' if spool['oldest_age_s'] is None else f' (oldest {duration(spool["oldest_age_s"])})'
     usage = ''.join(f', {spool[name]:,} {name}' for name in ('held', 'quarantined') if spool[name])
