@@ -117,6 +117,7 @@ def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path) -> N
         it.taken()
         it.pass_s(1.0)
         it.events.trigger('low_battery', 'condition')
+        until(lambda: any(b'low_battery' in path.read_bytes() for path in it.root.glob('*/*.open')), 'the slice knows of it')
         until(lambda: any(path.stat().st_size > 20_000 for path in it.root.glob('*/*.open')), 'it is synced')
         it.hear(range(10, 15), size=2000)
         it.taken()
