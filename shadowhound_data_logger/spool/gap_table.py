@@ -23,7 +23,7 @@ WHERE session > (SELECT max(id) FROM sessions) - 20 AND first_ns >= ? AND accoun
 ORDER BY robot, topic, session"""
 MOST_ROWS: Final = 500_000
 """Of the journal, some 100 MB: three days of a topic that loses messages in every second are 259,200."""
-_WHOLE_ROW: Final = 'SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged FROM gaps'
+_WHOLE_ROW: Final = 'SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged, to_ns FROM gaps'
 _TOLD: Final = """version <= CASE session WHEN 0 THEN (SELECT ifnull(max(version), 0) FROM gaps_told) ELSE ifnull((
     SELECT told.version FROM gaps_told AS told JOIN sessions USING (robot) WHERE sessions.id = gaps.session), 0) END"""
 """Whether the store is told of a row; those of objects have no session."""
@@ -32,6 +32,10 @@ _FORGETTABLE: Final = f"""{_WHOLE_ROW} WHERE begin_ns BETWEEN ? AND ? AND ifnull
 _OF_OLD_SESSIONS: Final = f"""{_WHOLE_ROW} WHERE (begin_ns BETWEEN {UNTIMED} AND ? - 1 OR begin_ns > ?)
   AND session BETWEEN 1 AND (SELECT ifnull(max(id), 0) FROM sessions WHERE ended_ns BETWEEN ? AND ?) AND {_TOLD}"""  # noqa: S608 - own constants only
 _LONGEST_UNCHANGED: Final = f"{_WHOLE_ROW} WHERE begin_ns <> {FORGOTTEN} AND kind <> 'quarantined' ORDER BY version"
+_FORGOTTEN_UNTIL: Final = f"""
+SELECT session, topic, max(ifnull(to_ns, (SELECT max(started_ns) FROM sessions)))
+FROM gaps WHERE begin_ns = {FORGOTTEN} AND EXISTS (SELECT 1 FROM gaps_told WHERE again) GROUP BY session, topic"""  # noqa: S608
+"""When the last forgotten gap ended. Where that is not known it was of an earlier session: older versions did not keep it."""
 _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
 
 
@@ -84,7 +88,9 @@ class GapTable:
             rest -= part
 
     def forget(self, before_ns: int, limit: int) -> bool:
-        """Drop rows of what was over before then, their sums stay; False when there may be more of them. In a transaction.
+        """Drop rows of what was over before then; False when there may be more of them. In a transaction.
+
+        Their sums stay, with the end of the last of them, for what is told again (``watermarks``).
 
         A row stays until a part of the spool tells it. Rows without a time, of before the clock was set or of a time to come go
         when their session has ended so long ago. Beyond ``MOST_ROWS`` those go that did not change for the longest. Rows of
@@ -99,12 +105,16 @@ class GapTable:
             old = list(dict.fromkeys(old + self._db.execute(f'{_LONGEST_UNCHANGED} LIMIT ?', (min(over, limit),)).fetchall()))
         sums = Counter[tuple[Any, ...]]()
         merged = Counter[tuple[Any, ...]]()
+        ends: dict[tuple[Any, ...], int | None] = {}
         for row in old:
             sums[row[:5]] += row[8]
             merged[row[:5]] += row[9]
+            end_ns, last_ns = row[10], ends.get(row[:5], 0)
+            is_known = end_ns is not None and end_ns >= EARLIEST_SANE_NS and last_ns is not None
+            ends[row[:5]] = max(end_ns, last_ns) if is_known else None
         self._db.executemany(
-            f"INSERT INTO gaps VALUES (?,?,?,?,?,'','',{FORGOTTEN},NULL,NULL,?,?,{NEXT_VERSION}) {MERGE}",  # noqa: S608
-            ((*what, count, merged[what]) for what, count in sums.items()),
+            f"INSERT INTO gaps VALUES (?,?,?,?,?,'','',{FORGOTTEN},NULL,?,?,?,{NEXT_VERSION}) {MERGE}",  # noqa: S608
+            ((*what, ends[what], count, merged[what]) for what, count in sums.items()),
         )
         self._db.executemany(
             f'DELETE FROM gaps WHERE {_NAMED} AND publisher = ? AND mission = ? AND begin_ns = ?',  # noqa: S608
@@ -169,9 +179,11 @@ class GapTable:
         """Of each sink and topic of the newest sessions that has one.
 
         Before the first message that still waits for delivery, since that may yet be evicted; and before the last message of each
-        publisher that was heard lately, since what it sent after that may be found to be missed.
+        publisher that was heard lately, since what it sent after that may be found to be missed. Once a robot of the spool was
+        asked to tell all again, none begins before the end of what was forgotten: the store may have lost that.
         """
         waiting = self._waiting()
+        forgotten = {(session, account): stamp for session, account, stamp in self._db.execute(_FORGOTTEN_UNTIL)}
         silent = {
             (session, account): stamp
             for session, account, stamp in self._db.execute(
@@ -187,7 +199,7 @@ class GapTable:
             if has_ended and sink == OBJECTS and is_over:
                 complete_ns = heard_ns  # noqa: PLW2901 - nothing was lost on its way after all
             end_ns = min(complete_ns, silent.get((session, account), complete_ns), waiting.get(account, complete_ns))
-            since_ns = max(first_ns, started_ns)
+            since_ns = max(first_ns, started_ns, forgotten.get((session, account), 0), forgotten.get((0, account), 0))
             if since_ns <= end_ns:
                 found.append(Watermark(robot, sink, topic, session, since_ns, end_ns, grade, received, skipped))
         return found
@@ -232,6 +244,8 @@ class GapTable:
         for (session, account, kind, cause, grade, publisher, mission, begin_ns, from_ns, to_ns, count, merged, version,
              robot, boot_id, started_ns) in self._db.execute(query, values):  # fmt: skip
             sink, topic = split(account)
+            if begin_ns == FORGOTTEN:
+                to_ns = None  # noqa: PLW2901 - a sum has no time
             is_boot = from_ns is not None and from_ns < EARLIEST_SANE_NS
             offset_ns = offsets.get(boot_id) if is_boot else 0
             yield Gap(

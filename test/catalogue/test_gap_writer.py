@@ -19,6 +19,7 @@ from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.lake.gaps import folded, of_rows
 from shadowhound_data_logger.lake.reading import arrow_schema
 from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
+from shadowhound_data_logger.spool.gaps import FORGOTTEN
 from shadowhound_data_logger.spool.listing import retry, tell_gaps_again
 from shadowhound_data_logger.spool.spool import Spool
 
@@ -212,6 +213,28 @@ def test_all_that_is_remembered_is_told_again_when_asked(spool: Spool, root: Pat
     assert [row['what'] for row in told(writer(root).parts())] == ['complete'], 'a new process does not begin anew'
     assert tell_gaps_again(root) == 1
     assert len(told(writer(root).parts())) == len(before), 'also where no process ran when it was asked'
+
+
+@pytest.mark.parametrize('is_of_older_version', [False, True])
+def test_what_is_forgotten_is_in_no_watermark_that_is_told_again(spool: Spool, root: Path, is_of_older_version: bool) -> None:
+    """The store may have lost what the robot forgot: it would be taken for all that was lost."""
+    hear(spool, 20)
+    store(spool, 'a')
+    hear(spool, 26, 27, 28)
+    store(spool, 'b', samples=3)
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(writer(root).parts())])
+    with spool._index.transaction():
+        assert spool._index.gaps.forget(NOON_NS + SECOND * 27 // 10, 100)
+        if is_of_older_version:
+            spool._index._db.execute('UPDATE gaps SET to_ns = NULL WHERE begin_ns = ?', (FORGOTTEN,))
+    (mark,) = told(writer(root).parts())
+    assert (mark['from_ns'], mark['to_ns']) == (NOON_NS + SECOND * 2, NOON_NS + SECOND * 28 // 10), 'it was told'
+    tell_gaps_again(root)
+    (mark,) = told(writer(root).parts())
+    begin_ns = NOON_NS + (SECOND * 2 if is_of_older_version else SECOND * 26 // 10)
+    assert (mark['what'], mark['from_ns'], mark['to_ns']) == ('complete', begin_ns, NOON_NS + SECOND * 28 // 10)
+    (total,) = [gap for gap in spool._index.gaps.known({}) if gap.begin_ns == FORGOTTEN]
+    assert (total.count, total.from_ns, total.to_ns) == (5, None, None), 'a sum has no time'
 
 
 def test_a_session_that_died_ends_where_it_was_heard_last(root: Path) -> None:
