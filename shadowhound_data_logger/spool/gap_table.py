@@ -23,19 +23,24 @@ WHERE session > (SELECT max(id) FROM sessions) - 20 AND first_ns >= ? AND accoun
 ORDER BY robot, topic, session"""
 MOST_ROWS: Final = 500_000
 """Of the journal, some 100 MB: three days of a topic that loses messages in every second are 259,200."""
-_WHOLE_ROW: Final = 'SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged, to_ns FROM gaps'
 _TOLD: Final = """version <= CASE session WHEN 0 THEN (SELECT ifnull(max(version), 0) FROM gaps_told) ELSE ifnull((
     SELECT told.version FROM gaps_told AS told JOIN sessions USING (robot) WHERE sessions.id = gaps.session), 0) END"""
 """Whether the store is told of a row; those of objects have no session."""
+_WHOLE_ROW: Final = f"""
+SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged, to_ns, {_TOLD} FROM gaps"""  # noqa: S608
 _FORGETTABLE: Final = f"""{_WHOLE_ROW} WHERE begin_ns BETWEEN ? AND ? AND ifnull(to_ns, begin_ns) <= ?
   AND kind <> 'quarantined' AND {_TOLD}"""
 _OF_OLD_SESSIONS: Final = f"""{_WHOLE_ROW} WHERE (begin_ns BETWEEN {UNTIMED} AND ? - 1 OR begin_ns > ?)
   AND session BETWEEN 1 AND (SELECT ifnull(max(id), 0) FROM sessions WHERE ended_ns BETWEEN ? AND ?) AND {_TOLD}"""  # noqa: S608 - own constants only
 _LONGEST_UNCHANGED: Final = f"{_WHOLE_ROW} WHERE begin_ns <> {FORGOTTEN} AND kind <> 'quarantined' ORDER BY version"
+_SUM_OF_TOLD, _SUM_OF_UNTOLD = 1, 0
+"""In ``from_ns`` of a sum: whether the store was told of all rows in it. NULL, of an older version: nobody knows."""
 _FORGOTTEN_UNTIL: Final = f"""
 SELECT session, topic, max(ifnull(to_ns, (SELECT max(started_ns) FROM sessions)))
-FROM gaps WHERE begin_ns = {FORGOTTEN} AND EXISTS (SELECT 1 FROM gaps_told WHERE again) GROUP BY session, topic"""  # noqa: S608
-"""When the last forgotten gap ended. Where that is not known it was of an earlier session: older versions did not keep it."""
+FROM gaps WHERE begin_ns = {FORGOTTEN} AND (ifnull(from_ns, {_SUM_OF_UNTOLD}) = {_SUM_OF_UNTOLD}
+  OR EXISTS (SELECT 1 FROM gaps_told WHERE again)) GROUP BY session, topic"""  # noqa: S608
+"""When the last forgotten gap ended that the store may not know of. Where that is not known it was of an earlier session: older
+versions did not keep it."""
 _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
 
 
@@ -106,15 +111,17 @@ class GapTable:
         sums = Counter[tuple[Any, ...]]()
         merged = Counter[tuple[Any, ...]]()
         ends: dict[tuple[Any, ...], int | None] = {}
+        told: dict[tuple[Any, ...], int] = {}
         for row in old:
             sums[row[:5]] += row[8]
             merged[row[:5]] += row[9]
             end_ns, last_ns = row[10], ends.get(row[:5], 0)
             is_known = end_ns is not None and end_ns >= EARLIEST_SANE_NS and last_ns is not None
             ends[row[:5]] = max(end_ns, last_ns) if is_known else None
+            told[row[:5]] = min(told.get(row[:5], _SUM_OF_TOLD), _SUM_OF_TOLD if row[11] else _SUM_OF_UNTOLD)
         self._db.executemany(
-            f"INSERT INTO gaps VALUES (?,?,?,?,?,'','',{FORGOTTEN},NULL,?,?,?,{NEXT_VERSION}) {MERGE}",  # noqa: S608
-            ((*what, ends[what], count, merged[what]) for what, count in sums.items()),
+            f"INSERT INTO gaps VALUES (?,?,?,?,?,'','',{FORGOTTEN},?,?,?,?,{NEXT_VERSION}) {MERGE}",  # noqa: S608
+            ((*what, told[what], ends[what], count, merged[what]) for what, count in sums.items()),
         )
         self._db.executemany(
             f'DELETE FROM gaps WHERE {_NAMED} AND publisher = ? AND mission = ? AND begin_ns = ?',  # noqa: S608
@@ -179,8 +186,9 @@ class GapTable:
         """Of each sink and topic of the newest sessions that has one.
 
         Before the first message that still waits for delivery, since that may yet be evicted; and before the last message of each
-        publisher that was heard lately, since what it sent after that may be found to be missed. Once a robot of the spool was
-        asked to tell all again, none begins before the end of what was forgotten: the store may have lost that.
+        publisher that was heard lately, since what it sent after that may be found to be missed. None begins before the end of
+        what was forgotten and the store was never told; nor, once a robot of the spool was asked to tell all again, before
+        the end of anything that was forgotten: the store may have lost that.
         """
         waiting = self._waiting()
         forgotten = {(session, account): stamp for session, account, stamp in self._db.execute(_FORGOTTEN_UNTIL)}
@@ -245,7 +253,7 @@ class GapTable:
              robot, boot_id, started_ns) in self._db.execute(query, values):  # fmt: skip
             sink, topic = split(account)
             if begin_ns == FORGOTTEN:
-                to_ns = None  # noqa: PLW2901 - a sum has no time
+                from_ns = to_ns = None  # noqa: PLW2901 - a sum has no time
             is_boot = from_ns is not None and from_ns < EARLIEST_SANE_NS
             offset_ns = offsets.get(boot_id) if is_boot else 0
             yield Gap(

@@ -19,6 +19,7 @@ from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.lake.gaps import folded, of_rows
 from shadowhound_data_logger.lake.reading import arrow_schema
 from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
+from shadowhound_data_logger.spool import gap_table
 from shadowhound_data_logger.spool.gaps import FORGOTTEN
 from shadowhound_data_logger.spool.listing import retry, tell_gaps_again
 from shadowhound_data_logger.spool.spool import Spool
@@ -235,6 +236,27 @@ def test_what_is_forgotten_is_in_no_watermark_that_is_told_again(spool: Spool, r
     assert (mark['what'], mark['from_ns'], mark['to_ns']) == ('complete', begin_ns, NOON_NS + SECOND * 28 // 10)
     (total,) = [gap for gap in spool._index.gaps.known({}) if gap.begin_ns == FORGOTTEN]
     assert (total.count, total.from_ns, total.to_ns) == (5, None, None), 'a sum has no time'
+
+
+def test_no_watermark_covers_what_was_forgotten_before_it_was_told(
+    spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows beyond the bound of the journal go, told or not: where they were, nobody knows what was lost."""
+    hear(spool, 20)
+    store(spool, 'a')
+    hear(spool, 26, 27, 28)
+    store(spool, 'b', samples=3)
+    monkeypatch.setattr(gap_table, 'MOST_ROWS', 0)
+    with spool._index.transaction():
+        assert spool._index.gaps.forget(0, 100)
+    (mark,) = told(writer(root).parts())
+    assert (mark['what'], mark['from_ns'], mark['to_ns']) == (
+        'complete',
+        NOON_NS + SECOND * 26 // 10,
+        NOON_NS + SECOND * 28 // 10,
+    )
+    (total,) = spool._index.gaps.known({})
+    assert (total.count, total.from_ns, total.to_ns) == (5, None, None)
 
 
 def test_a_session_that_died_ends_where_it_was_heard_last(root: Path) -> None:
