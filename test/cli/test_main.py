@@ -111,13 +111,15 @@ def test_every_verb_ends_with_a_code_of_the_table(name: str) -> None:
 
 
 def classes(base: type[Exception] = DataLoggerError) -> Iterator[type[Exception]]:
+    """All but those that never leave their module, of the node's modules only those that another test has imported already."""
     for each in pkgutil.walk_packages(shadowhound_data_logger.__path__, 'shadowhound_data_logger.'):
         if each.name.rpartition('.')[2] not in {'main', '__main__'} and '.capture.' not in each.name:
             importlib.import_module(each.name)
     pending = [base]
     while pending:
         pending += (one := pending.pop()).__subclasses__()
-        yield one
+        if not one.__name__.startswith('_'):
+            yield one
 
 
 def ended(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, list[str]]:
