@@ -134,7 +134,7 @@ def test_bags_of_a_clock_that_is_set_later(robot: Robot, tmp_path: Path) -> None
     )
     robot.set_clock()
     began_ns.append(time.time_ns())
-    until(lambda: robot.node.log.count(' is recorded') == 2, 'the next bag has begun')
+    until(lambda: robot.node.log.count('recording bag ') == 2, 'the next bag has begun')
     robot.publish()
     ledger = robot.node.stop()
     assert {row['open'] for row in ledger['bags'].values()} == {0}
