@@ -96,13 +96,14 @@ def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
 
 
 @long
-def test_the_spools_index_is_lost_meanwhile(home: Path) -> None:
+def test_the_spools_index_is_damaged_meanwhile(home: Path) -> None:
     """The bag is made whole and another follows it; both are in the store, and the call tells of the last."""
     program = 'shadowhound_data_logger.capture.bag_process'
     command = [sys.executable, '-m', program, '--duration=60', '--topic=/odom', 'patrol']
     with subprocess.Popen(command, stdout=subprocess.PIPE) as child:
         until(lambda: any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')), 'it records')
-        (home / 'spool' / 'index.db').unlink()
+        with (home / 'spool' / 'index.db').open('r+b') as index:
+            index.write(os.urandom(os.fstat(index.fileno()).st_size))
         until(lambda: len(list(rosbags_of(home).glob('patrol_*/manifest.json'))) == 1, 'the first bag is whole')
         until(lambda: any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')), 'it records again')
         child.send_signal(signal.SIGINT)
