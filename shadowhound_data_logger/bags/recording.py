@@ -132,7 +132,7 @@ class Recording:
         is_waiting = not state.is_named
         if has_slice:
             self._begin()  # until the bag is whole it says what is known of it
-        self._tell()
+        self._tell(state.record(place.spool.owner, self.number))  # also what was lost since the slice began
         try:
             self._leave()
             if (state.slices or state.missing) and not place.settle(state):
@@ -156,12 +156,12 @@ class Recording:
         self.state.event = event
         self._tell()
 
-    def _tell(self) -> None:
+    def _tell(self, record: Mapping[str, str] | None = None) -> None:
         """The index and the open slice what is known of the bag now."""
         self._place.writer.put(rows=[self.state.rows()], wait=False)
         if self._writer is not None:
             try:
-                self._writer.add_metadata(RECORD, self.state.news())
+                self._writer.add_metadata(RECORD, record or self.state.news())
                 self._writer.sync()
             except OSError as error:
                 self._break(error)

@@ -148,6 +148,8 @@ class BagRecovery:
     def _read(self, folder: Path) -> BagState:
         """By the index, by what an older version left, or by the newest slice. Raises OSError."""
         robot, rows, lines = self._place.robot, self._rows.get(folder.name), folder / LINES
+        if folder.is_symlink():
+            self._set_aside(folder, folder, 'it is a link')
         if os.path.lexists(lines) and not stat.S_ISREG(lines.lstat().st_mode):
             self._set_aside(folder, lines, 'it is no file')
         try:
@@ -170,7 +172,9 @@ class BagRecovery:
         ]
         said: dict[str, str] = {}
         for path in paths:
-            said |= {name: text for record in read_metadata(path, RECORD) for name, text in record.items()}
+            told = {name: text for record in read_metadata(path, RECORD) for name, text in record.items()}
+            if (told.get('recording'), told.get('owner')) == (folder.name, spool.owner):
+                said |= told
         state = BagState.of_record(folder, robot, said) if said else BagState(folder, folder.name, robot)
         for path in paths:
             if said and path.parent != folder and path.name not in state.slices:
