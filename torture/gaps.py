@@ -317,9 +317,11 @@ class Scene:
         self.node.signal(signal.SIGSTOP)
         try:
             for path in ready.glob(f'sensor-data/{ROBOT}/*_*/*/*.json'):
-                bodies[str(path.relative_to(ready))] = body = path.read_bytes()
-                with path.open('r+b') as file:
+                with suppress(FileNotFoundError), path.open('r+b') as file:  # what was about to stop may have finished a step
+                    body = file.read()
+                    file.seek(0)
                     file.write(bytes([body[0] ^ 1]))
+                    bodies[str(path.relative_to(ready))] = body
         finally:
             self.node.signal(signal.SIGCONT)
         return bodies

@@ -65,6 +65,10 @@ NOTICED_S: Final = (0.0, 3.0)
 """From a damage to the first death."""
 UNTOUCHED: Final = 0.2
 """Share of the damages after which nobody is killed."""
+REOPENED_S: Final = 5.0
+"""How long ``bag record`` may need to open the spool anew once it finds that the index is lost ..."""
+FOUND_S: Final = 30.0
+"""... and how long that may take: what is written over may be read late."""
 GO_ON_S: Final = 90.0
 STEADY_S: Final = 1.0
 DELIVER_S: Final = 300.0
@@ -398,8 +402,8 @@ def spans(deaths: Iterable[Death], loss_s: float) -> list[tuple[int, int]]:
 
 
 def judge_losses(found: Found, sink: str, lost: Mapping[str, Sequence[Loss]], said: Mapping[str, Sequence[Loss]],
-                 deaths: Sequence[Death]) -> None:  # fmt: skip
-    """What is lost is listed, or of a death."""
+                 deaths: Sequence[Death], reopened: Sequence[int] = ()) -> None:  # fmt: skip
+    """What is lost is listed, or of a death; ``reopened`` are times after which a process may have opened the spool anew."""
     allowed = spans(deaths, LOSS_S + SLACK_S)
     unlisted: list[int] = []
     longest = 0
@@ -416,7 +420,9 @@ def judge_losses(found: Found, sink: str, lost: Mapping[str, Sequence[Loss]], sa
             unlisted.append(count - known)
             longest = max(longest, end_ns - begin_ns)
             length_s = (end_ns - begin_ns) / SECOND
-            if not any(low - near_ns <= begin_ns and end_ns <= high + near_ns for low, high in allowed):
+            is_own = length_s <= REOPENED_S and any(at_ns <= end_ns <= at_ns + FOUND_S * SECOND for at_ns in reopened)
+            found.looked[f'{sink}: times that it opened the spool anew'] += is_own
+            if not is_own and not any(low - near_ns <= begin_ns and end_ns <= high + near_ns for low, high in allowed):
                 text = f'{stream.topic}: {count - known} of {count} from {utc(begin_ns):%H:%M:%S.%f} for {length_s:.2f} s'
                 found.wrong[f'lost: {sink}'].append(text)
     found.figures[sink] = {
@@ -483,7 +489,8 @@ def audit(found: Found, happened: Happened, tower: Tower, wire: Wire, robot: Rob
     }
     judge_losses(found, 'objects', lost['objects'], said['objects'], happened.deaths[NODE])
     judge_losses(found, 'bags', lost['bags'], said['bags'], happened.deaths[NODE])
-    judge_losses(found, 'beside', lost['beside'], in_bags, happened.deaths[RECORDER])
+    damaged = [at_ns for _, at_ns in happened.damages]
+    judge_losses(found, 'beside', lost['beside'], in_bags, happened.deaths[RECORDER], damaged)
     judge_watermarks(found, rows, {sink: lost[sink] for sink in ('objects', 'bags')})
     found.wrong['overwritten'] += happened.overwritten
     found.wrong['hung'] += happened.hung
@@ -581,7 +588,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _some(lines: Sequence[str]) -> str:
-    return f'{len(lines)}: ' + '; '.join(lines[:3]) if lines else ''
+    return f'{len(lines)}: ' + '; '.join(lines[:30]) if lines else ''
 
 
 if __name__ == '__main__':
