@@ -281,9 +281,12 @@ class Robot(joined.Killer):
         return True
 
     def _stores(self, since_ns: int) -> bool:
-        """Whether the store has an object of a later second."""
+        """Whether the store has an object of a later second: what was left of a node before is none of this one's work."""
         name = STREAMS[0].topic.strip('/')
-        prefix, first = f'{ROBOT}/{name}/{utc(time.time_ns()):%Y%m%d/%H}', f'{ROBOT}/{name}/{utc(since_ns):%Y%m%d/%H%M%S}'
+        prefix, first = (
+            f'{ROBOT}/{name}/{utc(time.time_ns()):%Y%m%d/%H}',
+            f'{ROBOT}/{name}/{utc(since_ns + SECOND):%Y%m%d/%H%M%S}',
+        )
         return any(info.key > first for info in self._store.list(BUCKET, prefix))
 
     def _records(self, since_ns: int) -> bool:
