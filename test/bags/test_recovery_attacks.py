@@ -31,6 +31,7 @@ def foreign(path: Path, bag: str, robot: str, owner: str) -> None:
 
 
 def test_a_slice_of_another_recording_tells_nothing_of_this_one(tmp_path: Path) -> None:
+    """It is spooled as a slice of the folder that it lies in, or set aside; the bag keeps its name."""
     folder = tmp_path / 'bags' / ROBOT / BAG
     folder.mkdir(parents=True)
     closed(folder / f'{BAG}_0.mcap', 10)
@@ -41,6 +42,7 @@ def test_a_slice_of_another_recording_tells_nothing_of_this_one(tmp_path: Path) 
 
 
 def test_what_was_dropped_after_the_last_slice_is_missing_without_the_index(tmp_path: Path) -> None:
+    """The last slice tells of it, so the manifest is the same with and without the index."""
     clock = Clocks()
     home = tmp_path / 'home'
     with desk(home, clock, queue_bytes=1000) as it:
@@ -64,6 +66,7 @@ def test_what_was_dropped_after_the_last_slice_is_missing_without_the_index(tmp_
 
 
 def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
+    """What lies behind it is neither read, moved nor removed."""
     home, outside = tmp_path / 'home', tmp_path / 'outside'
     with desk(home, record='always') as it:
         name = it.recorder.status().bag
@@ -86,6 +89,7 @@ def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
 
 
 def test_a_row_without_folder(tmp_path: Path) -> None:
+    """What was delivered is listed, the rest is not known, and the row goes."""
     home = tmp_path / 'home'
     with desk(home, record='always') as it:
         name = it.recorder.status().bag
