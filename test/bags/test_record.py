@@ -102,8 +102,9 @@ def test_the_spools_index_is_damaged_meanwhile(home: Path) -> None:
     command = [sys.executable, '-m', program, '--duration=60', '--topic=/odom', 'patrol']
     with subprocess.Popen(command, stdout=subprocess.PIPE) as child:
         until(lambda: any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')), 'it records')
-        with (home / 'spool' / 'index.db').open('r+b') as index:
-            index.write(os.urandom(os.fstat(index.fileno()).st_size))
+        for name in 'index.db', 'index.db-wal', 'index.db-shm':  # of one alone SQLite reads nothing for a while
+            with (home / 'spool' / name).open('r+b') as file:
+                file.write(os.urandom(os.fstat(file.fileno()).st_size))
         until(lambda: len(list(rosbags_of(home).glob('patrol_*/manifest.json'))) == 1, 'the first bag is whole')
         until(lambda: any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')), 'it records again')
         child.send_signal(signal.SIGINT)
