@@ -11,12 +11,13 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import math
 import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
 
@@ -50,7 +51,7 @@ from shadowhound_data_logger.worker import Worker
 
 NODE: Final = 'shadowhound_bag_record'
 DISCOVERY_S: Final = 3.0
-"""Longest wait for the first publisher of anything wanted."""
+"""Longest wait for the first publisher of anything wanted, and for the first message: the duration counts from there."""
 MORE_S: Final = 0.5
 """For the others, once one is known."""
 STEP_S: Final = 0.1
@@ -65,9 +66,10 @@ log = logging.getLogger(__name__)
 class _IndexLostError(SpoolError):
     """The spool's index was deleted, replaced or damaged while a bag was recorded."""
 
-    def __init__(self, bag: str) -> None:
+    def __init__(self, bag: str, end_s: float) -> None:
         super().__init__('the index of the spool was lost', remedy='it is rebuilt from the files when the spool is opened')
         self.bag = bag
+        self.end_s = end_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +77,12 @@ class _Wanted:
     """What is to be recorded."""
 
     name: str
-    cut_off: str
-    """The bag that was recorded when the index was lost; empty for the first."""
-    end_s: float
+    duration_s: float
     deadline_s: float
+    cut_off: str = ''
+    """The bag that was recorded when the index was lost; empty for the first."""
+    end_s: float = math.inf
+    """When the recording ends, once a message came."""
 
 
 class ManifestWriter(SpoolWriter):
@@ -137,14 +141,14 @@ def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[st
     topics = given.topic or ([] if given.regex else _topics_there(node, given.robot, stop))
     parameters = {'robot': given.robot, 'bag.topics': topics or [''], 'bag.regex': given.regex}
     settings = Settings.load(parameters, os.environ)
-    end_s, bag = time.monotonic() + given.duration, ''
+    wanted = _Wanted(name, given.duration, given.deadline)
     with _alone(settings), closing(open_store(settings.store, settings.upload)) as store:
         while True:
             try:
-                return _record_bag(node, settings, store, _Wanted(name, bag, end_s, given.deadline), stop)
+                return _record_bag(node, settings, store, wanted, stop)
             except _IndexLostError as lost:
-                bag = lost.bag
-                log.warning('%s: %s is made whole, and another bag follows it', lost, bag)
+                wanted = replace(wanted, cut_off=lost.bag, end_s=lost.end_s)
+                log.warning('%s: %s is made whole, and another bag follows it', lost, lost.bag)
 
 
 def _record_bag(node: Node, settings: Settings, store: ObjectStore, wanted: _Wanted, stop: StopSignals) -> dict[str, Any]:
@@ -222,15 +226,18 @@ def _until_over(recorder: Recorder, writer: SpoolWriter, workers: Sequence[Worke
     done, bag = recorder.start()
     if not done:
         raise BagError(f'no bag was recorded: {bag}')
-    while time.monotonic() < wanted.end_s and not stop.received:
-        time.sleep(min(STEP_S, max(0.0, wanted.end_s - time.monotonic())))
+    end_s, discovered_s = wanted.end_s, time.monotonic() + DISCOVERY_S
+    while time.monotonic() < end_s and not stop.received:
+        time.sleep(min(STEP_S, max(0.0, end_s - time.monotonic())))
+        if end_s == math.inf and (recorder.status().messages or time.monotonic() > discovered_s):
+            end_s = time.monotonic() + wanted.duration_s
         _supervise((*recorder.workers, *workers))
         if writer.damaged:
-            raise _IndexLostError(bag)
+            raise _IndexLostError(bag, end_s)
     dropped = recorder.status().dropped
     done, text = recorder.stop()
     if not done and writer.damaged:
-        raise _IndexLostError(bag)
+        raise _IndexLostError(bag, end_s)
     if not done:
         raise BagError(f'{bag} could not be ended: {text}', remedy='the next `shadowhound-data bag record` makes it whole')
     return bag, dropped

@@ -324,7 +324,8 @@ def bag_watch(*, folder: Path, settle: float, once: bool, robot: str, as_json: b
 
 @bag.command('record', epilog=examples('bag record kitchen --duration 60 --topics /imu,/odom'))
 @click.argument('name')
-@click.option('--duration', type=click.FloatRange(0.1, 86_400.0), required=True, help='Seconds; Ctrl-C ends it earlier.')
+@click.option('--duration', type=click.FloatRange(0.1, 86_400.0), required=True,
+              help='Seconds from the first message; Ctrl-C ends it earlier.')  # fmt: skip
 @click.option('--topic', '--topics', 'topics', multiple=True, help='Record it; more by repeating it, or with commas.')
 @click.option('--regex', default='', help='Record also topics in which it is found; ".*" is all of them.')
 @click.option('--deadline', type=click.FloatRange(0.0, 1e6), default=DEADLINE_S, show_default=True, help='Seconds for Tower.')
