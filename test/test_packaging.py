@@ -102,8 +102,8 @@ def test_every_dependency_has_its_reason(name: str) -> None:
         ('wheels.txt', ['runtime.in', 'ros.in', 'dev.in']),
         ('sourced.txt', ['runtime.in', 'dev.in']),
         ('lyrical.txt', ['runtime.in', 'dev.in']),
-        ('jazzy.txt', ['jazzy.in']),
-        ('jazzy_wheels.txt', ['runtime.in', 'jazzy.in', 'dev.in']),
+        ('jazzy.txt', ['ros.in']),
+        ('kilted_wheels.txt', ['runtime.in', 'kilted.in', 'dev.in']),
     ],
 )
 def test_a_lock_file_holds_what_it_is_made_from(lock: str, sources: list[str]) -> None:
