@@ -163,6 +163,28 @@ def _backlog_memory(figures: Figures) -> str:
     return _table(('phase', 'resident memory, greatest', 'node, of a core'), rows) + '\n\n' + level
 
 
+def _rosbag2(figures: Figures) -> str:
+    if 'rosbag2' not in figures:
+        return '*not measured*'
+    found = figures['rosbag2']
+
+    def us(recorder: str, runs: Figures) -> list[str]:
+        return [f'{sum(used) / len(used):.0f} us ({min(used):.0f} to {max(used):.0f})'
+                for used in (run['us'][recorder] for run in runs.values() if recorder in run['us'])]  # fmt: skip
+
+    def lost(recorder: str, runs: Figures) -> str:
+        return ', '.join(f'{100 * run["lost"][recorder] / run["published"]:.2g} %' if run['lost'][recorder] else '0'
+                         for run in runs.values() if recorder in run['lost'])  # fmt: skip
+
+    rows = [(f'{int(rate):,}/s', *us(recorder, runs), lost(recorder, runs), words)
+            for rate, runs in found['rates'].items()
+            for recorder, words in (('node', 'the node'), ('rosbag2', f'rosbag2 {found["version"]}'.strip()))]  # fmt: skip
+    table = _table(('messages', 'recorder', 'CPU a message, alone', 'both at the same time', 'lost, alone and beside'),
+                   [(rate, words, alone, both, gone) for rate, alone, both, gone, words in rows])  # fmt: skip
+    where = f'ROS 2 {found["ros"].capitalize() or "of the machine"}, rosbag2 in {found["storage"]}'
+    return f'{table}\n\n{where}, at {found["commit"]}.' if found.get('commit') else f'{table}\n\n{where}.'
+
+
 def _latency(figures: Figures) -> str:
     words = {'durable': 'durable: the group commit returned', 'confirmed': 'confirmed: the put returned',
              'created_ns': 'index: `created_ns`', 'settled_ns': 'index: `settled_ns`'}  # fmt: skip
@@ -229,7 +251,7 @@ _WHOLE: Final[Mapping[str, Callable[[Figures], str]]] = {'bars': _bars, 'machine
 _PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
     'node_cpu': ('node_cpu', _node_cpu), 'intake': ('intake', _intake), 'vendors': ('vendors', _vendors),
     'small_messages': ('small_messages', _small), 'full_rate': ('full_rate', _full_rate), 'memory': ('full_rate', _memory),
-    'backlog_memory': ('backlog_memory', _backlog_memory),
+    'backlog_memory': ('backlog_memory', _backlog_memory), 'rosbag2': ('bag_recording', _rosbag2),
     'latency': ('latency', _latency), 'encode_formats': ('encode_formats', _encode), 'spool_commits': ('spool_commits', _spool),
     'index_growth': ('index_growth', _growth),
     'drain': ('drain', _drain), 'mission_calls': ('mission_calls', _mission_calls), 'missions': ('missions', _missions),

@@ -41,14 +41,14 @@ class Failed(SystemExit):
 
 
 class Program:
-    """A Python program. It is asked line by line on its standard input, and answers with a line of JSON each."""
+    """A running program. One of this folder is asked line by line on its standard input, and answers with a line of JSON each."""
 
-    def __init__(self, name: str, arguments: Sequence[str], environ: Mapping[str, str], log: Path) -> None:
+    def __init__(self, name: str, command: Sequence[str], environ: Mapping[str, str], log: Path) -> None:
         self.name, self.log = name, log
         self._libc = ctypes.CDLL(None)
         with log.open('wb') as file:
             self._popen = subprocess.Popen(
-                [sys.executable, *arguments], env=dict(environ), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file,
+                [*command], env=dict(environ), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file,
                 text=True, start_new_session=True,
                 # Safe here: a bench has one thread when it starts its programs, and that one outlives them.
                 preexec_fn=self._die_with_the_bench,  # noqa: PLW1509
@@ -146,9 +146,12 @@ class World:
     def program(self, name: str, *arguments: str) -> Program:
         """A program of this folder, such as ``imu_publisher.py``, or whatever ``-m`` names."""
         first, *rest = arguments
-        arguments = (first if first.startswith('-') else str(HERE / first), *rest)
+        return self.command(name, sys.executable, first if first.startswith('-') else str(HERE / first), *rest)
+
+    def command(self, name: str, *words: str) -> Program:
+        """Any other command, in the environment of this world."""
         log = self.folder / f'{len(self._programs)}-{name}.log'
-        program = Program(name, arguments, self._environ, log)
+        program = Program(name, words, self._environ, log)
         self._programs.append(program)
         return program
 

@@ -3,17 +3,24 @@
 One node, one simulated robot: rounds without a bag and with one take turns, and next to nothing is stored as objects. The
 bag is not compressed, and no slice ends within a round, so that uploads are not part of it. Then a publisher of serialized
 messages sends 10,000 a second into a bag; the ledger says whether any was lost.
+
+Where ``ros2 bag`` is on the PATH, it records the same stream of small messages as well: each recorder alone, and both at the same
+time. rosbag2 runs with its defaults, in MCAP where it has that.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import shutil
+import subprocess
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from _report import Bar, Report, main, progress, ratio
 from _world import Failed, Program, World, lost, until
+from ruamel.yaml import YAML
 
 ROUNDS = 5
 SENSORS = ('camera', 'camera_info', 'lidar', 'imu', 'odom', 'states', 'joints', 'lowstate')
@@ -30,6 +37,16 @@ SMALL: dict[str, Any] = {
 WARM_S = 3.0
 SETTLE_S = 20.0
 BAR = 1.6
+
+RATES_HZ: Final = (260, 2_000, 10_000)
+"""Beside rosbag2: all that the Go2 profile has together, and small messages."""
+OURS: Final = 'node'
+THEIRS: Final = 'rosbag2'
+CASES: Final = {'alone': (OURS,), 'rosbag2 alone': (THEIRS,), 'together': (OURS, THEIRS)}
+PARTS: Final = 3
+"""Of a stream, each measured by itself: their spread is that of a figure."""
+QUIET_S: Final = 2.0
+HELP_S: Final = 60.0
 
 
 def switch(program: Program, what: str) -> None:
@@ -98,6 +115,80 @@ def small(folder: Path, seconds: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def rosbag2() -> dict[str, Any] | None:
+    """The ``ros2 bag record`` of the PATH: its command without the folder and the topic. None where there is none."""
+    program = shutil.which('ros2')
+    if program is None:
+        return None
+    command = [program, 'bag', 'record']
+    told = subprocess.run([*command, '--help'], capture_output=True, text=True, timeout=HELP_S, check=False)
+    if told.returncode:
+        return None
+    storage = ['--storage', 'mcap'] if 'mcap' in told.stdout else []
+    topics = ['--topics'] if '--topics' in told.stdout else []
+    return {'record': [*command, *storage], 'topics': topics, 'storage': 'mcap' if storage else 'its default',
+            'ros': os.environ.get('ROS_DISTRO', ''), 'version': _version(Path(program))}  # fmt: skip
+
+
+def _version(program: Path) -> str:
+    """What the package.xml beside the program, or in a prefix of the environment, says; empty if it is not there."""
+    prefixes = [str(program.resolve().parents[1]), *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
+    for prefix in prefixes:
+        manifest = Path(prefix) / 'share' / 'ros2bag' / 'package.xml'
+        if prefix and manifest.is_file():
+            return manifest.read_text(encoding='utf-8').partition('<version>')[2].partition('</version>')[0]
+    return ''
+
+
+def beside(folder: Path, found: dict[str, Any], seconds: float) -> dict[str, Any]:
+    """CPU a message and what was lost at each rate, by case and by recorder."""
+    rates: dict[str, Any] = {}
+    for rate_hz in RATES_HZ:
+        rates[str(rate_hz)] = {}
+        for case, recorders in CASES.items():
+            progress(f'{rate_hz:,} messages a second: {" and ".join(recorders)}, {seconds:g} s')
+            rates[str(rate_hz)][case] = stream(folder, found, rate_hz, seconds, recorders)
+    return {**{name: found[name] for name in ('ros', 'version', 'storage')}, 'rates': rates}
+
+
+def stream(folder: Path, found: dict[str, Any], rate_hz: int, seconds: float, recorders: tuple[str, ...]) -> dict[str, Any]:
+    """One stream of small messages, recorded by one or both."""
+    with World(folder, store=False) as world:
+        bag = world.folder / 'rosbag2'
+        running: dict[str, Program] = {}
+        if OURS in recorders:
+            running[OURS] = world.node(SMALL)
+        if THEIRS in recorders:
+            running[THEIRS] = world.command('ros2-bag', *found['record'], '--output', str(bag), *found['topics'], TOPIC)
+        publisher = world.program('imu_publisher', 'imu_publisher.py', '--topic', TOPIC)
+        heard = publisher.ask(subscribers=len(running))['subscribers']
+        if heard != len(running):
+            raise Failed(f'{heard} of {len(running)} recorders listen to {TOPIC}')
+        time.sleep(QUIET_S)
+        sent = int(publisher.ask(count=rate_hz, rate_hz=rate_hz)['published'])
+        used: dict[str, list[float]] = {name: [] for name in running}
+        for _ in range(PARTS):
+            before = {name: program.cpu_s() for name, program in running.items()}
+            told = publisher.ask(count=round(rate_hz * seconds / PARTS), rate_hz=rate_hz)
+            for name, program in running.items():
+                used[name].append(1e6 * (program.cpu_s() - before[name]) / told['published'])
+            sent += told['published']
+        time.sleep(QUIET_S)  # for what is on its way
+        for program in running.values():
+            program.stop()
+        stored = {name: world.ledger()['bags'][TOPIC]['stored'] if name == OURS else _messages(bag) for name in running}
+    return {'published': sent, 'us': used, 'lost': {name: sent - stored[name] for name in running}}
+
+
+def _messages(bag: Path) -> int:
+    """How many messages a bag of rosbag2 has, as its metadata.yaml says."""
+    try:
+        metadata = YAML(typ='safe').load((bag / 'metadata.yaml').read_text(encoding='utf-8'))
+    except OSError as error:
+        raise Failed(f'rosbag2 has left no bag: {error}') from None
+    return int(metadata['rosbag2_bagfile_information']['message_count'])
+
+
 def measure(options: argparse.Namespace) -> Report:
     progress(f'recording the profile, {options.seconds:g} s')
     found = profile(options.folder, options.seconds)
@@ -110,7 +201,12 @@ def measure(options: argparse.Namespace) -> Report:
             'of the intake', value <= BAR, rounds),
         Bar(f'lost of {SMALL_HZ:,} small messages a second into a bag', 'none', float(gone), 'messages', gone == 0),
     )  # fmt: skip
-    return Report(bars, {'profile': found, 'small': many})
+    figures = {'profile': found, 'small': many}
+    if (other := rosbag2()) is None:
+        progress('there is no ros2 bag on the PATH: nothing is recorded beside')
+    else:
+        figures['rosbag2'] = beside(options.folder, other, options.seconds / 4)
+    return Report(bars, figures)
 
 
 if __name__ == '__main__':

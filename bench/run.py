@@ -111,6 +111,19 @@ def machine() -> dict[str, str]:
     }  # fmt: skip
 
 
+def _keep_rosbag2(found: Mapping[str, Any]) -> None:
+    """Where there is no rosbag2, what an earlier machine measured beside it stays, with the commit that it was measured at."""
+    measured = found.get('bag_recording')
+    if measured is None:
+        return
+    figures = measured['figures']
+    if 'rosbag2' in figures:
+        figures['rosbag2']['commit'] = _commit()
+    else:
+        earlier = json.loads((DOCS / RESULTS).read_text(encoding='utf-8'))['benches'].get('bag_recording', {})
+        figures |= {name: value for name, value in earlier.get('figures', {}).items() if name == 'rosbag2'}
+
+
 def _ros() -> str:
     if distribution := os.environ.get('ROS_DISTRO'):
         return distribution
@@ -150,6 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     results: dict[str, Any] = {'machine': machine(), 'quick': options.quick}
     steps = [step for step in STEPS if (step.name in options.only if options.only else step.quick is not None or whole)]
     found = {step.name: run(step, options.folder, quick=options.quick) for step in steps}
+    _keep_rosbag2(found)
     where = {name: results['machine'][name] for name in ('commit', 'processor')}
     results['benches'] = benches = {name: {**answer, **where} for name, answer in found.items() if answer is not None}
     results['took_s'] = round(time.monotonic() - start)

@@ -45,3 +45,31 @@ def test_what_another_vendors_messages_cost_is_on_the_page(page: Any) -> None:
 
 def test_what_was_not_measured_says_so(page: Any) -> None:
     assert '*not measured*' in page.filled('<!-- bench vendors -->\n<!-- end vendors -->\n', {'benches': {}})
+
+
+def test_what_rosbag2_costs_beside_the_node_is_on_the_page(page: Any) -> None:
+    """Two lines for each rate; loss is a share of what was published."""
+
+    def run(published: int, **recorders: tuple[list[float], int]) -> dict[str, Any]:
+        return {
+            'published': published,
+            'us': {name: used for name, (used, _) in recorders.items()},
+            'lost': {name: lost for name, (_, lost) in recorders.items()},
+        }
+
+    runs = {
+        'alone': run(1000, node=([10.0, 14.0], 0)),
+        'rosbag2 alone': run(1000, rosbag2=([60.0, 60.0], 30)),
+        'together': run(2000, node=([11.0], 0), rosbag2=([70.0], 5)),
+    }
+    found = {'ros': 'humble', 'version': '0.15.12', 'storage': 'mcap', 'commit': 'abc', 'rates': {'10000': runs}}
+    block = '<!-- bench rosbag2 -->\n<!-- end rosbag2 -->\n'
+    lines = page.filled(block, {'benches': {'bag_recording': {'figures': {'rosbag2': found}}}}).splitlines()
+    assert lines[3:7] == [
+        '| 10,000/s | the node | 12 us (10 to 14) | 11 us (11 to 11) | 0, 0 |',
+        '| 10,000/s | rosbag2 0.15.12 | 60 us (60 to 60) | 70 us (70 to 70) | 3 %, 0.25 % |',
+        '',
+        'ROS 2 Humble, rosbag2 in mcap, at abc.',
+    ]
+    assert '*not measured*' in page.filled(block, {'benches': {'bag_recording': {'figures': {}}}})
+    assert '<!-- bench rosbag2 -->' in PAGE.read_text(encoding='utf-8')
