@@ -274,8 +274,9 @@ def test_whose_node(tmp_path: Path) -> None:
 def test_bad_usage_is_exit_code_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str]) -> None:
     """A name that is none, an interval without length and an unknown option are refused."""
     monkeypatch.setattr(sys, 'argv', ['shadowhound-data', 'status', '--spool', str(tmp_path), *arguments])
-    with pytest.raises(SystemExit, match=r'\A2\Z'):
+    with pytest.raises(SystemExit) as caught:
         main()
+    assert caught.value.code == 2
 
 
 @pytest.mark.parametrize('as_json', [False, True])

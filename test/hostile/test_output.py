@@ -105,8 +105,9 @@ def test_an_error_names_it_without_obeying_it(
         ['bag', 'fetch', CLIPBOARD, '--to', str(home)],
     ):
         monkeypatch.setattr(sys, 'argv', ['shadowhound-data', *arguments])
-        with pytest.raises(SystemExit, match=r'\A[12]\Z'):
+        with pytest.raises(SystemExit) as caught:
             main()
+        assert caught.value.code in {1, 2}
         said = capsys.readouterr()
         assert is_harmless(said.err)
         assert is_harmless(said.out)
