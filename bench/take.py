@@ -17,9 +17,9 @@ from rclpy.context import Context
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
-from shadowhound_data_logger.capture import reader
-from shadowhound_data_logger.capture.endpoints import Plan
-from shadowhound_data_logger.capture.reader import PolledGroup, Reader
+from shadowhound_data_logger.ros import reader
+from shadowhound_data_logger.ros.endpoints import Plan
+from shadowhound_data_logger.ros.reader import PolledGroup, Reader
 from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE, free_domain
 
 SIZES = {'small': (324, 2.0), 'large': (20_000, 2.0)}

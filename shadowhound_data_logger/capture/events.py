@@ -20,13 +20,13 @@ from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.ring import Claims, Held, Ring
 from shadowhound_data_logger.capture.bags import profiles_offered
 from shadowhound_data_logger.capture.consumers import Consumer, Drained, TopicChoice
-from shadowhound_data_logger.capture.endpoints import POLL_S
 from shadowhound_data_logger.capture.triggers import EventWatch, Inbox
 from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.mcap.rosbag2_metadata import offered_qos
 from shadowhound_data_logger.options import EventSettings
+from shadowhound_data_logger.ros.endpoints import POLL_S
 from shadowhound_data_logger.spool.accounts import PAUSED
 from shadowhound_data_logger.worker import Worker
 

@@ -28,10 +28,10 @@ from rclpy.parameter import Parameter
 
 from shadowhound_data_logger.capture.interface import Interface
 from shadowhound_data_logger.capture.parameters import Described, declare, parameter, plain
-from shadowhound_data_logger.capture.reader import endpoints
 from shadowhound_data_logger.capture.unheard import MOST_PUBLISHERS
 from shadowhound_data_logger.config import NOT_SETTINGS
 from shadowhound_data_logger.errors import DataLoggerError, NodeUnavailable
+from shadowhound_data_logger.ros.reader import endpoints
 from shadowhound_data_logger.ros_arguments import NODE
 from shadowhound_data_logger.spool.control import Connection
 from shadowhound_data_logger.worker import Worker

@@ -17,12 +17,12 @@ from typing import Final
 from rclpy.node import Node
 
 from shadowhound_data_logger.capture.consumers import Consumer
-from shadowhound_data_logger.capture.endpoints import POLL_S
 from shadowhound_data_logger.capture.extra_topics import ExtraTopics
-from shadowhound_data_logger.capture.reader import PolledGroup
 from shadowhound_data_logger.capture.subscriber import OtherTypes, Subscriber, SubscriberStatus, Surroundings
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.ros.endpoints import POLL_S
+from shadowhound_data_logger.ros.reader import PolledGroup
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.worker import Worker
 

@@ -34,7 +34,6 @@ from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_observer import MissionObserver
 from shadowhound_data_logger.capture.parameters import Parameters, live
 from shadowhound_data_logger.capture.pose_track import RobotTrack
-from shadowhound_data_logger.capture.reader import endpoints
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.capture.unheard import Unheard
@@ -46,6 +45,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import dated
 from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.ros.reader import endpoints
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import SINKS

@@ -12,12 +12,12 @@ from zlib import crc32
 
 from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.capture.encode_pool import BatchQueue
-from shadowhound_data_logger.capture.endpoints import POLL_S
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock, stamp_of
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.model import Batch, Sample
 from shadowhound_data_logger.options import ARCHIVES
+from shadowhound_data_logger.ros.endpoints import POLL_S
 from shadowhound_data_logger.spool.accounts import PAUSED, Accounts, TopicAccount
 
 QUEUE_FULL: Final = 'queue_full'

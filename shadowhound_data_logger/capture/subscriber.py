@@ -17,11 +17,11 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from shadowhound_data_logger.capture.consumers import Consumer
-from shadowhound_data_logger.capture.endpoints import POLL_S, Endpoint, HistoryDepth, Plan, logged_type, plans
-from shadowhound_data_logger.capture.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, unavailable
 from shadowhound_data_logger.capture.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.ros.endpoints import POLL_S, Endpoint, HistoryDepth, Plan, logged_type, plans
+from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, unavailable
 from shadowhound_data_logger.spool.accounts import MAX_NODES, MAX_OTHER_TYPES, SINKS, Accounts
 
 log = logging.getLogger(__name__)

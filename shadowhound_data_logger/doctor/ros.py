@@ -107,7 +107,7 @@ def _profiled(listener: Middleware | None, domain: int | None = None) -> Abstrac
 
 def _types(sensors: Sequence[SensorSettings]) -> Iterator[Result]:
     """Of the types that the settings expect."""
-    from shadowhound_data_logger.capture.reader import unavailable  # noqa: PLC0415 - rclpy
+    from shadowhound_data_logger.ros.reader import unavailable  # noqa: PLC0415 - rclpy
 
     missing: dict[str, list[str]] = {}
     for name in sorted({name for sensor in sensors for name in sensor.types}):

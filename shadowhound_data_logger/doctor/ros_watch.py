@@ -15,8 +15,8 @@ import rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 
-from shadowhound_data_logger.capture.endpoints import Endpoint, HistoryDepth, logged_type, plans
-from shadowhound_data_logger.capture.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
+from shadowhound_data_logger.ros.endpoints import Endpoint, HistoryDepth, logged_type, plans
+from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
 
 NODE: Final = 'shadowhound_doctor'
 DISCOVER_S: Final = 3.0

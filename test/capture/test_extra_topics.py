@@ -20,10 +20,10 @@ from std_msgs.msg import String
 from shadowhound_data_logger.capture import extra_topics as module
 from shadowhound_data_logger.capture.consumers import TopicChoice
 from shadowhound_data_logger.capture.extra_topics import ExtraTopics
-from shadowhound_data_logger.capture.reader import PolledGroup
 from shadowhound_data_logger.capture.subscriber import Surroundings
 from shadowhound_data_logger.config import BagSettings
 from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.ros.reader import PolledGroup
 from shadowhound_data_logger.spool.accounts import Accounts
 
 pytestmark = pytest.mark.ros

@@ -17,7 +17,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
-from shadowhound_data_logger.capture.reader import PolledGroup, SubscriptionEventCallbacks, disproof
+from shadowhound_data_logger.ros.reader import PolledGroup, SubscriptionEventCallbacks, disproof
 
 pytestmark = pytest.mark.ros
 TOLD = {'source_timestamp', 'received_timestamp'}

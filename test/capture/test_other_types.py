@@ -20,15 +20,15 @@ from rclpy.serialization import deserialize_message
 from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import Float64, Int32, String
 
-from shadowhound_data_logger.capture import endpoints
 from shadowhound_data_logger.capture import subscriber as module
-from shadowhound_data_logger.capture.endpoints import Endpoint
-from shadowhound_data_logger.capture.reader import FAST_DDS, PolledGroup
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.subscriber import OtherTypes, Subscriber, Surroundings
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.ros import endpoints
+from shadowhound_data_logger.ros.endpoints import Endpoint
+from shadowhound_data_logger.ros.reader import FAST_DDS, PolledGroup
 from shadowhound_data_logger.spool.account_rows import Totals
 from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts
 

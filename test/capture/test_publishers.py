@@ -24,11 +24,11 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import Int32, String
 
 from shadowhound_data_logger.capture.intake import Intake
-from shadowhound_data_logger.capture.reader import FAST_DDS
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.ros.reader import FAST_DDS
 from shadowhound_data_logger.spool.accounts import EXACT, Accounts
 
 pytestmark = pytest.mark.ros

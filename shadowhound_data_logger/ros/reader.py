@@ -30,11 +30,11 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
 from std_msgs.msg import String
 
-from shadowhound_data_logger.capture import librcl
-from shadowhound_data_logger.capture.endpoints import Endpoint, Plan
 from shadowhound_data_logger.clock import MAX_AGE_NS
 from shadowhound_data_logger.keys import printable
 from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.ros import librcl
+from shadowhound_data_logger.ros.endpoints import Endpoint, Plan
 
 try:
     from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -152,7 +152,7 @@ def endpoints(node: Node, topic: str) -> list[Endpoint]:
 
 
 class Reader:
-    """A live subscription. Created, drained and closed by the intake thread alone: a take after a destroy raises."""
+    """A live subscription. Created, drained and closed by one thread alone: a take after a destroy raises."""
 
     def __init__(self, node: Node, plan: Plan, group: PolledGroup) -> None:
         """Raises TypeUnavailable when the message package is missing, SubscriptionRefused when the middleware does not do it."""

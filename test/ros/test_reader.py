@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.capture.reader import TypeUnavailable, message_class
+from shadowhound_data_logger.ros.reader import TypeUnavailable, message_class
 
 BROKEN = """
 class Meta(type):
