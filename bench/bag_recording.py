@@ -156,15 +156,15 @@ def stream(folder: Path, found: dict[str, Any], rate_hz: int, seconds: float, re
     with World(folder, store=False) as world:
         bag = world.folder / 'rosbag2'
         running: dict[str, Program] = {}
-        if OURS in recorders:
-            running[OURS] = world.node(SMALL)
-        if THEIRS in recorders:
-            running[THEIRS] = world.command('ros2-bag', *found['record'], '--output', str(bag), *found['topics'], TOPIC)
         publisher = world.program('imu_publisher', 'imu_publisher.py', '--topic', TOPIC)
-        heard = publisher.ask(subscribers=len(running))['subscribers']
-        if heard != len(running):
-            raise Failed(f'{heard} of {len(running)} recorders listen to {TOPIC}')
-        time.sleep(QUIET_S)
+        record = [*found['record'], '--output', str(bag), *found['topics'], TOPIC]
+        heard = 0  # the node may have two subscriptions
+        for name in recorders:
+            running[name] = world.node(SMALL) if name == OURS else world.command('ros2-bag', *record)
+            if publisher.ask(subscribers=heard + 1)['subscribers'] <= heard:
+                raise running[name].failed(f'does not listen to {TOPIC}')
+            time.sleep(QUIET_S)
+            heard = publisher.ask(subscribers=1)['subscribers']
         sent = int(publisher.ask(count=rate_hz, rate_hz=rate_hz)['published'])
         used: dict[str, list[float]] = {name: [] for name in running}
         for _ in range(PARTS):
