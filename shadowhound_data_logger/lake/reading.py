@@ -420,7 +420,9 @@ def _footer_size(tail: bytes, size: int) -> int:
 def _opened(tail: bytes) -> pq.ParquetFile:
     _footer_size(tail, len(tail) + len(_MAGIC))
     limits = {'thrift_string_size_limit': MOST_FOOTER_BYTES, 'thrift_container_size_limit': MOST_LIST}
-    return pq.ParquetFile(pa.BufferReader(tail), pre_buffer=False, **limits)
+    file = pq.ParquetFile(pa.BufferReader(tail), pre_buffer=False, **limits)
+    _check_footer(tail, file.schema)
+    return file
 
 
 def _places(file: pq.ParquetFile, schema: pa.Schema, of: TableSchema) -> dict[str, int]:
@@ -460,6 +462,117 @@ def _may_hold(group: Any, places: Mapping[str, int], bounds: Sequence[_Bound]) -
         if told is not None and told.has_min_max and (told.max < low or told.min > high):
             return False
     return True
+
+
+# -- the footer ----------------------------------------------------------------------------------------------------------------
+
+_Fields = Mapping[int, Any]
+_COLUMN: Final[_Fields] = {3: {1: None, 16: {1: None, 2: None, 3: None}}, 8: None, 9: None}
+"""Of a ColumnChunk: its metadata (type, size statistics), crypto metadata, encrypted metadata."""
+_FOOTER: Final[_Fields] = {4: {1: _COLUMN}}
+"""Of the FileMetaData its row groups, and their columns."""
+_BYTE_ARRAY: Final = 6
+_FIXED: Final = {1: 1, 2: 1, 3: 1, 7: 8}
+"""Bytes of flags, bytes and doubles."""
+
+
+def _check_footer(tail: bytes, schema: pq.ParquetSchema) -> None:
+    """Pyarrow ends the process for these: an encrypted column, and size statistics that do not suit the column.
+
+    What it throws when a column of a row group is asked for (``ColumnChunkMetaData`` in its metadata.cc) it does not catch.
+    Raises ValueError, IndexError.
+    """
+    levels: dict[int, int] = {}
+    for group in _picked(tail, len(tail) - int.from_bytes(tail[-_END_BYTES:-4], 'little') - _END_BYTES, _FOOTER)[0].get(4, ()):
+        for place, column in enumerate(group.get(1, ())):
+            sizes = column.get(3, {}).get(16)
+            if 8 in column or 9 in column:
+                raise ValueError('a column of it is encrypted')
+            if sizes is None:
+                continue
+            if place not in levels:
+                levels[place] = schema.column(place).max_definition_level
+            if not (sizes.get(2, 0) <= 1 and sizes.get(3, 0) in {0, levels[place] + 1}
+                    and (1 not in sizes or column[3].get(1) == _BYTE_ARRAY)):  # fmt: skip
+                raise ValueError('its size statistics do not suit its columns')
+
+
+def _picked(data: bytes, at: int, wanted: _Fields) -> tuple[dict[int, Any], int]:
+    """Of a struct the fields that are wanted, and where it ends: whole numbers, of a list of numbers its length, else True."""
+    fields: dict[int, Any] = {}
+    number = 0
+    while head := data[at]:
+        at += 1
+        kind, step = head & 15, head >> 4
+        if step:
+            number += step
+        else:
+            number, at = _zigzag(data, at)
+        if number not in wanted:
+            at = at if kind <= 2 else _skipped(data, at, kind)
+        elif number in fields:
+            raise ValueError('its footer has a field twice')
+        elif (inner := wanted[number]) is not None and kind == 12:
+            fields[number], at = _picked(data, at, inner)
+        elif kind == 9 and (inner is not None or data[at] & 15 == 6):
+            fields[number], at = _listed(data, at, inner)
+        elif inner is not None:
+            raise ValueError('its footer cannot be read')
+        elif kind in {5, 6}:
+            fields[number], at = _zigzag(data, at)
+        else:
+            fields[number], at = True, at if kind <= 2 else _skipped(data, at, kind)
+    return fields, at + 1
+
+
+def _listed(data: bytes, at: int, wanted: _Fields | None) -> tuple[list[dict[int, Any]] | int, int]:
+    """The structs of a list, or how many numbers it has; and where it ends."""
+    kind, count, at = _list_head(data, at)
+    if wanted is None:
+        for _ in range(count):
+            at = _skipped(data, at, kind)
+        return count, at
+    if kind != 12:
+        raise ValueError('its footer cannot be read')
+    found = []
+    for _ in range(count):
+        fields, at = _picked(data, at, wanted)
+        found.append(fields)
+    return found, at
+
+
+def _list_head(data: bytes, at: int) -> tuple[int, int, int]:
+    """The type of a list's entries, how many it has, and where they begin."""
+    kind, count = data[at] & 15, data[at] >> 4
+    at += 1
+    if count == 15:
+        count, at = _varint(data, at)
+    if count > len(data):
+        raise ValueError('its footer cannot be read')
+    return kind, count, at
+
+
+def _skipped(data: bytes, at: int, kind: int, depth: int = 0) -> int:
+    """Where a value of this type ends; flags are bytes here, as in lists."""
+    if kind in _FIXED:
+        return at + _FIXED[kind]
+    if kind in {4, 5, 6}:
+        return _varint(data, at)[1]
+    if kind == 8:
+        size, at = _varint(data, at)
+        return at + size
+    if depth > 8 or kind not in {9, 10, 12}:
+        raise ValueError('its footer cannot be read')
+    if kind != 12:
+        kind, count, at = _list_head(data, at)
+        for _ in range(count):
+            at = _skipped(data, at, kind, depth + 1)
+        return at
+    while head := data[at]:
+        at = at + 1 if head >> 4 else _varint(data, at + 1)[1]
+        if head & 15 > 2:
+            at = _skipped(data, at, head & 15, depth + 1)
+    return at + 1
 
 
 # -- the headers of pages ------------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pyarrow.parquet import encryption
 
 from shadowhound_data_logger.catalogue import parquet, parts, schema
 from shadowhound_data_logger.lake import reading
@@ -106,6 +107,29 @@ def compacted(rows: Sequence[schema.Row], sources: str | Sequence[str]) -> tuple
     key = compacted_key('thor', DATE, [said], is_backfilled=False)
     table = pa.Table.from_pylist(list(rows), schema=reading.arrow_schema())
     return Path(key).stem, written(table, {SOURCES: said})
+
+
+def unfit_histogram(rows: Sequence[schema.Row]) -> bytes:
+    """A key that must be there, with the histogram of one that may be missing."""
+    body = written(pa.Table.from_pylist(list(rows)).select(['key']))
+    optional = b'\x15\x0c\x25\x02\x18\x03key'  # SchemaElement: type, repetition, name
+    assert body.count(optional) == 1
+    return body.replace(optional, optional.replace(b'\x25\x02', b'\x25\x00'))
+
+
+def encrypted(rows: Sequence[schema.Row]) -> bytes:
+    """A column that only its writer can read, and a footer that everybody can."""
+
+    class Kms(encryption.KmsClient):  # type: ignore[misc]
+        def wrap_key(self, key_bytes: bytes, master_key_identifier: str) -> bytes:
+            return base64.b64encode(key_bytes)
+
+        def unwrap_key(self, wrapped_key: bytes, master_key_identifier: str) -> bytes:
+            return base64.b64decode(wrapped_key)
+
+    how = encryption.EncryptionConfiguration(footer_key='footer', column_keys={'columns': ['topic']}, plaintext_footer=True)
+    keys = encryption.CryptoFactory(lambda _: Kms()).file_encryption_properties(encryption.KmsConnectionConfig(), how)
+    return written(pa.Table.from_pylist(list(rows), schema=reading.arrow_schema()), encryption_properties=keys)
 
 
 def footer_of(body: bytes) -> tuple[int, int]:

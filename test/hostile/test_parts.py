@@ -51,6 +51,8 @@ BAD: dict[str, Callable[[], bytes]] = {
     'a year of six digits': lambda: parts.encode([{**each, 't_start': (1 << 62)} for each in ROWS]),
     'a size below nothing': lambda: parts.encode([{**each, 'bytes': -5} for each in ROWS]),
     'a dictionary bomb': lambda: bad_parts.dictionary_bomb(ROWS[0], 20_000),
+    'a histogram of another column': lambda: bad_parts.unfit_histogram(ROWS),
+    'an encrypted column': lambda: bad_parts.encrypted(ROWS),
     'a bomb of zeros': lambda: bad_parts.zeros_bomb(ROWS, 1 << 23),
     'a page that claims 2 GB': lambda: bad_parts.lying_page(ROWS),
     'brotli': lambda: bad_parts.written(pa.Table.from_pylist(ROWS, schema=reading.arrow_schema()), compression='brotli'),
