@@ -26,7 +26,7 @@ from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, S
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.ship.uploader import Uploader, delivering
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
 from shadowhound_data_logger.spool.status import limits
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -102,7 +102,8 @@ def spool_upload(plan: UploadPlan, spool: Spool) -> None:
 
     Raises BagError where there is no room or another bag has the name, SpoolError.
     """
-    objects = []
+    objects: list[DataObject] = []
+    placed: list[SpooledObject] = []
     with tempfile.TemporaryDirectory(dir=plan.files[-1].path.parent) as work:
         try:
             _check_names(spool, plan)
@@ -112,7 +113,8 @@ def spool_upload(plan: UploadPlan, spool: Spool) -> None:
                 link = Path(work) / str(place)
                 _link_or_copy(file.path, link)
                 objects.append(_object(file, link))
-            placed = spool.commit(objects)
+            for begin in range(0, len(objects), MOST_OBJECTS):  # the manifest is the last
+                placed += spool.commit(objects[begin : begin + MOST_OBJECTS])
         except sqlite3.Error as error:
             raise spool.unwritable(error) from error
     if len(placed) < len(objects):

@@ -26,7 +26,7 @@ from shadowhound_data_logger.model import Binding, DataObject
 from shadowhound_data_logger.ship.uploader import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
 from shadowhound_data_logger.spool.status import limits
 
 FRAME_PRIORITY: Final = 6
@@ -121,8 +121,8 @@ class Spooler:
         with self._using(self._opened()) as spool, closing(Index(spool.root / 'index.db', read_only=True)) as known:
             known.open()
             new = [item for item in objects if not _has(known, item)]
-            if new:
-                spool.commit(new)
+            for begin in range(0, len(new), MOST_OBJECTS):
+                spool.commit(new[begin : begin + MOST_OBJECTS])
 
     def bind(self, mission_id: str, run_id: str) -> bool:
         """Give what is held for a mission its final names; False when nothing is held any more. Raises SpoolError."""

@@ -1,6 +1,7 @@
 """The new objects of one group commit: their rows, and their files as parts until the transaction is durable.
 
-Whole files come beside the parts before anything is locked, however long a copy takes. A file of the spool's own file system
+All content is written and synced beside the parts before the transaction begins, whole files before anything is locked, however
+long a copy takes. A file of the spool's own file system
 is linked, any other copied. Its source is nobody's to remove until the object that it is the content of is durable, so a death
 at any moment leaves the source, the object, or both.
 """
@@ -11,8 +12,7 @@ import errno
 import logging
 import os
 import shutil
-import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
 from shadowhound_data_logger.spool.binding import free_key
-from shadowhound_data_logger.spool.files import Tree, content_sha256, description, facts
+from shadowhound_data_logger.spool.files import Tree, content_sha256, describe, description, facts
 from shadowhound_data_logger.spool.index import MISSING, Index
 from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.retention import NO_ROOM
@@ -63,7 +63,7 @@ def remove_sources(tree: Tree, before: Sequence[DataObject], after: Sequence[Dat
 
 
 def _with_file(tree: Tree, session: int, item: DataObject, body: FileBody, paths: list[Path]) -> DataObject:
-    path = tree.incoming / f'{session}-{uuid.uuid4().hex}.body'
+    path = tree.new_body(session)
     paths.append(path)
     try:
         _link_or_copy(body.path, path)
@@ -88,19 +88,40 @@ def _link_or_copy(source: Path, target: Path) -> None:
 class Adding:
     """The new objects of one commit: their rows and files.
 
-    New for each commit, under the spool's lock; ``add`` inside its transaction, then ``place``, or ``discard`` inside it.
+    New for each commit, under the spool's lock; ``stage`` before its transaction, ``add`` and ``take`` inside it, then ``place``,
+    or ``discard`` inside it; ``close`` in any case. The transaction writes no file and syncs none: others wait for it.
     """
 
-    def __init__(self, index: Index, tree: Tree, repeats: Repeats, now_ns: int) -> None:
+    def __init__(self, index: Index, tree: Tree, repeats: Repeats, session: int, now_ns: int) -> None:
         self._index = index
         self._tree = tree
         self._repeats = repeats
+        self._session = session
         self._now_ns = now_ns
+        self._bodies: list[Path] = []
+        """Files that were written for this commit."""
+        self._said: dict[Path, Mapping[str, object]] = {}
+        """What the staged files say of themselves."""
+        self._unsynced: list[Path] = []
         self._added: list[tuple[SpooledObject, State]] = []
+        self._taking: list[tuple[int, Path, Mapping[str, object] | None]] = []
         repeats.begin()
 
+    def stage(self, objects: Sequence[DataObject], given_up: Collection[int]) -> list[DataObject]:
+        """The objects with their content in files beside the parts, durable under these names.
+
+        Not of those in these places of the group, nor of what looks like a repeat. Raises OSError; then ``close`` cleans up.
+        """
+        expected = self._repeats.expected(objects)
+        taken = [
+            item if (place in given_up and not item.protected) or place in expected else self._staged(item)
+            for place, item in enumerate(objects)
+        ]
+        self._sync()
+        return taken
+
     def add(self, item: DataObject, *, fits: bool) -> None:
-        """Row and part of one object."""
+        """Row of one object."""
         state, reason = (State.HELD, item.held) if item.held else (State.PENDING, None)
         if not fits and not item.protected:
             state, reason = State.EVICTED, NO_ROOM
@@ -115,30 +136,39 @@ class Adding:
                 self._add_repeat(replace(item, body=holder.body), key, {**metadata, **holder.said})
                 return
             metadata |= self._repeats.stored(item, key, sha256)
+        if state in {State.PENDING, State.HELD} and isinstance(item.body, bytes):
+            item = self._staged(item)  # it looked like a repeat, of what another process has evicted meanwhile
+            self._sync()
         number = self._index.insert(item, key, sha256, state, reason, metadata, self._now_ns)
         if words.GAP_VERSION in item.metadata:
             self._index.gaps.set_told(item.metadata[words.ROBOT], int(item.metadata[words.GAP_VERSION]))
         path = self._tree.part(number)
-        if state in {State.PENDING, State.HELD}:
+        if state in {State.PENDING, State.HELD} and isinstance(item.body, FileBody):
             said = description(item, key, sha256, metadata)
-            if isinstance(item.body, bytes):
-                self._tree.write_part(number, item.body, said)
-            else:
-                self._tree.take_part(number, item.body.path, said)
+            self._taking.append((number, item.body.path, said if said != self._said.get(item.body.path) else None))
             path = self._tree.path(state, reason, item.bucket, key)
         added = SpooledObject(number, item.bucket, key, path, len(item.body), sha256, item.content_type, metadata, item.priority,
                               self._now_ns)  # fmt: skip
         self._added.append((added, state))
 
-    def sync(self) -> None:
-        """Make the names of the parts durable."""
-        if self._added:
-            self._tree.sync_incoming()
+    def take(self) -> None:
+        """Make parts of the staged files, last of all before the commit.
+
+        These names need not be durable: after a power cut recovery finds the content under either name.
+        """
+        for number, path, said in self._taking:
+            self._tree.take_part(number, path, said)
 
     def discard(self) -> None:
-        """Remove the parts of a transaction that is rolled back: on a full disk they would keep it full."""
-        for item, _ in self._added:
-            self._tree.remove(self._tree.part(item.id))
+        """Undo ``take``, in a transaction that is rolled back: it may be tried again with the same files."""
+        for number, path, _ in self._taking:
+            if not path.exists():
+                self._tree.place(self._tree.part(number), path)
+
+    def close(self) -> None:
+        """Remove what was written and not taken: on a full disk it would keep that full."""
+        for path in self._bodies:
+            self._tree.remove(path)
 
     def place(self) -> list[SpooledObject]:
         """It is durable: give the files their names; returns the objects that may be shipped."""
@@ -150,6 +180,32 @@ class Adding:
             elif state is State.HELD:
                 self._tree.place(self._tree.part(item.id), item.path)
         return pending
+
+    def _staged(self, item: DataObject) -> DataObject:
+        """With its content in a file that describes itself, not synced yet; as it is where its file is gone."""
+        if not is_staged(self._tree, item.body):
+            return item
+        sha256 = content_sha256(item.body)
+        said = description(item, item.key, sha256, {**facts(item), words.SHA256: sha256})
+        if isinstance(item.body, bytes):
+            path = self._tree.new_body(self._session)
+            self._bodies.append(path)
+            self._tree.write_body(path, item.body, said)
+            item = replace(item, body=FileBody(path, len(item.body), sha256))
+        else:
+            path = item.body.path
+            describe(path, said)
+        self._said[path] = said
+        self._unsynced.append(path)
+        return item
+
+    def _sync(self) -> None:
+        """After all were written: the first sync takes most of the others along."""
+        for path in self._unsynced:
+            sync(path)
+        if self._unsynced:
+            self._tree.sync_incoming()
+        self._unsynced.clear()
 
     def _add_repeat(self, item: DataObject, key: str, metadata: Mapping[str, str]) -> None:
         sha256 = content_sha256(item.body)

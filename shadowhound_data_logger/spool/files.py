@@ -1,7 +1,7 @@
 """The spool's tree: a file's folder says what it is. ``ready/<bucket>/<key>`` can be rescued with ``aws s3 sync``.
 
-    incoming/<id>.part                 written and synced, its row not yet committed or its rename not yet done
-    incoming/<session>-<any>.body      a whole file that is about to become a part (staging.py)
+    incoming/<session>-<any>.body      written, synced and about to become a part (adding.py)
+    incoming/<id>.part                 its row not yet committed or its rename not yet done
     ready/<bucket>/<key>               waits for delivery under its final name
     held/<reason>/<bucket>/<key>       has no final name yet
     quarantine/<reason>/<bucket>/<key> will not be delivered as it is
@@ -19,6 +19,7 @@ import logging
 import os
 import re
 import stat
+import uuid
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -73,35 +74,32 @@ class Tree:
         reasons = () if state is State.PENDING else (_UNSAFE.sub('_', reason or '') or 'unknown',)
         return self.root.joinpath(_FOLDERS[state], *reasons, bucket, key)
 
-    def write_part(self, number: int, body: bytes, said: Mapping[str, Any]) -> None:
-        """Write and sync the bytes; raises OSError (a full disk, say) and then leaves nothing behind."""
-        path = self.part(number)
-        self._clear(path)
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    def new_body(self, session: int) -> Path:
+        """A name for a file that is about to become a part."""
+        return self.incoming / f'{session}-{uuid.uuid4().hex}.body'
+
+    @staticmethod
+    def write_body(path: Path, body: bytes, said: Mapping[str, Any]) -> None:
+        """Write a new file, to be synced; raises OSError (a full disk, say) and then leaves nothing behind."""
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         try:
             with os.fdopen(descriptor, 'wb') as file:
                 file.write(body)
                 describe(file.fileno(), said)
-                file.flush()
-                os.fsync(file.fileno())
         except OSError:
             path.unlink(missing_ok=True)
             raise
 
-    def take_part(self, number: int, source: Path, said: Mapping[str, Any]) -> None:
-        """Make a whole and synced file of this file system the part; raises OSError, and the file may then still be there."""
+    def take_part(self, number: int, body: Path, said: Mapping[str, Any] | None) -> None:
+        """Make a whole and synced file the part; ``said`` where it has to say something else. Raises OSError."""
         path = self.part(number)
         self._clear(path)
-        descriptor = os.open(source, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-        try:
-            describe(descriptor, said)
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        os.replace(source, path)
+        if said is not None:
+            describe(body, said)
+        os.replace(body, path)
 
     def sync_incoming(self) -> None:
-        """Make the names of the written parts durable."""
+        """Make the names of the written files durable."""
         sync(self.incoming)
 
     def place(self, source: Path, target: Path) -> bool:

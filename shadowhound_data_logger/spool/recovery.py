@@ -3,9 +3,10 @@
 After it every pending, held or quarantined row has its file, every file has its row, and sessions whose process died
 are settled: what they had received without an outcome is dropped with the reason ``restart``.
 
-A part without a row was never committed, promised to nobody, and is removed. That cannot be said of an index that went back
-in time: it is new, or it does not know a session whose file is there, or a session died and left no write-ahead log (SQLite
-removes that at a clean stop only). Then a part that is whole by its own description is adopted, as are files that have their
+A part without a row, or a file that was about to become one, was never committed, promised to nobody, and is removed; but a
+power cut may have given the part of a durable row its first name back. That cannot be said of an index that went back in time:
+it is new, or it does not know a session whose file is there, or a session died and left no write-ahead log (SQLite removes
+that at a clean stop only). Then a part that is whole by its own description is adopted, as are files that have their
 names. Where it had not been committed after all its samples are stored as well as lost at the restart: rather that than the
 other way round. A log that is there but damaged does not show; with it, what was being renamed in that instant is lost.
 
@@ -22,7 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.disk import lock
+from shadowhound_data_logger.disk import fingerprint, lock
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import SINKS
@@ -129,6 +130,7 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
     """Every row's file to where the row says it is. Other processes may deliver meanwhile."""
     missing: list[int] = []
     damaged: list[tuple[sqlite3.Row, Path]] = []
+    staged = _Staged(tree)
     for row in index.in_spool():
         state = State(row['state'])
         if state is State.QUARANTINED and row['reason'] == MISSING:
@@ -140,7 +142,7 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
         if tree.size(path) is None:
             # Last its own place again: another process may just have moved it there.
             places = (tree.part(row['id']), tree.path(State.PENDING, None, row['bucket'], row['key']), path)
-            found = next((place for place in places if tree.size(place) is not None), None)
+            found = next((place for place in places if tree.size(place) is not None), None) or staged.pop_content(row)
             if found is None:
                 missing.append(row['id'])
                 continue
@@ -163,6 +165,21 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
     for row, where in damaged:
         tree.place(where, tree.path(State.QUARANTINED, DAMAGED, row['bucket'], row['key']))
         report.counts['files damaged'] += 1
+
+
+class _Staged:
+    """Files of dead processes that were about to become parts: of a committed one a power cut may have undone the rename."""
+
+    def __init__(self, tree: Tree) -> None:
+        self._left = [body for session, body in tree.staged() if _is_dead(tree, session)]
+
+    def pop_content(self, row: sqlite3.Row) -> Path | None:
+        """One that is, byte for byte, what the row is of; once each."""
+        for body in self._left:
+            if Tree.size(body) == row['bytes'] and fingerprint(body)[1] == row['sha256']:
+                self._left.remove(body)
+                return body
+        return None
 
 
 def _went_back(tree: Tree, index: Index, *, has_log: bool) -> bool:

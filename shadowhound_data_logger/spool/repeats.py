@@ -8,13 +8,14 @@ object with another content tells, as metadata, how many repeats there were befo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 
 _HOLDS: Final = frozenset({State.PENDING.value, State.DELIVERED.value})
@@ -57,6 +58,18 @@ class Repeats:
     def keep(self) -> None:
         """It is durable."""
         self._last = self._next
+
+    def expected(self, items: Sequence[DataObject]) -> frozenset[int]:
+        """Places of those that look like repeats: their content need not be written."""
+        last = {source: each.sha256 for source, each in self._next.items()}
+        found = set[int]()
+        for place, item in enumerate(items):
+            if item.dedup and not item.held:
+                sha256 = content_sha256(item.body)
+                if last.get(_source(item)) == sha256:
+                    found.add(place)
+                last[_source(item)] = sha256
+        return frozenset(found)
 
     def holder(self, index: Index, item: DataObject, sha256: str) -> Holder | None:
         """The object that holds this content already, if it is what the sensor stored last and is still on its way or there."""

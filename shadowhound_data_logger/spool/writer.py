@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import DataObject, FileBody, Outcome, RecordingRows, SpooledObject
-from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
 from shadowhound_data_logger.worker import Worker
 
 COMMIT_S: Final = 0.1
@@ -26,9 +26,8 @@ HEARTBEAT_S: Final = 1.0
 """How often accounts and outcomes become durable when there is no object to commit them with."""
 MANY_OUTCOMES: Final = 64
 """So many outcomes are worth a commit of their own."""
-MOST_OBJECTS: Final = 32
 MOST_BYTES: Final = 4 << 20
-"""In one commit: its files are written and synced with the index locked, for which other processes wait."""
+"""In one commit: nothing else is done in the spool while its files are written and synced."""
 HANGING_S: Final = 10.0
 """A commit that takes longer hangs in the disk: usual is a hundredth of a second, a slow card at its worst takes a few."""
 

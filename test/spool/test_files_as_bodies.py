@@ -3,13 +3,16 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 from spool.conftest import Moments, Open
 from spool.making import BUCKET, FakeClock, abandon, assert_whole, files, make, new_spool, put, rows, settle
 
 from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
@@ -88,6 +91,27 @@ def test_a_commit_that_fails_leaves_the_source(spool: Spool, root: Path, source:
     assert files(root) == {}
     (spooled,) = spool.commit([item])
     assert spooled.path.read_bytes() == CONTENT
+    assert_whole(root)
+
+
+def test_a_file_outlives_a_transaction_that_gives_up_the_ballast(
+    spool: Spool, root: Path, source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the disk was full once the file was taken, the second try takes the same file."""
+    put(spool, make('thor/first.jpg'))
+    assert (root / 'ballast').stat().st_size
+    take_part, full = Tree.take_part, [OSError(errno.ENOSPC, 'full')]
+
+    def fails_once(tree: Tree, number: int, body: Path, said: Mapping[str, Any] | None) -> None:
+        take_part(tree, number, body, said)
+        if full:
+            raise full.pop()
+
+    monkeypatch.setattr(Tree, 'take_part', fails_once)
+    (item,) = put(spool, sliced(source))
+    assert item.path.read_bytes() == CONTENT
+    assert {row['state'] for row in rows(root)} == {'pending'}
+    assert not list((root / 'incoming').iterdir())
     assert_whole(root)
 
 

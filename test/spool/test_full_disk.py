@@ -144,17 +144,17 @@ def full(*_: Any, **__: Any) -> None:
 
 def test_no_space_for_a_payload(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A commit that runs out of space in its third payload leaves nothing behind, and the next one balances."""
-    write_part = Tree.write_part
+    write_body, written = Tree.write_body, list[Path]()
 
-    def third_fails(tree: Tree, number: int, *rest: Any) -> None:
-        write_part(tree, number, *rest)
-        if number == 3:
-            tree.part(number).unlink()
+    def third_fails(path: Path, *rest: Any) -> None:
+        write_body(path, *rest)
+        written.append(path)
+        if len(written) == 3:
             full()
 
     objects = [make(str(number)) for number in range(4)]
     with monkeypatch.context() as patch:
-        patch.setattr(Tree, 'write_part', third_fails)
+        patch.setattr(Tree, 'write_body', staticmethod(third_fails))
         with pytest.raises(OSError, match='No space left'):
             put(spool, *objects)
         assert files(root) == {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from spool.conftest import Open
 from spool.making import assert_whole, make, put, reopened, rows, settle
 
 from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool.files import ATTRIBUTE
 
 
 def died(root: Path, moment: str) -> None:
@@ -40,11 +42,11 @@ def test_what_was_committed_outlives_the_log(opened: Open, root: Path, before: s
     assert not list((root / 'sessions').iterdir())
 
 
-def test_a_part_that_was_not_committed_is_removed(opened: Open, root: Path) -> None:
+def test_a_file_that_was_not_committed_is_removed(opened: Open, root: Path) -> None:
     """With its log the index knows all that was promised; what was not is lost at the restart, and said to be."""
     died(root, 'uncommitted')
     done = reopened(opened, root)
-    assert done['uncommitted parts removed'] == 2
+    assert done['files not committed'] == 2
     assert [row['key'] for row in rows(root) if row['state'] == 'pending'] == ['thor/whole.jpg']
 
 
@@ -56,4 +58,21 @@ def test_a_part_that_is_not_whole_is_not_adopted(opened: Open, root: Path) -> No
     lose_log(root)
     done = reopened(opened, root)
     assert (done['files adopted'], done['uncommitted parts removed']) == (2, 1)
+    assert_whole(root)
+
+
+def test_a_part_has_its_first_name_again_after_a_power_cut(opened: Open, root: Path) -> None:
+    """The commit is durable, the names that it gave are not: the content is found by its checksum, also without attributes."""
+    died(root, 'committed')
+    parts = sorted((root / 'incoming').iterdir())
+    assert len(parts) == 2
+    (session,) = (int(path.name) for path in (root / 'sessions').iterdir())
+    for number, part in enumerate(parts):
+        os.removexattr(part, ATTRIBUTE)
+        part.rename(part.with_name(f'{session}-{number:032x}.body'))
+    done = reopened(opened, root)
+    assert done == {'renames completed': 2}
+    assert {row['key']: row['state'] for row in rows(root) if row['state'] != 'delivered'} == {
+        'thor/whole.jpg': 'pending', 'thor/a.jpg': 'pending', 'thor/b.jpg': 'held'}  # fmt: skip
+    assert not list((root / 'incoming').iterdir())
     assert_whole(root)

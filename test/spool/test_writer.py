@@ -19,8 +19,8 @@ from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, S
 from shadowhound_data_logger.spool import writer as writer_module
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES
-from shadowhound_data_logger.spool.spool import Outcome, Spool
-from shadowhound_data_logger.spool.writer import MANY_OUTCOMES, MOST_BYTES, MOST_OBJECTS, SpoolWriter
+from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Outcome, Spool
+from shadowhound_data_logger.spool.writer import MANY_OUTCOMES, MOST_BYTES, SpoolWriter
 
 
 @pytest.fixture
@@ -184,7 +184,7 @@ DiskOf = Callable[[int], Path]
 @pytest.fixture
 def disk_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DiskOf:
     """Makes the spool's disk one of so many bytes; beside the spool it has a folder for files that are to be taken in."""
-    beside, write_part = tmp_path / 'beside', Tree.write_part
+    beside, write_body = tmp_path / 'beside', Tree.write_body
     beside.mkdir()
 
     def of(size: int) -> Path:
@@ -192,13 +192,13 @@ def disk_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DiskOf:
             found = [*(tree.root / name for name in files(tree.root)), *beside.iterdir()]
             return size - sum({status.st_ino: status.st_size for status in map(Path.stat, found)}.values())
 
-        def writes_if_it_fits(tree: Tree, number: int, content: bytes, said: Mapping[str, Any]) -> None:
-            if len(content) > free(tree):
+        def writes_if_it_fits(path: Path, content: bytes, said: Mapping[str, Any]) -> None:
+            if len(content) > free(Tree(path.parents[1])):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            write_part(tree, number, content, said)
+            write_body(path, content, said)
 
         monkeypatch.setattr(Tree, 'free_bytes', free)
-        monkeypatch.setattr(Tree, 'write_part', writes_if_it_fits)
+        monkeypatch.setattr(Tree, 'write_body', staticmethod(writes_if_it_fits))
         return beside
 
     return of

@@ -1,0 +1,132 @@
+"""Prints for how long a commit keeps other processes out of the index: from BEGIN to the end of COMMIT.
+
+Run it as ``python bench/transactions.py [--folder F] [--json]``; F should lie on the disk that the spool will be on. It commits
+objects as many and as large as with the default profile, with every message stored, and as one commit of the writer may be at
+most. After each commit it syncs a file to which as many bytes were written as the transaction added to the index's log: that is
+what the disk itself takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sqlite3
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter, sleep
+from typing import Any, Final
+
+from _report import percentile
+from spool_commits import make, opened
+
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
+
+PROFILES: Final = {
+    'default profile': (3, 40_000, 0.1), 'every message stored': (20, 100_000, 0.1),
+    'the largest commit': (MOST_OBJECTS, 130_000, 0.1),
+}  # fmt: skip
+"""Objects of so many bytes in a commit, and the seconds from one to the next."""
+BAR_MS: Final = 50.0
+
+
+class Timed:
+    """Stands before the connection of an index and times its transactions, in milliseconds."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+        self._begun = 0.0
+        self.held: list[float] = []
+        self.committing: list[float] = []
+        """Of these, what COMMIT took: its sync, and at times a checkpoint, which keeps nobody out."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._connection, name)
+
+    def execute(self, statement: str, *values: Any) -> sqlite3.Cursor:
+        begun = perf_counter()
+        done = self._connection.execute(statement, *values)
+        if statement == 'BEGIN IMMEDIATE':
+            self._begun = perf_counter()
+        elif statement == 'COMMIT':
+            ended = perf_counter()
+            self.held.append((ended - self._begun) * 1e3)
+            self.committing.append((ended - begun) * 1e3)
+        return done
+
+
+@contextmanager
+def timed(index: Index) -> Iterator[Timed]:
+    """The index with its connection timed."""
+    connection = index._connection
+    assert connection is not None
+    found = Timed(connection)
+    index._connection = found  # type: ignore[assignment]
+    try:
+        yield found
+    finally:
+        index._connection = connection
+
+
+def raw_sync(descriptor: int, size: int) -> float:
+    """Milliseconds that the disk takes for so many bytes."""
+    os.pwrite(descriptor, os.urandom(size), 0)
+    begun = perf_counter()
+    os.fdatasync(descriptor)
+    return (perf_counter() - begun) * 1e3
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Median, p99 and maximum."""
+    return {'median': percentile(values, 50), 'p99': percentile(values, 99), 'max': max(values)}
+
+
+def measured(root: Path, objects: int, size: int, period_s: float, seconds: float) -> dict[str, object]:
+    """How long transactions were, and how much of that is the disk's."""
+    spool: Spool = opened(root)
+    log = root / 'index.db-wal'
+    raw: list[float] = []
+    number = 0
+    descriptor = os.open(root / 'raw', os.O_WRONLY | os.O_CREAT, 0o600)
+    os.pwrite(descriptor, bytes(1 << 20), 0)
+    os.fsync(descriptor)
+    with timed(spool._index) as found:
+        end = perf_counter() + seconds
+        while perf_counter() < end:
+            begun, before = perf_counter(), log.stat().st_size
+            spool.commit([make(number + place, size) for place in range(objects)])
+            number += objects
+            raw.append(raw_sync(descriptor, max(4096, min(1 << 20, log.stat().st_size - before))))
+            sleep(max(0.0, begun + period_s - perf_counter()))
+    os.close(descriptor)
+    spool.close()
+    share = sum(found.committing) / sum(found.held)
+    return {'objects': objects, 'bytes': size, 'transactions': len(found.held), 'held_ms': spread(found.held),
+            'committing_ms': spread(found.committing), 'raw_sync_ms': spread(raw), 'share_of_commit': share,
+            'rows_ms': spread([held - commit for held, commit in zip(found.held, found.committing, strict=True)]),
+            'over_bar': sum(held > BAR_MS for held in found.held)}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--folder', type=Path, help='where to make the spools')
+    parser.add_argument('--seconds', type=float, default=15.0, help='of each profile')
+    parser.add_argument('--json', action='store_true')
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
+        result = {
+            name: measured(Path(folder, str(place)), *profile, arguments.seconds)
+            for place, (name, profile) in enumerate(PROFILES.items())
+        }
+    if arguments.json:
+        print(json.dumps(result))
+        return
+    for name, figures in result.items():
+        print(name, json.dumps(figures, indent=1))
+
+
+if __name__ == '__main__':
+    main()
