@@ -229,9 +229,12 @@ def _copy(source: str, target: str) -> None:
 
 
 @pytest.mark.parametrize('synced', [True, False])
-def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path, synced: bool) -> None:
+def test_what_a_kill_leaves_is_made_whole_by_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, synced: bool
+) -> None:
     """Closed slices and what was synced of the open one are spooled; the rest is lost by the restart, as the manifest says."""
     home = tmp_path / 'home'
+    monkeypatch.setattr('shadowhound_data_logger.bags.recorder.SYNC_S', 3600.0)
     with desk(home, record='always') as it:
         name = it.recorder.status().bag
         it.hear(range(10))

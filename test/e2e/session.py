@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,8 @@ class Session:
     said: dict[str, int]
     """Topic -> messages, as the robot counted them."""
     ledger: dict[str, Any]
+    ended_ns: int
+    """When the node had ended."""
     heard: dict[str, list[Heard]]
     """By the witness, in order."""
     by_stamp: dict[str, dict[int, Heard]]
@@ -50,13 +53,24 @@ class Session:
         witness = processes.witness(TYPES, recording, best_effort=BEST_EFFORT)
         said = published(processes.sim(f'duration_s:={DURATION_S}'), DURATION_S + WAIT_S)
         ledger = node.stop()
+        ended_ns = time.time_ns()
         witness.signal(signal.SIGTERM)
         assert witness.wait() == 0
         heard = by_topic(recorded(recording))
         (bag,) = bags(store, processes.robot, processes.folder / 'bags')
         objects = Objects.of(store, 'sensor-data', processes.robot).without(f'{processes.robot}/rosbags/')
         return cls(
-            node, processes.folder, processes.robot, said, ledger, heard, _by_stamp(heard), objects, bag, by_topic(bag.messages())
+            node,
+            processes.folder,
+            processes.robot,
+            said,
+            ledger,
+            ended_ns,
+            heard,
+            _by_stamp(heard),
+            objects,
+            bag,
+            by_topic(bag.messages()),
         )
 
     def decoded(self, topic: str, stamp: int) -> Any:
