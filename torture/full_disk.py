@@ -13,21 +13,23 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from e2e.bag_reading import bags
+from e2e.bag_reading import Bag, bags
 from e2e.processes import Node, Processes, published, until
 from e2e.wire import PASS, REFUSE, Wire
 
+from shadowhound_data_logger.bags.objects import EVICTED
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import SpoolSettings, UploadSettings
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.retention import NO_ROOM
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.s3 import S3Store
@@ -197,6 +199,7 @@ class FullDisk:
             (bag,) = bags(store, ROBOT, self._processes.folder / 'bags')
         finally:
             store.close()
+        self._set_aside(bag)
         counts, lost = bag.check(), Counter[str]()
         for each in bag.manifest['missing']:
             lost[each['topic'] or 'slices'] += each['messages']
@@ -212,6 +215,21 @@ class FullDisk:
             self.found.check('bag, manifest and ledger agree', fine, (topic, counts[topic], lost[topic], row))
         evicted = sum(row['stored_in']['evicted'] for row in rows.values())
         self.found.check('bag, manifest and ledger agree', lost['slices'] == evicted, (lost['slices'], evicted))
+
+    def _set_aside(self, bag: Bag) -> None:
+        """Slices that were evicted while they were on their way, and arrived: the manifest says missing, and so may the ledger."""
+        told = {each['file'] for each in bag.manifest['slices']}
+        evicted = {each['file'] for each in bag.manifest['missing'] if each['what'] == EVICTED}
+        with closing(Index(self._home / 'spool' / 'index.db', read_only=True)) as index:
+            index.open()
+            states = {row['key']: row['state'] for row in index.with_prefix(BUCKET, f'{ROBOT}/rosbags/')}
+        others = {path.name: states.get(f'{ROBOT}/rosbags/{bag.folder.name}/{path.name}') for path in bag.slices
+                  if path.name not in told}  # fmt: skip
+        fine = all(name in evicted and state == 'evicted' for name, state in others.items())
+        self.found.check('a slice of the store is in the manifest, or was evicted on its way', fine, others)
+        self.found.figures['slices_evicted_on_their_way'] = len(others)
+        for name in others:
+            (bag.folder / name).unlink()
 
     def _breaks(self) -> None:
         """Read-only: the node stays up and tells, and the next one goes on where the disk was left."""
