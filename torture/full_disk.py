@@ -217,7 +217,7 @@ class FullDisk:
         self.found.check('bag, manifest and ledger agree', lost['slices'] == evicted, (lost['slices'], evicted))
 
     def _set_aside(self, bag: Bag) -> None:
-        """Slices that were evicted while they were on their way, and arrived: the manifest says missing, and so may the ledger."""
+        """Slices that were evicted on their way, and arrived all the same: the manifest calls them missing."""
         told = {each['file'] for each in bag.manifest['slices']}
         evicted = {each['file'] for each in bag.manifest['missing'] if each['what'] == EVICTED}
         with closing(Index(self._home / 'spool' / 'index.db', read_only=True)) as index:
