@@ -20,7 +20,8 @@ from typing import Any, Final
 
 from _report import Bar, Report, main, progress, ratio
 from _world import Failed, Program, World, lost, until
-from ruamel.yaml import YAML
+from imu_publisher import STAMP, STAMP_AT
+from rosbags.rosbag2 import Reader, ReaderError
 
 ROUNDS = 5
 SENSORS = ('camera', 'camera_info', 'lidar', 'imu', 'odom', 'states', 'joints', 'lowstate')
@@ -165,7 +166,8 @@ def stream(folder: Path, found: dict[str, Any], rate_hz: int, seconds: float, re
                 raise running[name].failed(f'does not listen to {TOPIC}')
             time.sleep(QUIET_S)
             heard = publisher.ask(subscribers=1)['subscribers']
-        sent = int(publisher.ask(count=rate_hz, rate_hz=rate_hz)['published'])
+        first = int(publisher.ask(count=rate_hz, rate_hz=rate_hz)['published'])
+        began_ns, sent = time.time_ns(), 0
         used: dict[str, list[float]] = {name: [] for name in running}
         for _ in range(PARTS):
             before = {name: program.cpu_s() for name, program in running.items()}
@@ -176,17 +178,19 @@ def stream(folder: Path, found: dict[str, Any], rate_hz: int, seconds: float, re
         time.sleep(QUIET_S)  # for what is on its way
         for program in running.values():
             program.stop()
-        stored = {name: world.ledger()['bags'][TOPIC]['stored'] if name == OURS else _messages(bag) for name in running}
+        stored = {name: world.ledger()['bags'][TOPIC]['stored'] - first if name == OURS else _messages(bag, began_ns)
+                  for name in running}  # fmt: skip
     return {'published': sent, 'us': used, 'lost': {name: sent - stored[name] for name in running}}
 
 
-def _messages(bag: Path) -> int:
-    """How many messages a bag of rosbag2 has, as its metadata.yaml says."""
+def _messages(bag: Path, began_ns: int) -> int:
+    """How many messages of a bag of rosbag2 were published since then: it may still be starting when the first ones come."""
     try:
-        metadata = YAML(typ='safe').load((bag / 'metadata.yaml').read_text(encoding='utf-8'))
-    except OSError as error:
-        raise Failed(f'rosbag2 has left no bag: {error}') from None
-    return int(metadata['rosbag2_bagfile_information']['message_count'])
+        with Reader(bag) as reader:
+            stamps = [STAMP.unpack_from(cdr, STAMP_AT) for _, _, cdr in reader.messages()]
+    except ReaderError as error:
+        raise Failed(f'rosbag2 has left no bag that can be read: {error}') from None
+    return sum(seconds * 1_000_000_000 + ns >= began_ns for seconds, ns in stamps)
 
 
 def measure(options: argparse.Namespace) -> Report:
