@@ -257,6 +257,10 @@ DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
         'topics': ('joint_states',), 'types': ('sensor_msgs/msg/JointState',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4,
     },
     'lowstate': {'topics': ('lowstate',), 'types': ('go2_interfaces/msg/LowState',), 'batch_s': 10.0, 'priority': 3},
+    'cmd_vel': {
+        'enabled': False, 'topics': ('cmd_vel',), 'types': ('geometry_msgs/msg/Twist',), 'rate_hz': 0.0, 'batch_s': 1.0,
+        'priority': 3,
+    },
     'voxel_map': {
         'enabled': False, 'topics': ('utlidar/voxel_map_compressed',), 'types': ('go2_interfaces/msg/VoxelMapCompressed',),
         'format': 'cdr', 'priority': 8,
