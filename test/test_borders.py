@@ -19,7 +19,7 @@ from shadowhound_data_logger import metadata_words
 PACKAGE = 'shadowhound_data_logger'
 ROOT = Path(__file__).parents[1] / PACKAGE
 ORDER = ('contracts', 'stores', 'mcap', 'encode', 'ros', 'spool', 'ship', 'catalogue', 'missions', 'face', 'bags', 'capture',
-         'lake', 'doctor', 'cli', 'sim')  # fmt: skip
+         'lake', 'datasets', 'doctor', 'cli', 'sim')  # fmt: skip
 """Each folder may import those before it. The contracts are the modules beside the folders, the face is the package itself."""
 ROS = {'ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'go2_interfaces', 'nav_msgs', 'rcl_interfaces', 'rclpy',
        'rosidl_generator_py', 'sensor_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs'}  # fmt: skip
@@ -28,11 +28,12 @@ ALLOWED = {
     'rclpy': {'capture', 'doctor', 'ros', 'sim'},
     **{name: {'stores'} for name in ('boto3', 'botocore')},
     'mlflow': {'missions'},
-    'daft': {'lake'},
+    'av': {'datasets'},
+    'daft': {'datasets', 'lake'},
     'obstore': {'stores'},
-    'pyarrow': {'lake', 'sim'},
+    'pyarrow': {'datasets', 'lake', 'sim'},
 }
-HEAVY = ('rclpy', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'obstore', 'pyarrow')
+HEAVY = ('rclpy', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'obstore', 'pyarrow', 'av')
 LATE = ('import_module', '__import__')
 MODULES = sorted(ROOT.rglob('*.py'))
 

@@ -15,6 +15,7 @@ import click
 from shadowhound_data_logger.cli.bag import bag
 from shadowhound_data_logger.cli.common import MEANINGS, PROGRAM, BadUsage, ExitCode, examples
 from shadowhound_data_logger.cli.doctor import doctor
+from shadowhound_data_logger.cli.export import export
 from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.cli.ledger import ledger
@@ -29,7 +30,7 @@ from shadowhound_data_logger.errors import DataLoggerError, SettingError
 SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
     'On every machine': (doctor,),
     'On the robot': (status, ledger, spool, node),
-    'On Tower and Spark': (query, fetch, bag, lake),
+    'On Tower and Spark': (query, fetch, bag, lake, export),
     'Missions': (missions,),
 }
 """The verbs by who needs them, in the order of the help."""

@@ -17,19 +17,23 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.lake.findings import Findings
 
 EXTRA: Final = {'daft', 'matplotlib', 'obstore', 'pyarrow'}
-_FLAGS: Final = (
-    click.option('--robot', metavar='NAME', help='Of this robot.'),
-    click.option('--sensor', metavar='NAME', help='Of this sensor: camera, lidar, odom, ...'),
-    click.option('--topic', metavar='NAME', help='Of this topic.'),
-    click.option('--since', metavar='TIME', help='Begun then or later: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).'),
-    click.option('--until', metavar='TIME', help='Begun before that.'),
-    click.option('--near', metavar='X,Y,R', help='At most R metres from X,Y in the odometry frame.'),
-    click.option('--mission', metavar='ID', help='Of this mission: its id or that of its run, or how one begins.'),
-    click.option('--mission-type', metavar='TYPE', help='Of missions of this type.'),
-    click.option('--failed', 'success', flag_value=False, type=bool, default=None, help='Of missions that failed.'),
-    click.option('--succeeded', 'success', flag_value=True, type=bool, default=None, help='Of missions that succeeded.'),
-    click.option('--where', metavar='SQL', help="A condition, such as 'battery_pct < 30'."),
-)
+FLAGS: Final = {
+    'robot': click.option('--robot', metavar='NAME', help='Of this robot.'),
+    'sensor': click.option('--sensor', metavar='NAME', help='Of this sensor: camera, lidar, odom, ...'),
+    'topic': click.option('--topic', metavar='NAME', help='Of this topic.'),
+    'since': click.option(
+        '--since', metavar='TIME', help='Begun then or later: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).'
+    ),
+    'until': click.option('--until', metavar='TIME', help='Begun before that.'),
+    'near': click.option('--near', metavar='X,Y,R', help='At most R metres from X,Y in the odometry frame.'),
+    'mission': click.option('--mission', metavar='ID', help='Of this mission: its id or that of its run, or how one begins.'),
+    'mission_type': click.option('--mission-type', metavar='TYPE', help='Of missions of this type.'),
+    'failed': click.option('--failed', 'success', flag_value=False, type=bool, default=None, help='Of missions that failed.'),
+    'succeeded': click.option(
+        '--succeeded', 'success', flag_value=True, type=bool, default=None, help='Of missions that succeeded.'
+    ),
+    'where': click.option('--where', metavar='SQL', help="A condition, such as 'battery_pct < 30'."),
+}
 NAMES: Final = ('robot', 'sensor', 'topic', 'since', 'until', 'near', 'mission', 'mission_type', 'success', 'where')
 _Command = TypeVar('_Command', bound=Callable[..., Any])
 
@@ -42,7 +46,7 @@ def question(command: _Command) -> _Command:
         flags = {name: given.pop(name) for name in NAMES}
         return command(flags={name: value for name, value in flags.items() if value is not None}, **given)
 
-    for flag in reversed(_FLAGS):
+    for flag in reversed(FLAGS.values()):
         asked = flag(asked)
     return asked  # type: ignore[return-value]
 

@@ -1,7 +1,8 @@
 """The lake: what is stored, as a catalogue of Parquet files beside the objects themselves, and how to ask it.
 
 ``lake.objects(sensor='camera', since='yesterday')`` is a Daft DataFrame (docs/lake.md), ``lake.MissionDataset`` what to train on,
-``lake.known('thor', '/imu', '2h')`` what is there of a time, what is not and why, and what nobody knows.
+``lake.known('thor', '/imu', '2h')`` what is there of a time, what is not and why, and what nobody knows;
+``lake.log_dataset(run, DIR)`` says in MLflow what a model was trained on.
 The names below load Daft when they are used: a robot, which writes the catalogue, needs none of it.
 """
 
@@ -15,11 +16,13 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.lake.gaps import Known, StatedGap, Stretch, known
     from shadowhound_data_logger.lake.query import missions, objects, sql, topics
     from shadowhound_data_logger.lake.samples import Near, Window
+    from shadowhound_data_logger.lake.training import log_dataset
 
 __all__ = [
-    'Known', 'MissionDataset', 'Near', 'StatedGap', 'Stretch', 'Window', 'known', 'missions', 'objects', 'sql', 'topics',
+    'Known', 'MissionDataset', 'Near', 'StatedGap', 'Stretch', 'Window', 'known', 'log_dataset', 'missions', 'objects', 'sql',
+    'topics',
 ]  # fmt: skip
-_MODULES = {'MissionDataset': 'dataset', 'Near': 'samples', 'Window': 'samples'}
+_MODULES = {'MissionDataset': 'dataset', 'log_dataset': 'training', 'Near': 'samples', 'Window': 'samples'}
 _MODULES |= dict.fromkeys(('Known', 'StatedGap', 'Stretch', 'known'), 'gaps')
 
 

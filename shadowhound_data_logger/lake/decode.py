@@ -54,6 +54,7 @@ _WHOLE_ODOMETRY: Final = (
     *(f'pose.pose.{name}' for name in _POSE),
     *(f'twist.twist.{kind}.{axis}' for kind in _TWIST for axis in 'xyz'),
 )
+_WHOLE: Final = dict(zip(ODOMETRY, _WHOLE_ODOMETRY, strict=True))
 FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     'go2_interfaces/msg/IMU': ('gyroscope', 'accelerometer', 'quaternion'),
     'sensor_msgs/msg/Imu': (
@@ -62,6 +63,7 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     'sensor_msgs/msg/JointState': ('position',),
     'go2_interfaces/msg/LowState': ('bms_state.soc', 'power_v', 'power_a'),
+    'geometry_msgs/msg/Twist': tuple(f'{kind}.{axis}' for kind in _TWIST for axis in 'xyz'),
 }  # fmt: skip
 """Type -> fields where none are asked for; of other types all numbers. An IMU is rad/s, m/s^2 and the quaternion w x y z."""
 
@@ -238,6 +240,8 @@ def table(samples: Sequence[Mapping[str, Any]], kind: str, fields: Sequence[str]
     stamps = np.array([sample['stamp_ns'] for sample in samples], np.int64) + offset_ns
     try:
         asked = asked or _of_type(samples, kind)
+        if kind == 'nav_msgs/msg/Odometry' and samples and 'pose' in samples[0]:
+            asked = whole_odometry(asked)
         columns = [_column(samples, name) for name in asked]
         values = np.hstack(columns) if columns else np.empty((len(samples), 0))
     except (LookupError, TypeError, ValueError, RecursionError, ArithmeticError, MemoryError) as error:
@@ -246,9 +250,14 @@ def table(samples: Sequence[Mapping[str, Any]], kind: str, fields: Sequence[str]
     return Table(stamps[order], values[order])
 
 
+def whole_odometry(fields: Sequence[str]) -> tuple[str, ...]:
+    """Fields of the short document of odometry (``ODOMETRY``) as the whole message names them; others as they are."""
+    return tuple(_WHOLE.get(name, name) for name in fields)
+
+
 def _of_type(samples: Sequence[Mapping[str, Any]], kind: str) -> tuple[str, ...]:
     if kind == 'nav_msgs/msg/Odometry':
-        return _WHOLE_ODOMETRY if samples and 'pose' in samples[0] else ODOMETRY
+        return ODOMETRY
     return FIELDS.get(kind) or (tuple(_numbers('', samples[0])) if samples else ())
 
 

@@ -304,12 +304,12 @@ def coverage(since_ns: int, until_ns: int, *, robot: str | None = None, topic: s
     covered = []
     for (name, of), rows in sorted(grouped.items()):
         each = of_rows(name, sink, of, since_ns, until_ns, rows)
-        thinned = tuple(_thinned(rows))
+        thinned = tuple(thinned_times(rows))
         covered.append(Coverage(each, tuple(_hours(each, thinned)), thinned))
     return covered
 
 
-def _thinned(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, int]]:
+def thinned_times(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, int]]:
     """Between two watermarks of a session by which more messages were skipped."""
     sessions: defaultdict[tuple[Any, ...], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:

@@ -160,6 +160,22 @@ class MlflowTracking:
                     self._delete(run.info.run_id)
             self._client.set_terminated(run_id, status=status, end_time=end_ms)
 
+    def tagged(self, tag: str, value: str) -> list[str]:
+        """The ids of the runs of all experiments that have this tag."""
+        self.open()
+        with self._translated('does not say which runs there are'):
+            experiments = [each.experiment_id for each in self._client.search_experiments()]
+            found: list[str] = []
+            for start in range(0, len(experiments), 100):
+                some, token = experiments[start : start + 100], None
+                while True:
+                    page = self._client.search_runs(some, f"tags.`{tag}` = '{value}'", max_results=1000, page_token=token)
+                    found += [run.info.run_id for run in page]
+                    token = page.token
+                    if not token:
+                        break
+            return sorted(found)
+
     def _delete(self, run_id: str) -> None:
         """Where this user may not delete, as on a Tower with passwords, the run stays, ended and with its tag."""
         from mlflow.exceptions import MlflowException  # noqa: PLC0415 - see open

@@ -1,0 +1,334 @@
+"""``shadowhound-data export``: training sets of missions: made, proved, found again, and with episodes taken out."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import click
+from rich.text import Text
+
+from shadowhound_data_logger.cli.common import (
+    BadUsage,
+    ExitCode,
+    as_json,
+    examples,
+    exit_code,
+    store_hint,
+    the_home,
+    the_store,
+    the_store_settings,
+)
+from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, progress, volume
+from shadowhound_data_logger.cli.question import FLAGS, NAMES, asking, quietly, tell_left_out
+from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.stores import open_reader
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.datasets.export import Exported
+    from shadowhound_data_logger.datasets.features import ExportOptions
+    from shadowhound_data_logger.datasets.verify import Proved, Seen
+
+SCHEME: Final = 's3://'
+SHOWN: Final = 30
+COPIES: Final = 'exports'
+"""In SHADOWHOUND_HOME: the folders of what is exported to a store."""
+NOT_ASKED: Final = {'sensor', 'topic', 'near'}
+_Command = TypeVar('_Command', bound=Callable[..., Any])
+_place = click.argument('place', metavar='DIR|s3://...')
+
+
+@click.group(epilog=examples('export lerobot go2_patrol --mission-type patrol --since 30d', 'export verify go2_patrol'))
+def export() -> None:
+    """Make training sets of missions.
+
+    One mission is one episode. What is missing is marked, and every value names the object that it came from.
+    """
+
+
+def _missions(command: _Command) -> _Command:
+    """Adds the flags that choose missions; their values come as one mapping ``flags`` of those that were given."""
+
+    @functools.wraps(command)
+    def asked(**given: Any) -> Any:
+        flags = {name: given.pop(name) for name in NAMES if name not in NOT_ASKED}
+        return command(flags={name: value for name, value in flags.items() if value is not None}, **given)
+
+    for name in reversed([name for name in FLAGS if name not in NOT_ASKED]):
+        asked = FLAGS[name](asked)
+    return asked  # type: ignore[return-value]
+
+
+@export.command(
+    'lerobot',
+    epilog=examples(
+        'export lerobot go2_patrol --mission-type patrol --since 30d',
+        'export lerobot go2_patrol --mission-type patrol --to s3://lerobot/datasets/go2/go2_patrol --wait',
+        'export lerobot go2_patrol --since yesterday --state pose,joints --dry-run',
+    ),
+)
+@click.argument('name')
+@_missions
+@click.option('--to', metavar='DIR|s3://...', help='Where  [default: the folder NAME]')
+@click.option(
+    '--fps', default='auto', show_default=True, metavar='N', help='Frames a second; auto: the rate of the slowest camera.'
+)
+@click.option('--state', default='pose', show_default=True, metavar='WORDS',
+              help='What observation.state is made of: pose, twist, velocity, imu, joints, battery.')  # fmt: skip
+@click.option('--action', type=click.Choice(['auto', 'cmd_vel', 'odometry']), default='auto', show_default=True,
+              help='The logged commands, or velocities derived from odometry.')  # fmt: skip
+@click.option(
+    '--camera', 'cameras', default='camera', show_default=True, metavar='NAMES', help='Sensors whose pictures are taken.'
+)
+@click.option('--codec', type=click.Choice(['av1', 'h264']), default='av1', show_default=True, help='Of the videos.')
+@click.option('--lossless', is_flag=True, help='Keep the pictures as they were published, instead of videos.')
+@click.option('--resample', multiple=True, metavar='SENSOR=HOW', help='hold (default) or linear: between the last two messages.')
+@click.option('--max-age', multiple=True, metavar='SENSOR=S', help='Older messages are stale  [default: 1.5 periods]')
+@click.option('--max-gap', type=click.FloatRange(0.0), default=5.0, show_default=True, metavar='S',
+              help='Refuse missions in which a stream is silent for longer.')  # fmt: skip
+@click.option('--max-stale', type=click.FloatRange(0.0, 1.0), default=0.05, show_default=True, metavar='SHARE',
+              help='Refuse missions in which more of the frames are stale for a stream.')  # fmt: skip
+@click.option('--allow-gaps', is_flag=True, help='Take such missions, and those of which nobody knows what is missing.')
+@click.option('--validation', type=click.FloatRange(0.0, 0.9), default=0.0, show_default=True, metavar='SHARE',
+              help='Share of the missions that are marked as validation.')  # fmt: skip
+@click.option('--wait', is_flag=True, help='Wait until it is known of each mission what is missing.')
+@click.option('--dry-run', is_flag=True, help='Only say what would be exported.')
+@click.option('--workers', type=click.IntRange(1, 64), default=1, show_default=True, metavar='N', help='Episodes at a time.')
+@as_json
+def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, wait: bool, dry_run: bool, workers: int,
+                   as_json: bool, **how: Any) -> ExitCode:  # fmt: skip
+    """Add missions to the LeRobot data set NAME (v3.0).
+
+    A mission that is in it already stays as it is. Exit code 1 when a mission was refused or waits: the report says why.
+    """
+    with _exporting():
+        from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415
+        from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset, upload  # noqa: PLC0415
+        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+        check_name(name, 'the name of the data set')
+        options = _options(how)
+        place = DatasetPlace.of(to) if to and to.startswith(SCHEME) else None
+    folder = _copy_of(to) if place and to else Path(to or name)
+    left_out, moved = quietly(), None
+    with progress('looking at what there is') as bar:
+        if place is not None and not dry_run:
+            with the_store() as store:
+                if not (folder / 'meta/info.json').is_file() and store.head(place.bucket, f'{place.prefix}meta/info.json'):
+                    fetch_dataset(place, folder, store, bar.say)
+        result = library.export(
+            folder, default_source(the_store_settings()), flags, options, workers=workers, wait=wait, is_dry=dry_run,
+            findings=left_out, say=bar.say,
+        )  # fmt: skip
+        if result.digest and not dry_run:
+            library.remember(the_home(), folder)
+            if place is not None:
+                with the_store() as store:
+                    moved = upload(folder, place, store, bar.say)
+    if as_json:
+        print_json({**asdict(result), 'folder': str(folder), 'to': to or str(folder), 'uploaded': moved and asdict(moved)})
+    else:
+        print_lines(*_report(result, str(place or folder), is_dry=dry_run))
+        if moved is not None:
+            print_lines(plain(f'{number(moved.files)} files ({volume(moved.bytes)}) uploaded to {place}.'))
+    tell_left_out(left_out)
+    return exit_code(finding=result.refused or result.waiting or len(left_out))
+
+
+def _options(how: Mapping[str, Any]) -> ExportOptions:
+    from shadowhound_data_logger.datasets.features import ExportOptions  # noqa: PLC0415
+
+    fps = how['fps']
+    if fps != 'auto' and not fps.isdecimal():
+        raise BadUsage(f'--fps {fps} is refused', 'allowed is auto, or a whole number of frames a second')
+    return ExportOptions(
+        fps=None if fps == 'auto' else int(fps), state=_words(how['state']), action=how['action'], cameras=_words(how['cameras']),
+        codec=how['codec'], is_lossless=how['lossless'], resample=_pairs('--resample', how['resample'], str),
+        max_age_s=_pairs('--max-age', how['max_age'], float), max_gap_s=how['max_gap'], max_stale=how['max_stale'],
+        allow_gaps=how['allow_gaps'], validation=how['validation'],
+    )  # fmt: skip
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(filter(None, (word.strip() for word in text.split(','))))
+
+
+def _pairs(name: str, given: tuple[str, ...], kind: Callable[[str], Any]) -> dict[str, Any]:
+    try:
+        return {sensor: kind(value) for sensor, value in (pair.split('=') for pair in given)}
+    except ValueError:
+        raise BadUsage(f'{name} {" ".join(given)} is refused', f'allowed is {name} SENSOR=VALUE') from None
+
+
+def _copy_of(url: str) -> Path:
+    """The folder on this machine of a data set in a store."""
+    return the_home() / COPIES / url.removeprefix(SCHEME).rstrip('/')
+
+
+@contextmanager
+def _exporting() -> Iterator[None]:
+    """Bad usage, as of questions; and a machine without the extra."""
+    try:
+        with asking():
+            yield
+    except ModuleNotFoundError as error:
+        if error.name != 'av':
+            raise
+        raise BadUsage('av is not installed', "pip install 'shadowhound_data_logger[datasets]'") from error
+
+
+def _report(result: Exported, where: str, *, is_dry: bool) -> Iterator[Text]:
+    for mission, streams in list(result.streams.items())[:SHOWN]:
+        yield plain(f'  {mission}')
+        yield from (plain(f'    {name}: {told}') for name, told in streams.items())
+    for told in result.added[:SHOWN]:
+        stale = max((each['stale_share'] for each in told['streams'].values()), default=0.0)
+        yield plain(f'  {told["mission_id"]}: {number(told["frames"])} frames, {stale:.1%} stale')
+    for mission, why in list(result.refused.items())[:SHOWN]:
+        yield plain(f'  {mission} is refused: {why}', 'red')
+    for mission, why in list(result.waiting.items())[:SHOWN]:
+        yield plain(f'  {mission} waits: {why}', 'yellow')
+    if is_dry:
+        yield plain(f'{counted(len(result.streams), "mission")} would be exported to {where} at {result.fps} frames a second, '
+                    f'with {result.action} as action; {number(len(result.present))} are in it already.')  # fmt: skip
+        return
+    if not (result.added or result.present):
+        yield plain(f'No mission was exported.{store_hint()}')
+        return
+    yield plain(f'{counted(len(result.added), "episode")} added to {where}, {number(len(result.present))} were in it already; '
+                f'digest {result.digest[:16]}.')  # fmt: skip
+
+
+@export.command('verify', epilog=examples('export verify go2_patrol', 'export verify s3://lerobot/datasets/go2/go2_patrol --all'))
+@_place
+@click.option('--all', 'is_all', is_flag=True, help='Compare every frame with its source, not five of each episode.')
+@click.option('--read', 'is_read', is_flag=True, help='Read every source again, instead of asking for its checksum.')
+@as_json
+def export_verify(*, place: str, is_all: bool, is_read: bool, as_json: bool) -> ExitCode:
+    """Prove that a data set is as it was written.
+
+    Its files are whole, its sources unchanged, its pictures those of their sources.
+
+    Exit code 1 when something is wrong.
+    """
+    with _exporting():
+        from shadowhound_data_logger.datasets import verify as library  # noqa: PLC0415
+        from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset  # noqa: PLC0415
+
+        stored = DatasetPlace.of(place) if place.startswith(SCHEME) else None
+    with TemporaryDirectory() as temporary, progress('files') as bar, closing(open_reader(the_store_settings())) as store:
+        folder = Path(place)
+        if stored is not None:
+            folder = Path(temporary)
+            fetch_dataset(stored, folder, store, bar.say)
+        found = library.verify(folder, store, frames=None if is_all else library.FRAMES, is_read=is_read, say=bar.say)
+    if as_json:
+        print_json(asdict(found))
+    else:
+        print_lines(*_proof(found, place))
+    return exit_code(finding=found.wrong)
+
+
+def _proof(found: Proved, place: str) -> Iterator[Text]:
+    for wrong in found.wrong[:SHOWN]:
+        yield plain(f'  {wrong}', 'red')
+    said = f'{number(len(found.wrong))} things are wrong' if found.wrong else 'all is as it was written'
+    like = '' if not found.frames else f', {number(found.frames)} frames compared (least SSIM {found.least_likeness:.3f})'
+    yield plain(f'{place}: {counted(found.episodes, "episode")}, {counted(found.files, "file")}, '
+                f'{counted(found.sources, "source")}{like}: {said}.')  # fmt: skip
+
+
+@export.command('where', epilog=examples('export where sensor-data/thor/camera/20261121/120000_front.jpg'))
+@click.argument('key')
+@click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
+              help='Look there  [default: all that this machine exported, and the bucket lerobot]')  # fmt: skip
+@as_json
+def export_where(*, key: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
+    """Find the data sets and models that saw an object.
+
+    Models by the runs of MLflow that lake.log_dataset marked.
+    """
+    with _exporting():
+        from shadowhound_data_logger.lake.training import runs_trained_on  # noqa: PLC0415
+    found = list(_seen(key, places))
+    runs = runs_trained_on(digest for each in found for digest in each.digests)
+    told = [{**asdict(each), 'runs': sorted({run for digest in each.digests for run in runs[digest]})} for each in found]
+    if as_json:
+        print_json(told)
+        return ExitCode.FINE
+    lines = []
+    for each in told:
+        lines.append(plain(f'{each["where"]}: {number(each["frames"])} frames of {", ".join(each["missions"])}'))
+        lines += [plain(f'  trained on it: run {run}') for run in each['runs']]
+    print_lines(*lines or [plain(f'No data set has values of {key}.')])
+    return ExitCode.FINE
+
+
+def _seen(key: str, places: tuple[str, ...]) -> Iterator[Seen]:
+    from shadowhound_data_logger.datasets import verify as library  # noqa: PLC0415
+    from shadowhound_data_logger.datasets.export import known_folders  # noqa: PLC0415
+    from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in  # noqa: PLC0415
+    from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
+
+    settings = the_store_settings()
+    folders = [Path(each) for each in places if not each.startswith(SCHEME)]
+    stored = [DatasetPlace.of(each) for each in places if each.startswith(SCHEME)]
+    if not places:
+        copies = the_home() / COPIES
+        folders = [each for each in known_folders(the_home()) if copies not in each.parents]
+        with closing(open_reader(settings)) as store:
+            stored = list(datasets_in(store))
+    for folder in folders:
+        if (seen := library.seen_in_folder(folder, key)) is not None:
+            yield seen
+    for place in stored:
+        if (seen := library.seen_in_store(Bucket(settings, place.bucket), place, key)) is not None:
+            yield seen
+
+
+@export.command('drop', epilog=examples('export drop mission_20261121_120000_ab12', 'export drop MISSION --in go2_patrol'))
+@click.argument('mission')
+@click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
+              help='Out of these alone  [default: all that this machine exported, and the bucket lerobot]')  # fmt: skip
+@as_json
+def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
+    """Take the episode of a mission out of data sets.
+
+    It is not exported to them again.
+
+    Exit code 1 when none of them has it.
+    """
+    with _exporting():
+        from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415
+        from shadowhound_data_logger.datasets.lerobot import Lerobot  # noqa: PLC0415
+        from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in, fetch_dataset, upload  # noqa: PLC0415
+
+        stored = [DatasetPlace.of(each) for each in places if each.startswith(SCHEME)]
+    folders = [Path(each) for each in places if not each.startswith(SCHEME)]
+    dropped: dict[str, str] = {}
+    with progress('looking for it') as bar, the_store() as store:
+        if not places:
+            copies = the_home() / COPIES
+            folders = [each for each in library.known_folders(the_home()) if copies not in each.parents]
+            stored = list(datasets_in(store))
+        for folder in folders:
+            if mission in Lerobot(folder).mission_ids or (folder / library.DROPPING).is_file():
+                dropped[str(folder)] = library.drop(folder, mission)
+        for place in stored:
+            folder = _copy_of(str(place))
+            bar.say(str(place))
+            fetch_dataset(place, folder, store, bar.say)
+            if mission in Lerobot(folder).mission_ids:
+                dropped[str(place)] = library.drop(folder, mission)
+                upload(folder, place, store, bar.say)
+    if as_json:
+        print_json(dropped)
+    else:
+        told = [plain(f'{where}: dropped; its digest is {digest[:16]} now.') for where, digest in dropped.items()]
+        print_lines(*told or [plain(f'No data set has an episode of {mission}.', 'yellow')])
+    return exit_code(finding=not dropped)

@@ -1,0 +1,350 @@
+"""Makes one episode of one mission in a folder of its own: rows, videos, where each value came from, and what was missing.
+
+The folder is whole once it has ``episode.json``; made again it has the same bytes. What numbers the episode has in its data set
+is settled later (``lerobot.py``): only then it is known which missions before it were refused.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from shutil import rmtree
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shadowhound_data_logger.catalogue.gaps import GAPS as STATEMENTS
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.datasets.features import LINEAR, ExportOptions
+from shadowhound_data_logger.datasets.plan import EpisodePlan, StreamPlan
+from shadowhound_data_logger.datasets.series import Recordings, Series
+from shadowhound_data_logger.datasets.ticks import (
+    LATE,
+    UNKNOWN,
+    Sampled,
+    cause_of,
+    interpolated,
+    motion,
+    phase_of,
+    sample,
+    ticks_of,
+    whole_fps,
+)
+from shadowhound_data_logger.datasets.video import VideoWriter
+from shadowhound_data_logger.disk import replacing
+from shadowhound_data_logger.errors import BagDamaged, LakeError, ObjectRefused, Rejected
+from shadowhound_data_logger.lake import decode
+from shadowhound_data_logger.lake.prefetch import Place
+from shadowhound_data_logger.lake.reading import arrow_schema
+from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.stores import open_store
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+ROWS, SOURCES, GAPS, TOLD = 'rows.parquet', 'sources.parquet', 'gaps.parquet', 'episode.json'
+"""Files of an episode's folder; beside them ``<camera>.mp4``."""
+BATCH: Final = 128
+"""Rows with pictures that are written at a time."""
+EPISODE: Final = 'episode_mission'
+"""The column that says whose row it is: statements about gaps have a ``mission_id`` of their own."""
+SOURCE_SCHEMA: Final = pa.schema([
+    pa.field(EPISODE, pa.string(), nullable=False), pa.field('frame', pa.int64(), nullable=False),
+    pa.field('stream', pa.string(), nullable=False), pa.field('bucket', pa.string(), nullable=False),
+    pa.field('key', pa.string(), nullable=False), pa.field('sha256', pa.string(), nullable=False),
+    pa.field('stamp_ns', pa.int64(), nullable=False), pa.field('held_s', pa.float64(), nullable=False),
+])  # fmt: skip
+"""One row a frame and message that it was made from: ``held_s`` is how much older than the tick it was."""
+GAP_SCHEMA: Final = arrow_schema(STATEMENTS).insert(0, pa.field(EPISODE, pa.string(), nullable=False))
+"""The statements of the gap journal that were believed (catalogue/gaps.py)."""
+PICTURE: Final = pa.struct([('bytes', pa.binary()), ('path', pa.string())])
+
+
+@dataclass(frozen=True, slots=True)
+class _Stream:
+    """A stream that was read and sampled."""
+
+    plan: StreamPlan
+    series: Series
+    sampled: Sampled
+    values: NDArray[np.float64]
+
+
+def build(plan: EpisodePlan, options: ExportOptions, fps: int, settings: StoreSettings, folder: Path) -> dict[str, Any]:
+    """Make the episode, or find out why there can be none; returns what ``episode.json`` says. Raises StoreError, OSError."""
+    told = folder / TOLD
+    if told.is_file():
+        return dict(json.loads(told.read_text(encoding='utf-8')))
+    rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    store = open_store(settings, UploadSettings())
+    try:
+        with Recordings(Place(settings), store, plan.tracks, plan.topics, plan.span_ns, plan.bags, folder / 'tmp') as recordings:
+            found = _built(plan, options, fps, recordings, folder)
+    except (LakeError, BagDamaged, Rejected, ObjectRefused) as error:
+        found = {'refused': error.what}
+    finally:
+        store.close()
+        rmtree(folder / 'tmp', ignore_errors=True)
+    with replacing(told, is_synced=True) as file:
+        file.write(json.dumps(found, indent=1).encode())
+    return found
+
+
+def _built(plan: EpisodePlan, options: ExportOptions, fps: int, recordings: Recordings, folder: Path) -> dict[str, Any]:
+    if plan.missing:
+        raise LakeError(f'the store has nothing of {", ".join(sorted(set(plan.missing)))} in it')
+    if fps > whole_fps(plan.camera_hz):
+        slow = min((each for each in plan.streams if each.part is None), key=lambda each: each.recording.rate_hz)
+        raise LakeError(f'{slow.recording.topic} has {slow.recording.rate_hz:.3g} Hz in the {slow.recording.sink}, '
+                        f'less than {fps} frames a second')  # fmt: skip
+    series = _read(plan, options, recordings)
+    ticks = _ticks(plan, series, fps)
+    streams = [_sampled(each, one, ticks, fps, options) for each, one in zip(plan.streams, series, strict=True)]
+    causes = [_causes(each, ticks) for each in streams]
+    told = _told(plan, streams, causes, ticks, fps)
+    if (why := _refusal(told, options)) and not options.allow_gaps:
+        return {**told, 'refused': why}
+    pictures = [each for each in streams if each.plan.part is None]
+    told |= {'histograms': {}, 'sizes': {}}
+    for each in pictures:
+        histogram, size = _write_pictures(each, fps, options, folder)
+        told['histograms'][each.plan.name], told['sizes'][each.plan.name] = histogram, size
+    _write_rows(streams, causes, ticks, fps, options, folder)
+    _write_sources(plan, streams, ticks, folder / SOURCES)
+    gaps = plan.gaps.add_column(0, EPISODE, pa.array([plan.mission.mission_id] * len(plan.gaps), pa.string()))
+    pq.write_table(gaps.cast(GAP_SCHEMA), folder / GAPS, compression='zstd')
+    return told
+
+
+def _read(plan: EpisodePlan, options: ExportOptions, recordings: Recordings) -> list[Series]:
+    """Each stream's own series; what two streams need of one sensor is read once."""
+    known: dict[tuple[str, tuple[str, ...]], Series] = {}
+    found = []
+    for each in plan.streams:
+        fields = each.part.fields if each.part else ()
+        name = each.recording.sensor, fields
+        if name not in known:
+            known[name] = recordings.series(each.recording, fields)
+        one = known[name]
+        if not len(one):
+            raise LakeError(f'{each.recording.topic} has no message in it')
+        if each.part is None:
+            found.append(one)
+            continue
+        good = np.isfinite(one.values).all(axis=1)
+        if not good.any():
+            raise LakeError(f'{each.recording.topic} has no finite numbers in it')
+        one = Series(one.recording, one.stamps[good], one.values[good], one.file[good], one.files, one.names)
+        found.append(_derived(one, options) if each.part.is_derived else one)
+    return found
+
+
+def _derived(poses: Series, options: ExportOptions) -> Series:
+    later, values = motion(poses.stamps, poses.values, round(options.max_gap_s * SECOND))
+    if not len(later):
+        raise LakeError(f'{poses.recording.topic} has no two poses from which a velocity could be derived')
+    previous = np.column_stack([poses.stamps[later - 1], poses.file[later - 1]])
+    return Series(poses.recording, poses.stamps[later], values, poses.file[later], poses.files, previous=previous)
+
+
+def _ticks(plan: EpisodePlan, series: Sequence[Series], fps: int) -> NDArray[np.int64]:
+    """From the first picture on at which all streams have begun, until the mission's end."""
+    cameras = [one for each, one in zip(plan.streams, series, strict=True) if each.part is None]
+    slowest = min(cameras, key=len)
+    bound = max(plan.mission.begin_ns, *(int(one.stamps[0]) for one in series))
+    later = slowest.stamps[slowest.stamps >= bound]
+    if not len(later):
+        raise LakeError('there is no time at which all of its streams have begun')
+    first = int(later[0])
+    return ticks_of(first + phase_of(later, first, fps), plan.mission.end_ns, fps)
+
+
+def _sampled(plan: StreamPlan, series: Series, ticks: NDArray[np.int64], fps: int, options: ExportOptions) -> _Stream:
+    sensor = plan.recording.sensor
+    given = (options.max_age_s or {}).get(sensor)
+    most = round(given * SECOND) if given is not None else int(LATE * max(series.period_ns, SECOND // fps))
+    found = sample(series.stamps, ticks, most)
+    if plan.part is None:
+        return _Stream(plan, series, found, np.empty((len(ticks), 0)))
+    if (options.resample or {}).get(sensor) != LINEAR or plan.part.is_derived:
+        return _Stream(plan, series, found, series.values[found.message])
+    values, earlier = interpolated(series.stamps, series.values, ticks, round(options.max_gap_s * SECOND), plan.part.turns)
+    return _Stream(plan, series, Sampled(found.message, earlier, found.age_s, found.stale), values)
+
+
+def _causes(stream: _Stream, ticks: NDArray[np.int64]) -> dict[int, str]:
+    """Tick -> why its newest message is too old."""
+    stamps = stream.series.stamps[stream.sampled.message]
+    return {
+        int(tick): cause_of(stream.plan.known, stream.plan.thinned, int(stamps[tick]), int(ticks[tick]))
+        for tick in np.flatnonzero(stream.sampled.stale)
+    }
+
+
+def _told(plan: EpisodePlan, streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]], ticks: NDArray[np.int64],
+          fps: int) -> dict[str, Any]:  # fmt: skip
+    mission = plan.mission
+    return {
+        'mission_id': mission.mission_id, 'run_id': mission.run_id, 'robot': mission.robot, 'mission_type': mission.mission_type,
+        'task': mission.task, 'frames': len(ticks), 'fps': fps, 'first_tick_ns': int(ticks[0]),
+        'last_tick_ns': int(ticks[-1]), 'begins_late_s': round((int(ticks[0]) - mission.begin_ns) / SECOND, 3),
+        'streams': {
+            each.plan.name: {
+                'sensor': each.plan.recording.sensor, 'topic': each.plan.recording.topic, 'from': each.plan.recording.sink,
+                'type': each.plan.recording.type, 'messages': len(each.series), 'rate_hz': round(each.plan.recording.rate_hz, 3),
+                'stale_share': round(float(each.sampled.stale.mean()), 6),
+                'longest_gap_s': round(float(each.sampled.age_s[each.sampled.stale].max(initial=0.0)), 3),
+                'causes': dict(sorted(Counter(why.values()).items())), 'names': list(_names(each)),
+                'known': _grades(each, ticks),
+            }
+            for each, why in zip(streams, causes, strict=True)
+        },
+    }  # fmt: skip
+
+
+def _grades(stream: _Stream, ticks: NDArray[np.int64]) -> list[str]:
+    """How well it is known what is missing, from the first tick to the last."""
+    return sorted({each.grade or UNKNOWN for each in stream.plan.known.between(int(ticks[0]), int(ticks[-1])).stretches})
+
+
+def _names(stream: _Stream) -> tuple[str, ...]:
+    part, width = stream.plan.part, stream.values.shape[1]
+    if part is None:
+        return ()
+    if len(part.names) == width:
+        return part.names
+    named = stream.series.names if len(stream.series.names) == width else tuple(f'joint_{place}' for place in range(width))
+    return tuple(f'{name}.pos' for name in named)
+
+
+def _refusal(told: Mapping[str, Any], options: ExportOptions) -> str:
+    for name, each in told['streams'].items():
+        share, longest_s = each['stale_share'], each['longest_gap_s']
+        if share > options.max_stale:
+            why = ', '.join(f'{cause} {count}' for cause, count in each['causes'].items())
+            return f'{name} is stale in {share:.1%} of the frames ({why}), more than --max-stale {options.max_stale:g}'
+        if longest_s > options.max_gap_s:
+            return f'{name} was last heard {longest_s:.1f} s before a frame, more than --max-gap {options.max_gap_s:g}'
+    return ''
+
+
+# -- files ---------------------------------------------------------------------------------------------------------------------
+
+
+def _write_pictures(stream: _Stream, fps: int, options: ExportOptions, folder: Path) -> tuple[list[list[int]], list[int]]:
+    """The video, unless pictures stay as they are; ((3, 256) pixels of each value by colour, (height, width))."""
+    histogram = np.zeros((3, 256), np.int64)
+    numbers, counts = np.unique(stream.sampled.message, return_counts=True)
+    size = _picture(stream, int(numbers[0])).shape[:2]
+    with ExitStack() as stack:
+        writer = None
+        if not options.is_lossless:
+            writer = stack.enter_context(VideoWriter(folder / f'{stream.plan.name}.mp4', fps, size, options.codec))
+        for number, count in zip(numbers, counts, strict=True):
+            pixels = _picture(stream, int(number))
+            _check_size(stream, pixels, size)
+            for colour in range(3):
+                histogram[colour] += np.bincount(pixels[..., colour].ravel(), minlength=256) * int(count)
+            for _ in range(int(count) if writer else 0):
+                assert writer is not None
+                writer.add(pixels)
+    return histogram.tolist(), list(size)
+
+
+def _check_size(stream: _Stream, pixels: NDArray[np.uint8], size: tuple[int, int]) -> None:
+    if pixels.shape[:2] != size:
+        raise LakeError(f'the pictures of {stream.plan.recording.topic} change their size')
+
+
+def _picture(stream: _Stream, message: int) -> NDArray[np.uint8]:
+    body, _ = stream.series.picture(message)
+    pixels = decode.image(body)
+    if pixels.ndim != 3 or pixels.dtype != np.uint8:
+        raise LakeError(f'the pictures of {stream.plan.recording.topic} are not colour pictures of 8 bits')
+    return np.asarray(pixels, np.uint8)
+
+
+def vectors(values: NDArray[Any], kind: pa.DataType) -> pa.Array:
+    """A column of vectors as lerobot's reader expects them: a list of fixed length, or of one number that number."""
+    width = values.shape[1]
+    flat = pa.array(np.ascontiguousarray(values).ravel(), kind)
+    return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
+
+
+def _write_rows(streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]], ticks: NDArray[np.int64], fps: int,
+                options: ExportOptions, folder: Path) -> None:  # fmt: skip
+    count = len(ticks)
+    state = np.hstack([each.values for each in streams if each.plan.name.startswith('state.')]).astype(np.float32)
+    action = next(each.values for each in streams if each.plan.name == 'action').astype(np.float32)
+    told = [''] * count
+    for each, why in zip(streams, causes, strict=True):
+        for tick, word in why.items():
+            told[tick] = f'{told[tick]};{each.plan.name}={word}' if told[tick] else f'{each.plan.name}={word}'
+    columns: dict[str, pa.Array] = {
+        'observation.state': vectors(state, pa.float32()),
+        'action': vectors(action, pa.float32()),
+        'observation.stale': vectors(np.column_stack([each.sampled.stale for each in streams]).astype(np.float32), pa.float32()),
+        'observation.age_s': vectors(np.column_stack([each.sampled.age_s for each in streams]), pa.float32()),
+        'shadowhound.cause': pa.array(told, pa.string()),
+        'shadowhound.stamp_ns': pa.array(ticks, pa.int64()),
+        'timestamp': pa.array((np.arange(count) / fps).astype(np.float32)),
+        'frame_index': pa.array(np.arange(count), pa.int64()),
+    }
+    table = pa.table(columns)
+    cameras = [each for each in streams if each.plan.part is None] if options.is_lossless else []
+    schema = table.schema
+    for each in cameras:
+        schema = schema.append(pa.field(f'observation.{each.plan.name}', PICTURE))
+    with pq.ParquetWriter(folder / ROWS, schema, compression='snappy') as writer:
+        for begin in range(0, count, BATCH if cameras else count):
+            some = table.slice(begin, BATCH if cameras else count)
+            for each in cameras:
+                some = some.append_column(f'observation.{each.plan.name}', _raw(each, begin, begin + len(some)))
+            writer.write_table(some)
+
+
+def _raw(stream: _Stream, begin: int, end: int) -> pa.Array:
+    found = []
+    for tick in range(begin, end):
+        body, extension = stream.series.picture(int(stream.sampled.message[tick]))
+        found.append({'bytes': body, 'path': f'frame-{tick:06d}.{extension}'})
+    return pa.array(found, PICTURE)
+
+
+def _write_sources(plan: EpisodePlan, streams: Sequence[_Stream], ticks: NDArray[np.int64], path: Path) -> None:
+    with pq.ParquetWriter(path, SOURCE_SCHEMA, compression='zstd') as writer:
+        for each in streams:
+            for table in _sources(plan.mission.mission_id, each, ticks):
+                writer.write_table(table)
+
+
+def _sources(mission_id: str, stream: _Stream, ticks: NDArray[np.int64]) -> Iterator[pa.Table]:
+    series, sampled = stream.series, stream.sampled
+    frames = np.arange(len(ticks))
+    is_line = sampled.other >= 0
+    used = np.where(is_line, sampled.other + 1, sampled.message)
+    yield _source_rows(mission_id, stream, frames, series.stamps[used], series.file[used], ticks)
+    if is_line.any():
+        other = sampled.other[is_line]
+        yield _source_rows(mission_id, stream, frames[is_line], series.stamps[other], series.file[other], ticks[is_line])
+    if series.previous is not None:
+        earlier = series.previous[sampled.message]
+        yield _source_rows(mission_id, stream, frames, earlier[:, 0], earlier[:, 1], ticks)
+
+
+def _source_rows(mission_id: str, stream: _Stream, frames: NDArray[np.int64], stamps: NDArray[np.int64],
+                 files: NDArray[np.int64], ticks: NDArray[np.int64]) -> pa.Table:  # fmt: skip
+    known = stream.series.files
+    named = {name: pa.array([getattr(known[int(number)], name) for number in files]) for name in ('bucket', 'key', 'sha256')}
+    return pa.table({
+        EPISODE: pa.array([mission_id] * len(frames)), 'frame': pa.array(frames, pa.int64()),
+        'stream': pa.array([stream.plan.name] * len(frames)), **named, 'stamp_ns': pa.array(stamps, pa.int64()),
+        'held_s': pa.array((ticks - stamps) / SECOND, pa.float64()),
+    }, schema=SOURCE_SCHEMA)  # fmt: skip

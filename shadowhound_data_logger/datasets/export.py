@@ -1,0 +1,313 @@
+"""From a question to a data set: choose missions, make their episodes side by side, put them together, bring them to the store.
+
+Killed at any moment it goes on where it was: an episode that is made lies in ``DIR/.shadowhound/`` until the data set has it,
+and what ``info.json`` does not count is made again, with the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+from pathlib import Path
+from shutil import rmtree
+from typing import Any, Final
+
+from shadowhound_data_logger.datasets import plan as planning
+from shadowhound_data_logger.datasets.episodes import TOLD, build
+from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.datasets.lerobot import REPORT, Lerobot
+from shadowhound_data_logger.datasets.plan import ChosenMission, EpisodePlan
+from shadowhound_data_logger.datasets.report import draw
+from shadowhound_data_logger.datasets.ticks import whole_fps
+from shadowhound_data_logger.disk import flock, replacing
+from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.training import INFO
+from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.stores import open_store
+
+WORK: Final = '.shadowhound'
+"""What is not part of the data set, in its folder."""
+DROPPING: Final = f'{WORK}/dropping.json'
+KNOWN: Final = 'exports.json'
+"""In SHADOWHOUND_HOME: the folders that were exported to from this machine."""
+LOOK_S: Final = 5.0
+"""Between two looks at what has arrived."""
+TRAIN, VALIDATION = 'train', 'validation'
+
+
+@dataclass(slots=True)
+class Exported:
+    """What an export did, or with ``is_dry`` would try to do."""
+
+    folder: Path
+    added: list[Mapping[str, Any]] = field(default_factory=list)
+    """What ``episode.json`` says of each new episode."""
+    present: list[str] = field(default_factory=list)
+    """Missions that were in it already."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """Mission -> why."""
+    waiting: dict[str, str] = field(default_factory=dict)
+    """Mission -> what is not known yet."""
+    fps: int = 0
+    action: str = ''
+    digest: str = ''
+    streams: dict[str, Mapping[str, str]] = field(default_factory=dict)
+    """Mission -> stream -> where it comes from, of a dry run."""
+
+
+Say = Callable[[str], None]
+
+
+def export(  # noqa: PLR0913 - the flags of the command
+    folder: Path, source: Bucket, flags: Mapping[str, Any], options: ExportOptions, *, workers: int = 1, wait: bool = False,
+    is_dry: bool = False, findings: Findings | None = None, say: Say = lambda _: None,
+    sleep: Callable[[float], object] = time.sleep,
+) -> Exported:  # fmt: skip
+    """Add the missions that the flags choose to the data set in this folder, which is made where there is none.
+
+    With ``wait`` it comes back once it is known of each mission what is missing. Raises LakeError, SettingError, StoreError.
+    """
+    findings = Findings() if findings is None else findings
+    with writing(folder, is_dry=is_dry):
+        made = resumed(folder)
+        options, fps, action = _settled(made, options)
+        result = Exported(folder, present=made.mission_ids)
+        with closing(open_store(source.settings, UploadSettings())) as store:
+            while True:
+                missions = _new(made, planning.chosen(source, flags, findings))
+                look = folder / WORK / 'look'
+                plans = list(planning.planned(source, store, missions, options, action, look, findings))
+                late = [each for each in plans if each.waits_for]
+                if not wait or not late:
+                    break
+                say(f'{len(late)} of {len(plans)} missions wait: {late[0].mission.mission_id}: {late[0].waits_for}')
+                sleep(LOOK_S)
+        ready = [each for each in plans if not each.waits_for or (options.allow_gaps and each.mission.end_ns)]
+        result.waiting = {each.mission.mission_id: each.waits_for for each in plans if each not in ready}
+        result.action = action = planning.settled_action(ready, action)
+        ready = [_only(each, action) for each in ready]
+        result.fps = fps = fps or _auto_fps(ready)
+        if is_dry:
+            result.streams = {each.mission.mission_id: _where(each) for each in ready}
+            result.refused = {each.mission.mission_id: f'nothing of {", ".join(each.missing)}' for each in ready if each.missing}
+            return result
+        settings = {**options.told(), 'fps': fps, 'action': action}
+        built = _build(ready, options, fps, source.settings, folder / WORK, settings=settings, workers=workers, say=say)
+        _put_together(made, built, options, settings, result, folder)
+        return result
+
+
+@contextmanager
+def writing(folder: Path, *, is_dry: bool = False) -> Iterator[None]:
+    """One process at a time. Raises LakeError where another one is at work."""
+    if is_dry:
+        yield
+        return
+    try:
+        (folder / WORK).mkdir(parents=True, exist_ok=True)
+        with flock(folder / WORK / 'lock', wait=False) as is_ours:
+            if not is_ours:
+                raise LakeError(f'another export is writing to {folder}', remedy='wait for it, or name another folder')
+            yield
+    except OSError as error:
+        raise LakeError(f'{error.filename or folder} cannot be written: {error.strerror}',
+                        remedy='name a folder of yours, on a disk that has room') from error  # fmt: skip
+
+
+def resumed(folder: Path) -> Lerobot:
+    """The data set; where a drop was killed, after it has come to its end."""
+    pending = folder / DROPPING
+    if not pending.is_file():
+        return Lerobot(folder)
+    told = json.loads(pending.read_text(encoding='utf-8'))
+    if not (folder / INFO).is_file():
+        with replacing(folder / INFO) as file:
+            file.write(json.dumps(told['info']).encode())
+    made = Lerobot(folder)
+    _drop(made, told['mission_id'])
+    return Lerobot(folder)
+
+
+def drop(folder: Path, mission_id: str) -> str:
+    """Take a mission out of a data set, and remember that it must not come back; the new digest.
+
+    Raises LakeError where it is not in it.
+    """
+    with writing(folder):
+        made = resumed(folder)
+        if mission_id not in made.mission_ids:
+            raise LakeError(f'{folder} has no episode of the mission {mission_id}')
+        with replacing(folder / DROPPING, is_synced=True) as file:
+            file.write(json.dumps({'mission_id': mission_id, 'info': made.info}).encode())
+        return _drop(made, mission_id)
+
+
+def _drop(made: Lerobot, mission_id: str) -> str:
+    made.drop(mission_id)
+    report = json.loads((made.folder / REPORT).read_text(encoding='utf-8'))
+    report['episodes'] = [each for each in report['episodes'] if each['mission_id'] != mission_id]
+    for name in ('refused', 'waiting'):
+        report[name].pop(mission_id, None)
+    report['dropped'] = sorted({*made.dropped})
+    picture = made.folder / 'meta/report.png'
+    picture.unlink(missing_ok=True)
+    if made.rows:
+        draw(made, picture)
+    digest = made.commit(report, {})
+    (made.folder / DROPPING).unlink(missing_ok=True)
+    return digest
+
+
+def _settled(made: Lerobot, options: ExportOptions) -> tuple[ExportOptions, int | None, str]:
+    """What a data set was begun with holds for all of it. Raises LakeError for other settings."""
+    if made.settings is None:
+        return options, options.fps, options.action
+    now = {**options.told(), 'fps': options.fps or made.settings['fps'],
+           'action': made.settings['action'] if options.action == 'auto' else options.action}  # fmt: skip
+    if other := [name for name, value in made.settings.items() if now.get(name) != value]:
+        said = ', '.join(f'{name} {made.settings[name]}' for name in other)
+        raise LakeError(f'{made.folder} was begun with {said}', remedy='export to another folder, or with the same settings')
+    return options, made.settings['fps'], made.settings['action']
+
+
+def _new(made: Lerobot, missions: Sequence[ChosenMission]) -> list[ChosenMission]:
+    """Those that are neither in it nor were dropped."""
+    known = {*made.mission_ids}
+    return [each for each in missions if each.mission_id not in known and _hashed(each.mission_id) not in made.dropped]
+
+
+def _hashed(mission_id: str) -> str:
+    return hashlib.sha256(mission_id.encode()).hexdigest()
+
+
+def _only(plan: EpisodePlan, action: str) -> EpisodePlan:
+    """With ``auto``, a mission may have what the data set does not take."""
+    wrong = [each for each in plan.streams if each.name == 'action' and each.part is not None and each.part.name != action]
+    if not wrong:
+        return plan
+    return replace(plan, streams=tuple(each for each in plan.streams if each not in wrong), missing=(*plan.missing, action))
+
+
+def _auto_fps(plans: Sequence[EpisodePlan]) -> int:
+    """Raises LakeError where no camera has a frame a second."""
+    rates = [each.camera_hz for each in plans if not each.missing and each.camera_hz]
+    if not rates:
+        return 1
+    fps = whole_fps(min(rates))
+    if fps < 1:
+        raise LakeError(f'the slowest camera has {min(rates):.3g} Hz, and LeRobot knows whole frames a second alone',
+                        remedy='record a bag (shadowhound-data node bag start), or name missions with --mission')  # fmt: skip
+    return fps
+
+
+def _where(plan: EpisodePlan) -> dict[str, str]:
+    return {
+        each.name: f'{each.recording.sink}: {each.recording.topic}, {each.recording.messages} messages, '
+        f'{each.recording.rate_hz:.3g} Hz' for each in plan.streams
+    }  # fmt: skip
+
+
+Built = list[tuple[EpisodePlan, dict[str, Any], Path]]
+
+
+def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store: StoreSettings, work: Path, *,  # noqa: PLR0913
+           settings: Mapping[str, Any], workers: int, say: Say) -> Built:  # fmt: skip
+    folders = [work / f'{_hashed(each.mission.mission_id)[:16]}-{_key_of(each, settings, options)}' for each in plans]
+    jobs = [(each, options, fps, store, folder) for each, folder in zip(plans, folders, strict=True)]
+    found: Built = []
+    if workers == 1 or len(jobs) < 2:
+        for number, job in enumerate(jobs):
+            say(f'episode {number + 1} of {len(jobs)}: {job[0].mission.mission_id}')
+            found.append((job[0], build(*job), job[-1]))
+        return found
+    with ProcessPoolExecutor(workers, mp_context=get_context('spawn')) as pool:
+        for number, (job, told) in enumerate(zip(jobs, pool.map(build, *zip(*jobs, strict=True)), strict=True)):
+            say(f'episode {number + 1} of {len(jobs)}: {job[0].mission.mission_id}')
+            found.append((job[0], told, job[-1]))
+    return found
+
+
+def _key_of(plan: EpisodePlan, settings: Mapping[str, Any], options: ExportOptions) -> str:
+    """What is left of an earlier run is used where it was made in the same way of the same objects and gaps."""
+    told = [settings, options.max_stale, options.allow_gaps, sorted(plan.topics.items()), plan.missing, _where(plan),
+            [(name, sorted(track.key.tolist())) for name, track in sorted(plan.tracks.items())]]  # fmt: skip
+    whole = hashlib.sha256(json.dumps(told, default=str).encode())
+    for column in plan.gaps.to_pydict().items():
+        whole.update(json.dumps(column, default=str).encode())
+    return whole.hexdigest()[:16]
+
+
+def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings: Mapping[str, Any], result: Exported,
+                  folder: Path) -> None:  # fmt: skip
+    report: dict[str, Any] = {'settings': settings, 'episodes': _told_before(folder), 'dropped': made.dropped}
+    new: dict[str, Path] = {}
+    for plan, told, work in built:
+        mission = plan.mission.mission_id
+        if 'refused' in told:
+            result.refused[mission] = told['refused']
+            continue
+        split = VALIDATION if int(_hashed(mission)[:8], 16) / 0x1_0000_0000 < options.validation else TRAIN
+        try:
+            made.add(told, work, options, split)
+        except LakeError as error:
+            result.refused[mission] = error.what
+            continue
+        result.added.append(told)
+        new[mission] = work
+        kept = {name: value for name, value in told.items() if name not in {'histograms', 'sizes'}}
+        report['episodes'].append({'split': split, **kept})
+    report |= {'refused': result.refused, 'waiting': result.waiting}
+    if not made.rows:
+        return
+    if new or not (folder / INFO).is_file() or report != _json_of(folder / REPORT):
+        if new:
+            draw(made, _made_folder(folder / 'meta') / 'report.png')
+        made.commit(report, new)
+    result.digest = made.digest
+    for work in (folder / WORK).glob('*-*'):
+        if (work / TOLD).is_file():
+            rmtree(work)
+
+
+def _told_before(folder: Path) -> list[dict[str, Any]]:
+    found = _json_of(folder / REPORT) if (folder / INFO).is_file() else {}
+    return list(found.get('episodes', []))
+
+
+def _json_of(path: Path) -> dict[str, Any]:
+    return dict(json.loads(path.read_text(encoding='utf-8'))) if path.is_file() else {}
+
+
+def _made_folder(path: Path) -> Path:
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+# -- which data sets there are ---------------------------------------------------------------------------------------------
+
+
+def remember(home: Path, folder: Path) -> None:
+    """Note that this folder is a data set: ``export where`` and ``export drop`` look into all of them. Raises OSError."""
+    home.mkdir(parents=True, exist_ok=True)
+    with flock(home / f'{KNOWN}.lock'):
+        found = {*known_folders(home), folder.absolute()}
+        with replacing(home / KNOWN, is_synced=True) as file:
+            file.write(json.dumps(sorted(map(os.fspath, found)), indent=1).encode())
+
+
+def known_folders(home: Path) -> list[Path]:
+    """Those that are there still."""
+    try:
+        told = json.loads((home / KNOWN).read_text(encoding='utf-8'))
+    except (OSError, ValueError):
+        return []
+    return [Path(each) for each in told if isinstance(each, str) and (Path(each) / INFO).is_file()]

@@ -1,0 +1,104 @@
+"""What a data set consists of: which numbers make the state and the action, from which sensor, with names and units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.lake import decode
+
+_POSE: Final = decode.ODOMETRY[:7]
+_TWIST: Final = decode.ODOMETRY[7:]
+
+
+@dataclass(frozen=True, slots=True)
+class StatePart:
+    """Some numbers of one sensor that belong together."""
+
+    name: str
+    sensor: str
+    fields: tuple[str, ...]
+    """Paths in a message; empty: those that the lake takes of its type."""
+    names: tuple[str, ...]
+    """Of the numbers; empty where the message names them (joints)."""
+    units: tuple[str, ...]
+    turns: tuple[slice, ...] = ()
+    """Quaternions x y z w among them."""
+    is_derived: bool = False
+    """From two poses of odometry, instead of from a message."""
+
+
+STATE_PARTS: Final[Mapping[str, StatePart]] = {
+    part.name: part
+    for part in (
+        StatePart('pose', 'odom', _POSE, tuple(f'pose.{axis}' for axis in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')),
+                  ('m',) * 3 + ('1',) * 4, (slice(3, 7),)),
+        StatePart('twist', 'odom', _TWIST, tuple(f'twist.{axis}' for axis in ('vx', 'vy', 'vz', 'wx', 'wy', 'wz')),
+                  ('m/s',) * 3 + ('rad/s',) * 3),
+        StatePart('velocity', 'odom', _POSE, ('x.vel', 'y.vel', 'theta.vel'), ('m/s', 'm/s', 'rad/s'), is_derived=True),
+        StatePart('imu', 'imu', (), tuple(f'imu.{axis}' for axis in ('wx', 'wy', 'wz', 'ax', 'ay', 'az', 'qw', 'qx', 'qy', 'qz')),
+                  ('rad/s',) * 3 + ('m/s^2',) * 3 + ('1',) * 4),
+        StatePart('joints', 'joints', ('position',), (), ('rad',)),
+        StatePart('battery', 'lowstate', ('bms_state.soc',), ('battery_pct',), ('%',)),
+    )
+}  # fmt: skip
+"""By the word that ``--state`` takes."""
+COMMAND: Final = StatePart(
+    'cmd_vel', 'cmd_vel', ('linear.x', 'linear.y', 'angular.z'), ('x.vel', 'y.vel', 'theta.vel'), ('m/s', 'm/s', 'rad/s')
+)
+DERIVED: Final = StatePart('odometry', 'odom', _POSE, COMMAND.names, COMMAND.units, is_derived=True)
+ACTIONS: Final = {'auto': None, 'cmd_vel': COMMAND, 'odometry': DERIVED}
+"""By the word that ``--action`` takes; with ``auto``, the command topic in a data set whose first mission has it."""
+HOLD, LINEAR = 'hold', 'linear'
+AV1, H264 = 'av1', 'h264'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportOptions:
+    """How missions become episodes; the same for all of a data set."""
+
+    fps: int | None = None
+    """None: the rate of the slowest camera."""
+    state: tuple[str, ...] = ('pose',)
+    action: str = 'auto'
+    cameras: tuple[str, ...] = ('camera',)
+    codec: str = AV1
+    is_lossless: bool = False
+    resample: Mapping[str, str] | None = None
+    """Sensor -> ``hold`` or ``linear``; of those that are not named, hold."""
+    max_age_s: Mapping[str, float] | None = None
+    """Sensor -> seconds; of those that are not named, ``ticks.LATE`` periods of the stream or of the ticks."""
+    max_gap_s: float = 5.0
+    max_stale: float = 0.05
+    allow_gaps: bool = False
+    validation: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raises SettingError."""
+        for word in self.state:
+            if word not in STATE_PARTS:
+                raise SettingError('--state', word, ', '.join(STATE_PARTS))
+        if not self.state or len(set(self.state)) != len(self.state):
+            raise SettingError('--state', ','.join(self.state), 'one or more different words')
+        if not self.cameras:
+            raise SettingError('--camera', '', 'the name of a sensor with pictures')
+        for sensor, how in (self.resample or {}).items():
+            if how not in {HOLD, LINEAR}:
+                raise SettingError(f'--resample {sensor}', how, f'{HOLD} or {LINEAR}')
+        if self.fps is not None and self.fps < 1:
+            raise SettingError('--fps', self.fps, 'auto, or a whole number of frames a second')
+
+    def told(self) -> dict[str, Any]:
+        """What decides about the bytes of an episode, but for the frames a second and the action, which are settled later."""
+        return {
+            'state': list(self.state), 'cameras': list(self.cameras), 'codec': self.codec, 'lossless': self.is_lossless,
+            'resample': dict(sorted((self.resample or {}).items())), 'max_age_s': dict(sorted((self.max_age_s or {}).items())),
+            'max_gap_s': self.max_gap_s,
+        }  # fmt: skip
+
+
+def camera_name(sensor: str) -> str:
+    """What a camera's feature is called by: ``front`` for the default one, else its sensor's name."""
+    return 'front' if sensor == 'camera' else sensor

@@ -1,0 +1,463 @@
+"""A data set in LeRobot's format v3.0, as lerobot 0.6.1 reads it, in a folder: whole while it has ``meta/info.json``.
+
+https://github.com/huggingface/lerobot, src/lerobot/datasets: utils.py has the paths, dataset_metadata.py and io_utils.py what is
+read. Each episode has a data file, a video for each camera and an episodes file of its own, which are never written again; what
+speaks of all of them is written anew, ``info.json`` last. Ours are the columns ``shadowhound/...`` of the episodes and the files
+``meta/shadowhound_*``, which lerobot keeps and does not look at.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shadowhound_data_logger.datasets.episodes import EPISODE, GAP_SCHEMA, GAPS, PICTURE, ROWS, SOURCE_SCHEMA, SOURCES
+from shadowhound_data_logger.datasets.features import COMMAND, DERIVED, STATE_PARTS, ExportOptions
+from shadowhound_data_logger.datasets.video import feature_info
+from shadowhound_data_logger.disk import fingerprint, replacing, sync
+from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.lake.training import DIGEST_FILES, INFO, digest_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+VERSION: Final = 'v3.0'
+CHUNK: Final = 1000
+"""Files in a folder."""
+DATA: Final = 'data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet'
+VIDEO: Final = 'videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4'
+EPISODES: Final = 'meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet'
+STATS, TASKS = 'meta/stats.json', 'meta/tasks.parquet'
+SOURCE_TABLE, GAP_TABLE = DIGEST_FILES[1:]
+REPORT, FILES, DIGESTS = 'meta/shadowhound_report.json', 'meta/shadowhound_files.json', 'meta/shadowhound_digests.json'
+OURS: Final = 'shadowhound/'
+"""What the columns of ``meta/episodes`` that are ours begin with."""
+QUANTILES: Final = {'q01': 0.01, 'q10': 0.10, 'q50': 0.50, 'q90': 0.90, 'q99': 0.99}
+_COUNTERS: Final = {
+    'timestamp': 'float32',
+    'frame_index': 'int64',
+    'episode_index': 'int64',
+    'index': 'int64',
+    'task_index': 'int64',
+}
+
+EpisodeRow = dict[str, Any]
+"""Column of ``meta/episodes`` -> value."""
+
+
+class Lerobot:
+    """A data set that is there, or becomes one. One process at a time writes it (``export.py`` holds the lock)."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.info: dict[str, Any] | None = _json(folder / INFO)
+        report = _json(folder / REPORT) or {}
+        self.settings: dict[str, Any] | None = report.get('settings') if self.info else None
+        """How its episodes were made."""
+        self.dropped: list[str] = report.get('dropped', [])
+        """SHA-256 of the ids of missions that must not come back."""
+        self.rows: list[EpisodeRow] = list(self._rows()) if self.info else []
+        self._is_changed = False
+        """Whether earlier episodes were."""
+
+    @property
+    def mission_ids(self) -> list[str]:
+        return [str(row[f'{OURS}mission_id']) for row in self.rows]
+
+    @property
+    def digest(self) -> str:
+        return digest_of(self.folder)
+
+    def path(self, pattern: str, row: Mapping[str, Any], what: str, **names: str) -> Path:
+        """Of a file of an episode; ``what`` is ``data``, ``meta/episodes`` or ``videos/KEY``."""
+        place = {each: row[f'{what}/{each}'] for each in ('chunk_index', 'file_index')}
+        return self.folder / pattern.format(**place, **names)
+
+    def video_keys(self) -> list[str]:
+        return [key for key, feature in (self.info or {}).get('features', {}).items() if feature['dtype'] == 'video']
+
+    def picture_keys(self) -> list[str]:
+        return [key for key, feature in (self.info or {}).get('features', {}).items() if feature['dtype'] in {'video', 'image'}]
+
+    def _rows(self) -> Iterator[EpisodeRow]:
+        assert self.info is not None
+        for place, path in enumerate(sorted((self.folder / 'meta/episodes').glob('*/*.parquet'))):
+            if place >= self.info['total_episodes']:
+                return  # of a run that was killed before it said so
+            yield pq.read_table(path).to_pylist()[0]
+
+    # -- adding ----------------------------------------------------------------------------------------------------
+
+    def add(self, told: Mapping[str, Any], made: Path, options: ExportOptions, split: str) -> None:
+        """One episode, whose folder is ``made``, at the end. Its files are there afterwards, ``commit`` makes them count.
+
+        Raises LakeError where it does not fit the episodes before it.
+        """
+        features = features_of(told, options)
+        if self.info is None:
+            self.info = _empty_info(told, features)
+        if (other := different(self.info['features'], features)) or self.info['fps'] != told['fps']:
+            raise LakeError(f'its {other or "frames a second"} differ from those of the episodes before it')
+        number = int(self.rows[-1]['data/file_index'] + CHUNK * self.rows[-1]['data/chunk_index'] + 1) if self.rows else 0
+        begin = int(self.rows[-1]['dataset_to_index']) if self.rows else 0
+        place = {'chunk_index': number // CHUNK, 'file_index': number % CHUNK}
+        row: EpisodeRow = {
+            'episode_index': len(self.rows), 'tasks': [told['task']], 'length': told['frames'],
+            **{f'data/{name}': value for name, value in place.items()},
+            'dataset_from_index': begin, 'dataset_to_index': begin + told['frames'],
+        }  # fmt: skip
+        for key, feature in features.items():
+            if feature['dtype'] == 'video':
+                row |= {f'videos/{key}/{name}': value for name, value in place.items()}
+                row |= {f'videos/{key}/from_timestamp': 0.0, f'videos/{key}/to_timestamp': told['frames'] / told['fps']}
+        self.rows.append(row)
+        target = self.path(DATA, row, 'data')
+        values = _write_data(made / ROWS, target, row, self._tasks().index(told['task']), features)
+        stats = {key: vector_stats(column) for key, column in values.items()}
+        for name, histogram in told['histograms'].items():
+            stats[f'observation.{name}'] = picture_stats(np.array(histogram), told['frames'])
+            row[f'{OURS}histogram/observation.{name}'] = np.array(histogram).ravel().tolist()
+            if not options.is_lossless:
+                video = self.path(VIDEO, row, f'videos/observation.{name}', video_key=f'observation.{name}')
+                _take(made / f'{name}.mp4', video)
+        row |= {f'stats/{key}/{name}': value for key, each in stats.items() for name, value in each.items()}
+        row |= {f'meta/episodes/{name}': value for name, value in place.items()}
+        row |= _ours(told, split)
+        self._write_row(row)
+
+    def _write_row(self, row: EpisodeRow) -> None:
+        arrays = {name: pa.array([value], _type_of(name, value)) for name, value in row.items()}
+        _write(self.path(EPISODES, row, 'meta/episodes'), pa.table(arrays))
+
+    def _tasks(self) -> list[str]:
+        """In the order in which they first appear."""
+        return list(dict.fromkeys(task for row in self.rows for task in row['tasks']))
+
+    # -- what speaks of all ----------------------------------------------------------------------------------------
+
+    def commit(self, report: Mapping[str, Any], made: Mapping[str, Path]) -> str:
+        """Write what speaks of all episodes, ``info.json`` last; returns the digest. ``made`` are the folders of new ones."""
+        assert self.info is not None
+        tasks = self._tasks()
+        self.info |= {
+            'total_episodes': len(self.rows), 'total_frames': sum(row['length'] for row in self.rows), 'total_tasks': len(tasks),
+            'splits': {'train': f'0:{len(self.rows)}'},
+        }  # fmt: skip
+        (self.folder / 'meta').mkdir(exist_ok=True)
+        _write(self.folder / TASKS, _task_table(tasks))
+        _put_json(self.folder / STATS, self._stats())
+        self._write_parts(self.folder / SOURCE_TABLE, SOURCES, made, SOURCE_SCHEMA)
+        self._write_parts(self.folder / GAP_TABLE, GAPS, made, GAP_SCHEMA)
+        _put_json(self.folder / REPORT, dict(report))
+        info = _dump(self.info)
+        digest = digest_of(self.folder, info)
+        self._note_digest(digest)
+        self._write_files(info, is_changed=self._is_changed)
+        with replacing(self.folder / INFO, is_synced=True) as file:
+            file.write(info)
+        sync(self.folder / 'meta')
+        return digest
+
+    def _stats(self) -> dict[str, Any]:
+        """Of all frames together, not of what is known of each episode."""
+        assert self.info is not None
+        numeric = [key for key, feature in self.info['features'].items() if feature['dtype'] not in {'video', 'image', 'string'}]
+        columns: dict[str, list[NDArray[Any]]] = {key: [] for key in numeric}
+        for row in self.rows:
+            table = pq.read_table(self.path(DATA, row, 'data'), columns=numeric)
+            for key in numeric:
+                columns[key].append(matrix(table[key]))
+        stats = {key: vector_stats(np.concatenate(found)) for key, found in columns.items()}
+        for key in self.picture_keys():
+            histogram = sum(np.array(row[f'{OURS}histogram/{key}'], np.int64).reshape(3, 256) for row in self.rows)
+            stats[key] = picture_stats(np.asarray(histogram), sum(row['length'] for row in self.rows))
+        return stats
+
+    def _write_parts(self, path: Path, name: str, made: Mapping[str, Path], schema: pa.Schema) -> None:
+        """One row group of each episode, in their order: of new ones from their folders, of others from the file before."""
+        before: dict[str, pa.Table] = {}
+        if path.is_file():
+            file = pq.ParquetFile(path)
+            for place in range(file.num_row_groups):
+                table = file.read_row_group(place)
+                before[table[EPISODE][0].as_py()] = table
+        with replacing(path, is_synced=True) as out, pq.ParquetWriter(out, schema, compression='zstd') as writer:
+            for mission in self.mission_ids:
+                table = before[mission] if mission in before else pq.read_table(made[mission] / name)
+                if len(table):
+                    writer.write_table(table.select(schema.names).cast(schema), row_group_size=max(len(table), 1))
+
+    def _note_digest(self, digest: str) -> None:
+        """Which missions a digest stands for: a data set grows, and a model was trained on what it was then."""
+        told = _json(self.folder / DIGESTS) or {'digests': []}
+        if not told['digests'] or told['digests'][-1]['digest'] != digest:
+            told['digests'].append({'digest': digest, 'missions': self.mission_ids})
+        _put_json(self.folder / DIGESTS, told)
+
+    def _write_files(self, info: bytes, *, is_changed: bool) -> None:
+        """Size and SHA-256 of every file but this one; those of earlier episodes are known, unless they were changed."""
+        before = {} if is_changed else (_json(self.folder / FILES) or {}).get('files') or {}
+        known = {name: each for name, each in before.items() if name.startswith(('data/', 'videos/', 'meta/episodes/'))}
+        found = {}
+        for path in self.paths():
+            name = path.relative_to(self.folder).as_posix()
+            if name in known and path.stat().st_size == known[name]['bytes']:
+                found[name] = known[name]
+            else:
+                size, sha256 = fingerprint(path)
+                found[name] = {'bytes': size, 'sha256': sha256}
+        found[INFO] = {'bytes': len(info), 'sha256': hashlib.sha256(info).hexdigest()}
+        _put_json(self.folder / FILES, {'files': dict(sorted(found.items()))})
+
+    def paths(self) -> Iterator[Path]:
+        """The files that belong to it, but for ``info.json`` and the list of them."""
+        for row in self.rows:
+            yield from self._files_of(row)
+        optional = ('meta/report.png',)
+        yield from (self.folder / name for name in (STATS, TASKS, SOURCE_TABLE, GAP_TABLE, REPORT, DIGESTS))
+        yield from (self.folder / name for name in optional if (self.folder / name).is_file())
+
+    # -- taking away -----------------------------------------------------------------------------------------------
+
+    def drop(self, mission_id: str) -> None:
+        """Take an episode out: its files are gone, and those after it are numbered again. ``commit`` is still to be called."""
+        assert self.info is not None
+        self._is_changed = True
+        (self.folder / INFO).unlink(missing_ok=True)  # in between it is none
+        gone = [row for row in self.rows if row[f'{OURS}mission_id'] == mission_id]
+        self.rows = [row for row in self.rows if row[f'{OURS}mission_id'] != mission_id]
+        tasks, begin = self._tasks(), 0
+        self.dropped.append(hashlib.sha256(mission_id.encode()).hexdigest())
+        for number, row in enumerate(self.rows):
+            path = self.path(DATA, row, 'data')
+            table = pq.read_table(path)
+            count = len(table)
+            wanted = {'episode_index': [number] * count, 'index': range(begin, begin + count),
+                      'task_index': [tasks.index(row['tasks'][0])] * count}  # fmt: skip
+            new = table
+            for name, values in wanted.items():
+                new = new.set_column(new.column_names.index(name), new.schema.field(name), pa.array(values, pa.int64()))
+            if not new.equals(table):
+                _write(path, new)
+                row |= {'episode_index': number, 'dataset_from_index': begin, 'dataset_to_index': begin + count}
+                for name in wanted:
+                    row |= {f'stats/{name}/{each}': value for each, value in vector_stats(matrix(new[name])).items()}
+                self._write_row(row)
+            begin += count
+        for path in (path for row in gone for path in self._files_of(row)):
+            path.unlink(missing_ok=True)
+        kept = (_json(self.folder / DIGESTS) or {'digests': []})['digests']
+        _put_json(self.folder / DIGESTS, {'digests': [
+            {**each, 'missions': [name for name in each['missions'] if name != mission_id]} for each in kept]})  # fmt: skip
+
+    def _files_of(self, row: EpisodeRow) -> Iterator[Path]:
+        """What says that they are there, last."""
+        yield self.path(DATA, row, 'data')
+        for key in self.video_keys():
+            yield self.path(VIDEO, row, f'videos/{key}', video_key=key)
+        yield self.path(EPISODES, row, 'meta/episodes')
+
+
+def features_of(told: Mapping[str, Any], options: ExportOptions) -> dict[str, Any]:
+    """The features of ``info.json`` for an episode like this."""
+    streams: Mapping[str, Any] = told['streams']
+    features: dict[str, Any] = {}
+    for name, size in told['sizes'].items():
+        shape, names = [*size, 3], ['height', 'width', 'channels']
+        if options.is_lossless:
+            features[f'observation.{name}'] = {'dtype': 'image', 'shape': shape, 'names': names}
+        else:
+            info = feature_info(options.codec, told['fps'], (size[0], size[1]))
+            features[f'observation.{name}'] = {'dtype': 'video', 'shape': shape, 'names': names, 'info': info}
+    state: list[str] = []
+    units: list[str] = []
+    origins: list[str] = []
+    for word in options.state:
+        names, part = streams[f'state.{word}']['names'], STATE_PARTS[word]
+        state += names
+        units += part.units if len(part.units) == len(names) else part.units[:1] * len(names)
+        origins += [f'{part.sensor}, derived' if part.is_derived else part.sensor] * len(names)
+    features['observation.state'] = _vector(state, units=units, source=origins)
+    is_command = streams['action']['sensor'] == COMMAND.sensor
+    features['action'] = _vector(
+        list(COMMAND.names), units=list(COMMAND.units), source=COMMAND.sensor if is_command else f'{DERIVED.sensor}, derived',
+        derived=not is_command,
+    )  # fmt: skip
+    features['observation.stale'] = _vector(list(streams), about='1 where the newest message is older than it may be')
+    features['observation.age_s'] = _vector(list(streams), about='seconds since the newest message')
+    features['shadowhound.cause'] = {'dtype': 'string', 'shape': [1], 'names': None}
+    features['shadowhound.stamp_ns'] = {'dtype': 'int64', 'shape': [1], 'names': None}
+    features |= {name: {'dtype': kind, 'shape': [1], 'names': None} for name, kind in _COUNTERS.items()}
+    return features
+
+
+def _vector(names: list[str], **info: Any) -> dict[str, Any]:
+    return {'dtype': 'float32', 'shape': [len(names)], 'names': names, 'info': info}
+
+
+def different(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+    """Which features are not the same; empty where all are."""
+    plain = json.loads(json.dumps(other))
+    return ', '.join(sorted(key for key in {*one, *plain} if one.get(key) != plain.get(key)))
+
+
+def _empty_info(told: Mapping[str, Any], features: Mapping[str, Any]) -> dict[str, Any]:
+    has_video = any(feature['dtype'] == 'video' for feature in features.values())
+    return {
+        'codebase_version': VERSION, 'fps': told['fps'], 'features': json.loads(json.dumps(features)), 'total_episodes': 0,
+        'total_frames': 0, 'total_tasks': 0, 'chunks_size': CHUNK, 'data_files_size_in_mb': 100, 'video_files_size_in_mb': 200,
+        'data_path': DATA, 'video_path': VIDEO if has_video else None, 'robot_type': 'go2', 'splits': {},
+    }  # fmt: skip
+
+
+def _ours(told: Mapping[str, Any], split: str) -> EpisodeRow:
+    named = ('mission_id', 'run_id', 'robot', 'mission_type', 'first_tick_ns', 'last_tick_ns', 'begins_late_s')
+    row: EpisodeRow = {f'{OURS}{name}': told[name] for name in named}
+    row[f'{OURS}split'] = split
+    for stream, each in told['streams'].items():
+        row |= {f'{OURS}{stream}/{name}': each[name] for name in ('from', 'topic', 'stale_share', 'longest_gap_s')}
+        row[f'{OURS}{stream}/causes'] = json.dumps(each['causes'])
+    return row
+
+
+def _type_of(name: str, value: Any) -> pa.DataType:
+    """As lerobot's writer has them: 64 bits, and lists of any depth."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list):
+        inner = _type_of(name, value[0]) if value else pa.string()
+        return pa.list_(inner)
+    return {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}[type(value)]
+
+
+def _write_data(source: Path, target: Path, row: EpisodeRow, task: int, features: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """The rows of an episode with their numbers; returns the columns of numbers."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    order = [key for key, feature in features.items() if feature['dtype'] != 'video']
+    found: dict[str, list[NDArray[Any]]] = {}
+    file, begin = pq.ParquetFile(source), 0
+    with replacing(target, is_synced=True) as out:
+        writer: pq.ParquetWriter | None = None
+        for place in range(file.num_row_groups):
+            table = file.read_row_group(place)
+            count, first = len(table), int(row['dataset_from_index']) + begin
+            table = table.append_column('episode_index', pa.array([row['episode_index']] * count, pa.int64()))
+            table = table.append_column('index', pa.array(range(first, first + count), pa.int64()))
+            table = table.append_column('task_index', pa.array([task] * count, pa.int64())).select(order)
+            writer = writer or pq.ParquetWriter(out, table.schema, compression='snappy')
+            writer.write_table(table)
+            begin += count
+            for key in order:
+                if table.schema.field(key).type not in (PICTURE, pa.string()):
+                    found.setdefault(key, []).append(matrix(table[key]))
+        assert writer is not None
+        writer.close()
+    return {key: np.concatenate(parts) for key, parts in found.items()}
+
+
+def matrix(column: pa.ChunkedArray) -> NDArray[Any]:
+    """(rows, numbers) of a column of numbers or of lists of one length."""
+    flat = column.combine_chunks()
+    if isinstance(flat, pa.ChunkedArray):  # pyarrow keeps an empty one so
+        flat = flat.chunk(0) if flat.num_chunks else pa.array([], column.type)
+    count = len(flat)
+    values = flat.flatten() if pa.types.is_nested(flat.type) else flat
+    return np.asarray(values.to_numpy(zero_copy_only=False)).reshape(count, -1)
+
+
+def vector_stats(values: NDArray[Any]) -> dict[str, Any]:
+    """Of (frames, numbers), over the frames; ``count`` is how many these are."""
+    found = {'min': values.min(axis=0), 'max': values.max(axis=0), 'mean': values.mean(axis=0, dtype=np.float64),
+             'std': values.std(axis=0, dtype=np.float64)}  # fmt: skip
+    made = dict(zip(QUANTILES, np.quantile(values, list(QUANTILES.values()), axis=0), strict=True))
+    told = {name: np.asarray(each, np.float64).tolist() for name, each in {**found, **made}.items()}
+    return {
+        **{name: told[name] for name in ('min', 'max', 'mean', 'std')},
+        'count': [len(values)],
+        **{q: told[q] for q in QUANTILES},
+    }
+
+
+def picture_stats(histogram: NDArray[np.int64], frames: int) -> dict[str, Any]:
+    """Of every pixel of every frame, by colour, 0 to 1; each in the shape (3, 1, 1). ``histogram`` is (3, 256)."""
+    levels, total = np.arange(256) / 255, histogram.sum(axis=1)
+    mean = (histogram * levels).sum(axis=1) / total
+    spread = np.sqrt((histogram * (levels - mean[:, None]) ** 2).sum(axis=1) / total)
+    upto = histogram.cumsum(axis=1)
+    there = histogram > 0
+
+    def quantile(share: float) -> list[float]:
+        """The lowest value that so many pixels do not exceed."""
+        return [float(levels[int(np.searchsorted(upto[colour], share * total[colour]))]) for colour in range(3)]
+
+    found = {
+        'min': [float(levels[there[colour].argmax()]) for colour in range(3)],
+        'max': [float(levels[255 - there[colour][::-1].argmax()]) for colour in range(3)],
+        'mean': mean.tolist(), 'std': spread.tolist(),
+    }  # fmt: skip
+    told = {**found, **{name: quantile(share) for name, share in QUANTILES.items()}}
+    shaped = {name: [[[value]] for value in values] for name, values in told.items()}
+    return {**{name: shaped[name] for name in found}, 'count': [frames], **{name: shaped[name] for name in QUANTILES}}
+
+
+def _task_table(tasks: Sequence[str]) -> pa.Table:
+    """As pandas writes a frame whose index is the task: without what says so, lerobot looks tasks up by number."""
+    about = {
+        'index_columns': ['task'],
+        'column_indexes': [{'name': None, 'field_name': None, 'pandas_type': 'unicode', 'numpy_type': 'object',
+                            'metadata': {'encoding': 'UTF-8'}}],
+        'columns': [
+            {'name': 'task_index', 'field_name': 'task_index', 'pandas_type': 'int64', 'numpy_type': 'int64', 'metadata': None},
+            {'name': 'task', 'field_name': 'task', 'pandas_type': 'unicode', 'numpy_type': 'object', 'metadata': None},
+        ],
+        'creator': {'library': 'pyarrow', 'version': pa.__version__}, 'pandas_version': '2.2.0',
+    }  # fmt: skip
+    table = pa.table({'task_index': pa.array(range(len(tasks)), pa.int64()), 'task': pa.array(tasks, pa.string())})
+    return table.replace_schema_metadata({'pandas': json.dumps(about)})
+
+
+# -- files ---------------------------------------------------------------------------------------------------------------------
+
+
+def _write(path: Path, table: pa.Table) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path, is_synced=True) as file:
+        pq.write_table(table, file, compression='snappy')
+
+
+def _take(source: Path, target: Path) -> None:
+    """A second time, where a kill came between: it has been taken already."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if source.is_file():
+        sync(source)
+        with source.open('rb') as file, replacing(target, is_synced=True) as out:
+            while piece := file.read(1 << 20):
+                out.write(piece)
+
+
+def _dump(value: Any) -> bytes:
+    return json.dumps(value, indent=4, ensure_ascii=False).encode() + b'\n'
+
+
+def _put_json(path: Path, value: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path, is_synced=True) as file:
+        file.write(_dump(value))
+
+
+def _json(path: Path) -> dict[str, Any] | None:
+    """Raises LakeError for what is there and cannot be read."""
+    try:
+        found = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise LakeError(f'{path} cannot be read: {error}', remedy='fetch or export the data set again') from error
+    return found if isinstance(found, dict) else None

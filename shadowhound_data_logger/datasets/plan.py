@@ -1,0 +1,214 @@
+"""Which missions are asked for, what of each is in the store, and whether it is known what is missing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.catalogue.schema import Row
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.datasets.features import (
+    ACTIONS,
+    COMMAND,
+    DERIVED,
+    STATE_PARTS,
+    ExportOptions,
+    StatePart,
+    camera_name,
+)
+from shadowhound_data_logger.datasets.series import RecordedSensor, Recordings, bags_of
+from shadowhound_data_logger.lake import query
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.gaps import Known, newest, of_rows, thinned_times, watermarks
+from shadowhound_data_logger.lake.prefetch import Place
+from shadowhound_data_logger.lake.track import NEEDED, Track
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.times import moment
+
+from daft import col  # isort: skip
+
+BEFORE_NS: Final = 10 * SECOND
+"""So long before its start what a mission's first tick may still hold was published."""
+LONGEST_BATCH_NS: Final = 3600 * SECOND
+"""An object that began so long before may reach into a mission (sensor.batch_s)."""
+END_SLACK_NS: Final = 2 * SECOND
+"""A topic's last message comes so much before the end of a mission that the robot is switched off with."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenMission:
+    """A mission that is asked for."""
+
+    robot: str
+    mission_id: str
+    run_id: str
+    mission_type: str
+    task: str
+    """In the words of whoever ordered it; else its type."""
+    begin_ns: int
+    end_ns: int
+    """0 while it goes on, or its end has not reached the store."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamPlan:
+    """One column group of a data set in one mission: what it is called by, where it comes from, and what is known of its gaps."""
+
+    name: str
+    part: StatePart | None
+    """None for a camera."""
+    recording: RecordedSensor
+    known: Known
+    thinned: tuple[tuple[int, int], ...]
+    complete_ns: int
+    """Up to here the robot has said what is missing; 0 where it has said nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodePlan:
+    """A mission, and all that has to be known to make an episode of it. Can be sent to another process."""
+
+    mission: ChosenMission
+    streams: tuple[StreamPlan, ...]
+    tracks: Mapping[str, Track]
+    topics: Mapping[str, str]
+    bags: tuple[Manifest, ...]
+    gaps: pa.Table
+    """The statements of the gap journal that were believed."""
+    missing: tuple[str, ...] = ()
+    """Sensors that are wanted and of which there is nothing."""
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        return self.mission.begin_ns - BEFORE_NS, self.mission.end_ns
+
+    @property
+    def waits_for(self) -> str:
+        """Why nobody can say yet what is missing; empty where it is known."""
+        if not self.mission.end_ns:
+            return 'it goes on, or its summary has not arrived'
+        for stream in self.streams:
+            if stream.complete_ns + END_SLACK_NS < self.mission.end_ns:
+                behind = (self.mission.end_ns - stream.complete_ns) / SECOND
+                said = f'up to {behind:.1f} s before its end' if stream.complete_ns else 'nothing'
+                return f'of {stream.recording.topic} the robot has said {said} what is missing'
+        return ''
+
+    @property
+    def camera_hz(self) -> float:
+        """Of the slowest camera."""
+        return min((each.recording.rate_hz for each in self.streams if each.part is None), default=0.0)
+
+
+def chosen(source: Bucket, flags: Mapping[str, Any], findings: Findings) -> list[ChosenMission]:
+    """In the order of their begin. Raises LakeError, SettingError, StoreError."""
+    with query.answering():
+        rows = query.missions(source, findings=findings, **flags).sort(['first', 'mission_id']).to_pylist()
+    return sorted(map(_mission, rows), key=lambda each: (each.begin_ns, each.mission_id))
+
+
+def _mission(row: Mapping[str, Any]) -> ChosenMission:
+    now_ns = time.time_ns()
+    begin = moment('start', row['started'], now_ns) if row['started'] else _ns(row['first'])
+    end = moment('end', row['ended'], now_ns) if row['ended'] else 0
+    kind = row['mission_type'] or 'mission'
+    return ChosenMission(row['robot'], row['mission_id'], row['run_id'] or '', kind, row['command'] or kind, begin, end)
+
+
+def _ns(stamp: Any) -> int:
+    return int(stamp.timestamp() * 1_000_000) * 1000
+
+
+def planned(source: Bucket, store: ObjectStore, missions: Sequence[ChosenMission], options: ExportOptions, action: str,
+            work: Path, findings: Findings) -> Iterator[EpisodePlan]:  # fmt: skip
+    """Each with what is there of it. ``action`` is ``cmd_vel`` or ``odometry``, or ``auto`` for what the first of them has.
+
+    Raises LakeError, StoreError.
+    """
+    for robot in sorted({mission.robot for mission in missions}):
+        ours = [mission for mission in missions if mission.robot == robot]
+        stated = newest(source, robot=robot, since_ns=min(mission.begin_ns for mission in ours) - BEFORE_NS, findings=findings)
+        for mission in ours:
+            yield _planned(source, store, mission, options, action=action, stated=stated, work=work, findings=findings)
+
+
+def settled_action(plans: Sequence[EpisodePlan], action: str) -> str:
+    """``cmd_vel`` or ``odometry``: with ``auto`` the command topic where a mission has one."""
+    if action != 'auto':
+        return action
+    return 'cmd_vel' if any(stream.part == COMMAND for plan in plans for stream in plan.streams) else 'odometry'
+
+
+def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options: ExportOptions, *, action: str,  # noqa: PLR0913
+             stated: pa.Table, work: Path, findings: Findings) -> EpisodePlan:  # fmt: skip
+    if not mission.end_ns:
+        return EpisodePlan(mission, (), {}, {}, (), stated.slice(0, 0))
+    since, until = mission.begin_ns - BEFORE_NS, mission.end_ns
+    parts = [STATE_PARTS[word] for word in options.state]
+    actions = [COMMAND, DERIVED] if action == 'auto' else [ACTIONS[action]]
+    sensors = [*options.cameras, *(part.sensor for part in parts), *(part.sensor for part in actions if part)]
+    rows = query.objects(
+        source, findings=findings, robot=mission.robot, since=utc(since - LONGEST_BATCH_NS), until=utc(until + 1000)
+    )
+    with query.answering():
+        found = (
+            rows.where(col('sensor').is_in(sorted(set(sensors))) & col('t_start').not_null()).select(*NEEDED, 'topic').to_pylist()
+        )
+    tracks, topics = _tracks(found)
+    bags = tuple(bags_of(store, mission.robot, since, until))
+    with Recordings(Place(source.settings), store, tracks, topics, (since, until), bags, work) as recordings:
+        best = {sensor: recordings.best(sensor) for sensor in set(sensors)}
+    streams, missing = [], []
+    wanted: list[tuple[str, StatePart | None, str]] = [
+        (f'images.{camera_name(sensor)}', None, sensor) for sensor in options.cameras
+    ]
+    wanted += [(f'state.{part.name}', part, part.sensor) for part in parts]
+    commands = [part for part in actions if part is not None and best[part.sensor] is not None]
+    if commands:
+        wanted.append(('action', commands[0], commands[0].sensor))
+    else:
+        missing.append('odom' if action != 'cmd_vel' else 'cmd_vel')
+    for name, part, sensor in wanted:
+        recording = best[sensor]
+        if recording is None:
+            missing.append(sensor)
+            continue
+        streams.append(_stream(name, part, recording, mission, stated))
+    topics_used = pa.array(sorted({stream.recording.topic for stream in streams}), pa.string())
+    return EpisodePlan(mission, tuple(streams), tracks, topics, bags, _about(stated, topics_used, since, until), tuple(missing))
+
+
+def _stream(name: str, part: StatePart | None, recording: RecordedSensor, mission: ChosenMission, stated: pa.Table) -> StreamPlan:
+    mine = stated.filter(pc.and_(pc.equal(stated['topic'], recording.topic), pc.equal(stated['sink'], recording.sink)))
+    rows = mine.to_pylist()
+    begin, end = mission.begin_ns - BEFORE_NS, mission.end_ns + SECOND
+    known = of_rows(mission.robot, recording.sink, recording.topic, begin, end, rows)
+    complete = [row['to_ns'] for row in watermarks(rows) if row['from_ns'] <= mission.end_ns]
+    return StreamPlan(name, part, recording, known, tuple(thinned_times(rows)), max(complete, default=0))
+
+
+def _about(stated: pa.Table, topics: pa.Array, since: int, until: int) -> pa.Table:
+    """The statements about these topics and this time, and those without a time, in one order."""
+    reaches = pc.and_(pc.less_equal(stated['from_ns'], until), pc.greater_equal(stated['to_ns'], since))
+    kept = stated.filter(pc.and_(pc.is_in(stated['topic'], value_set=topics), pc.fill_null(reaches, fill_value=True)))
+    return kept.sort_by([(name, 'ascending') for name in ('topic', 'sink', 'what', 'id')]).combine_chunks()
+
+
+def _tracks(rows: Sequence[Row]) -> tuple[dict[str, Track], dict[str, str]]:
+    """By sensor, of the topic and type that most objects are of: a sensor may have changed its topic."""
+    tracks, topics = {}, {}
+    for sensor in sorted({row['sensor'] for row in rows}):
+        ours = [row for row in rows if row['sensor'] == sensor]
+        kinds = [(row['topic'] or '', row['type'] or '') for row in ours]
+        best = max(sorted(set(kinds)), key=kinds.count)
+        tracks[sensor] = Track.of([row for row, kind in zip(ours, kinds, strict=True) if kind == best])
+        topics[sensor] = best[0]
+    return tracks, topics

@@ -1,0 +1,426 @@
+"""What one mission recorded, sensor by sensor: all messages of a time, from objects or from a bag, whichever has more.
+
+A series is in memory but for its pictures: those of objects are read again when they are needed, those of a bag are kept in a
+file of the work folder meanwhile.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags import naming
+from shadowhound_data_logger.bags.contents import Plain
+from shadowhound_data_logger.bags.manifest import Manifest, SliceEntry
+from shadowhound_data_logger.bags.remote import find_bags, read_manifest
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.encode.definitions import SEPARATOR
+from shadowhound_data_logger.encode.image import encode_png
+from shadowhound_data_logger.encode.payload import Job
+from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
+from shadowhound_data_logger.errors import BagDamaged, LakeError, Rejected
+from shadowhound_data_logger.lake import decode
+from shadowhound_data_logger.lake.gaps import BAGS, OBJECTS
+from shadowhound_data_logger.lake.prefetch import Place, Prefetch
+from shadowhound_data_logger.lake.track import Object, Track
+from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage
+from shadowhound_data_logger.mcap.ranges import StoredFile
+from shadowhound_data_logger.mcap.slice_info import Channel
+from shadowhound_data_logger.model import Batch, ObjectInfo, Sample
+from shadowhound_data_logger.options import COMPRESSED_IMAGE, DEFAULT_SENSORS, IMAGE, SensorSettings
+from shadowhound_data_logger.stores.base import ObjectStore
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from typing_extensions import Self
+
+KEEP_BYTES: Final = 16 << 20
+THREADS: Final = 8
+AHEAD: Final = 16
+"""Pictures that are fetched before they are needed."""
+_MESSAGE_TITLE: Final = re.compile(r'^MSG: ([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)\s*$', re.ASCII)
+_ODOMETRY: Final = 'nav_msgs/msg/Odometry'
+
+
+@dataclass(frozen=True, slots=True)
+class SourceFile:
+    """An object, or a slice of a bag, that values were taken from."""
+
+    bucket: str
+    key: str
+    sha256: str
+    """Empty where nobody knows it."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedSensor:
+    """The messages of one sensor in a time, before they are read: where they are and how many."""
+
+    sensor: str
+    topic: str
+    type: str
+    sink: str
+    """``objects`` or ``bags``, as the gap journal names them."""
+    messages: int
+    rate_hz: float
+    """Of what was recorded, without its gaps; 0 where it is not known."""
+
+
+@dataclass(slots=True)
+class Series:
+    """The messages of one sensor in the order of their stamps."""
+
+    recording: RecordedSensor
+    stamps: NDArray[np.int64]
+    """ns since 1970, sorted."""
+    values: NDArray[np.float64]
+    """(messages, numbers); of pictures (messages, 0)."""
+    file: NDArray[np.int64]
+    """Of each message, its place in ``files``."""
+    files: Sequence[SourceFile]
+    names: tuple[str, ...] = ()
+    """Of joints, by the first message."""
+    previous: NDArray[np.int64] | None = None
+    """Of values that are derived from two messages, (messages, 2): stamp of the earlier one, and its place in ``files``."""
+    picture: Callable[[int], tuple[bytes, str]] = field(default=lambda _: (b'', ''))
+    """Content and extension (``jpg``, ``png``) of a message of a camera."""
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def period_ns(self) -> int:
+        """Between two messages, as a rule."""
+        return int(np.median(np.diff(self.stamps))) if len(self.stamps) > 1 else 0
+
+
+class Recordings:
+    """What there is of one mission. Enter once; ``series`` any number of times, while it is entered; one thread."""
+
+    def __init__(self, place: Place, store: ObjectStore, tracks: Mapping[str, Track], topics: Mapping[str, str],
+                 span_ns: tuple[int, int], bags: Sequence[Manifest], work: Path) -> None:  # fmt: skip
+        """``tracks`` and ``topics`` are by sensor; ``span_ns`` is the time that counts, both ends included."""
+        self._place = place
+        self._store = store
+        self._tracks = tracks
+        self._topics = topics
+        self._span = span_ns
+        self._bags = bags
+        self._work = work
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        self._work.mkdir(parents=True, exist_ok=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def best(self, sensor: str) -> RecordedSensor | None:
+        """Where most messages of a sensor are; None where there is none."""
+        found = [each for each in (self._in_objects(sensor), *self._in_bags(sensor)) if each is not None and each.messages]
+        return max(found, key=lambda each: each.messages, default=None)
+
+    def series(self, recording: RecordedSensor, fields: Sequence[str] = ()) -> Series:
+        """All messages of the time. Raises StoreError, LakeError, BagDamaged."""
+        is_picture = recording.type in {COMPRESSED_IMAGE, IMAGE}
+        if recording.sink == OBJECTS:
+            track = self._within(recording.sensor)
+            return self._pictures(recording, track) if is_picture else self._numbers(recording, track, fields)
+        return self._from_bag(recording, fields, is_picture=is_picture)
+
+    # -- objects ---------------------------------------------------------------------------------------------------
+
+    def _within(self, sensor: str) -> Track:
+        track = self._tracks[sensor]
+        return track.only(track.within(*self._span))
+
+    def _in_objects(self, sensor: str) -> RecordedSensor | None:
+        if sensor not in self._tracks:
+            return None
+        track = self._within(sensor)
+        if not len(track):
+            return None
+        several = track.count > 1
+        if several.any():
+            spans = (track.end_ns - track.start_ns)[several]
+            rates = (track.count[several] - 1) / np.maximum(spans, 1) * 1e9
+            rate = float(np.median(rates))
+        else:
+            steps = np.diff(np.unique(track.start_ns))
+            rate = 1e9 / float(np.median(steps)) if len(steps) else 0.0
+        return RecordedSensor(sensor, self._topics.get(sensor, ''), track.kind, OBJECTS, int(track.count.sum()), rate)
+
+    def _numbers(self, recording: RecordedSensor, track: Track, fields: Sequence[str]) -> Series:
+        tables: list[decode.Table] = []
+        counts: list[int] = []
+        names: tuple[str, ...] = ()
+        with Prefetch(self._place.read, KEEP_BYTES, THREADS) as prefetch:
+            objects = [track.object(number) for number in range(len(track))]
+            for number, wanted in enumerate(objects):
+                prefetch.ahead(objects[number : number + AHEAD])
+                found = decode.records(prefetch.get(wanted))
+                if found and not names and isinstance(found[0].get('name'), list):
+                    names = tuple(map(str, found[0]['name']))
+                tables.append(decode.table(found, track.kind, tuple(fields), int(track.offset_ns[number])))
+                counts.append(len(found))
+        width = tables[0].values.shape[1] if tables else 0
+        if any(each.values.shape[1] != width for each in tables):
+            raise LakeError(f'{recording.topic} changes the number of its values within the mission')
+        stamps = np.concatenate([np.empty(0, np.int64), *(each.stamps for each in tables)])
+        values = np.concatenate([np.empty((0, width)), *(each.values for each in tables)])
+        file = np.repeat(np.arange(len(tables)), counts)
+        return self._ordered(recording, stamps, values, file, [_file(each) for each in objects], names)
+
+    def _pictures(self, recording: RecordedSensor, track: Track) -> Series:
+        """The content of an object is read for its stamps only where it is an archive."""
+        prefetch = self._stack.enter_context(Prefetch(self._place.read, KEEP_BYTES, THREADS))
+        stamps: list[int] = []
+        where: list[tuple[int, int]] = []
+        objects = [track.object(number) for number in range(len(track))]
+        members = lru_cache(maxsize=2)(partial(_unpacked, prefetch))
+        for number, wanted in enumerate(objects):
+            if decode.extension_of(wanted.key) in decode.ARCHIVES:
+                for member, each in enumerate(members(wanted)):
+                    stamps.append(each.stamp_ns + int(track.offset_ns[number]))
+                    where.append((number, member))
+            else:
+                stamps.append(int(track.start_ns[number]))
+                where.append((number, -1))
+        order = np.argsort(np.array(stamps, np.int64), kind='stable')
+
+        def picture(message: int) -> tuple[bytes, str]:
+            coming = {where[int(order[place])][0] for place in range(message, min(message + AHEAD, len(order)))}
+            prefetch.ahead([objects[number] for number in sorted(coming)])
+            number, member = where[int(order[message])]
+            if member < 0:
+                return prefetch.get(objects[number]), decode.extension_of(objects[number].key)
+            found = members(objects[number])[member]
+            return found.body, found.extension
+
+        file = np.array([number for number, _ in where], np.int64)
+        made = self._ordered(
+            recording, np.array(stamps, np.int64), np.empty((len(stamps), 0)), file, [_file(each) for each in objects]
+        )
+        return _with_pictures(made, picture, order, np.array(stamps, np.int64), self._span)
+
+    def _ordered(self, recording: RecordedSensor, stamps: NDArray[np.int64], values: NDArray[np.float64], file: NDArray[np.int64],
+                 files: Sequence[SourceFile], names: tuple[str, ...] = ()) -> Series:  # fmt: skip
+        order = np.argsort(stamps, kind='stable')
+        inside = order[(stamps[order] >= self._span[0]) & (stamps[order] <= self._span[1])]
+        return Series(recording, stamps[inside], values[inside], file[inside], files, names)
+
+    # -- bags ------------------------------------------------------------------------------------------------------
+
+    def _in_bags(self, sensor: str) -> Iterator[RecordedSensor]:
+        for bag in self._bags:
+            for topic in bag.topics:
+                if not self._is_of(sensor, topic.topic, topic.type):
+                    continue
+                slices = [each for each in bag.slices if each.counts.get(topic.topic) and self._overlaps(bag, each)]
+                count = sum(each.counts[topic.topic] for each in slices)
+                rates = [(each.counts[topic.topic] - 1) / (each.t_end_ns - each.t_start_ns) * 1e9
+                         for each in slices if each.t_end_ns > each.t_start_ns]  # fmt: skip
+                yield RecordedSensor(sensor, topic.topic, topic.type, BAGS, count, max(rates, default=0.0))
+
+    def _is_of(self, sensor: str, topic: str, kind: str) -> bool:
+        known = self._topics.get(sensor)
+        if known is not None:
+            return topic == known
+        told = DEFAULT_SENSORS.get(sensor, {})
+        names = zip(told.get('topics', ()), told.get('types', ()), strict=False)
+        return any(kind == wanted and (topic == f'/{name}' or topic.endswith(f'/{name}')) for name, wanted in names)
+
+    def _overlaps(self, bag: Manifest, each: SliceEntry) -> bool:
+        step = _offset_of(bag)
+        return each.t_start_ns + step <= self._span[1] and each.t_end_ns + step >= self._span[0]
+
+    def _from_bag(self, recording: RecordedSensor, fields: Sequence[str], *, is_picture: bool) -> Series:
+        stamps: list[int] = []
+        rows: list[NDArray[np.float64]] = []
+        where: list[tuple[int, int, str]] = []
+        file: list[int] = []
+        files: list[SourceFile] = []
+        names: tuple[str, ...] = ()
+        bodies = self._stack.enter_context(tempfile.TemporaryFile(dir=self._work)) if is_picture else None  # noqa: SIM115
+        for bag, each in self._slices(recording.topic):
+            files.append(SourceFile(naming.BUCKET, each.key, each.sha256))
+            for message, types in self._messages(each, recording.topic):
+                stamp = _stamp(message, types) + _offset_of(bag)
+                try:
+                    if bodies is not None:
+                        content, extension = _picture(message, types)
+                        where.append((bodies.tell(), len(content), extension))
+                        bodies.write(content)
+                    else:
+                        told = types.deserialize(message.channel.type, message.cdr)
+                        names = names or tuple(map(str, getattr(told, 'name', ()) or ()))
+                        rows.append(_values(told, message.channel.type, fields))
+                except Rejected:
+                    continue
+                stamps.append(stamp)
+                file.append(len(files) - 1)
+        values = np.array(rows, np.float64).reshape(len(stamps), -1) if rows else np.empty((len(stamps), 0))
+        stamped = np.array(stamps, np.int64)
+        made = self._ordered(recording, stamped, values, np.array(file, np.int64), files, names)
+        if bodies is None:
+            return made
+        order = np.argsort(stamped, kind='stable')
+
+        def picture(message: int) -> tuple[bytes, str]:
+            start, size, extension = where[int(order[message])]
+            bodies.seek(start)
+            return bodies.read(size), extension
+
+        return _with_pictures(made, picture, order, stamped, self._span)
+
+    def _slices(self, topic: str) -> Iterator[tuple[Manifest, SliceEntry]]:
+        """Of the bag that has most of it: two bags of one time would have each message twice."""
+        counts = [sum(each.counts.get(topic, 0) for each in bag.slices if self._overlaps(bag, each)) for bag in self._bags]
+        if any(counts):
+            bag = self._bags[int(np.argmax(counts))]
+            yield from ((bag, each) for each in bag.slices if each.counts.get(topic) and self._overlaps(bag, each))
+
+    def _messages(self, each: SliceEntry, topic: str) -> Iterator[tuple[RecordedMessage, MessageTypes]]:
+        source = StoredFile(self._store, naming.BUCKET, each.key, each.bytes)
+        wanted = MessageFilter(0, 1 << 63, lambda channel: channel.topic == topic)
+        known: dict[Channel, MessageTypes] = {}
+        for message in Plain([source], None).messages(wanted):
+            if message.channel not in known:
+                folder = self._stack.enter_context(tempfile.TemporaryDirectory(dir=self._work))
+                known[message.channel] = _types_of(message.channel, Path(folder))
+            yield message, known[message.channel]
+
+
+def bags_of(store: ObjectStore, robot: str, begin_ns: int, end_ns: int) -> list[Manifest]:
+    """The bags of a robot that have messages of a time, and whose files are MCAP of ours. Raises StoreError."""
+    found = []
+    for bag in find_bags(store, robot):
+        if bag.is_archive:
+            continue
+        try:
+            manifest = read_manifest(store, bag)
+        except BagDamaged:
+            continue
+        if manifest is None or (manifest.clock is not None and manifest.clock.offset_ns is None):
+            continue
+        step = _offset_of(manifest)
+        if any(each.t_start_ns + step <= end_ns and each.t_end_ns + step >= begin_ns for each in manifest.slices):
+            found.append(manifest)
+    return found
+
+
+def _file(wanted: Object) -> SourceFile:
+    return SourceFile(wanted.bucket, wanted.key, wanted.sha256)
+
+
+def _unpacked(prefetch: Prefetch, wanted: Object) -> list[decode.ArchiveMember]:
+    return decode.members(prefetch.get(wanted), decode.extension_of(wanted.key))
+
+
+def _with_pictures(made: Series, picture: Callable[[int], tuple[bytes, str]], order: NDArray[np.intp], stamps: NDArray[np.int64],
+                   span: tuple[int, int]) -> Series:  # fmt: skip
+    """``picture`` counts all messages in their order; the series may begin later."""
+    before = int((stamps[order] < span[0]).sum())
+    made.picture = lambda message: picture(before + message)
+    return made
+
+
+def _offset_of(bag: Manifest) -> int:
+    return 0 if bag.clock is None else bag.clock.offset_ns or 0
+
+
+def _types_of(channel: Channel, folder: Path) -> MessageTypes:
+    """What the bag itself says of its messages: a machine that trains has no ROS."""
+    text, named = channel.definition, re.fullmatch(r'([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)', channel.type, re.ASCII)
+    if channel.encoding == 'ros2msg' and named is not None:
+        first, *others = text.split(f'{SEPARATOR}\n')
+        definitions = [(named[1], named[2], first)]
+        for other in others:
+            title, _, body = other.partition('\n')
+            if (told := _MESSAGE_TITLE.match(title)) is not None:
+                definitions.append((told[1], told[2], body))
+        for package, name, body in definitions:
+            path = folder / 'share' / package / 'msg' / f'{name}.msg'
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(body, encoding='utf-8')
+    return MessageTypes([folder])
+
+
+def _stamp(message: RecordedMessage, types: MessageTypes) -> int:
+    """That of its header where it is set, else when it was published."""
+    stamp = header_stamp_ns(message.cdr) if types.has_header(message.channel.type) else 0
+    return stamp if stamp >= EARLIEST_SANE_NS else message.publish_ns or message.log_ns
+
+
+def _picture(message: RecordedMessage, types: MessageTypes) -> tuple[bytes, str]:
+    """A compressed picture as it was published, a raw one as PNG."""
+    sample = Sample(message.log_ns, message.cdr)
+    batch = Batch('camera', message.channel.topic, message.channel.type, (sample,), len(message.cdr))
+    made = encode_png(Job(batch, SensorSettings(name='camera', format='png'), 'robot', types), sample)
+    return made.body, made.ext
+
+
+def _values(message: Any, kind: str, fields: Sequence[str]) -> NDArray[np.float64]:
+    paths = fields or decode.FIELDS.get(kind, ())
+    if kind == _ODOMETRY:
+        paths = decode.whole_odometry(paths or decode.ODOMETRY)
+    found = [np.atleast_1d(np.asarray(attrgetter(path)(message), np.float64)).ravel() for path in paths]
+    return np.concatenate(found) if found else np.empty(0)
+
+
+def pictures_of(
+    store: ObjectStore, asked: Collection[tuple[str, str, int, str]], topic: str, work: Path
+) -> dict[tuple[str, int], bytes]:
+    """(key, stamp) -> the picture, of (bucket, key, stamp, sha256); those that are not there are left out.
+
+    Raises StoreError; LakeError for an object that is not what it was.
+    """
+    found: dict[tuple[str, int], bytes] = {}
+    with ExitStack() as stack:
+        for bucket, key, sha256 in sorted({(bucket, key, sha256) for bucket, key, _, sha256 in asked}):
+            stamps = {stamp for _, other, stamp, _ in asked if other == key}
+            held = store.head(bucket, key)
+            if held is None:
+                continue
+            if key.endswith('.mcap'):
+                found |= _pictures_in_slice(store, held, stamps, topic, stack, work)
+                continue
+            body = store.get(bucket, key)
+            if sha256 and hashlib.sha256(body).hexdigest() != sha256:
+                raise LakeError(f'the source {bucket}/{key} is not what it was')
+            extension = decode.extension_of(key)
+            if extension in decode.ARCHIVES:
+                offset = int(held.metadata.get(words.CLOCK_OFFSET_NS, 0))
+                members = decode.members(body, extension)
+                found |= {(key, each.stamp_ns + offset): each.body for each in members if each.stamp_ns + offset in stamps}
+            else:
+                found |= {(key, stamp): body for stamp in stamps}
+    return found
+
+
+def _pictures_in_slice(store: ObjectStore, held: ObjectInfo, stamps: Collection[int], topic: str, stack: ExitStack,
+                       work: Path) -> dict[tuple[str, int], bytes]:  # fmt: skip
+    found: dict[tuple[str, int], bytes] = {}
+    known: dict[Channel, MessageTypes] = {}
+    offset = int(held.metadata.get(words.CLOCK_OFFSET_NS, 0))
+    wanted = MessageFilter(0, 1 << 63, lambda channel: channel.topic == topic)
+    for message in Plain([StoredFile(store, held.bucket, held.key, held.size)], None).messages(wanted):
+        if message.channel not in known:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(dir=work))
+            known[message.channel] = _types_of(message.channel, Path(folder))
+        stamp = _stamp(message, known[message.channel]) + offset
+        if stamp in stamps:
+            found[held.key, stamp] = _picture(message, known[message.channel])[0]
+    return found

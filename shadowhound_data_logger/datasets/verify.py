@@ -1,0 +1,225 @@
+"""Proves a data set: its files are whole, its sources are in the store as they were, its pictures are theirs.
+
+And the other way round: which data sets, and which models, saw an object.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from shadowhound_data_logger.datasets.episodes import EPISODE
+from shadowhound_data_logger.datasets.lerobot import DATA, DIGESTS, FILES, OURS, SOURCE_TABLE, VIDEO, EpisodeRow, Lerobot
+from shadowhound_data_logger.datasets.series import pictures_of
+from shadowhound_data_logger.datasets.transfer import DatasetPlace
+from shadowhound_data_logger.datasets.video import likeness, video_frames
+from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.lake import decode
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.training import INFO
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.untrusted import is_path
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+THREADS: Final = 16
+FRAMES: Final = 5
+"""Of each camera in each episode, unless all are asked for."""
+ALIKE: Final = 0.8
+"""Least similarity (SSIM) of a frame of a video to its source; AV1 at crf 30 keeps more than 0.9 of what cameras see."""
+MOST_TABLE_BYTES: Final = 1 << 30
+
+
+@dataclass(slots=True)
+class Proved:
+    """What was looked at, and what is wrong."""
+
+    episodes: int = 0
+    files: int = 0
+    sources: int = 0
+    frames: int = 0
+    least_likeness: float = 1.0
+    wrong: list[str] = field(default_factory=list)
+
+
+def verify(folder: Path, store: ObjectStore, *, frames: int | None = FRAMES, is_read: bool = False,
+           say: Callable[[str], None] = lambda _: None) -> Proved:  # fmt: skip
+    """``frames`` is how many of each camera and episode are compared, None for all; ``is_read`` reads every source again.
+
+    Raises LakeError for what is no data set of ours, StoreError.
+    """
+    made = Lerobot(folder)
+    if made.info is None:
+        raise LakeError(f'{folder} is not a data set: it has no {INFO}', remedy='name a folder that export lerobot wrote')
+    found = Proved(episodes=len(made.rows))
+    _files(made, found)
+    try:
+        table = pq.read_table(folder / SOURCE_TABLE)
+    except (pa.ArrowException, OSError) as error:
+        found.wrong.append(f'{SOURCE_TABLE} cannot be read: {error}')
+        return found
+    say('sources')
+    _sources(table, store, found, is_read=is_read)
+    for row in made.rows:
+        say(f'episode {row["episode_index"] + 1} of {len(made.rows)}')
+        mine = table.filter(pc.equal(table[EPISODE], row[f'{OURS}mission_id']))
+        for key in made.picture_keys():
+            try:
+                _frames(made, row, key, mine, store, frames, found)
+            except (LakeError, ObjectRefused) as error:
+                found.wrong.append(f'episode {row["episode_index"]}, {key}: {error.what}')
+            except (pa.ArrowException, OSError) as error:
+                found.wrong.append(f'episode {row["episode_index"]}, {key}: {error}')
+    return found
+
+
+def _files(made: Lerobot, found: Proved) -> None:
+    told = json.loads((made.folder / FILES).read_text(encoding='utf-8'))['files'] if (made.folder / FILES).is_file() else {}
+    for name in sorted({*told, *(path.relative_to(made.folder).as_posix() for path in made.paths())}):
+        path = made.folder / name
+        if not is_path(name) or not path.is_file():
+            found.wrong.append(f'{name} is missing')
+        elif name not in told:
+            found.wrong.append(f'{name} is not in {FILES}')
+        elif fingerprint(path) != (told[name]['bytes'], told[name]['sha256']):
+            found.wrong.append(f'{name} is not what was written')
+        found.files += 1
+
+
+def _sources(table: pa.Table, store: ObjectStore, found: Proved, *, is_read: bool) -> None:
+    rows = table.group_by(['bucket', 'key', 'sha256']).aggregate([]).sort_by('key').to_pylist()
+
+    def wrong(row: dict[str, str]) -> str:
+        name = f'{row["bucket"]}/{row["key"]}'
+        try:
+            held = store.head(row['bucket'], row['key'])
+            if held is None:
+                return f'the source {name} is gone'
+            sha256 = held.sha256
+            if is_read and row['sha256']:
+                sha256 = _sha256_of(store, row['bucket'], row['key'])
+        except ObjectRefused as error:
+            return f'the source {name}: {error.what}'
+        return '' if not row['sha256'] or sha256 == row['sha256'] else f'the source {name} is not what it was'
+
+    with ThreadPoolExecutor(THREADS, 'export-verify') as pool:
+        found.wrong += [said for said in pool.map(wrong, rows) if said]
+    found.sources = len(rows)
+
+
+def _sha256_of(store: ObjectStore, bucket: str, key: str) -> str:
+
+    digest = hashlib.sha256()
+    with store.content(bucket, key) as content:
+        for piece in content:
+            digest.update(piece)
+    return digest.hexdigest()
+
+
+def _frames(made: Lerobot, row: EpisodeRow, key: str, sources: pa.Table, store: ObjectStore, most: int | None,
+            found: Proved) -> None:  # fmt: skip
+    stream, length = key.removeprefix('observation.'), int(row['length'])
+    wanted = range(length) if most is None else sorted({round(at) for at in np.linspace(0, length - 1, min(most, length))})
+    mine = sources.filter(pc.and_(pc.equal(sources['stream'], stream), pc.is_in(sources['frame'], pa.array(wanted, pa.int64()))))
+    told = {each['frame']: each for each in mine.to_pylist()}
+    if sorted(told) != list(wanted):
+        found.wrong.append(f'episode {row["episode_index"]}: frames of {key} have no source')
+        return
+    with TemporaryDirectory() as work:
+        asked = {(each['bucket'], each['key'], each['stamp_ns'], each['sha256']) for each in told.values()}
+        pictures = pictures_of(store, asked, row[f'{OURS}{stream}/topic'], Path(work))
+    count = 0
+    for number, content in _shown(made, row, key):
+        count += 1
+        if number not in told:
+            continue
+        body = pictures.get((told[number]['key'], told[number]['stamp_ns']))
+        if body is None:
+            found.wrong.append(
+                f'episode {row["episode_index"]}, frame {number}: its source {told[number]["key"]} has no such picture'
+            )
+            continue
+        found.frames += 1
+        if isinstance(content, bytes):
+            if content != body:
+                found.wrong.append(f'episode {row["episode_index"]}, frame {number} of {key} is not its source, byte for byte')
+            continue
+        alike = likeness(content, decode.image(body))
+        found.least_likeness = min(found.least_likeness, alike)
+        if alike < ALIKE:
+            found.wrong.append(
+                f'episode {row["episode_index"]}, frame {number} of {key} is not like its source (SSIM {alike:.2f})'
+            )
+    if count != length:
+        found.wrong.append(f'episode {row["episode_index"]}: {key} has {count} frames, the episode {length}')
+
+
+def _shown(made: Lerobot, row: EpisodeRow, key: str) -> Iterator[tuple[int, NDArray[np.uint8] | bytes]]:
+    if key in made.video_keys():
+        path = made.path(VIDEO, row, f'videos/{key}', video_key=key)
+        yield from ((number, pixels) for number, (_, pixels) in enumerate(video_frames(path)))
+        return
+    number = 0
+    for batch in pq.ParquetFile(made.path(DATA, row, 'data')).iter_batches(batch_size=64, columns=[key]):
+        for value in batch.column(0):
+            yield number, value.as_py()['bytes']
+            number += 1
+
+
+# -- which data sets saw an object ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A data set with values of an object."""
+
+    where: str
+    missions: tuple[str, ...]
+    frames: int
+    digests: tuple[str, ...]
+    """Of all its states in which it had them."""
+
+
+def seen_in_folder(folder: Path, key: str) -> Seen | None:
+    """Raises LakeError for a folder that is none of ours."""
+    try:
+        return _seen(str(folder), pq.read_table(folder / SOURCE_TABLE), json.loads((folder / DIGESTS).read_text()), key)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise LakeError(f'{folder} is no data set of this program: {error}') from error
+
+
+def seen_in_store(source: Bucket, place: DatasetPlace, key: str) -> Seen | None:
+    """Raises StoreError, LakeError."""
+    try:
+        body = source.get(place.prefix + SOURCE_TABLE, MOST_TABLE_BYTES)
+        told = json.loads(source.get(place.prefix + DIGESTS, MOST_TABLE_BYTES))
+        return _seen(str(place), pq.read_table(io.BytesIO(body)), told, key)
+    except (ValueError, pa.ArrowException) as error:
+        raise LakeError(f'{place} is no data set of this program: {error}') from error
+
+
+def _seen(where: str, table: pa.Table, told: Any, key: str) -> Seen | None:
+    bucket, _, rest = key.partition('/')
+    mine = table.filter(
+        pc.or_(pc.equal(table['key'], key), pc.and_(pc.equal(table['bucket'], bucket), pc.equal(table['key'], rest)))
+    )
+    if not len(mine):
+        return None
+    missions = tuple(sorted(set(mine[EPISODE].to_pylist())))
+    frames = len(mine.group_by([EPISODE, 'frame']).aggregate([]))
+    digests = tuple(each['digest'] for each in told['digests'] if {*missions} & {*each['missions']})
+    return Seen(where, missions, frames, digests)

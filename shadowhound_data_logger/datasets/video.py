@@ -1,0 +1,112 @@
+"""Pictures to an mp4 and back, with PyAV: the settings that LeRobot itself uses, and the same bytes whoever runs it.
+
+SVT-AV1 writes the same for any number of threads; x264 does not, so it has one. A frame's time is its number divided by the
+frames a second, exactly: the stream's time base is that or a fraction of it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final
+
+import av
+import numpy as np
+
+from shadowhound_data_logger.datasets.features import AV1, H264
+from shadowhound_data_logger.errors import LakeError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from typing_extensions import Self
+
+PIXELS: Final = 'yuv420p'
+CODECS: Final = {
+    AV1: ('libsvtav1', {'g': '2', 'crf': '30', 'preset': '12'}),
+    H264: ('libx264', {'g': '2', 'crf': '23', 'preset': 'fast', 'threads': '1', 'bf': '0'}),
+}
+"""lerobot 0.6.1, configs/video.py: a key frame every second frame, so that a random one is decoded quickly."""
+_NAMES: Final = {AV1: 'av1', H264: 'h264'}
+BLOCK: Final = 8
+"""Pixels of a side of what is compared at a time."""
+
+
+class VideoWriter:
+    """Frames of one size, one after the other. Enter once; a file that an error leaves behind is not whole."""
+
+    def __init__(self, path: Path, fps: int, size: tuple[int, int], codec: str) -> None:
+        """``size`` is (height, width), both even. Raises LakeError otherwise."""
+        if size[0] % 2 or size[1] % 2:
+            raise LakeError(f'pictures of {size[1]} x {size[0]} cannot be {PIXELS} video', remedy='export them with --lossless')
+        self._path, self._fps, self._size = path, fps, size
+        self._encoder, self._options = CODECS[codec]
+        self._count = 0
+        self._file: Any = None
+        self._stream: Any = None
+
+    def __enter__(self) -> Self:
+        os.environ.setdefault('SVT_LOG', '1')  # errors alone
+        self._file = av.open(str(self._path), 'w', format='mp4')
+        self._stream = self._file.add_stream(self._encoder, rate=self._fps, options=dict(self._options))
+        self._stream.height, self._stream.width = self._size
+        self._stream.pix_fmt = PIXELS
+        self._stream.codec_context.time_base = Fraction(1, self._fps)
+        return self
+
+    def add(self, pixels: NDArray[np.uint8]) -> None:
+        """``pixels`` is (height, width, 3) RGB."""
+        frame = av.VideoFrame.from_ndarray(pixels, format='rgb24')
+        frame.pts, frame.time_base = self._count, Fraction(1, self._fps)
+        self._count += 1
+        self._file.mux(self._stream.encode(frame))
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if error is None:
+            self._file.mux(self._stream.encode(None))
+        self._file.close()
+
+
+def video_frames(path: Path) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+    """(seconds, pixels RGB) of each frame. Raises LakeError for what is no video."""
+    try:
+        with av.open(str(path)) as file:
+            stream = file.streams.video[0]
+            for frame in file.decode(stream):
+                yield float(frame.pts * stream.time_base), frame.to_ndarray(format='rgb24')
+    except (av.error.FFmpegError, IndexError, OSError) as error:
+        raise LakeError(f'{path} is not a video that can be read: {error}') from error
+
+
+def feature_info(codec: str, fps: int, size: tuple[int, int]) -> dict[str, Any]:
+    """What lerobot writes of a video into ``info.json`` (video_utils.get_video_info)."""
+    _, options = CODECS[codec]
+    return {
+        'video.height': size[0], 'video.width': size[1], 'video.codec': _NAMES[codec], 'video.pix_fmt': PIXELS, 'video.fps': fps,
+        'video.channels': 3, 'has_audio': False, 'video.g': int(options['g']), 'video.crf': int(options['crf']),
+        'video.preset': int(options['preset']) if options['preset'].isdigit() else options['preset'], 'is_depth_map': False,
+    }  # fmt: skip
+
+
+def likeness(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
+    """The mean structural similarity of two pictures' luminance in blocks of 8 x 8, 1 for equal ones.
+
+    Wang, Bovik, Sheikh, Simoncelli: Image quality assessment, IEEE TIP 13 (2004), with even weights.
+    """
+    first, second = (_blocks(each) for each in (one, other))
+    means = first.mean(axis=-1), second.mean(axis=-1)
+    variances = first.var(axis=-1), second.var(axis=-1)
+    shared = ((first - means[0][..., None]) * (second - means[1][..., None])).mean(axis=-1)
+    small, large = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+    above = (2 * means[0] * means[1] + small) * (2 * shared + large)
+    below = (means[0] ** 2 + means[1] ** 2 + small) * (variances[0] + variances[1] + large)
+    return float((above / below).mean())
+
+
+def _blocks(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
+    grey = pixels.astype(np.float64) @ np.array([0.299, 0.587, 0.114])
+    height, width = (side - side % BLOCK for side in grey.shape)
+    cut = grey[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
+    return np.asarray(cut.transpose(0, 2, 1, 3).reshape(height // BLOCK, width // BLOCK, BLOCK * BLOCK))

@@ -1,0 +1,64 @@
+"""What a model was trained on: the digest of a data set, and the mark of it in a run of MLflow.
+
+A digest stands for everything in a data set of ``shadowhound-data export``: ``info.json`` says how it was made, the table of
+sources has the SHA-256 of every object that a value came from, and that of gaps what was known to be missing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.config import home
+from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.missions.replay import open_tracking
+from shadowhound_data_logger.missions.tracking import MlflowTracking
+
+INFO: Final = 'meta/info.json'
+DIGEST_FILES: Final = (INFO, 'meta/shadowhound_sources.parquet', 'meta/shadowhound_gaps.parquet')
+DIGEST_TAG: Final = 'shadowhound_dataset_digest'
+NAME_TAG: Final = 'shadowhound_dataset'
+
+
+def digest_of(folder: Path, info: bytes | None = None) -> str:
+    """SHA-256 (hex) over ``DIGEST_FILES``; ``info`` stands for ``info.json`` while that is not written yet. Raises LakeError."""
+    whole = hashlib.sha256()
+    for name in DIGEST_FILES:
+        try:
+            body = info if info is not None and name == INFO else (folder / name).read_bytes()
+        except OSError as error:
+            raise LakeError(f'{folder} is no data set of this program: {name}: {error.strerror}',
+                            remedy='name a folder that export lerobot wrote') from error  # fmt: skip
+        whole.update(f'{name} {hashlib.sha256(body).hexdigest()}\n'.encode())
+    return whole.hexdigest()
+
+
+def log_dataset(run: Any, folder: Path | str) -> str:
+    """Say in a run of MLflow what it is trained on: tags with the digest and the name. Returns the digest.
+
+    ``run`` is a run (``mlflow.active_run()``) or the id of one; the server is MLflow's own in this process, else that of
+    MLFLOW_TRACKING_URI. Raises LakeError, TrackingUnavailable, TrackingRefused.
+    """
+    folder = Path(folder)
+    digest = digest_of(folder)
+    run_id = run if isinstance(run, str) else run.info.run_id
+    _tracking().log(run_id, (), {}, {DIGEST_TAG: digest, NAME_TAG: folder.absolute().name})
+    return digest
+
+
+def runs_trained_on(digests: Iterable[str]) -> dict[str, list[str]]:
+    """Digest -> the ids of the runs that ``log_dataset`` marked with it. Raises TrackingUnavailable, TrackingRefused."""
+    wanted = sorted(set(digests))
+    tracking = _tracking() if wanted else None
+    return {digest: tracking.tagged(DIGEST_TAG, digest) for digest in wanted} if tracking else {}
+
+
+def _tracking() -> MlflowTracking:
+    loaded = sys.modules.get('mlflow')
+    if loaded is not None and hasattr(loaded, 'get_tracking_uri'):
+        return MlflowTracking(loaded.get_tracking_uri(), '')
+    return open_tracking(home(os.environ), '')

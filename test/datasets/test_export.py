@@ -1,0 +1,273 @@
+"""A data set has what each mission recorded, as it was known at each tick, and says what is missing and where it came from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from datasets.recorded import House, Mission, lost, x_of
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.datasets.export import Exported, drop, export, resumed
+from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.datasets.lerobot import DATA, OURS, Lerobot, matrix
+from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in, fetch_dataset, upload
+from shadowhound_data_logger.datasets.verify import seen_in_folder, seen_in_store, verify
+from shadowhound_data_logger.datasets.video import video_frames
+from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.stores.directory import DirectoryStore
+
+PATROLS = {'mission_type': 'patrol'}
+
+
+def jittered(sensor: str, number: int) -> int:
+    """Each message is moved by an amount of its own, up to 8 ms."""
+    return (number * 7919 + len(sensor) * 104729) % 8 * 1_000_000
+
+
+@pytest.fixture(scope='module')
+def house(tmp_path_factory: pytest.TempPathFactory) -> House:
+    """Three missions: a jittered one, one with gaps, one that the robot has not told all of."""
+    made = House(tmp_path_factory.mktemp('house'))
+    made.record(Mission('whole', seconds=3, jitter_ns=jittered))
+    gappy = Mission('gappy', begin_s=100, seconds=4)
+    gappy.has['camera'] = lambda _, stamp: not gappy.begin_ns + 1.05 * SECOND < stamp < gappy.begin_ns + 1.75 * SECOND
+    gappy.has['odom'] = lambda _, stamp: not gappy.begin_ns + 2.51 * SECOND < stamp < gappy.begin_ns + 2.89 * SECOND
+    gappy.gaps = (lost(gappy, 'camera', 1.0, 1.8),)
+    made.record(gappy)
+    made.record(Mission('fresh', begin_s=200, seconds=3, told_until_s=-3))
+    return made
+
+
+def rows_of(made: Lerobot, mission: str, *columns: str) -> list[np.ndarray[Any, Any]]:
+    row = made.rows[made.mission_ids.index(mission)]
+    table = pq.read_table(made.path(DATA, row, 'data'))
+    return [matrix(table[name]) for name in columns]
+
+
+@pytest.fixture(scope='module')
+def exported(house: House) -> Exported:
+    options = ExportOptions(state=('pose', 'imu', 'joints'), allow_gaps=False, max_stale=0.2)
+    return export(house.folder / 'set', house.source, PATROLS, options)
+
+
+def test_a_mission_is_an_episode_once_it_is_known_what_is_missing(exported: Exported) -> None:
+    """The one of which the robot has not told all waits, and says for what."""
+    assert [each['mission_id'] for each in exported.added] == ['whole', 'gappy']
+    assert list(exported.waiting) == ['fresh']
+    assert '3.0 s before its end what is missing' in exported.waiting['fresh']
+    assert (exported.fps, exported.action, exported.refused) == (10, 'odometry', {})
+
+
+def test_no_value_of_a_tick_comes_from_its_future(house: House, exported: Exported) -> None:
+    """Each message has been moved by its own amount: every number is still the newest one at or before its tick."""
+    made = Lerobot(exported.folder)
+    mission = Mission('whole', seconds=3, jitter_ns=jittered)
+    stamps, state, age = rows_of(made, 'whole', 'shadowhound.stamp_ns', 'observation.state', 'observation.age_s')
+    names = made.info['features']['observation.state']['names'] if made.info else []
+    streams = made.info['features']['observation.age_s']['names'] if made.info else []
+    for sensor, stream, column in (
+        ('odom', 'state.pose', 'pose.x'),
+        ('imu', 'state.imu', 'imu.wx'),
+        ('joints', 'state.joints', 'leg3.pos'),
+    ):
+        published = np.array(mission.stamps(sensor))
+        newest = published[np.searchsorted(published, stamps[:, 0], 'right') - 1]
+        assert (newest <= stamps[:, 0]).all()
+        assert state[:, names.index(column)] == pytest.approx([x_of(int(stamp)) for stamp in newest], abs=1e-4)
+        assert age[:, streams.index(stream)] == pytest.approx((stamps[:, 0] - newest) / SECOND, abs=1e-6)
+    assert state.shape == (len(stamps), 7 + 10 + 12)
+
+
+def test_a_gap_is_flagged_at_its_ticks_and_nowhere_else(exported: Exported) -> None:
+    """With the cause that the journal states, or as not published where it knows of none."""
+    made = Lerobot(exported.folder)
+    mission = Mission('gappy', begin_s=100, seconds=4)
+    stamps, stale = rows_of(made, 'gappy', 'shadowhound.stamp_ns', 'observation.stale')
+    streams = made.info['features']['observation.stale']['names'] if made.info else []
+    causes = pq.read_table(made.path(DATA, made.rows[1], 'data'))['shadowhound.cause'].to_pylist()
+    away = (stamps[:, 0] - mission.begin_ns) / SECOND
+    camera = (away > 1.0 + 0.15) & (away < 1.8)
+    odom = (away > 2.5 + 0.15) & (away < 2.9)
+    assert np.array_equal(stale[:, streams.index('images.front')] == 1, camera)
+    assert np.array_equal(stale[:, streams.index('state.pose')] == 1, odom)
+    assert not stale[:, streams.index('state.joints')].any()
+    assert camera.sum() == 6
+    assert odom.sum() == 2
+    for tick, cause in enumerate(causes):
+        said = dict(pair.split('=') for pair in cause.split(';') if pair)
+        assert said.get('images.front') == ('transport' if camera[tick] else None)
+        assert said.get('state.pose') == ('not_published' if odom[tick] else None)
+    row = made.rows[1]
+    assert json.loads(row[f'{OURS}images.front/causes']) == {'transport': 6}
+    assert row[f'{OURS}images.front/stale_share'] == pytest.approx(6 / len(stamps), abs=1e-6)
+
+
+def test_a_mission_with_too_large_gaps_is_refused(house: House, tmp_path: Path) -> None:
+    """With the reason, on the screen and in the report; ``allow_gaps`` takes it with its flags."""
+    options = ExportOptions(max_stale=0.05)
+    found = export(tmp_path / 'set', house.source, {'mission': 'gappy'}, options)
+    assert list(found.refused) == ['gappy']
+    assert 'images.front is stale in 1' in found.refused['gappy']
+    assert 'transport 6' in found.refused['gappy']
+    found = export(tmp_path / 'set', house.source, {'mission': 'gappy'}, ExportOptions(max_stale=0.05, allow_gaps=True))
+    assert [each['mission_id'] for each in found.added] == ['gappy']
+
+
+def test_frames_in_the_video_are_the_rows(exported: Exported) -> None:
+    """As many, at their times, and like their sources."""
+    made = Lerobot(exported.folder)
+    for row in made.rows:
+        path = made.folder / f'videos/observation.images.front/chunk-000/file-{row["episode_index"]:03d}.mp4'
+        times = [time for time, _ in video_frames(path)]
+        assert times == pytest.approx(np.arange(row['length']) / 10, abs=1e-9)
+
+
+def test_it_is_proved(house: House, exported: Exported) -> None:
+    """And what is changed afterwards, here or in the store, is found."""
+    store = DirectoryStore(house.settings.directory)
+    store.open()
+    found = verify(exported.folder, store, frames=None, is_read=True)
+    assert found.wrong == []
+    assert (found.episodes, found.least_likeness > 0.9) == (2, True)
+    assert found.frames == sum(row['length'] for row in Lerobot(exported.folder).rows)
+
+
+def test_what_was_changed_is_found(house: House, tmp_path: Path) -> None:
+    """A byte of a file, and an object that is not what it was."""
+    place = House(tmp_path)
+    place.record(Mission('only', seconds=2, sensors=('camera', 'odom')))
+    export(tmp_path / 'set', place.source, PATROLS, ExportOptions(is_lossless=True))
+    store = DirectoryStore(place.settings.directory)
+    store.open()
+    assert verify(tmp_path / 'set', store, frames=None).wrong == []
+    picture = sorted((place.settings.directory / 'sensor-data/thor/camera').rglob('*.tar'))[1]
+    body = picture.read_bytes()
+    picture.write_bytes(body[:700] + bytes([body[700] ^ 1]) + body[701:])
+    data = tmp_path / 'set/data/chunk-000/file-000.parquet'
+    data.write_bytes(data.read_bytes() + b' ')
+    wrong = verify(tmp_path / 'set', store, is_read=True).wrong
+    assert any('data/chunk-000/file-000.parquet is not what was written' in each for each in wrong)
+    assert any(picture.name in each and 'not what it was' in each for each in wrong)
+
+
+def test_another_mission_rewrites_nothing_before_it(house: House, tmp_path: Path) -> None:
+    """The files of the episodes before stay as they are, byte for byte, and the digest changes."""
+    first = export(tmp_path / 'set', house.source, {'mission': 'whole'}, ExportOptions())
+    before = {path: path.read_bytes() for path in sorted((tmp_path / 'set').rglob('file-000.*'))}
+    assert len(before) == 3
+    second = export(tmp_path / 'set', house.source, {'mission': 'gappy'}, ExportOptions(allow_gaps=True))
+    assert second.present == ['whole']
+    assert {path: path.read_bytes() for path in before} == before
+    assert first.digest != second.digest
+    made = Lerobot(tmp_path / 'set')
+    assert [row['dataset_from_index'] for row in made.rows] == [0, made.rows[0]['length']]
+    again = export(tmp_path / 'set', house.source, PATROLS, ExportOptions(allow_gaps=True, max_stale=0.3))
+    assert 'fresh' in [each['mission_id'] for each in again.added]
+
+
+def test_two_workers_write_what_one_writes(house: House, exported: Exported, tmp_path: Path) -> None:
+    """And so does whoever begins anew."""
+    options = ExportOptions(state=('pose', 'imu', 'joints'), max_stale=0.2)
+    export(tmp_path / 'set', house.source, PATROLS, options, workers=2)
+    assert contents(tmp_path / 'set') == contents(exported.folder)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for part in ('data', 'meta', 'videos')
+            for path in sorted((folder / part).rglob('*')) if path.is_file()}  # fmt: skip
+
+
+def test_statistics_are_those_of_all_frames(exported: Exported) -> None:
+    """Of the numbers of all episodes together, with exact quantiles."""
+    made = Lerobot(exported.folder)
+    stats = json.loads((exported.folder / 'meta/stats.json').read_text())
+    state = np.concatenate([rows_of(made, mission, 'observation.state')[0] for mission in made.mission_ids])
+    assert stats['observation.state']['q50'] == pytest.approx(np.quantile(state, 0.5, axis=0).tolist(), abs=1e-6)
+    assert stats['observation.state']['std'] == pytest.approx(state.std(axis=0).tolist(), abs=1e-5)
+    assert stats['observation.state']['count'] == [len(state)]
+    assert np.array(stats['observation.images.front']['mean']).shape == (3, 1, 1)
+
+
+def test_commands_are_the_action_where_they_were_logged(tmp_path: Path) -> None:
+    """As they were at or before the tick, and not said to be derived; a mission without them does not fit."""
+    place = House(tmp_path)
+    commanded = place.record(Mission('commanded', seconds=2, sensors=('camera', 'odom', 'cmd_vel')))
+    place.record(Mission('silent', begin_s=50, seconds=2, sensors=('camera', 'odom')))
+    found = export(tmp_path / 'set', place.source, PATROLS, ExportOptions())
+    made = Lerobot(tmp_path / 'set')
+    stamps, action = rows_of(made, 'commanded', 'shadowhound.stamp_ns', 'action')
+    published = np.array(commanded.stamps('cmd_vel'))
+    newest = published[np.searchsorted(published, stamps[:, 0], 'right') - 1]
+    assert action[:, 0] == pytest.approx([x_of(int(stamp)) for stamp in newest], abs=1e-4)
+    assert made.info is not None
+    assert made.info['features']['action']['info'] == {'units': ['m/s', 'm/s', 'rad/s'], 'source': 'cmd_vel', 'derived': False}
+    assert found.refused == {'silent': 'the store has nothing of cmd_vel in it'}
+
+
+def test_other_settings_are_another_data_set(house: House, exported: Exported, tmp_path: Path) -> None:
+    """What it was begun with holds for all of it; what no source has is refused, and what is there is told."""
+    with pytest.raises(LakeError, match='was begun with codec av1'):
+        export(exported.folder, house.source, PATROLS, ExportOptions(state=('pose', 'imu', 'joints'), codec='h264'))
+    found = export(tmp_path / 'set', house.source, {'mission': 'whole'}, ExportOptions(fps=30))
+    assert found.refused == {'whole': '/camera has 10 Hz in the objects, less than 30 frames a second'}
+    with pytest.raises(SettingError, match='--state'):
+        ExportOptions(state=('mood',))
+
+
+def test_an_episode_is_taken_out(house: House, exported: Exported, tmp_path: Path) -> None:
+    """Everywhere in the data set, for good; the others have the numbers that they would have had without it."""
+    options = ExportOptions(max_stale=0.3)
+    export(tmp_path / 'set', house.source, PATROLS, options)
+    drop(tmp_path / 'set', 'whole')
+    made = resumed(tmp_path / 'set')
+    assert made.mission_ids == ['gappy']
+    told = b''.join(contents(tmp_path / 'set').values())
+    assert b'"whole"' not in told
+    table = pq.read_table(made.path(DATA, made.rows[0], 'data'))
+    assert table['index'].to_pylist() == list(range(len(table)))
+    assert set(table['episode_index'].to_pylist()) == {0}
+    assert seen_in_folder(tmp_path / 'set', 'thor/camera/20261028/120000_000_front.tar') is None
+    assert export(tmp_path / 'set', house.source, PATROLS, options).added == []
+    store = DirectoryStore(house.settings.directory)
+    store.open()
+    assert verify(tmp_path / 'set', store).wrong == []
+
+
+def test_a_data_set_goes_to_the_store_and_back(house: House, exported: Exported, tmp_path: Path) -> None:
+    """Verified, twice without moving anything, and an object tells where it went."""
+    store = DirectoryStore(house.settings.directory)
+    store.open()
+    place = DatasetPlace.of('s3://lerobot/datasets/go2/patrol')
+    moved = upload(exported.folder, place, store)
+    assert moved.files == len(contents(exported.folder))
+    assert upload(exported.folder, place, store).files == 0
+    assert list(datasets_in(store)) == [place]
+    fetch_dataset(place, tmp_path / 'back', store)
+    assert contents(tmp_path / 'back') == contents(exported.folder)
+    (tmp_path / 'back/data/chunk-000/file-777.parquet').write_bytes(b'stray')
+    assert fetch_dataset(place, tmp_path / 'back', store).removed == 1
+    sources = pq.read_table(exported.folder / 'meta/shadowhound_sources.parquet')
+    key = sources['key'][0].as_py()
+    seen = seen_in_store(Bucket(house.settings, 'lerobot'), place, f'sensor-data/{key}')
+    assert seen is not None
+    assert seen.missions == ('whole',)
+    assert seen.digests == (exported.digest,)
+    assert seen_in_folder(exported.folder, 'thor/nothing.jpg') is None
+
+
+def test_lerobot_doctor_finds_nothing_wrong(exported: Exported) -> None:
+    """An independent reader: no check of the format fails."""
+    from lerobot_doctor.dataset_loader import load_dataset
+    from lerobot_doctor.runner import Severity, run_checks
+
+    results = run_checks(load_dataset(str(exported.folder)))
+    assert len(results.results) >= 8
+    assert [
+        (each.name, message.message) for each in results.results for message in each.messages if message.severity is Severity.FAIL
+    ] == []
