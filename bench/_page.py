@@ -173,7 +173,7 @@ def _rosbag2(figures: Figures) -> str:
                 for used in (run['us'][recorder] for run in runs.values() if recorder in run['us'])]  # fmt: skip
 
     def lost(recorder: str, runs: Figures) -> str:
-        return ', '.join(f'{100 * run["lost"][recorder] / run["published"]:.2g} %' if run['lost'][recorder] else '0'
+        return ', '.join(f'{show(100 * run["lost"][recorder] / run["published"])} %' if run['lost'][recorder] else '0'
                          for run in runs.values() if recorder in run['lost'])  # fmt: skip
 
     rows = [(f'{int(rate):,}/s', *us(recorder, runs), lost(recorder, runs), words)
