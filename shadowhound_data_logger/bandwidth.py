@@ -52,12 +52,14 @@ class Pace:
         self._lock = threading.Lock()
         self._waiting: list[_Waiter] = []  # who waits longest first
         self._max_mbps = 0.0
+        self._yielded_mbps = 0.0
+        self._yields_until = 0.0
         self._free_at = 0.0  # when the next piece may leave
         self._bodies = self._pieces = self._sent_bytes = self._abandoned = 0
         self.set(max_mbps)
 
     def __repr__(self) -> str:
-        return f'Pace({self._max_mbps:g} Mbit/s)' if self._max_mbps else 'Pace(no cap)'
+        return f'Pace({self.max_mbps:g} Mbit/s)' if self.max_mbps else 'Pace(no cap)'
 
     def set(self, max_mbps: float) -> None:
         """The cap in megabits a second of payload, 0 for none; at once, for bodies under way as well."""
@@ -68,9 +70,21 @@ class Pace:
             self._free_at = self._now()
             self._wake_all()
 
+    def yield_to(self, max_mbps: float, seconds: float) -> None:
+        """For so long no more than this, whatever the cap is: it ends by itself, and a later call takes its place."""
+        if not 0.0 < max_mbps < float('inf'):
+            raise ValueError(f'{max_mbps} Mbit/s is not a cap')
+        with self._lock:
+            self._yielded_mbps = max_mbps
+            self._yields_until = self._now() + seconds
+            self._wake_all()
+
     @property
     def max_mbps(self) -> float:
-        return self._max_mbps
+        """The cap that is in force now; 0 for none."""
+        if self._now() >= self._yields_until:
+            return self._max_mbps
+        return min(self._max_mbps or self._yielded_mbps, self._yielded_mbps)
 
     @property
     def sent_bytes(self) -> int:
@@ -79,7 +93,7 @@ class Pace:
 
     def bytes_in(self, seconds: float) -> float:
         """What the cap lets leave in that time; infinite without one."""
-        return self._max_mbps * BYTES_PER_MEGABIT * seconds or float('inf')
+        return self.max_mbps * BYTES_PER_MEGABIT * seconds or float('inf')
 
     def count(self, size: int) -> None:
         """So many bytes left by a way that knows no cap."""
@@ -130,7 +144,7 @@ class Pace:
 
     def _pause(self, waiter: _Waiter) -> float | None:
         """How long the waiter has to wait; None when it is another one's turn."""
-        if not self._max_mbps:
+        if not self.max_mbps:
             return 0.0
         return self._free_at - self._now() if self._next() is waiter else None
 
@@ -142,14 +156,15 @@ class Pace:
     def _grant(self, size: int) -> None:
         self._sent_bytes += size
         self._pieces += 1
-        if self._max_mbps:
-            self._free_at = max(self._free_at, self._now() - LATE_S) + size / (self._max_mbps * BYTES_PER_MEGABIT)
+        if max_mbps := self.max_mbps:
+            self._free_at = max(self._free_at, self._now() - LATE_S) + size / (max_mbps * BYTES_PER_MEGABIT)
 
     def _wake_all(self) -> None:
         for waiter in self._waiting:
             waiter.turn.notify()
 
     def _piece_bytes(self) -> int:
-        if not self._max_mbps:
+        max_mbps = self.max_mbps
+        if not max_mbps:
             return LARGEST_PIECE
-        return min(max(round(self._max_mbps * BYTES_PER_MEGABIT * PIECE_S), SMALLEST_PIECE), LARGEST_PIECE)
+        return min(max(round(max_mbps * BYTES_PER_MEGABIT * PIECE_S), SMALLEST_PIECE), LARGEST_PIECE)

@@ -166,3 +166,26 @@ def test_what_is_no_cap_is_refused(cap: float) -> None:
         pace.set(cap)
     assert pace.max_mbps == 3.0
     assert repr(pace) == 'Pace(3 Mbit/s)'
+
+
+def test_a_cap_that_yields_ends_by_itself() -> None:
+    """For so long the lower of the two is in force, for bodies under way as well; then the cap is what it was."""
+    now = [100.0]
+    pace = Pace(8.0, lambda: now[0])
+    pace.yield_to(2.0, 5.0)
+    assert pace.max_mbps == 2.0
+    assert pace.bytes_in(1.0) == 2.0 * BYTES_PER_MEGABIT
+    now[0] += 4.0
+    pace.yield_to(20.0, 5.0)
+    assert pace.max_mbps == 8.0
+    pace.yield_to(2.0, 5.0)
+    now[0] += 5.0
+    assert pace.max_mbps == 8.0
+    pace.set(0.0)
+    pace.yield_to(2.0, 5.0)
+    assert pace.max_mbps == 2.0
+    now[0] += 5.0
+    assert pace.bytes_in(1.0) == float('inf')
+    for wrong in (0.0, -1.0, float('inf'), float('nan')):
+        with pytest.raises(ValueError, match='not a cap'):
+            pace.yield_to(wrong, 5.0)

@@ -17,6 +17,7 @@ from shadowhound_data_logger.bags.recorder import Answer
 from shadowhound_data_logger.capture.diagnostics import told
 from shadowhound_data_logger.capture.status import Stages, Status
 from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.keys import printable
 
 log = logging.getLogger(__name__)
 
@@ -24,10 +25,14 @@ FLUSH_S: Final = 5.0
 """A caller is told what has not been done by then; it takes a fraction of that unless the disk is slow."""
 MANUAL: Final = 'manual'
 """Name of an event that somebody asked for and did not name."""
-ASKERS: Final = ('command', 'service')
+ASKERS: Final = ('command', 'service', 'page')
 """By whom it is said to have been triggered."""
 MOST_NAME: Final = 100
 """Letters of an event's name."""
+YIELD_S: Final = 5.0
+"""For so long uploads yield to whoever watches, unless it is asked for again: a live page that was killed slows nothing down."""
+WHO: Final = 'who'
+"""With any request: whom somebody asks for, to be said in the log."""
 MOST_NOTE: Final = 1000
 """Letters of what is said of it."""
 
@@ -72,6 +77,7 @@ class Commands:
             'bag pause': _Command(lambda: recorder.pause(paused=True)),
             'bag resume': _Command(lambda: recorder.pause(paused=False)),
             'event': _Command(self._trigger, {'name': str, 'note': str, 'by': str}, quiet=True),
+            'yield': _Command(self._yield, {'max_mbps': float}, quiet=True),
             'set': _Command(self._set, {'values': dict}, quiet=True),
             'get': _Command(self._get, {'names': list}, quiet=True),
             'parameters': _Command(self._list, quiet=True),
@@ -100,7 +106,8 @@ class Commands:
         command = self._known.get(name) if isinstance(name, str) else None
         if command is None:
             return False, f'"do" is one of {", ".join(self._known)}; it is {str(name)[:MOST_NAME]!r}'
-        arguments = {key: value for key, value in request.items() if key != 'do'}
+        who = printable(str(request.get(WHO, '')))[:MOST_NAME]
+        arguments = {key: value for key, value in request.items() if key not in ('do', WHO)}
         for key, value in arguments.items():
             kind = command.arguments.get(key)
             if kind is None:
@@ -109,8 +116,8 @@ class Commands:
             if not isinstance(value, kind):
                 return False, f'{key} of {name} is {_KINDS[kind]}, not {str(value)[:MOST_NAME]!r}'
         done = command.do(**arguments)
-        if not isinstance(done, dict) and not (done[0] and command.quiet):
-            log.log(logging.INFO if done[0] else logging.WARNING, '%s: %s', name, done[1])
+        if not isinstance(done, dict) and (who or not (done[0] and command.quiet)):
+            log.log(logging.INFO if done[0] else logging.WARNING, '%s%s: %s', who and f'{who}: ', name, done[1])
         return done
 
     # -- what they do ----------------------------------------------------------------------------------------------
@@ -152,6 +159,13 @@ class Commands:
             return False, f'an event is triggered by {" or ".join(ASKERS)}, not {by[:MOST_NAME]!r}'
         return self._stages.event_buffer.events.trigger(name, by, note)
 
+    def _yield(self, max_mbps: float = 0.0) -> Answer:
+        """Leave the link to whoever watches the robot, for some seconds."""
+        if not 0.0 < max_mbps < float('inf'):
+            return False, 'yield takes max_mbps, which is above 0'
+        self._stages.uploader.yield_to(max_mbps, YIELD_S)
+        return True, f'uploads send at most {max_mbps:g} Mbit/s for {YIELD_S:g} s'
+
     def _get(self, names: list[Any] | None = None) -> Answer | dict[str, Any]:
         if not all(isinstance(name, str) for name in names or ()):
             return False, 'names of get are strings'
@@ -187,7 +201,7 @@ class Commands:
         return unheard.compare(found or {}) if unheard is not None else (False, 'the node listens through the RMW of the robot')
 
 
-_KINDS: Final[Mapping[type, str]] = {str: 'a string', list: 'a list', dict: 'an object'}
+_KINDS: Final[Mapping[type, str]] = {str: 'a string', float: 'a number with a point', list: 'a list', dict: 'an object'}
 
 
 def _count(number: int, noun: str) -> str:

@@ -122,6 +122,10 @@ class Uploader:
         """Another cap (megabits of payload a second, 0 for none), at once. Raises ValueError for one below 0."""
         self._store.pace.set(max_mbps)
 
+    def yield_to(self, max_mbps: float, seconds: float) -> None:
+        """Send no more than this for so long; it ends by itself. Raises ValueError for 0 and below."""
+        self._store.pace.yield_to(max_mbps, seconds)
+
     def drain(self, deadline_s: float) -> bool:
         """Wait until nothing is pending and every outcome is durable; whether that is so.
 

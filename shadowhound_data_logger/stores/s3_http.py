@@ -48,6 +48,8 @@ UNSIGNED: Final = 'UNSIGNED-PAYLOAD'
 """Instead of a part's SHA-256: its MD5 is among the signed headers, and two hashes of each byte are enough."""
 EMPTY: Final = hashlib.sha256().hexdigest()
 """Of the body of a GET."""
+CS1: Final = 8 << 2
+"""DSCP of background traffic (RFC 3662), in the byte where IP has it: what is live goes first, where the network cares."""
 _SOCKET: Final = ((socket.IPPROTO_TCP, socket.TCP_NODELAY, 1), (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1))
 """What botocore's client sets for us as well."""
 
@@ -56,6 +58,18 @@ _prepared: Any = AWSPreparedRequest
 _create_parser: Any = create_parser
 _awaiting: Any = AWSConnection
 """Their stubs know less than they take."""
+
+
+def _background() -> tuple[tuple[int, int, int], ...]:
+    """The option that marks a socket's traffic as background, where the system has it."""
+    option = socket.IPPROTO_IP, socket.IP_TOS, CS1
+    try:
+        for family in (socket.AF_INET, socket.AF_INET6):
+            with socket.socket(family, socket.SOCK_STREAM) as tried:
+                tried.setsockopt(*option)
+    except OSError:
+        return ()
+    return (option,)
 
 
 class ContentRequests:
@@ -78,7 +92,7 @@ class ContentRequests:
         self._session = _open_session(
             verify=trust, proxies=get_environ_proxies(self._server),
             timeout=(upload.connect_timeout_s, upload.read_timeout_s), max_pool_connections=max(10, upload.threads),
-            socket_options=[*_SOCKET],
+            socket_options=[*_SOCKET, *_background()],
         )  # fmt: skip
         getattr(self._session, '_pool_classes_by_scheme', {}).update(http=_Pool, https=_TLSPool)
 

@@ -25,7 +25,7 @@ class Stages:
         self.stuck = stuck
         self.spooled = [(10, 100), (10 + spooled[0], 100 + spooled[1])]
         self.paused = False
-        self.intake = self.queue = self.recorder = self.events = self.mission = self
+        self.intake = self.queue = self.recorder = self.events = self.mission = self.uploader = self
         self.event_buffer = SimpleNamespace(events=self)
         self.writer = Writer(self)
         self.latest: Mapping[str, Any] | None = None
@@ -59,6 +59,9 @@ class Stages:
 
     def split(self) -> tuple[bool, str]:
         raise OSError('the disk burns')
+
+    def yield_to(self, *given: float) -> None:
+        self.asked.append(given)
 
     def trigger(self, *given: str) -> tuple[bool, str]:
         self.asked.append(given)
@@ -262,3 +265,29 @@ def test_what_changes_something_is_logged(caplog: pytest.LogCaptureFixture) -> N
         ('INFO', 'flush: 0 objects with 0 messages spooled'),
         ('WARNING', 'bag stop: nothing is recorded'),
     ]
+
+
+def test_whom_somebody_asks_for_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    """Also where a success is worth no line otherwise; whatever is in the name, it stays one line."""
+    caplog.set_level(logging.INFO)
+    stages = Stages()
+    assert ask(stages.commands(), 'event', name='fall', by='page', who='operator at 10.0.0.7') == (True, 'event_1 begins')
+    assert ask(stages.commands(), 'bag stop', who='a\nb' * 1000)[0] is False
+    assert stages.asked == [('fall', 'page', '')]
+    first, second = (record.getMessage() for record in caplog.records)
+    assert first == 'operator at 10.0.0.7: event: event_1 begins'
+    assert '\n' not in second
+    assert len(second) < 200
+
+
+def test_uploads_yield_for_some_seconds(caplog: pytest.LogCaptureFixture) -> None:
+    """Whoever asks asks again; that is no line in the log each time."""
+    caplog.set_level(logging.INFO)
+    stages = Stages()
+    assert ask(stages.commands(), 'yield', max_mbps=2.0) == (True, 'uploads send at most 2 Mbit/s for 5 s')
+    assert stages.asked == [(2.0, 5.0)]
+    assert not caplog.records
+    for wrong in (0.0, -1.0, float('inf'), float('nan')):
+        assert ask(stages.commands(), 'yield', max_mbps=wrong)[0] is False
+    assert ask(stages.commands(), 'yield', max_mbps=2)[0] is False
+    assert ask(stages.commands(), 'yield')[0] is False
