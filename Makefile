@@ -1,7 +1,7 @@
 # Every target makes the environment first (see scripts/setup); with nothing to do that takes milliseconds.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-long test-matrix torture check format demo bench docs lock tower tower-secrets clean
+.PHONY: help setup test test-long test-matrix torture check format demo bench docs lock vendor tower tower-secrets clean
 
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
@@ -45,6 +45,9 @@ docs: setup ## write docs/parameters.md and docs/commands.md anew from the code
 
 lock: setup ## write requirements/*.txt anew from requirements/*.in; LOCK_ARGS=--upgrade renews the pins
 	scripts/lock $(LOCK_ARGS)
+
+vendor: ## bundle what the live page needs of others (three, uPlot, preact) from npm
+	scripts/vendor
 
 tower-secrets: ## credentials of a Tower, once; TOWER_ARGS="--host 192.168.1.10 --robot thor" is handed on
 	python3 tower/make_secrets.py $(TOWER_ARGS)

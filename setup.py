@@ -16,7 +16,7 @@ setup(
     maintainer_email='maintainers@shadowhound.invalid',
     license='Apache-2.0',
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
-    package_data={PACKAGE: ['py.typed']},
+    package_data={PACKAGE: ['py.typed', 'live/page/*.*', 'live/page/vendor/*.*']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),
         ('share/' + PACKAGE, ['package.xml']),
@@ -26,6 +26,7 @@ setup(
     python_requires='>=3.10',
     # The same as requirements/runtime.in, which says what each is for.
     install_requires=[
+        'aiohttp>=3.9',
         'backports-zstd>=1.0; python_version < "3.14"',
         'boto3>=1.36',
         'click>=8.1',

@@ -1,6 +1,6 @@
 """Launches the data logger with its parameter file, in a namespace if asked to, and starts it again when it crashes.
 
-ros2 launch shadowhound_data_logger sensor_logger.launch.py namespace:=tachi params_file:=/path/to/my.yaml
+ros2 launch shadowhound_data_logger sensor_logger.launch.py namespace:=tachi params_file:=/path/to/my.yaml live:=true
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo, RegisterEventHandler, SetEnvironmentVariable, TimerAction
+from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessExit
 from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
@@ -54,13 +55,29 @@ def logger() -> list[Action]:
     return [RegisterEventHandler(OnProcessExit(target_action=node, on_exit=ended)), node]
 
 
+def live_page() -> Action:
+    """The page on which the robot can be watched, where it is asked for; it starts again whatever ends it."""
+    return Node(
+        package='shadowhound_data_logger',
+        executable='shadowhound-data',
+        arguments=['live', '--bind', LaunchConfiguration('live_bind')],
+        condition=IfCondition(LaunchConfiguration('live')),
+        output='screen',
+        respawn=True,
+        respawn_delay=RESTART_AFTER_S,
+    )
+
+
 def generate_launch_description() -> LaunchDescription:
     """What `ros2 launch` asks for."""
     return LaunchDescription(
         [
             DeclareLaunchArgument('params_file', default_value=str(FOLDER / 'go2.yaml'), description='The parameter file.'),
             DeclareLaunchArgument('namespace', default_value='', description='Namespace of the robot, for several robots.'),
+            DeclareLaunchArgument('live', default_value='false', description='Serve the live page too.'),
+            DeclareLaunchArgument('live_bind', default_value='127.0.0.1', description='Where it listens.'),
             *profile(),
             *logger(),
+            live_page(),
         ]
     )

@@ -19,13 +19,14 @@ from shadowhound_data_logger import metadata_words
 PACKAGE = 'shadowhound_data_logger'
 ROOT = Path(__file__).parents[1] / PACKAGE
 ORDER = ('contracts', 'stores', 'mcap', 'encode', 'ros', 'spool', 'ship', 'catalogue', 'missions', 'face', 'bags', 'capture',
-         'lake', 'datasets', 'doctor', 'cli', 'sim')  # fmt: skip
+         'lake', 'datasets', 'doctor', 'live', 'cli', 'sim')  # fmt: skip
 """Each folder may import those before it. The contracts are the modules beside the folders, the face is the package itself."""
 ROS = {'ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'go2_interfaces', 'nav_msgs', 'rcl_interfaces', 'rclpy',
        'rosidl_generator_py', 'sensor_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs'}  # fmt: skip
 ALLOWED = {
     **{name: {'capture', 'ros', 'sim'} for name in ROS},
-    'rclpy': {'capture', 'doctor', 'ros', 'sim'},
+    'rclpy': {'capture', 'doctor', 'live', 'ros', 'sim'},
+    'aiohttp': {'live'},
     **{name: {'stores'} for name in ('boto3', 'botocore')},
     'mlflow': {'missions'},
     'av': {'datasets'},
@@ -33,7 +34,7 @@ ALLOWED = {
     'obstore': {'stores'},
     'pyarrow': {'datasets', 'lake', 'sim'},
 }
-HEAVY = ('rclpy', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'obstore', 'pyarrow', 'av')
+HEAVY = ('rclpy', 'aiohttp', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'obstore', 'pyarrow', 'av')
 LATE = ('import_module', '__import__')
 MODULES = sorted(ROOT.rglob('*.py'))
 
@@ -161,6 +162,13 @@ def test_one_module_owns_the_sql_of_the_spools_index() -> None:
     }  # fmt: skip
     assert senders == index | own
     assert [name for name in own if 'FROM objects' in (ROOT / name).read_text(encoding='utf-8')] == []
+
+
+def test_the_live_page_knows_nothing_of_the_nodes_insides() -> None:
+    """It reads topics through ros/ and what is stored through spool/; one file of it knows ROS, and is loaded where ROS is."""
+    ours = [path for path in MODULES if folder(path) == 'live']
+    assert {name for path in ours for name in folders(path)} <= {'contracts', 'encode', 'live', 'ros', 'spool'}
+    assert [path.name for path in ours if any(name.startswith('rclpy') for name in imports(path))] == ['topics.py']
 
 
 def test_one_file_of_the_doctor_knows_ros() -> None:

@@ -19,6 +19,7 @@ from shadowhound_data_logger.cli.export import export
 from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.cli.ledger import ledger
+from shadowhound_data_logger.cli.live import live
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.node import node
 from shadowhound_data_logger.cli.output import tell_error
@@ -29,7 +30,7 @@ from shadowhound_data_logger.errors import DataLoggerError, SettingError
 
 SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
     'On every machine': (doctor,),
-    'On the robot': (status, ledger, spool, node),
+    'On the robot': (status, ledger, spool, node, live),
     'On Tower and Spark': (query, fetch, bag, lake, export),
     'Missions': (missions,),
 }

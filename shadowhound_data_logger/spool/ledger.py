@@ -14,7 +14,7 @@ from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import clock_record
 from shadowhound_data_logger.spool.account_rows import OtherTypeRow
 from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
-from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED, Gap
+from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED, Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
 
 STATES: Final = tuple(state.value for state in State)
@@ -41,6 +41,12 @@ def journal(spool: Path, robot: str) -> list[Gap]:
             raise SpoolError(f'the spool {spool} is of an older version, which kept no times of losses',
                              remedy='start the node once: it brings the spool up to date')  # fmt: skip
         return index.gaps.known(clock_record.read(spool, robot)['offsets'])
+
+
+def watermarks(spool: Path) -> list[Watermark]:
+    """From when until when the journal of a spool folder is complete, by sink and topic. Raises SpoolError as ``journal``."""
+    with _reading(spool) as index:
+        return index.gaps.watermarks()
 
 
 @contextmanager

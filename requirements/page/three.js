@@ -1,0 +1,2 @@
+export { AmbientLight, BufferAttribute, BufferGeometry, BoxGeometry, CanvasTexture, Color, ConeGeometry, CylinderGeometry, DirectionalLight, GridHelper, Group, Line, LineBasicMaterial, Mesh, MeshBasicMaterial, MeshLambertMaterial, PerspectiveCamera, PlaneGeometry, Points, PointsMaterial, Scene, ShaderMaterial, SphereGeometry, Vector3, WebGLRenderer } from 'three';
+export { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';

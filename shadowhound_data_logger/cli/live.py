@@ -1,0 +1,84 @@
+"""``shadowhound-data live``: serves the page on which the robot, its data and what is missing can be watched."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+from pathlib import Path
+
+import click
+
+from shadowhound_data_logger.cli.common import (
+    BadUsage,
+    ExitCode,
+    as_json,
+    examples,
+    robot_name,
+    spool_folder,
+    the_home,
+    the_spool,
+)
+from shadowhound_data_logger.cli.output import print_json
+from shadowhound_data_logger.spool.status import robots
+
+PORT = 8765
+
+
+@click.command(epilog=examples('live', 'live --bind 0.0.0.0', 'live --bind 0.0.0.0 --tls tower.crt tower.key'))
+@click.option('--bind', default='127.0.0.1', show_default=True, metavar='ADDRESS', help='Listen there.')
+@click.option('--port', type=click.IntRange(0, 65535), default=PORT, show_default=True, help='0: any that is free.')
+@click.option('--tls', nargs=2, type=click.Path(path_type=Path, dir_okay=False), metavar='CERTIFICATE KEY', help='Serve https.')
+@click.option(
+    '--name', 'names', multiple=True, metavar='HOST', help='A further name of this machine in the address; may be repeated.'
+)
+@click.option('--uploads-mbps', type=click.FloatRange(0.0, 10_000.0), default=4.0, show_default=True,
+              help='What uploads are left, in Mbit/s, while somebody watches over the network; 0: no cap.')  # fmt: skip
+@click.option('--new-tokens', is_flag=True, help='Make new tokens first: everybody has to sign in again.')
+@click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Whose  [default: the one that ran here]')
+@spool_folder
+@as_json
+def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[str, ...], uploads_mbps: float, new_tokens: bool,  # noqa: PLR0913 - one an option
+         robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
+    """Serve a page to watch robot and data on.
+
+    It shows in a browser what the robot sees now, its data, and what is missing.
+
+    It ends with Ctrl-C. On 127.0.0.1 whoever is on this machine may watch; anywhere else a token is asked for. Acting (bags,
+    events, flush, pause) always needs the token of the operator. The tokens are in files, in SHADOWHOUND_HOME/live.
+    """
+    try:
+        from shadowhound_data_logger.live.access import make_tokens  # noqa: PLC0415 - loaded by this verb alone
+        from shadowhound_data_logger.live.server import LiveServer, LiveSettings  # noqa: PLC0415 - aiohttp
+    except ImportError as error:
+        raise BadUsage(f'the live page needs aiohttp: {error}', 'install requirements/robot.txt') from error
+    folder = the_spool(spool)
+    tokens = the_home() / 'live'
+    paths = make_tokens(tokens, anew=new_tokens)
+    settings = LiveSettings(
+        spool=folder, robot=robot or next(iter(robots(folder)), 'thor'), tokens=tokens, bind=bind, port=port, names=names,
+        certificate=tls or None, uploads_mbps=uploads_mbps,
+    )  # fmt: skip
+    logging.basicConfig(level=logging.INFO, format='%(message)s')
+
+    async def serve() -> None:
+        server = LiveServer(settings)
+        stop = asyncio.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        try:
+            await server.open()
+            if as_json:
+                print_json({'url': server.url, 'pid': os.getpid(), 'tokens': {role: str(path) for role, path in paths.items()},
+                            'problem': server.ros_problem})  # fmt: skip
+            else:
+                click.echo(f"{server.url}\nthe operator's token is in {paths['operator']}, a viewer's in {paths['viewer']}")
+                if server.ros_problem:
+                    click.echo(server.ros_problem, err=True)
+            await stop.wait()
+        finally:
+            await server.close()
+
+    asyncio.run(serve())
+    return ExitCode.FINE

@@ -1,0 +1,113 @@
+"""What the page says of the data: the node's status, the ledger and today's gaps, read from the spool and changing nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.clock import SECOND, Clock, utc
+from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.gaps import OBJECTS, Gap
+from shadowhound_data_logger.spool.status import read as read_status
+
+_HEAD: Final = (
+    'robot',
+    'state',
+    'age_s',
+    'time',
+    'uptime_s',
+    'version',
+    'paused',
+    'mission',
+    'clock',
+    'queue',
+    'spool',
+    'session',
+)
+_OF_STORE: Final = ('target', 'state', 'last_error', 'mbps', 'max_mbps', 'in_flight', 'delivered')
+_OF_STATUS: Final = ('sensor', 'rate_hz', 'age_s', 'publishers', 'unavailable', 'may_be_silent')
+MOST_GAPS: Final = 4000
+"""Rows of the timeline; of more, neighbours of a topic and cause are one."""
+DAY_NS: Final = 24 * 3600 * SECOND
+
+
+class SpoolFigures:
+    """Reads the spool of one robot. From one thread at a time."""
+
+    def __init__(self, spool: Path, robot: str, clock: Clock) -> None:
+        self._spool, self._robot, self._clock = spool, robot, clock
+        self._ledger: dict[str, Any] = {}
+        self._problem = ''
+
+    def now(self, *, with_ledger: bool) -> dict[str, Any]:
+        """What changes from second to second; the ledger's part anew only when it is asked for.
+
+        ``topics``: received, stored, missed and so on as in ``ledger --json``, the rest as in ``status --json``.
+        """
+        status = read_status(self._spool, self._robot, self._clock)
+        if with_ledger:
+            try:
+                self._ledger, self._problem = ledger.read(self._spool, self._robot), ''
+            except DataLoggerError as error:
+                self._ledger, self._problem = {}, str(error)
+        accounts, live = self._ledger.get('topics', {}), status.get('topics', {})
+        found = {name: status.get(name) for name in _HEAD}
+        return {
+            **found, 'findings': [*status['findings'], *([self._problem] if self._problem else [])],
+            'store': {name: (status.get('store') or {}).get(name) for name in _OF_STORE},
+            'bag': _without(status.get('bag'), 'topics'), 'events': _without(status.get('events'), 'topics'),
+            'balanced': self._ledger.get('balanced'), 'objects': self._ledger.get('objects'), 'bytes': self._ledger.get('bytes'),
+            'topics': [_row(topic, accounts.get(topic, {}), live.get(topic, {})) for topic in sorted({*accounts, *live})],
+        }  # fmt: skip
+
+    def gaps(self, since_ns: int | None = None, until_ns: int | None = None) -> dict[str, Any]:
+        """Every gap between two times (today's, unless they are given), and what the journal can say of each topic.
+
+        ``known``: [topic, since, until]; between them no row is no gap, beyond nobody knows yet. Times are UTC in ms.
+        """
+        now_ns = self._clock.wall_ns()
+        midnight = utc(now_ns).replace(hour=0, minute=0, second=0, microsecond=0)
+        since_ns = since_ns if since_ns is not None else int(midnight.timestamp()) * SECOND
+        until_ns = until_ns if until_ns is not None else int((midnight + timedelta(days=1)).timestamp()) * SECOND
+        rows = [gap for gap in ledger.journal(self._spool, self._robot) if _is_within(gap, since_ns, until_ns)]
+        grain_ns = (until_ns - since_ns) // MOST_GAPS if len(rows) > MOST_GAPS else 0
+        merged: dict[tuple[str, str, str, str], list[Any]] = {}
+        shown: list[list[Any]] = []
+        for gap in rows:
+            key = gap.sink, gap.topic, gap.kind, gap.cause
+            last = merged.get(key)
+            from_ns, to_ns = gap.from_ns or 0, gap.to_ns or 0
+            if last is not None and grain_ns and from_ns - last[5] < grain_ns:
+                last[5], last[6] = max(last[5], to_ns), last[6] + (gap.count or 0)
+                continue
+            merged[key] = [*key, from_ns, to_ns, gap.count or 0, gap.grade]
+            shown.append(merged[key])
+        for row in shown:
+            row[4:6] = row[4] / 1e6, row[5] / 1e6
+        marks = [mark for mark in ledger.watermarks(self._spool) if mark.complete_ns >= since_ns and mark.since_ns <= until_ns]
+        return {
+            'from': since_ns / 1e6, 'to': until_ns / 1e6, 'now': now_ns / 1e6,
+            'columns': ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade'], 'gaps': shown,
+            'known': [[mark.topic, mark.since_ns / 1e6, mark.complete_ns / 1e6] for mark in marks if mark.sink == OBJECTS],
+        }  # fmt: skip
+
+
+def _is_within(gap: Gap, since_ns: int, until_ns: int) -> bool:
+    return gap.from_ns is not None and gap.to_ns is not None and gap.to_ns >= since_ns and gap.from_ns <= until_ns
+
+
+def _row(topic: str, account: Mapping[str, Any], live: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        'topic': topic, 'type': account.get('type') or live.get('type', ''),
+        **{name: account.get(name) for name in ('received', 'stored', 'skipped', 'missed', 'missed_estimated', 'accounting')},
+        'lost': sum(sum(account.get(name, {}).values()) for name in ('rejected', 'dropped')),
+        'pending': account.get('stored_in', {}).get('pending', 0),
+        **{name: live.get(name) for name in _OF_STATUS},
+    }  # fmt: skip
+
+
+def _without(section: Mapping[str, Any] | None, name: str) -> dict[str, Any] | None:
+    return None if section is None else {key: value for key, value in section.items() if key != name}

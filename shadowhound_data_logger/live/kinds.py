@@ -1,0 +1,222 @@
+"""What of a message the page shows: its type decides the kind, and the kind what is sent to a browser.
+
+A camera's frame goes as JPEG, a cloud as uint16 in its bounding box, everything else as rows of float32. Frames and clouds exist
+in three sizes (``FULL`` to ``SMALLEST``), for links that carry less. Raises Rejected for a message that is broken.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import simplejpeg
+
+from shadowhound_data_logger.encode.image import JPEG_MAGIC
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.errors import Rejected
+from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+FULL, HALF, SMALLEST = 0, 1, 2
+SIZES: Final = (FULL, HALF, SMALLEST)
+_SIDE: Final = {HALF: 2, SMALLEST: 4}
+"""By how much a smaller frame's sides are divided."""
+_QUALITY: Final = {FULL: 75, HALF: 60, SMALLEST: 45}
+_EVERY: Final = {FULL: 1, HALF: 4, SMALLEST: 16}
+"""Which points of a smaller cloud are kept."""
+MOST_POINTS: Final = 200_000
+"""Of a cloud that is sent; of a larger one each second, third, ... is."""
+_COLORSPACES: Final = {'bgr8': 'BGR', 'rgb8': 'RGB', 'bgra8': 'BGRA', 'rgba8': 'RGBA', 'mono8': 'GRAY'}
+_AXES: Final = ('x', 'y', 'z')
+_FLOAT32: Final = 7
+"""sensor_msgs/msg/PointField.FLOAT32."""
+
+
+@dataclass(frozen=True)
+class LiveItem:
+    """Something to be sent to whoever watches a topic; packed once for all of them."""
+
+    topic: str
+    kind: str
+    size: int = FULL
+    head: Mapping[str, Any] | None = None
+    body: bytes = b''
+
+    @cached_property
+    def packed(self) -> bytes:
+        """A uint32 with the length of the head, the head as JSON, spaces up to a multiple of 8 bytes, the body."""
+        head = json.dumps({'topic': self.topic, 'kind': self.kind, **(self.head or {})}, separators=(',', ':')).encode()
+        head += b' ' * (-(4 + len(head)) % 8)
+        return len(head).to_bytes(4, 'little') + head + self.body
+
+
+class Kind(NamedTuple):
+    """How the messages of some types are shown."""
+
+    name: str
+    most_hz: float
+    """Messages beyond it are left out."""
+    is_bulk: bool
+    """Whether only the newest one matters."""
+    values: Callable[[Any], Mapping[str, float]] | None = None
+    """The figures of a message, where it goes as a row of them."""
+
+
+def _turn(q: Any) -> tuple[float, float, float]:
+    """Roll, pitch and yaw of a quaternion, rad."""
+    x, y, z, w = q.x, q.y, q.z, q.w
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    return (
+        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        pitch,
+        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    )
+
+
+def _named(prefix: str, values: Sequence[float]) -> Iterator[tuple[str, float]]:
+    return zip((f'{prefix}.{axis}' for axis in _AXES), map(float, values), strict=False)
+
+
+def _imu(message: Any) -> dict[str, float]:
+    rate, force = message.angular_velocity, message.linear_acceleration
+    return dict([*_named('rpy', _turn(message.orientation)), *_named('gyro', (rate.x, rate.y, rate.z)),
+                 *_named('accel', (force.x, force.y, force.z))])  # fmt: skip
+
+
+def _go2_imu(message: Any) -> dict[str, float]:
+    return dict([*_named('rpy', message.rpy), *_named('gyro', message.gyroscope), *_named('accel', message.accelerometer),
+                 ('temperature', float(message.temperature))])  # fmt: skip
+
+
+def _odometry(message: Any) -> dict[str, float]:
+    place, turn = message.pose.pose.position, message.pose.pose.orientation
+    return {'x': place.x, 'y': place.y, 'z': place.z, 'qx': turn.x, 'qy': turn.y, 'qz': turn.z, 'qw': turn.w}
+
+
+def _joints(message: Any) -> dict[str, float]:
+    return dict(zip(message.name, map(float, message.position), strict=False))
+
+
+def _low_state(message: Any) -> dict[str, float]:
+    battery = message.bms_state
+    return {
+        'battery': float(battery.soc), 'volts': float(message.power_v), 'amperes': battery.current / 1000,
+        'body': float(message.temperature_ntc1), 'motor': float(max(motor.temperature for motor in message.motor_state)),
+        'cells': float(max(battery.bq_ntc)),
+    }  # fmt: skip
+
+
+def _battery(message: Any) -> dict[str, float]:
+    return {
+        'battery': 100 * message.percentage,
+        'volts': message.voltage,
+        'amperes': message.current,
+        'cells': message.temperature,
+    }
+
+
+def _go2_state(message: Any) -> dict[str, float]:
+    return {'height': float(message.body_height), **dict(_named('velocity', message.velocity)),
+            **{f'foot.{place}': float(force) for place, force in enumerate(message.foot_force)}}  # fmt: skip
+
+
+KINDS: Final[Mapping[str, Kind]] = {
+    COMPRESSED_IMAGE: Kind('camera', 30.0, is_bulk=True),
+    IMAGE: Kind('camera', 15.0, is_bulk=True),
+    POINT_CLOUD: Kind('cloud', 10.0, is_bulk=True),
+    'sensor_msgs/msg/Imu': Kind('imu', 100.0, is_bulk=False, values=_imu),
+    'go2_interfaces/msg/IMU': Kind('imu', 100.0, is_bulk=False, values=_go2_imu),
+    'nav_msgs/msg/Odometry': Kind('odom', 25.0, is_bulk=False, values=_odometry),
+    'sensor_msgs/msg/JointState': Kind('joints', 20.0, is_bulk=False, values=_joints),
+    'go2_interfaces/msg/LowState': Kind('battery', 2.0, is_bulk=False, values=_low_state),
+    'sensor_msgs/msg/BatteryState': Kind('battery', 2.0, is_bulk=False, values=_battery),
+    'go2_interfaces/msg/Go2State': Kind('state', 10.0, is_bulk=False, values=_go2_state),
+}
+"""By type of message; topics of other types are counted on the page and not drawn."""
+
+
+def series(
+    topic: str, kind: Kind, type_name: str, types: MessageTypes, messages: Sequence[tuple[float, bytes]]
+) -> LiveItem | None:
+    """Rows of figures from messages and when each came (ms): all times as float64, then a row of float32 for each."""
+    assert kind.values is not None
+    rows = [(at_ms, kind.values(types.deserialize(type_name, memoryview(cdr)))) for at_ms, cdr in messages]
+    names = list(rows[-1][1])
+    rows = [row for row in rows if list(row[1]) == names]
+    times = np.array([at_ms for at_ms, _ in rows], '<f8')
+    table = np.array([list(values.values()) for _, values in rows], '<f4')
+    head = {'names': names, 'rows': len(rows), 'at': round(rows[-1][0], 1)}
+    return LiveItem(topic, kind.name, FULL, head, times.tobytes() + table.tobytes())
+
+
+def frames(topic: str, type_name: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Sequence[int]) -> Iterator[LiveItem]:
+    """A camera's message in each size that is asked for; a JPEG goes as it came. Raises Rejected."""
+    message = types.deserialize(type_name, memoryview(cdr))
+    if type_name == COMPRESSED_IMAGE:
+        body = message.data.tobytes()
+        if not body.startswith(JPEG_MAGIC):
+            raise Rejected('unsupported_encoding', f'{message.format[:40]!r} is shown by no browser')
+        for size in sizes:
+            yield LiveItem(topic, 'camera', size, {'at': round(at_ms, 1)}, body if size == FULL else _smaller(body, size))
+        return
+    pixels, colorspace = _pixels(message)
+    for size in sizes:
+        side = _SIDE.get(size, 1)
+        chosen = np.ascontiguousarray(pixels[::side, ::side])
+        sampling = 'Gray' if chosen.shape[2] == 1 else '420'
+        jpeg = simplejpeg.encode_jpeg(chosen, _QUALITY[size], colorspace, sampling, fastdct=True)
+        yield LiveItem(topic, 'camera', size, {'at': round(at_ms, 1)}, bytes(jpeg))
+
+
+def _smaller(jpeg: bytes, size: int) -> bytes:
+    try:
+        height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
+        side = _SIDE[size]
+        pixels = simplejpeg.decode_jpeg(
+            jpeg, 'BGR', fastdct=True, fastupsample=True, min_height=height // side, min_width=width // side
+        )
+        return bytes(simplejpeg.encode_jpeg(pixels, _QUALITY[size], 'BGR', '420', fastdct=True))
+    except ValueError as error:
+        raise Rejected('malformed', str(error)) from error
+
+
+def _pixels(message: Any) -> tuple[NDArray[Any], str]:
+    colorspace = _COLORSPACES.get(message.encoding)
+    if colorspace is None:
+        raise Rejected('unsupported_encoding', f'{message.encoding[:40]!r} is not shown')
+    height, width, step, channels = message.height, message.width, message.step, {'GRAY': 1}.get(colorspace, len(colorspace))
+    if not 0 < width * channels <= step or not height or message.data.size != step * height or max(width, height) > 65_500:
+        raise Rejected('size_mismatch', f'{width} x {height} {message.encoding}, step {step}, {message.data.size} bytes')
+    return message.data.reshape(height, step)[:, : width * channels].reshape(height, width, channels), colorspace
+
+
+def clouds(topic: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Sequence[int]) -> Iterator[LiveItem]:
+    """A cloud's finite points in each size that is asked for: x, y, z as uint16, metres are ``low + value * step``."""
+    cloud = types.deserialize(POINT_CLOUD, memoryview(cdr))
+    offsets = {field.name: field.offset for field in cloud.fields if field.name in _AXES and field.datatype == _FLOAT32}
+    count, step = cloud.width * cloud.height, cloud.point_step
+    if len(offsets) != len(_AXES) or max(offsets.values(), default=0) + 4 > step or cloud.data.size < count * step:
+        raise Rejected('size_mismatch', 'a cloud without x, y and z as float32, or with fewer bytes than it says')
+    layout = np.dtype({'names': list(_AXES), 'formats': [('>' if cloud.is_bigendian else '<') + 'f4'] * 3,
+                       'offsets': [offsets[axis] for axis in _AXES], 'itemsize': step})  # fmt: skip
+    every = max(1, -(-count // MOST_POINTS))
+    points = np.frombuffer(cloud.data, layout, count)[::every]
+    table = np.stack([points[axis] for axis in _AXES], axis=1).astype('<f4', copy=False)
+    table = table[np.isfinite(table).all(axis=1)]
+    low = table.min(axis=0) if len(table) else np.zeros(3, '<f4')
+    span = (table.max(axis=0) - low if len(table) else low).astype('f8')
+    scale = np.where(span > 0, span, 1.0) / 65_535
+    for size in sizes:
+        chosen = ((table[:: _EVERY[size]] - low) * (1 / scale).astype('f4') + np.float32(0.5)).astype('<u2')
+        head = {
+            'at': round(at_ms, 1), 'low': [round(float(value), 4) for value in low], 'step': [float(value) for value in scale],
+            'points': len(chosen), 'frame': cloud.header.frame_id[:80],
+        }  # fmt: skip
+        yield LiveItem(topic, 'cloud', size, head, chosen.tobytes())

@@ -1,0 +1,253 @@
+// The live page: what the robot sees now, its data, and what is missing.
+import { batch, html, render, signal, useEffect, useRef, useState } from './vendor/preact.js';
+import { Cards, Controls, Findings, TopicTable } from './data.js';
+import { Link } from './link.js';
+import { Plot, Ring } from './plots.js';
+import { Timeline } from './timeline.js';
+import { span } from './words.js';
+
+const calm = matchMedia('(prefers-reduced-motion: reduce)');
+const OLD_MS = { camera: 1500, cloud: 2000, odom: 1500, imu: 1500, joints: 1500, battery: 5000, state: 2000, figures: 4000 };
+const session = signal(null);
+const connection = signal('connecting');
+const figures = signal(null);
+const topics = signal([]);
+const problem = signal('');
+const picked = signal({});
+const seen = new Map(); // kind -> { at } of what is shown, by the robot's clock
+const rings = { imu: new Ring(30), joints: new Ring(30), battery: new Ring(900), odom: new Ring(30), state: new Ring(30) };
+const views = {};
+// For whoever measures: how late items were when they came and when they were drawn, ms.
+const stats = (window.shadowhound = { came: {}, drawn: {}, count: {}, link: null, ages: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, link.now() - at])) });
+let link;
+
+function note(where, kind, at) {
+  const now = link.now();
+  if (now !== null) (where[kind] ??= []).push(now - at);
+  if (where[kind]?.length > 4000) where[kind].splice(0, 2000);
+}
+
+function chosen(kind) {
+  const having = topics.value.filter(([, each]) => each === kind);
+  const wanted = having.find(([topic]) => topic === picked.value[kind]);
+  if (wanted) return wanted[0];
+  const logged = new Set((figures.value?.topics ?? []).filter((row) => row.sensor && row.publishers).map((row) => row.topic));
+  const rank = ([topic, , type]) => (logged.has(topic) ? 0 : 2) + (type.endsWith('/Image') ? 1 : 0);
+  return having.sort((a, b) => rank(a) - rank(b) || (a[0] < b[0] ? -1 : 1))[0]?.[0];
+}
+
+const KINDS = ['camera', 'cloud', 'odom', 'imu', 'joints', 'battery', 'state'];
+function rewatch() {
+  link?.watch(KINDS.map(chosen).filter(Boolean));
+}
+
+let decoding = false;
+let waiting = null;
+async function showFrame(head, body) {
+  waiting = { head, body };
+  if (decoding || !views.camera) return;
+  decoding = true;
+  while (waiting) {
+    const { head: now, body: jpeg } = waiting;
+    waiting = null;
+    try {
+      const picture = await createImageBitmap(new Blob([jpeg], { type: 'image/jpeg' }));
+      const canvas = views.camera;
+      if (canvas.width !== picture.width) canvas.width = picture.width;
+      if (canvas.height !== picture.height) canvas.height = picture.height;
+      canvas.getContext('2d').drawImage(picture, 0, 0);
+      picture.close();
+      note(stats.drawn, 'camera', now.at);
+    } catch { /* a broken frame: the next one comes */ }
+  }
+  decoding = false;
+}
+
+function onItem(head, body) {
+  const { kind } = head;
+  stats.count[kind] = (stats.count[kind] ?? 0) + 1;
+  if (head.at !== undefined) {
+    seen.set(kind, { at: head.at });
+    note(stats.came, kind, head.at);
+  }
+  if (kind === 'topics') {
+    batch(() => {
+      topics.value = head.topics;
+      problem.value = head.problem;
+    });
+    rewatch();
+  } else if (kind === 'figures') {
+    figures.value = head.figures;
+    document.title = `${head.figures.robot} · live`;
+    rewatch();
+  } else if (kind === 'camera') {
+    showFrame(head, body);
+  } else if (kind === 'cloud') {
+    views.cloud?.cloud(head, body, () => note(stats.drawn, 'cloud', head.at));
+    views.plan?.cloud(head, body);
+  } else if (rings[kind]) {
+    rings[kind].add(head, body);
+    if (kind === 'odom') {
+      const pose = rings.odom.last();
+      views.cloud?.pose(pose);
+      if (views.plan?.pose(pose)) views.cloud?.trail(views.plan.path);
+    }
+  }
+}
+
+function Age({ kind, children }) {
+  const [, again] = useState(0);
+  useEffect(() => {
+    const timer = setInterval(() => again((count) => count + 1), 200);
+    return () => clearInterval(timer);
+  }, []);
+  const at = seen.get(kind)?.at;
+  const now = link?.now();
+  const age = at === undefined || now === null || now === undefined ? null : Math.max(0, now - at);
+  const isOld = age === null || age > OLD_MS[kind];
+  return html`<span class=${`age ${isOld ? 'old' : ''}`} data-age=${kind} data-ms=${age === null ? '' : Math.round(age)}>${age === null ? 'nothing yet' : isOld ? `${span(age / 1000)} old` : `${Math.round(age)} ms`}</span>${children}`;
+}
+
+function Panel({ title, kind, className = '', tools, children }) {
+  const having = topics.value.filter(([, each]) => each === kind);
+  return html`<section class=${`panel view ${className}`} aria-label=${title}><div class="panel-head"><h3>${title}</h3>
+    ${having.length > 1 && html`<select aria-label=${`Topic of ${title}`} value=${chosen(kind)} onChange=${(event) => { picked.value = { ...picked.value, [kind]: event.target.value }; rewatch(); }}>
+      ${having.map(([topic]) => html`<option>${topic}</option>`)}</select>`}
+    ${tools}<${Age} kind=${kind} /></div>${children}</section>`;
+}
+
+function Camera() {
+  const canvas = useRef(null);
+  useEffect(() => { views.camera = canvas.current; }, []);
+  return html`<${Panel} title="Camera" kind="camera" className="camera"><div class="stage"><canvas ref=${canvas} width="640" height="480" role="img" aria-label="The newest frame of the camera"></canvas></div></${Panel}>`;
+}
+
+function Cloud() {
+  const canvas = useRef(null);
+  const [follows, setFollows] = useState(true);
+  const [lacks, setLacks] = useState('');
+  useEffect(() => {
+    import('./scene.js').then(({ CloudView }) => { views.cloud = new CloudView(canvas.current); }).catch(() => setLacks('This browser shows no 3D (WebGL).'));
+  }, []);
+  const turn = () => { views.cloud?.follow(!follows); setFollows(!follows); };
+  return html`<${Panel} title="Point cloud" kind="cloud" className="cloud" tools=${html`<button type="button" aria-pressed=${follows} onClick=${turn} title="Keep the robot in the middle">Follow</button>`}>
+    <div class="stage">${lacks && html`<p class="empty">${lacks}</p>`}<canvas ref=${canvas} tabindex="0" role="img" aria-label="The points of the lidar around the robot; drag to turn, scroll to zoom, arrow keys to move"></canvas></div></${Panel}>`;
+}
+
+function Plan() {
+  const canvas = useRef(null);
+  useEffect(() => {
+    let timer;
+    import('./scene.js').then(({ FloorPlan }) => {
+      views.plan = new FloorPlan(canvas.current);
+      timer = setInterval(() => !document.hidden && views.plan.draw(), calm.matches ? 1000 : 250);
+    });
+    return () => clearInterval(timer);
+  }, []);
+  return html`<${Panel} title="Path" kind="odom" className="plan"><div class="stage"><canvas ref=${canvas} role="img" aria-label="Where the robot went, on the floor plan that its lidar makes"></canvas></div></${Panel}>`;
+}
+
+function Chart({ title, kind, lines, options, className = '', figure }) {
+  const box = useRef(null);
+  const [, again] = useState(0);
+  useEffect(() => {
+    const plot = new Plot(box.current, rings[kind], lines, options);
+    let rounds = 0;
+    const timer = setInterval(() => {
+      if (document.hidden) return;
+      plot.draw();
+      if ((rounds += 1) % 4 === 0) again(rounds);
+    }, calm.matches ? 1000 : 200);
+    return () => clearInterval(timer);
+  }, []);
+  const last = rings[kind].last();
+  return html`<${Panel} title=${title} kind=${kind} className=${`chart ${className}`}><div class="legend small">
+    ${(lines ?? []).map(([name, label, factor], place) => html`<span><i class=${`stroke line-${place + 1}`}></i>${label} <b>${last[name] === undefined ? '–' : (last[name] * factor).toFixed(options.digits ?? 1)}</b>${options.unit ? ` ${options.units?.[place] ?? options.unit}` : ''}</span>`)}
+    ${!lines && html`<span>${rings[kind].names.length} ${figure}</span>`}</div><div class="plot" ref=${box}></div></${Panel}>`;
+}
+
+const DEGREES = 180 / Math.PI;
+const ATTITUDE = [['rpy.x', 'roll', DEGREES], ['rpy.y', 'pitch', DEGREES], ['rpy.z', 'yaw', DEGREES]];
+const FORCE = [['accel.x', 'x', 1], ['accel.y', 'y', 1], ['accel.z', 'z', 1]];
+const POWER = [['battery', 'battery', 1], ['volts', 'voltage', 1]];
+const HEAT = [['body', 'body', 1], ['motor', 'warmest motor', 1], ['cells', 'cells', 1]];
+
+function SignIn({ box, onDone }) {
+  const [wrong, setWrong] = useState('');
+  const submit = async (event) => {
+    event.preventDefault();
+    const token = new FormData(event.target).get('token').trim();
+    const answer = await fetch('/api/session', { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify({ token }) });
+    const content = await answer.json();
+    if (!answer.ok) return setWrong(answer.status === 429 ? `${content.error}: wait ${answer.headers.get('Retry-After')} s` : content.error);
+    event.target.reset();
+    setWrong('');
+    onDone(content);
+  };
+  return html`<form onSubmit=${submit} class="sign-in"><h2>Sign in</h2><p>The token is in a file on the robot; <code>shadowhound-data live</code> says where.</p>
+    <input name="token" type="password" autocomplete="current-password" required autofocus aria-label="Token" aria-invalid=${Boolean(wrong)} />
+    ${wrong && html`<p class="note bad" role="alert">${wrong}</p>`}
+    <div class="row"><button class="primary">Sign in</button>${box && html`<button type="button" onClick=${() => box.current.close()}>Cancel</button>`}</div></form>`;
+}
+
+function Head({ onSignIn }) {
+  const told = figures.value;
+  const isLost = connection.value !== 'connected';
+  const running = told?.state === 'running';
+  const [text, kind] = isLost ? ['no connection: trying again', 'bad'] : !told ? ['connecting', 'none'] : running ? [told.paused ? 'paused' : 'recording', told.paused ? 'watch' : 'good']
+    : [told.state === 'not_answering' ? 'the node does not answer' : 'the node is not running', 'bad'];
+  const signOut = async () => {
+    await fetch('/api/sign-out', { method: 'POST', headers: { 'X-CSRF-Token': session.value.csrf } });
+    location.reload();
+  };
+  return html`<header><a class="skip" href="#data">Skip to the data</a><img src="icon.svg" alt="" width="30" height="30" /><h1>${session.value?.robot ?? 'Live'}</h1>
+    <span class=${`pill ${kind}`} role="status">${text}</span>
+    <nav aria-label="Parts of this page"><a href="#now">Now</a><a href="#data">The data</a><a href="#gaps">Gaps</a></nav>
+    <span class="spacer"></span>${told && html`<${Age} kind="figures" />`}
+    ${session.value?.signed_in ? html`<button type="button" onClick=${signOut}>Sign out (${session.value.role})</button>` : html`<button type="button" onClick=${onSignIn}>Sign in</button>`}</header>`;
+}
+
+function App() {
+  const box = useRef(null);
+  const who = session.value;
+  const open = () => box.current?.showModal();
+  const done = (content) => {
+    box.current?.close();
+    session.value = content;
+    start();
+  };
+  if (who === null) return html`<main class="alone"><p class="empty">…</p></main>`;
+  if (who === false) return html`<main class="alone"><div class="panel"><${SignIn} onDone=${done} /></div></main>`;
+  const told = figures.value;
+  return html`<${Head} onSignIn=${open} />
+    <main class=${connection.value === 'connected' ? '' : 'stale'}>
+      <section id="now" aria-label="Now">${problem.value && html`<p class="banner">${problem.value}</p>`}
+        <div class="views"><${Camera} /><${Cloud} /><${Plan} />
+        <${Chart} title="Attitude" kind="imu" lines=${ATTITUDE} options=${{ unit: '°' }} />
+        <${Chart} title="Acceleration" kind="imu" lines=${FORCE} options=${{ unit: 'm/s²' }} />
+        <${Chart} title="Joints" kind="joints" lines=${null} options=${{ unit: 'rad' }} figure="joints, rad" />
+        <${Chart} title="Battery" kind="battery" lines=${POWER} options=${{ unit: '%', units: ['%', 'V'], seconds: 600 }} />
+        <${Chart} title="Temperature" kind="battery" lines=${HEAT} options=${{ unit: '°C', seconds: 600, digits: 0 }} /></div></section>
+      <section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} />
+        <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div>` : html`<p class="empty">…</p>`}</section>
+      <section id="gaps" aria-label="Gaps"><h2>What is missing</h2><${Timeline} /></section>
+    </main>
+    <dialog ref=${box}><${SignIn} box=${box} onDone=${done} /></dialog>`;
+}
+
+function start() {
+  if (link) return;
+  link = stats.link = new Link({ onItem, onState: (state) => { connection.value = state; if (state === 'lost') check(); } });
+}
+
+// Whether the cookie is still good: a token that was replaced ends it.
+async function check() {
+  try {
+    const answer = await fetch('/api/session');
+    if (answer.status === 401) session.value = false;
+    if (answer.ok && session.value?.role === undefined) session.value = await answer.json();
+  } catch { /* the link says that the robot cannot be reached */ }
+}
+
+render(html`<${App} />`, document.getElementById('app'));
+check().then(() => session.value && start());

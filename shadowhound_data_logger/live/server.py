@@ -1,0 +1,527 @@
+"""The server of the live page: HTTP, WebSocket, who may what, and what each viewer is sent."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import json
+import logging
+import mimetypes
+import os
+import socket
+import ssl
+import sys
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from hashlib import sha256
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from aiohttp import WSMsgType, web
+
+from shadowhound_data_logger.clock import SECOND, SystemClock
+from shadowhound_data_logger.errors import DataLoggerError, NodeUnavailable
+from shadowhound_data_logger.live.access import (
+    COOKIE,
+    LASTS_S,
+    Access,
+    OwnNames,
+    SignIn,
+    is_loopback,
+    is_same_origin,
+    make_tokens,
+)
+from shadowhound_data_logger.live.figures import SpoolFigures
+from shadowhound_data_logger.live.kinds import KINDS, LiveItem
+from shadowhound_data_logger.live.viewer import Viewer
+from shadowhound_data_logger.spool.control import connect
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.live.topics import Topics
+
+log = logging.getLogger(__name__)
+
+PAGE: Final = Path(__file__).parent / 'page'
+MOST_VIEWERS: Final = 16
+MOST_BODY: Final = 4096
+"""Bytes of a request."""
+MOST_MESSAGE: Final = 16 << 10
+"""Bytes of a message of a viewer."""
+MOST_WATCHED: Final = 16
+"""Topics that one viewer watches."""
+FIGURES_S: Final = 1.0
+LEDGER_EVERY: Final = 2
+"""The ledger is read with each second status."""
+SEND_BUFFER: Final = 32 << 10
+LEASE_EVERY_S: Final = 2.0
+DOCTOR_S: Final = 60.0
+"""What the doctor found is told again for so long, however many ask."""
+AF41: Final = 34 << 2
+"""DSCP of interactive video (RFC 4594), in the byte where IP has it."""
+SILENT_S: Final = 15.0
+"""A viewer that says nothing for so long is gone: the page says something each second."""
+ACTS: Final[Mapping[str, tuple[str, ...]]] = {
+    'flush': (), 'pause': (), 'resume': (), 'bag start': (), 'bag stop': (), 'bag split': (), 'event': ('name', 'note'),
+}  # fmt: skip
+"""What an operator may ask of the node, and with what."""
+SECURITY: Final[Mapping[str, str]] = {
+    'Content-Security-Policy': "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self';"
+                               " connect-src 'self'; font-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'self';"
+                               " frame-ancestors 'none'",
+    'X-Content-Type-Options': 'nosniff', 'X-Frame-Options': 'DENY', 'Referrer-Policy': 'no-referrer',
+    'Cross-Origin-Opener-Policy': 'same-origin', 'Cross-Origin-Resource-Policy': 'same-origin',
+}  # fmt: skip
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveSettings:
+    """How the page is served."""
+
+    spool: Path
+    robot: str
+    tokens: Path
+    """The folder of the tokens."""
+    bind: str = '127.0.0.1'
+    port: int = 8765
+    names: tuple[str, ...] = ()
+    """Further names under which the page may be asked for."""
+    certificate: tuple[Path, Path] | None = None
+    """Certificate and key, for https."""
+    uploads_mbps: float = 4.0
+    """What uploads are left while somebody watches over the network; 0: all they want."""
+
+
+@dataclass(eq=False)
+class _Connected:
+    """A viewer, and who it is."""
+
+    viewer: Viewer
+    who: SignIn
+    address: str
+    tasks: list[asyncio.Task[None]] = field(default_factory=list)
+
+
+class LiveServer:
+    """Serves the page until it is closed. New; open once; close once; all on one event loop."""
+
+    def __init__(self, settings: LiveSettings) -> None:
+        self._settings = settings
+        self._access = Access(make_tokens(settings.tokens), is_open=is_loopback(settings.bind))
+        self._names = OwnNames(settings.bind, settings.names)
+        self._figures = SpoolFigures(settings.spool, settings.robot, SystemClock.of_this_machine())
+        self._files = dict(_static(PAGE))
+        self._viewers: set[_Connected] = set()
+        self._wanted: dict[str, frozenset[int]] | None = None
+        self._graph: Mapping[str, str] = {}
+        self._topics: Topics | None = None
+        self._pool = ThreadPoolExecutor(2, 'spool')
+        self._reading = asyncio.Lock()
+        self._asking = asyncio.Lock()
+        self._doctor: tuple[float, dict[str, Any]] | None = None
+        self._examining = asyncio.Lock()
+        self._runner: web.AppRunner | None = None
+        self._ticker: asyncio.Task[None] | None = None
+        self.port = settings.port
+        self.ros_problem = ''
+        """Why nothing but the data is shown; empty where topics are read."""
+
+    async def open(self) -> None:
+        """Raises OSError where nobody can listen there, or the certificate cannot be read."""
+        self._loop = asyncio.get_running_loop()
+        app = web.Application(middlewares=[self._guard], client_max_size=MOST_BODY)
+        app.add_routes([
+            web.get('/ws', self._watch), web.get('/api/session', self._session), web.post('/api/session', self._sign_in),
+            web.post('/api/sign-out', self._sign_out), web.post('/api/act', self._act), web.get('/api/gaps', self._tell_gaps),
+            web.get('/api/doctor', self._tell_doctor), web.get('/{name:.*}', self._file),
+        ])  # fmt: skip
+        self._runner = web.AppRunner(app, access_log=None, handle_signals=False)
+        await self._runner.setup()
+        secure = None
+        if self._settings.certificate is not None:
+            secure = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+            secure.load_cert_chain(*self._settings.certificate)
+        listener = _listener(self._settings.bind, self._settings.port)
+        self.port = listener.getsockname()[1]
+        await web.SockSite(self._runner, listener, ssl_context=secure).start()
+        self._open_topics()
+        self._ticker = asyncio.create_task(self._tick())
+
+    async def close(self) -> None:
+        if self._ticker is not None:
+            self._ticker.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._ticker
+        for one in list(self._viewers):
+            for task in one.tasks:
+                task.cancel()
+        if self._runner is not None:
+            await self._runner.cleanup()
+        if self._topics is not None:
+            await asyncio.to_thread(self._topics.close)
+        self._pool.shutdown()
+
+    @property
+    def url(self) -> str:
+        bind = self._settings.bind
+        host = {'0.0.0.0': socket.gethostname(), '::': socket.gethostname()}.get(bind, f'[{bind}]' if ':' in bind else bind)  # noqa: S104 - compared
+        return f'{self._scheme}://{host}:{self.port}/'
+
+    @property
+    def _scheme(self) -> str:
+        return 'https' if self._settings.certificate is not None else 'http'
+
+    def _open_topics(self) -> None:
+        """Where ROS is, read topics; else the data alone is shown."""
+        if find_spec('rclpy') is None:
+            self.ros_problem = 'ROS is not sourced here: the page shows the data, and no camera, cloud or plots'
+            return
+        from shadowhound_data_logger.live.topics import Topics  # noqa: PLC0415 - rclpy
+
+        def tell(graph: Mapping[str, str]) -> None:
+            self._loop.call_soon_threadsafe(self._on_graph, graph)
+
+        def show(items: list[LiveItem]) -> None:
+            self._loop.call_soon_threadsafe(self._on_items, items)
+
+        topics = Topics(lambda: self._wanted, tell, show)
+        topics.open()
+        self._topics = topics
+
+    # -- what comes ------------------------------------------------------------------------------------------------
+
+    def _on_graph(self, graph: Mapping[str, str]) -> None:
+        self._graph = graph
+        for one in self._viewers:
+            self._offer_catalogue(one)
+
+    def _on_items(self, items: list[LiveItem]) -> None:
+        for item in items:
+            for one in self._viewers:
+                if item.topic in one.viewer.watched and one.viewer.size(item.topic) == item.size:
+                    one.viewer.offer(item)
+
+    def _offer_catalogue(self, one: _Connected) -> None:
+        topics = [[topic, KINDS[name].name, name] for topic, name in self._graph.items() if name in KINDS]
+        one.viewer.offer(LiveItem('', 'topics', head={'topics': topics, 'problem': self.ros_problem}))
+
+    def _rewatch(self) -> None:
+        """After any viewer came, went or chose."""
+        wanted: dict[str, set[int]] = {}
+        for one in self._viewers:
+            for topic in one.viewer.watched:
+                wanted.setdefault(topic, set()).add(one.viewer.size(topic))
+        before = self._wanted
+        self._wanted = {topic: frozenset(sizes) for topic, sizes in wanted.items()} if self._viewers else None
+        if self._topics is not None and self._wanted != before:
+            self._topics.wake()
+
+    async def _tick(self) -> None:
+        """Once a second: the figures, the sizes, the lease, and threads that died."""
+        rounds = 0
+        lease_s = 0.0
+        while True:
+            began_s = time.monotonic()
+            if self._topics is not None:
+                self._topics.worker.look()
+            if self._viewers:
+                try:
+                    await self._tell_figures(with_ledger=rounds % LEDGER_EVERY == 0)
+                except Exception:  # the one supervised catch-all: the page shows the age of what it has
+                    log.exception('the figures cannot be read')
+                for one in self._viewers:
+                    one.viewer.choose_sizes()
+                self._rewatch()
+                if (
+                    self._settings.uploads_mbps
+                    and began_s >= lease_s
+                    and any(not is_loopback(one.address) for one in self._viewers)
+                ):
+                    lease_s = began_s + LEASE_EVERY_S
+                    self._loop.run_in_executor(self._pool, self._lease)
+            rounds += 1
+            await asyncio.sleep(max(0.05, began_s + FIGURES_S - time.monotonic()))
+
+    async def _tell_figures(self, *, with_ledger: bool) -> None:
+        async with self._reading:
+            figures = await self._loop.run_in_executor(self._pool, partial(self._figures.now, with_ledger=with_ledger))
+        item = LiveItem('', 'figures', head={'at': round(time.monotonic() * 1e3, 1), 'figures': figures})
+        for one in self._viewers:
+            one.viewer.offer(item)
+
+    def _lease(self) -> None:
+        """Uploads yield for some seconds; a node that does not run uploads nothing."""
+        with suppress(NodeUnavailable), closing(connect(self._settings.spool, self._settings.robot, 5.0)) as connection:
+            connection.ask('yield', max_mbps=self._settings.uploads_mbps)
+
+    # -- requests --------------------------------------------------------------------------------------------------
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Whom it is for, where it comes from; and the headers of each answer."""
+        try:
+            response = await self._guarded(request, handler)
+        except web.HTTPException as error:
+            response = _problem(error.status, error.text or error.reason)
+        if not response.prepared:
+            response.headers.update(SECURITY)
+        return response
+
+    async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        own = request.transport.get_extra_info('sockname') if request.transport is not None else None
+        if not self._names.has(request.host, own[0] if own else ''):
+            return _problem(403, f'this page is not called {request.host[:100]!r}: see --name')
+        is_ws = request.path == '/ws'
+        if is_ws or request.method not in ('GET', 'HEAD'):
+            if not is_same_origin(request.headers.get('Origin'), request.host, self._scheme):
+                return _problem(403, 'the request does not come from this page')
+            if (request.content_length or 0) > MOST_BODY:
+                return _problem(413, f'a request has at most {MOST_BODY} bytes')
+        if request.path == '/ws' or request.path.startswith('/api/'):
+            is_known = self._access.who(request.cookies.get(COOKIE)) is not None
+            if not is_known and (request.method, request.path) != ('POST', '/api/session'):
+                return _problem(401, 'sign in first')
+        return await handler(request)
+
+    def _who(self, request: web.Request) -> SignIn:
+        """Of a request that came through the guard."""
+        who = self._access.who(request.cookies.get(COOKIE))
+        assert who is not None
+        return who
+
+    async def _file(self, request: web.Request) -> web.StreamResponse:
+        found = self._files.get(request.match_info['name'] or 'index.html')
+        if found is None:
+            return _problem(404, 'there is no such page')
+        body, packed, kind, tag = found
+        headers = {'ETag': tag, 'Cache-Control': 'no-cache', 'Vary': 'Accept-Encoding'}
+        if request.headers.get('If-None-Match') == tag:
+            return web.Response(status=304, headers=headers)
+        if 'gzip' in request.headers.get('Accept-Encoding', ''):
+            return web.Response(body=packed, headers={**headers, 'Content-Encoding': 'gzip', 'Content-Type': kind})
+        return web.Response(body=body, headers={**headers, 'Content-Type': kind})
+
+    async def _session(self, request: web.Request) -> web.StreamResponse:
+        who = self._who(request)
+        return _json({'role': who.role, 'csrf': who.csrf, 'signed_in': bool(who.nonce), 'robot': self._settings.robot})
+
+    async def _sign_in(self, request: web.Request) -> web.StreamResponse:
+        address = request.remote or ''
+        if wait_s := self._access.wait_s(address):
+            return _problem(429, 'too many wrong tokens', {'Retry-After': str(round(wait_s))})
+        token = (await _body(request)).get('token')
+        found = self._access.sign_in(token, address) if isinstance(token, str) else None
+        if found is None:
+            log.warning('a wrong token from %s', address)
+            return _problem(401, 'this is not the token of a viewer or operator')
+        who, cookie = found
+        log.info('%s signed in from %s', who.role, address)
+        response = _json({'role': who.role, 'csrf': who.csrf, 'signed_in': True, 'robot': self._settings.robot})
+        response.set_cookie(COOKIE, cookie, max_age=LASTS_S, httponly=True, samesite='Strict', secure=self._scheme == 'https')
+        return response
+
+    async def _sign_out(self, request: web.Request) -> web.StreamResponse:
+        who = self._who(request)
+        if not self._access.is_csrf(who, request.headers.get('X-CSRF-Token', '')):
+            return _problem(403, 'the request does not come from this page')
+        self._access.sign_out(who)
+        for one in list(self._viewers):
+            if one.who.nonce == who.nonce:
+                for task in one.tasks:
+                    task.cancel()
+        response = _json({})
+        response.del_cookie(COOKIE)
+        return response
+
+    async def _act(self, request: web.Request) -> web.StreamResponse:
+        """What an operator asks of the node, with the node's answer."""
+        who = self._who(request)
+        if not who.may_act:
+            return _problem(403, 'only an operator may do that: sign in with the token of the operator')
+        if not self._access.is_csrf(who, request.headers.get('X-CSRF-Token', '')):
+            return _problem(403, 'the request does not come from this page')
+        asked = await _body(request)
+        do = asked.get('do')
+        takes = ACTS.get(do) if isinstance(do, str) else None
+        given = {name: value for name, value in asked.items() if name != 'do'}
+        if takes is None or not all(name in takes and isinstance(value, str) for name, value in given.items()):
+            return _problem(400, f'"do" is one of {", ".join(ACTS)}')
+        async with self._asking:
+            answer = await self._loop.run_in_executor(self._pool, partial(self._ask, str(do), request.remote or '', given))
+        return _json(answer)
+
+    def _ask(self, do: str, address: str, given: Mapping[str, str]) -> dict[str, Any]:
+        try:
+            with closing(connect(self._settings.spool, self._settings.robot)) as connection:
+                by = {'by': 'page'} if do == 'event' else {}
+                return connection.ask(do, who=f'operator at {address}', **given, **by)
+        except NodeUnavailable as error:
+            return {'ok': False, 'robot': self._settings.robot, 'error': str(error)}
+
+    async def _tell_gaps(self, request: web.Request) -> web.StreamResponse:
+        times = []
+        for name in ('from', 'to'):
+            text = request.query.get(name, '')
+            if text and not (text.isdecimal() and len(text) < 15):
+                return _problem(400, 'from and to are UTC in ms')
+            times.append(int(text) * SECOND // 1000 if text else None)
+        try:
+            async with self._reading:
+                found = await self._loop.run_in_executor(self._pool, partial(self._figures.gaps, *times))
+        except DataLoggerError as error:
+            return _problem(503, str(error))
+        response = _json(found)
+        response.enable_compression()
+        return response
+
+    async def _tell_doctor(self, _: web.Request) -> web.StreamResponse:
+        async with self._examining:
+            if self._doctor is None or time.monotonic() - self._doctor[0] > DOCTOR_S:
+                self._doctor = time.monotonic(), await _examine()
+        return _json(self._doctor[1])
+
+    # -- a viewer --------------------------------------------------------------------------------------------------
+
+    async def _watch(self, request: web.Request) -> web.StreamResponse:
+        if len(self._viewers) >= MOST_VIEWERS:
+            return _problem(429, f'{MOST_VIEWERS} viewers are here, which is the most there may be', {'Retry-After': '10'})
+        ws = web.WebSocketResponse(max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0)
+        one = _Connected(Viewer(), self._who(request), request.remote or '')
+        self._viewers.add(one)  # before anything waits: the cap counts those that are coming
+        try:
+            await ws.prepare(request)
+            _quicken(request)
+            self._offer_catalogue(one)
+            self._rewatch()
+            one.tasks = [asyncio.create_task(self._send(ws, one.viewer)), asyncio.create_task(self._receive(ws, one))]
+            await asyncio.wait(one.tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            self._viewers.discard(one)
+            for task in one.tasks:
+                task.cancel()
+            for task in one.tasks:
+                with suppress(asyncio.CancelledError, ConnectionError, RuntimeError, asyncio.TimeoutError):
+                    await task
+            self._rewatch()
+            if request.transport is not None and not ws.closed:
+                request.transport.abort()  # one that reads nothing would not read a farewell either
+        return ws
+
+    async def _send(self, ws: web.WebSocketResponse, viewer: Viewer) -> None:
+        while True:
+            frame = viewer.next_frame()
+            if frame is None:
+                viewer.ready.clear()
+                await viewer.ready.wait()
+            else:
+                await ws.send_bytes(frame)
+
+    async def _receive(self, ws: web.WebSocketResponse, one: _Connected) -> None:
+        viewer = one.viewer
+        while True:
+            message = await ws.receive(SILENT_S)
+            if message.type == WSMsgType.BINARY and len(message.data) == 4:
+                viewer.acknowledge(int.from_bytes(message.data, 'little'))
+            elif message.type == WSMsgType.TEXT:
+                said = _parsed(message.data)
+                ping, watched = said.get('ping'), said.get('watch')
+                if isinstance(ping, (int, float)):
+                    viewer.offer(LiveItem('', 'pong', head={'ping': ping, 'now': round(time.monotonic() * 1e3, 2)}))
+                if isinstance(watched, list):
+                    viewer.watch(topic for topic in watched[:MOST_WATCHED] if isinstance(topic, str))
+                    self._rewatch()
+            elif message.type in (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR):
+                return
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    """What is no object says nothing."""
+    try:
+        said = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return said if isinstance(said, dict) else {}
+
+
+async def _body(request: web.Request) -> dict[str, Any]:
+    try:
+        return _parsed((await request.read()).decode())
+    except UnicodeDecodeError:
+        return {}
+
+
+def _json(content: Mapping[str, Any]) -> web.Response:
+    return web.json_response(content, headers={'Cache-Control': 'no-store'})
+
+
+def _problem(status: int, text: str, headers: Mapping[str, str] | None = None) -> web.Response:
+    return web.json_response({'error': text}, status=status, headers={'Cache-Control': 'no-store', **(headers or {})})
+
+
+def _static(folder: Path) -> list[tuple[str, tuple[bytes, bytes, str, str]]]:
+    """All files of the page, as they are and packed: names are looked up among these, so that no path leads elsewhere."""
+    found = []
+    for path in sorted(path for path in folder.rglob('*') if path.is_file() and path.suffix != '.json'):
+        body = path.read_bytes()
+        kind = (
+            {'.js': 'text/javascript', '.svg': 'image/svg+xml'}.get(path.suffix)
+            or mimetypes.guess_type(path.name)[0]
+            or 'text/plain'
+        )
+        tag = f'"{sha256(body).hexdigest()[:16]}"'
+        found.append(
+            (path.relative_to(folder).as_posix(), (body, gzip.compress(body, 9, mtime=0), f'{kind}; charset=utf-8', tag))
+        )
+    return found
+
+
+def _listener(bind: str, port: int) -> socket.socket:
+    """Before it listens its connections' buffers are made small: what waits there is stale when it arrives."""
+    family = socket.AF_INET6 if ':' in bind else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        listener.bind((bind, port))
+        listener.listen(64)
+        listener.setblocking(False)
+    except BaseException:
+        listener.close()
+        raise
+    return listener
+
+
+def _quicken(request: web.Request) -> None:
+    """Frames of a viewer leave at once, marked as interactive video where the system lets us."""
+    transport = request.transport
+    connection = transport.get_extra_info('socket') if transport is not None else None
+    if connection is None:
+        return
+    with suppress(OSError):
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.IPPROTO_TCP, 25, 16 << 10)  # TCP_NOTSENT_LOWAT
+        if connection.family == socket.AF_INET6:
+            connection.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_TCLASS, AF41)
+        else:
+            connection.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, AF41)
+
+
+async def _examine() -> dict[str, Any]:
+    """What ``shadowhound-data doctor --json`` says, in a process of its own."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'doctor', '--json', stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL, env=dict(os.environ),
+    )  # fmt: skip
+    try:
+        out, _ = await asyncio.wait_for(process.communicate(), 60.0)
+        return {'doctor': json.loads(out)}
+    except (asyncio.TimeoutError, ValueError) as error:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+        return {'error': f'the doctor did not answer: {type(error).__name__}'}

@@ -1,0 +1,160 @@
+"""What one browser gets, in which order, and never more than it can take.
+
+A frame of the WebSocket is a byte with its lane, a byte of flags (1: an item begins, 2: it ends), two of nothing, and a part of
+an item (``kinds.LiveItem.packed``). Each browser says after each frame how many bytes of frames it has received, as a uint32 that
+wraps. No more than a window of them is under way; what waits is small, or the newest of its topic.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Final
+
+from shadowhound_data_logger.live.kinds import FULL, HALF, SIZES, SMALLEST, LiveItem
+
+CHUNK: Final = 12 << 10
+LEAST_WINDOW, MOST_WINDOW = 24 << 10, 64 << 10
+WINDOW_S: Final = 0.08
+"""What may be under way lasts so long on the link, within these bounds."""
+MOST_ROWS_WAITING: Final = 12
+"""Items of a series, each of some 33 ms; older ones are left out."""
+SMALL_LANE: Final = 0
+BEGIN, END = 1, 2
+WEIGHTS: Final[Mapping[str, float]] = {'figures': 4.0, 'camera': 4.0, 'cloud': 1.0}
+"""How bulk topics share a link."""
+LEAST_MEASURED: Final = 4 << 10
+"""Bytes of an item by which the link is measured."""
+CAMERA_SHARE, CAMERA_HZ = 0.7, 8.0
+CLOUD_SHARE, CLOUD_HZ = 0.2, 2.0
+SMALLER: Final = {FULL: 1.0, HALF: 0.25, SMALLEST: 0.07}
+"""About how large smaller sizes are."""
+UP: Final = 1.6
+"""By how much the link must be better than a larger size needs, before it is sent."""
+FIRST_RATE: Final = 500_000.0
+"""Bytes a second that a link is taken for until it was measured."""
+
+
+class _Lane:
+    """A bulk item on its way."""
+
+    __slots__ = ('at', 'body', 'number')
+
+    def __init__(self, number: int, body: bytes) -> None:
+        self.number, self.body, self.at = number, memoryview(body), 0
+
+
+class Viewer:
+    """The queue of one browser. Used by the event loop alone.
+
+    ``offer`` what comes; ``next_frame`` until it is None, then wait for ``ready``; ``acknowledge`` what the browser says.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self.ready = asyncio.Event()
+        self.watched: frozenset[str] = frozenset()
+        self.rate = FIRST_RATE
+        """Bytes a second that the link carries, as measured."""
+        self.replaced = 0
+        """Bulk items that were replaced by newer ones before they were sent."""
+        self._now = now
+        self._rows: dict[str, deque[LiveItem]] = {}
+        self._slots: dict[str, LiveItem] = {}
+        self._lanes: dict[str, _Lane] = {}
+        self._used: dict[str, float] = {}
+        self._virtual = 0.0  # start-time fair queueing: Goyal, Vin, Cheng, SIGCOMM 1996
+        self._kinds: dict[str, str] = {'': 'figures'}
+        self._sizes: dict[str, int] = {}
+        self._bytes: dict[str, int] = {}
+        self._sent = self._acked = 0
+        self._measured: deque[tuple[int, int, float]] = deque()
+
+    def watch(self, topics: Iterable[str]) -> None:
+        """From now on these and no others."""
+        self.watched = frozenset(topics)
+        for waiting in (self._rows, self._slots):
+            for topic in [topic for topic in waiting if topic and topic not in self.watched]:
+                del waiting[topic]
+
+    def size(self, topic: str) -> int:
+        """In which size it gets a bulk topic."""
+        return self._sizes.get(topic, FULL)
+
+    def offer(self, item: LiveItem) -> None:
+        """Send it when there is room; a newer one of a bulk topic takes its place."""
+        if item.kind in WEIGHTS:
+            self._kinds[item.topic] = item.kind
+            self._bytes[item.topic] = round(len(item.packed) / SMALLER[item.size])
+            self.replaced += item.topic in self._slots
+            self._slots[item.topic] = item
+        else:
+            self._rows.setdefault(item.topic, deque(maxlen=MOST_ROWS_WAITING)).append(item)
+        self.ready.set()
+
+    @property
+    def window(self) -> int:
+        """Bytes that may be under way."""
+        return int(min(max(self.rate * WINDOW_S, LEAST_WINDOW), MOST_WINDOW))
+
+    def next_frame(self) -> bytes | None:
+        """What is sent now; None while nothing waits or may be sent."""
+        if self._sent - self._acked >= self.window:
+            return None
+        for topic, rows in self._rows.items():
+            if rows:
+                self._rows[topic] = self._rows.pop(topic)  # the others have their turn first
+                return self._count(bytes((SMALL_LANE, BEGIN | END, 0, 0)) + rows.popleft().packed)
+        return self._bulk()
+
+    def acknowledge(self, received: int) -> None:
+        """The browser has received so many bytes, modulo 2^32. What it cannot have received is left out."""
+        received = self._sent - ((self._sent - received) & 0xFFFF_FFFF)
+        if self._acked < received <= self._sent:
+            self._acked = received
+            while self._measured and self._measured[0][0] <= received:
+                _, before, since_s = self._measured.popleft()
+                rate = (received - before) / max(self._now() - since_s, 1e-4)
+                self.rate += 0.3 * (min(rate, 1e8) - self.rate)
+            self.ready.set()
+
+    def choose_sizes(self) -> None:
+        """For the link as it is now; called once a second."""
+        for topic, kind in self._kinds.items():
+            if kind == 'figures' or topic not in self._bytes:
+                continue
+            share, hz = (CAMERA_SHARE, CAMERA_HZ) if kind == 'camera' else (CLOUD_SHARE, CLOUD_HZ)
+            room, now = self.rate * share / hz, self.size(topic)
+            fitting = [size for size in SIZES if self._bytes[topic] * SMALLER[size] * (UP if size < now else 1.0) <= room]
+            self._sizes[topic] = min(fitting, default=SMALLEST)
+
+    def _bulk(self) -> bytes | None:
+        waiting = {*self._slots, *self._lanes}
+        if not waiting:
+            return None
+        topic = min(waiting, key=lambda name: (max(self._used.get(name, 0.0), self._virtual), name))
+        lane = self._lanes.get(topic)
+        flags = 0
+        if lane is None:
+            body = self._slots.pop(topic).packed
+            lane = self._lanes[topic] = _Lane(self._free_lane(), body)
+            flags = BEGIN
+            if len(body) >= LEAST_MEASURED:
+                self._measured.append((self._sent + len(body), self._acked, self._now()))
+        part = lane.body[lane.at : lane.at + CHUNK]
+        lane.at += len(part)
+        self._virtual = max(self._used.get(topic, 0.0), self._virtual)
+        self._used[topic] = self._virtual + len(part) / WEIGHTS[self._kinds[topic]]
+        if lane.at >= len(lane.body):
+            flags |= END
+            del self._lanes[topic]
+        return self._count(bytes((lane.number, flags, 0, 0)) + part)
+
+    def _free_lane(self) -> int:
+        taken = {lane.number for lane in self._lanes.values()}
+        return next(number for number in range(1, 256) if number not in taken)
+
+    def _count(self, frame: bytes) -> bytes:
+        self._sent += len(frame)
+        return frame

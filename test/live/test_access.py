@@ -1,0 +1,270 @@
+"""Who may what: a table of requests to the real server, and what becomes of those who are not allowed."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import stat
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+
+from shadowhound_data_logger.live import server as module
+from shadowhound_data_logger.live.access import MOST_FAILURES, Access, OwnNames, TokenRefused, make_tokens
+from shadowhound_data_logger.live.server import MOST_BODY, MOST_MESSAGE, MOST_VIEWERS, SECURITY, LiveServer, LiveSettings
+
+WHO = ('stranger', 'viewer', 'operator')
+UPGRADE = {'Connection': 'Upgrade', 'Upgrade': 'websocket', 'Sec-WebSocket-Version': '13',
+           'Sec-WebSocket-Key': 'AAAAAAAAAAAAAAAAAAAAAA=='}  # fmt: skip
+
+
+class Page:
+    """A server, and a client that signs in as whom it is told to."""
+
+    def __init__(self, server: LiveServer, folder: Path) -> None:
+        self.server, self.folder = server, folder
+        self.origin = f'http://127.0.0.1:{server.port}'
+        self.cookies: dict[str, str] = {}
+        self.csrf: dict[str, str] = {}
+
+    def token(self, role: str) -> str:
+        return (self.folder / f'{role}.token').read_text().strip()
+
+    async def sign_in(self, role: str) -> None:
+        async with aiohttp.ClientSession(headers={'Origin': self.origin}) as session:
+            answer = await session.post(f'{self.origin}/api/session', json={'token': self.token(role)})
+            assert answer.status == 200
+            cookie = answer.cookies['shadowhound_live']
+            assert cookie['httponly']
+            assert cookie['samesite'] == 'Strict'
+            self.cookies[role] = cookie.value
+            self.csrf[role] = (await answer.json())['csrf']
+
+    async def ask(self, who: str, method: str, path: str, *, csrf: bool = True, headers: dict[str, str] | None = None,
+                  body: bytes = b'') -> tuple[int, dict[str, str], bytes]:  # fmt: skip
+        """As a raw request: clients would tidy up a path that climbs."""
+        reader, writer = await asyncio.open_connection('127.0.0.1', self.server.port)
+        given = {'Host': f'127.0.0.1:{self.server.port}', 'Connection': 'close', 'Content-Length': str(len(body))}
+        if method == 'POST' or path == '/ws':
+            given['Origin'] = self.origin
+        if path == '/ws':
+            given |= {
+                'Connection': 'Upgrade',
+                'Upgrade': 'websocket',
+                'Sec-WebSocket-Version': '13',
+                'Sec-WebSocket-Key': 'AAAAAAAAAAAAAAAAAAAAAA==',
+            }
+        if who != 'stranger':
+            given['Cookie'] = f'shadowhound_live={self.cookies[who]}'
+            if csrf and method == 'POST':
+                given['X-CSRF-Token'] = self.csrf[who]
+        given |= headers or {}
+        lines = [f'{method} {path} HTTP/1.1', *(f'{name}: {value}' for name, value in given.items() if value), '', '']
+        writer.write('\r\n'.join(lines).encode() + body)
+        await writer.drain()
+        head = await asyncio.wait_for(reader.readuntil(b'\r\n\r\n'), 60.0)
+        answer = {} if path == '/ws' else await asyncio.wait_for(reader.read(), 60.0)
+        writer.close()
+        fields = dict(line.split(': ', 1) for line in head.decode().split('\r\n')[1:] if ': ' in line)
+        return int(head.split()[1]), fields, answer or b''
+
+
+@asynccontextmanager
+async def serving(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '0.0.0.0') -> AsyncIterator[Page]:
+    monkeypatch.setattr(module, 'find_spec', lambda _: None)  # no ROS here
+    server = LiveServer(LiveSettings(spool=folder / 'spool', robot='thor', tokens=folder / 'live', bind=bind, port=0))
+    await server.open()
+    try:
+        page = Page(server, folder / 'live')
+        for role in WHO[1:]:
+            await page.sign_in(role)
+        yield page
+    finally:
+        await server.close()
+
+
+ACT = json.dumps({'do': 'flush'}).encode()
+REBOUND = {'Host': 'evil.example:8765'}
+FOREIGN = {'Origin': 'http://evil.example'}
+TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
+    # method, path, what is special, and the status for a stranger, a viewer and an operator
+    ('GET', '/', {}, (200, 200, 200)),
+    ('GET', '/app.js', {}, (200, 200, 200)),
+    ('GET', '/../server.py', {}, (404, 404, 404)),
+    ('GET', '/%2e%2e/server.py', {}, (404, 404, 404)),
+    ('GET', '/..%2f..%2fetc/passwd', {}, (404, 404, 404)),
+    ('GET', '//etc/passwd', {}, (404, 404, 404)),
+    ('GET', '/', {'headers': REBOUND}, (403, 403, 403)),
+    ('GET', '/api/session', {}, (401, 200, 200)),
+    ('GET', '/api/session', {'headers': REBOUND}, (403, 403, 403)),
+    ('GET', '/api/gaps', {}, (401, 503, 503)),  # there is no spool
+    ('GET', '/api/gaps?from=-1', {}, (401, 400, 400)),
+    ('GET', '/api/doctor', {'headers': REBOUND}, (403, 403, 403)),
+    ('GET', '/ws', {}, (401, 101, 101)),
+    ('GET', '/ws', {'headers': FOREIGN}, (403, 403, 403)),
+    ('GET', '/ws', {'headers': {'Origin': ''}}, (403, 403, 403)),
+    ('POST', '/api/act', {'body': ACT}, (401, 403, 200)),
+    ('POST', '/api/act', {'body': ACT, 'csrf': False}, (401, 403, 403)),
+    ('POST', '/api/act', {'body': ACT, 'headers': FOREIGN}, (403, 403, 403)),
+    ('POST', '/api/act', {'body': ACT, 'headers': {'Origin': ''}}, (403, 403, 403)),
+    ('POST', '/api/act', {'body': ACT, 'headers': REBOUND}, (403, 403, 403)),
+    ('POST', '/api/act', {'body': b'{"do": "set", "values": {}}'}, (401, 403, 400)),
+    ('POST', '/api/act', {'body': b'{"do": "flush", "who": "somebody else"}'}, (401, 403, 400)),
+    ('POST', '/api/act', {'body': b'{' * 100}, (401, 403, 400)),
+    ('POST', '/api/act', {'body': b' ' * (MOST_BODY + 1)}, (413, 413, 413)),
+    ('POST', '/api/session', {'body': b' ' * (MOST_BODY + 1)}, (413, 413, 413)),
+    ('POST', '/api/sign-out', {'csrf': False}, (401, 403, 403)),
+    ('DELETE', '/api/session', {}, (403, 403, 403)),
+)
+
+
+def test_a_table_of_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each as a stranger, as a viewer and as an operator; every answer has the headers that keep others out."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page:
+            found, expected = [], []
+            for method, path, special, statuses in TABLE:
+                for who, status in zip(WHO, statuses, strict=True):
+                    given, headers, _ = await page.ask(who, method, path, **special)
+                    case = f'{who}: {method} {path} {special}'
+                    found.append((case, given))
+                    expected.append((case, status))
+                    if given != 101:
+                        assert SECURITY.items() <= headers.items(), case
+            assert found == expected
+
+    asyncio.run(run())
+
+
+def test_wrong_tokens_have_to_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond a few, an address is not heard for a while, the right token neither; whoever is signed in stays."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page:
+            statuses = [
+                (await page.ask('stranger', 'POST', '/api/session', body=b'{"token": "guess"}'))[0]
+                for _ in range(MOST_FAILURES + 2)
+            ]
+            assert statuses == [401] * MOST_FAILURES + [429] * 2
+            right = json.dumps({'token': page.token('operator')}).encode()
+            status, headers, _ = await page.ask('stranger', 'POST', '/api/session', body=right)
+            assert (status, 0 < int(headers['Retry-After']) <= 60) == (429, True)
+            assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 200
+
+    asyncio.run(run())
+
+
+def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cookie is worth nothing then, wherever it was copied to."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page:
+            assert (await page.ask('viewer', 'POST', '/api/sign-out'))[0] == 200
+            assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 401
+            assert (await page.ask('operator', 'GET', '/api/session'))[0] == 200
+            make_tokens(page.folder, anew=True)
+            assert (await page.ask('operator', 'GET', '/api/session'))[0] == 401
+
+    asyncio.run(run())
+
+
+def test_on_the_loopback_whoever_is_there_may_watch_and_not_act(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Acting needs the token of the operator everywhere."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch, '127.0.0.1') as page:
+            assert (await page.ask('stranger', 'GET', '/ws'))[0] == 101
+            assert (await page.ask('stranger', 'POST', '/api/act', body=ACT))[0] == 403
+
+    asyncio.run(run())
+
+
+def test_the_viewers_and_their_messages_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One too many is told to wait; a message that is too large ends its connection alone."""
+
+    async def run() -> None:
+        async with (
+            serving(tmp_path, monkeypatch, '127.0.0.1') as page,
+            aiohttp.ClientSession(headers={'Origin': page.origin}) as session,
+        ):
+            there = [await session.ws_connect(f'{page.origin}/ws') for _ in range(MOST_VIEWERS)]
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await session.ws_connect(f'{page.origin}/ws')
+            assert refused.value.status == 429
+            first, second = there[:2]
+            await first.send_str('x' * (MOST_MESSAGE + 1))
+            while (message := await first.receive(60.0)).type is aiohttp.WSMsgType.BINARY:
+                pass
+            assert first.close_code == 1009 or message.type in (aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR)
+            for nonsense in ('{' * 5000, '[]', '{"ping": "x", "watch": 7}', '\x00'):
+                await second.send_str(nonsense)
+            await second.send_bytes(b'\xff' * 9)
+            await second.send_str('{"ping": 5}')
+            while (message := await second.receive(60.0)).type is aiohttp.WSMsgType.BINARY and b'"pong"' not in message.data:
+                pass
+            assert b'"ping":5' in message.data
+            for each in there:
+                await each.close()
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(
+    ('mode', 'text', 'why'), [(0o640, 'a' * 30, 'for its owner alone'), (0o600, 'short', 'no token of at least')]
+)
+def test_a_token_that_others_know_is_refused(tmp_path: Path, mode: int, text: str, why: str) -> None:
+    """The start says which file and what to do."""
+    paths = make_tokens(tmp_path)
+    assert {stat.S_IMODE(path.stat().st_mode) for path in paths.values()} == {0o600}
+    paths['viewer'].write_text(text)
+    paths['viewer'].chmod(mode)
+    with pytest.raises(TokenRefused, match=why):
+        make_tokens(tmp_path)
+
+
+def test_a_cookie_says_what_its_token_signed(tmp_path: Path) -> None:
+    """Another role, a later end, or nothing that is a cookie: nobody."""
+    now = [1000.0]
+    access = Access(make_tokens(tmp_path), is_open=False, now=lambda: now[0])
+    signed = access.sign_in((tmp_path / 'viewer.token').read_text().strip(), '10.0.0.1')
+    assert signed is not None
+    _, cookie = signed
+    role, until, nonce, signature = cookie.split('.')
+    assert access.who(cookie) is not None
+    for forged in (f'operator.{until}.{nonce}.{signature}', f'{role}.{int(until) + 1}.{nonce}.{signature}',
+                   f'{role}.{until}.x.{signature}', '', '...', 'viewer.²..', f'{role}.{"9" * 400}.{nonce}.{signature}',
+                   'é.é.é.é'):  # fmt: skip
+        assert access.who(forged) is None
+    now[0] += 13 * 3600
+    assert access.who(cookie) is None
+
+
+@pytest.mark.parametrize(('host', 'own'), [
+    ('127.0.0.1:8765', True), ('localhost:8765', True), ('10.1.2.3', True), ('thor.lan:8765', True), ('10.1.2.4', False),
+    ('evil.example', False), ('', False), ('[::1', False), ('127.0.0.1.evil.example', False), ('127.0.0.1@evil.example', False),
+])  # fmt: skip
+def test_the_page_has_its_names_and_the_address_that_was_asked(host: str, own: bool) -> None:
+    """A name that leads here and is none of ours is an attack."""
+    names = OwnNames('127.0.0.1', ['thor.lan'])
+    assert names.has(host, '10.1.2.3') is own
+
+
+def test_the_page_is_small_and_loads_nothing_from_elsewhere() -> None:
+    """At most 250 KB compressed, bundles included; each is what was made of the versions that are pinned."""
+    files = {name: (body, packed) for name, (body, packed, _, _) in module._static(module.PAGE)}
+    served = {name: each for name, each in files.items() if not name.endswith(('.txt', 'SUMS'))}
+    assert sum(len(packed) for _, packed in served.values()) < 250_000
+    ours = b''.join(body for name, (body, _) in served.items() if not name.startswith('vendor/'))
+    assert re.findall(rb'https?://(?!www\.w3\.org/2000/svg)', ours) == []
+    sums = dict(line.split()[::-1] for line in files['vendor/SHA256SUMS'][0].decode().splitlines())
+    assert sums == {name.partition('/')[2]: sha256(body).hexdigest() for name, (body, _) in served.items() if 'vendor/' in name}
+    pinned = json.loads((Path(__file__).parents[2] / 'requirements' / 'page' / 'package.json').read_text())['dependencies']
+    licences = files['vendor/LICENSES.txt'][0].decode()
+    assert all(f'{name} {version} (' in licences for name, version in pinned.items())

@@ -1,0 +1,130 @@
+"""What of a message goes to a browser."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import simplejpeg
+from rosbags.typesys import Stores, get_typestore
+
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.errors import Rejected
+from shadowhound_data_logger.live.kinds import FULL, HALF, KINDS, SIZES, SMALLEST, clouds, frames, series
+from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+
+STORE = get_typestore(Stores.LATEST)
+TYPES = MessageTypes()
+
+
+def new(type_name: str, /, **given: Any) -> Any:
+    return STORE.types[type_name](**given)
+
+
+def header(frame_id: str = 'odom') -> Any:
+    return new('std_msgs/msg/Header', stamp=new('builtin_interfaces/msg/Time', sec=1, nanosec=2), frame_id=frame_id)
+
+
+def cdr(message: Any, name: str) -> bytes:
+    return bytes(STORE.serialize_cdr(message, name))
+
+
+def cloud(points: Any, **changed: Any) -> bytes:
+    fields = [
+        new('sensor_msgs/msg/PointField', name=name, offset=4 * place, datatype=7, count=1) for place, name in enumerate('xyz')
+    ]
+    given = {'header': header(), 'height': 1, 'width': len(points), 'fields': fields, 'is_bigendian': False, 'point_step': 16,
+             'row_step': 16 * len(points), 'is_dense': True,
+             'data': np.hstack([points, np.zeros((len(points), 1))]).astype('<f4').view(np.uint8).reshape(-1)}  # fmt: skip
+    return cdr(new(POINT_CLOUD, **{**given, **changed}), POINT_CLOUD)
+
+
+def image(pixels: Any, kind: str, **changed: Any) -> bytes:
+    height, width, channels = pixels.shape
+    given = {'header': header(), 'height': height, 'width': width, 'encoding': kind, 'is_bigendian': 0,
+             'step': width * channels, 'data': pixels.reshape(-1)}  # fmt: skip
+    return cdr(new(IMAGE, **{**given, **changed}), IMAGE)
+
+
+def test_points_come_back_within_half_a_step() -> None:
+    """uint16 in the box of the cloud; points that are not finite are left out."""
+    points = np.random.default_rng(1).uniform(-30, 30, (20_000, 3)).astype('<f4')
+    points[7] = np.nan
+    full, half, smallest = clouds('/points', TYPES, 12.5, cloud(points), SIZES)
+    assert (full.size, half.size, smallest.size) == (FULL, HALF, SMALLEST)
+    assert len(full.body) == 19_999 * 6
+    assert full.head is not None
+    assert full.head['at'] == 12.5
+    steps = np.frombuffer(full.body, '<u2').reshape(-1, 3)
+    found = np.array(full.head['low']) + steps * np.array(full.head['step'])
+    assert np.abs(found - np.delete(points, 7, axis=0)).max() < 0.6 * max(full.head['step'])
+    assert len(half.body) == 5_000 * 6
+    assert len(smallest.body) == 1_250 * 6
+
+
+def test_an_empty_cloud_and_one_of_a_single_point_are_shown() -> None:
+    """Their box has no extent."""
+    for points in (np.empty((0, 3)), np.array([[1.0, 2.0, 3.0]])):
+        (item,) = clouds('/points', TYPES, 0.0, cloud(points), [FULL])
+        assert len(item.body) == 6 * len(points)
+
+
+@pytest.mark.parametrize('changed', [{'width': 1 << 30}, {'point_step': 8}, {'fields': []}, {'point_step': 0}])
+def test_a_cloud_that_contradicts_itself_is_rejected(changed: dict[str, Any]) -> None:
+    """Nothing is allocated for what it claims."""
+    with pytest.raises(Rejected):
+        list(clouds('/points', TYPES, 0.0, cloud(np.zeros((10, 3)), **changed), [FULL]))
+
+
+@pytest.mark.parametrize(('encoding', 'channels'), [('bgr8', 3), ('rgb8', 3), ('rgba8', 4), ('mono8', 1)])
+def test_a_raw_image_becomes_a_jpeg_of_each_size(encoding: str, channels: int) -> None:
+    """A half and a quarter of its sides."""
+    pixels = np.full((240, 320, channels), 128, np.uint8)
+    made = list(frames('/image', IMAGE, TYPES, 0.0, image(pixels, encoding), SIZES))
+    assert [simplejpeg.decode_jpeg_header(item.body)[:2] for item in made] == [(240, 320), (120, 160), (60, 80)]
+
+
+def test_a_compressed_image_goes_as_it_came() -> None:
+    """Only a smaller one is made of it."""
+    jpeg = simplejpeg.encode_jpeg(np.zeros((480, 640, 3), np.uint8), 80, 'BGR')
+    message = new(COMPRESSED_IMAGE, header=header(), format='jpeg', data=np.frombuffer(jpeg, np.uint8))
+    full, small = frames('/image', COMPRESSED_IMAGE, TYPES, 0.0, cdr(message, COMPRESSED_IMAGE), [FULL, SMALLEST])
+    assert full.body == jpeg
+    assert simplejpeg.decode_jpeg_header(small.body)[:2] == (120, 160)
+
+
+@pytest.mark.parametrize('changed', [{'encoding': 'bayer'}, {'step': 1}, {'height': 1 << 20}, {'width': 0}])
+def test_an_image_that_cannot_be_shown_is_rejected(changed: dict[str, Any]) -> None:
+    """With a reason, and nothing else happens."""
+    with pytest.raises(Rejected):
+        list(frames('/image', IMAGE, TYPES, 0.0, image(np.zeros((8, 8, 3), np.uint8), 'bgr8', **changed), [FULL]))
+
+
+@pytest.mark.parametrize('type_name', KINDS)
+def test_broken_bytes_are_rejected(type_name: str) -> None:
+    """Of each kind."""
+    kind, broken = KINDS[type_name], b'\0\1\0\0xyz'
+
+    def show() -> None:
+        if kind.values is not None:
+            series('/topic', kind, type_name, TYPES, [(0.0, broken)])
+        elif kind.name == 'cloud':
+            list(clouds('/topic', TYPES, 0.0, broken, [FULL]))
+        else:
+            list(frames('/topic', type_name, TYPES, 0.0, broken, [FULL]))
+
+    with pytest.raises(Rejected):
+        show()
+
+
+def test_rows_of_figures_come_with_their_times() -> None:
+    """All times, then a row for each."""
+    name, empty = 'sensor_msgs/msg/JointState', np.array([])
+    joints = [cdr(new(name, header=header(), name=['a', 'b'], position=np.array([turn, 2.0]), velocity=empty, effort=empty), name)
+              for turn in (0.5, 1.5)]  # fmt: skip
+    item = series('/joints', KINDS[name], name, TYPES, [(10.0, joints[0]), (20.0, joints[1])])
+    assert item is not None
+    assert item.head == {'names': ['a', 'b'], 'rows': 2, 'at': 20.0}
+    assert np.frombuffer(item.body[:16], '<f8').tolist() == [10.0, 20.0]
+    assert np.frombuffer(item.body[16:], '<f4').tolist() == [0.5, 2.0, 1.5, 2.0]

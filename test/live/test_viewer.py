@@ -1,0 +1,163 @@
+"""What one browser gets: the newest, small things first, and never more than it acknowledges."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from shadowhound_data_logger.live.kinds import FULL, SMALLEST, LiveItem
+from shadowhound_data_logger.live.viewer import BEGIN, CHUNK, END, LEAST_WINDOW, MOST_ROWS_WAITING, MOST_WINDOW, SMALLER, Viewer
+
+
+class Browser:
+    """The other end: puts frames together, and acknowledges when it is told to."""
+
+    def __init__(self, viewer: Viewer) -> None:
+        self.viewer = viewer
+        self.received = 0
+        self.items: list[dict[str, Any]] = []
+        self._parts: dict[int, bytes] = {}
+
+    def read(self, most: int = 10_000) -> list[dict[str, Any]]:
+        """What comes until nothing more may be sent."""
+        before = len(self.items)
+        while most and (frame := self.viewer.next_frame()) is not None:
+            most -= 1
+            assert len(frame) <= CHUNK + 4
+            self.received += len(frame)
+            lane, flags = frame[:2]
+            assert bool(flags & BEGIN) is (lane not in self._parts)
+            self._parts[lane] = self._parts.get(lane, b'') + frame[4:]
+            if flags & END:
+                whole = self._parts.pop(lane)
+                length = int.from_bytes(whole[:4], 'little')
+                assert (4 + length) % 8 == 0
+                self.items.append({**json.loads(whole[4 : 4 + length]), 'body': whole[4 + length :]})
+        return self.items[before:]
+
+    def acknowledge(self) -> None:
+        self.viewer.acknowledge(self.received & 0xFFFF_FFFF)
+
+
+def frame(number: int, size: int = 100_000, topic: str = '/camera') -> LiveItem:
+    return LiveItem(topic, 'camera', FULL, {'number': number}, bytes([number % 251]) * size)
+
+
+def row(number: int, topic: str = '/imu') -> LiveItem:
+    return LiveItem(topic, 'imu', FULL, {'number': number}, b'12345678')
+
+
+@pytest.fixture
+def now() -> list[float]:
+    """A clock that tests turn."""
+    return [0.0]
+
+
+@pytest.fixture
+def browser(now: list[float]) -> Browser:
+    return Browser(Viewer(lambda: now[0]))
+
+
+def all_of(browser: Browser) -> list[dict[str, Any]]:
+    """What comes to a browser that acknowledges everything."""
+    found: list[dict[str, Any]] = []
+    while True:
+        before = browser.received
+        found += browser.read()
+        browser.acknowledge()
+        if browser.received == before:
+            return found
+
+
+def test_an_item_arrives_as_it_was(browser: Browser) -> None:
+    """Its head and its body, whatever was cut into frames."""
+    browser.viewer.offer(frame(7))
+    (item,) = all_of(browser)
+    assert (item['topic'], item['kind'], item['number'], item['body']) == ('/camera', 'camera', 7, bytes([7]) * 100_000)
+
+
+def test_a_browser_that_reads_nothing_is_sent_a_window_and_holds_one_item_a_topic(browser: Browser) -> None:
+    """However much comes: what is under way, the item that was begun, and the newest one."""
+    for number in range(500):
+        browser.viewer.offer(frame(number))
+        browser.viewer.offer(row(number))
+        browser.read()
+    assert LEAST_WINDOW <= browser.received <= MOST_WINDOW + CHUNK
+    browser.acknowledge()
+    items = all_of(browser)
+    frames = [item['number'] for item in items if item['topic'] == '/camera']
+    assert len(frames) <= 2
+    assert frames[-1] == 499
+    rows = [item['number'] for item in items if item['topic'] == '/imu']
+    assert rows == list(range(500 - MOST_ROWS_WAITING, 500))
+    assert browser.viewer.replaced > 400
+
+
+def test_small_items_go_before_what_is_left_of_a_large_one(browser: Browser) -> None:
+    """A row that comes while a frame is under way is in the next frame of the WebSocket."""
+    browser.viewer.offer(frame(1))
+    assert browser.read(2) == []
+    browser.viewer.offer(row(1))
+    assert [item['topic'] for item in browser.read(1)] == ['/imu']
+
+
+def test_bulk_topics_share_a_link_by_weight(browser: Browser) -> None:
+    """A cloud in between costs a camera a fifth, not a half; one that was silent has no claim on what it did not use."""
+    for number in range(50):
+        browser.viewer.offer(frame(number, 20_000))
+        all_of(browser)
+    sizes = {'/camera': 0, '/cloud': 0}
+    for number in range(400):
+        browser.viewer.offer(frame(number, 40_000))
+        browser.viewer.offer(LiveItem('/cloud', 'cloud', FULL, {}, bytes(40_000)))
+        for item in browser.read(2):
+            sizes[item['topic']] += len(item['body'])
+        browser.acknowledge()
+    assert 3.0 < sizes['/camera'] / sizes['/cloud'] < 5.0
+
+
+def test_a_slow_link_gets_smaller_pictures_and_a_better_one_larger_again(browser: Browser, now: list[float]) -> None:
+    """The size follows what the browser acknowledges."""
+    viewer = browser.viewer
+
+    def through(bytes_per_s: float, seconds: float) -> None:
+        end = now[0] + seconds
+        while now[0] < end:
+            size = viewer.size('/camera')
+            viewer.offer(LiveItem('/camera', 'camera', size, {}, bytes(int(60_000 * SMALLER[size]))))
+            for _ in range(12):
+                before = browser.received
+                browser.read(1)
+                now[0] += max(browser.received - before, 1) / bytes_per_s
+                browser.acknowledge()
+            viewer.choose_sizes()
+
+    through(5e6, 5.0)
+    assert viewer.size('/camera') == FULL
+    through(60_000, 30.0)
+    assert viewer.size('/camera') == SMALLEST
+    assert viewer.window < 30_000
+    through(5e6, 10.0)
+    assert viewer.size('/camera') == FULL
+
+
+@pytest.mark.parametrize('said', [0, 1, 0xFFFF_FFFF, 0x8000_0000])
+def test_an_acknowledgement_of_what_was_not_sent_opens_no_window(browser: Browser, said: int) -> None:
+    """A browser that lies gets no more than one that is silent."""
+    browser.viewer.offer(frame(1, 400_000))
+    browser.read()
+    before = browser.received
+    browser.viewer.acknowledge(said)
+    browser.read()
+    assert browser.received - before <= CHUNK + 4
+
+
+def test_what_is_not_watched_any_more_is_not_sent(browser: Browser) -> None:
+    """A hidden tab watches nothing, and gets at most what was begun."""
+    browser.viewer.watch(['/camera', '/imu'])
+    browser.viewer.offer(row(1))
+    browser.viewer.offer(frame(1))
+    browser.viewer.watch([])
+    assert all_of(browser) == []
