@@ -4,10 +4,9 @@ A publisher numbers and stamps what it sends on four topics, RELIABLE and BEST_E
 message of them. Meanwhile the node is stopped for seconds, starved, paused, and killed and started again; files of its objects
 are damaged before they are sent, so that they are quarantined, and some are mended and retried. A second node has no store and
 room for few objects, which it evicts, and its disk is filled up. What is not in the store, between two messages that are, is a
-gap: the journal must have it from the one message to the other, within a period, with its count and its cause, and nothing
-else. (Of an object that was evicted or quarantined the journal has the times of its own first and last message; where the
-publisher stood still beside them, which its other topics show, they may lie further from those around it.)
-All the time somebody reads the ledger, whose every commit must balance.
+gap: the journal must have it from the one message to the other, within a period and after a kill within the open batch, with its
+count and its cause, and nothing else. Rows with the times of the lost messages themselves may lie further off where the publisher
+stood still, which its other topics show. All the time somebody reads the ledger, whose every commit must balance.
 """
 
 from __future__ import annotations
@@ -66,8 +65,6 @@ DISK_MB: Final = 96
 RETRIED: Final = 0.5
 """Share of the damaged files that are mended and retried."""
 KINDS: Final = ('stopped', 'killed', 'paused', 'starved', 'filled', 'damaged')
-OWN_TIMES: Final = frozenset({'damaged', 'no_room'})
-"""Causes of objects that were lost: their rows have the times of their own messages, not of those around them."""
 RESTARTED_S: Final = 10.0
 """What a kill cost ends with the first message of the next start."""
 
@@ -260,11 +257,10 @@ def audit(found: Found, node: Node, roots: Iterable[Path], who: str) -> None:
             found.say('with its count', text, holds=counts[0] == counts[1])
             causes = {loss.cause for loss in journal}
             said_ns = min(loss.from_ns for loss in journal), max(loss.to_ns for loss in journal)
-            off_ns = [abs(said_ns[0] - begin_ns), abs(said_ns[1] - end_ns)]
-            if causes & OWN_TIMES:
-                off_ns[0] -= stalled_ns(still, begin_ns, said_ns[0])
-                off_ns[1] -= stalled_ns(still, said_ns[1], end_ns)
-            found.say('within a period of its time', text, holds=max(off_ns) <= near_ns)
+            off_ns = max(abs(said_ns[0] - begin_ns) - stalled_ns(still, begin_ns, said_ns[0]),
+                         abs(said_ns[1] - end_ns) - stalled_ns(still, said_ns[1], end_ns))  # fmt: skip
+            bound_ns = near_ns + (round(BATCH_S * SECOND) if 'restart' in causes else 0)
+            found.say('within a period of its time, after a kill within the open batch', text, holds=off_ns <= bound_ns)
             for loss in journal:
                 found.lost[loss.cause] += loss.count
             why = [each.what for each in found.done if each.from_ns <= end_ns and each.to_ns >= begin_ns]
