@@ -16,7 +16,8 @@ from typing import Final
 from shadowhound_data_logger.live.kinds import FULL, HALF, SIZES, SMALLEST, LiveItem
 
 CHUNK: Final = 12 << 10
-LEAST_WINDOW, MOST_WINDOW = 24 << 10, 64 << 10
+"""Bytes of a frame, or a third of the window: on a slow link small items wait for less."""
+LEAST_WINDOW, MOST_WINDOW = 16 << 10, 64 << 10
 WINDOW_S: Final = 0.08
 """What may be under way lasts so long on the link, within these bounds."""
 MOST_ROWS_WAITING: Final = 12
@@ -142,7 +143,7 @@ class Viewer:
             flags = BEGIN
             if len(body) >= LEAST_MEASURED:
                 self._measured.append((self._sent + len(body), self._acked, self._now()))
-        part = lane.body[lane.at : lane.at + CHUNK]
+        part = lane.body[lane.at : lane.at + min(CHUNK, self.window // 3)]
         lane.at += len(part)
         self._virtual = max(self._used.get(topic, 0.0), self._virtual)
         self._used[topic] = self._virtual + len(part) / WEIGHTS[self._kinds[topic]]

@@ -1,0 +1,182 @@
+#!/usr/bin/env python3
+"""What the live page costs and how late it is: CPU of node and page without viewers and with some, and links that are slow.
+
+    scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8]
+
+Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a network
+namespace where what the page sends leaves at so many Mbit/s (tc htb; needs root). One line of JSON for each part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import secrets
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+
+sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
+from domains import free_domain
+from e2e.processes import Process, Processes, until
+
+KINDS = ('camera', 'cloud', 'imu', 'odom', 'joints', 'battery')
+
+
+class Watcher:
+    """A viewer without a browser: counts what comes by kind, and how late it is by the clock of this machine."""
+
+    def __init__(self, url: str, topics: list[str]) -> None:
+        self.url, self.topics = url, topics
+        self.late_ms: dict[str, list[float]] = {}
+        self.bytes = 0
+
+    async def run(self, *, reads: bool = True) -> None:
+        async with (
+            aiohttp.ClientSession(headers={'Origin': self.url.rstrip('/')}) as session,
+            session.ws_connect(f'{self.url}ws') as ws,
+        ):
+            await ws.send_json({'watch': self.topics})
+            parts: dict[int, bytes] = {}
+            if not reads:
+                await asyncio.sleep(3600)
+            said_s = time.monotonic()
+            async for message in ws:
+                self.bytes += len(message.data)
+                await ws.send_bytes((self.bytes & 0xFFFF_FFFF).to_bytes(4, 'little'))
+                lane, flags = message.data[:2]
+                parts[lane] = (b'' if flags & 1 else parts.get(lane, b'')) + message.data[4:]
+                if flags & 2:
+                    whole = parts.pop(lane)
+                    head = json.loads(whole[4 : 4 + int.from_bytes(whole[:4], 'little')])
+                    if 'at' in head and head['kind'] in KINDS:  # one machine, one monotonic clock
+                        self.late_ms.setdefault(head['kind'], []).append(time.monotonic() * 1e3 - head['at'])
+                if time.monotonic() - said_s > 1:
+                    said_s = time.monotonic()
+                    await ws.send_json({'ping': said_s})
+
+    def told(self, seconds: float) -> dict[str, Any]:
+        found: dict[str, Any] = {'mbps': round(self.bytes * 8e-6 / seconds, 2)}
+        for kind, unordered in sorted(self.late_ms.items()):
+            late = sorted(unordered)
+            found[kind] = {'hz': round(len(late) / seconds, 1), 'median_ms': round(statistics.median(late), 1),
+                           'p95_ms': round(late[int(len(late) * 0.95)], 1)}  # fmt: skip
+        return found
+
+
+def cpu_s(pid: int) -> float:
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def private_mb(pid: int) -> float:
+    lines = Path(f'/proc/{pid}/smaps_rollup').read_text().splitlines()
+    return round(sum(int(line.split()[1]) for line in lines if line.startswith('Private_')) / 1024, 1)
+
+
+def watched(url: str, count: int, seconds: float, pids: dict[str, int], deaf: int = 0) -> dict[str, Any]:
+    """So many viewers for so long, ``deaf`` of which read nothing: what each gets, and the CPU of the processes, % of a core."""
+    topics = ['/camera/compressed', '/point_cloud2', '/imu', '/odom', '/joint_states', '/lowstate']
+    watchers = [Watcher(url, topics) for _ in range(count)]
+
+    async def run() -> tuple[float, dict[str, float]]:
+        tasks = [asyncio.create_task(watcher.run(reads=place >= deaf)) for place, watcher in enumerate(watchers)]
+        await asyncio.sleep(4)  # discovery
+        for watcher in watchers:
+            watcher.late_ms.clear()
+        sizes = [watcher.bytes for watcher in watchers]
+        before, began = {name: cpu_s(pid) for name, pid in pids.items()}, time.monotonic()
+        await asyncio.sleep(seconds)
+        took = time.monotonic() - began
+        used = {name: round(100 * (cpu_s(pid) - before[name]) / took, 2) for name, pid in pids.items()}
+        for task, watcher, size in zip(tasks, watchers, sizes, strict=True):
+            task.cancel()
+            watcher.told_bytes = watcher.bytes - size
+            watcher.bytes = watcher.told_bytes
+        await asyncio.gather(*tasks, return_exceptions=True)
+        return took, used
+
+    took, used = asyncio.run(run())
+    return {'viewers': count, 'deaf': deaf, 'cpu_percent': used, 'private_mb': private_mb(pids['live']),
+            'each': [watcher.told(took) for watcher in watchers[deaf:][:2]]}  # fmt: skip
+
+
+def shape(url: str, mbps: float) -> None:
+    """What the page sends carries no more, in packets as on a network; all else on this loopback is as fast as ever."""
+    port = url.rstrip('/').rpartition(':')[2]
+    for command in (
+        'ip link set lo mtu 1500',
+        'tc qdisc add dev lo root handle 1: htb default 1',
+        'tc class add dev lo parent 1: classid 1:1 htb rate 10gbit quantum 60000',
+        f'tc class add dev lo parent 1: classid 1:2 htb rate {mbps}mbit burst 8kb',
+        'tc qdisc add dev lo parent 1:2 bfifo limit 200kb',
+        f'tc filter add dev lo parent 1: protocol ip u32 match ip sport {port} 0xffff flowid 1:2',
+    ):
+        subprocess.run(command.split(), check=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--seconds', type=float, default=20.0)
+    parser.add_argument('--viewers', type=int, default=3)
+    parser.add_argument('--link', type=float, default=0.0)
+    parser.add_argument('--kills', type=int, default=0)
+    parser.add_argument('--scale', type=float, default=1.0)
+    given = parser.parse_args()
+    if given.link and 'LIVE_BENCH' not in os.environ:
+        command = ['unshare', '-n', sys.executable, *sys.argv]
+        sys.exit(subprocess.run(command, env={**os.environ, 'LIVE_BENCH': '1'}, check=False).returncode)
+    if given.link:
+        subprocess.run(['ip', 'link', 'set', 'lo', 'up'], check=True)
+    with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
+        domain = stack.enter_context(free_domain())
+        processes = Processes(Path(folder), domain, f'r{secrets.token_hex(4)}')
+        stack.callback(processes.end)
+        node = processes.node()
+        sim = processes.sim(f'rate_scale:={given.scale}')
+        environ = {**processes.environ, 'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_ROBOT': node.robot}
+
+        def serve(port: int) -> tuple[Process, str]:
+            log = Path(folder) / f'live-{time.monotonic_ns()}.log'
+            command = ['-m', 'shadowhound_data_logger.cli.main', 'live', '--json', '--port', str(port)]
+            live = Process('live', command, log, environ)
+            processes.started.append(live)
+            live.said('"problem"')
+            return live, json.loads(live.log[live.log.index('{') : live.log.rindex('}') + 1])['url']
+
+        live, url = serve(0)
+        pids = {'node': node.popen.pid, 'live': live.popen.pid}
+        until(lambda: node.topic('/imu').get('received', 0) > 50, 'the robot is heard')
+        if given.link:
+            shape(url, given.link)
+            rows = [watched(url, 1, given.seconds, pids)]
+        else:
+            rows = [watched(url, count, given.seconds, pids) for count in (0, 1, given.viewers, 0)]
+            rows.append(watched(url, given.viewers, given.seconds / 2, pids, deaf=given.viewers - 1))
+        for row in rows:
+            print(json.dumps({'link_mbps': given.link or None, 'load': os.getloadavg()[0], **row}), flush=True)
+        for _ in range(given.kills):
+            live.signal(signal.SIGKILL)
+            live.wait()
+            live, url = serve(0)
+            watched(url, 8, 2.0, {'live': live.popen.pid})
+        sim.signal(signal.SIGINT)
+        sim.wait()
+        time.sleep(1)
+        ledger = node.stop()
+        lost = {topic: (row['missed'], sum(row['dropped'].values())) for topic, row in ledger['topics'].items()}
+        print(json.dumps({'balanced': ledger['balanced'], 'missed_and_dropped': lost, 'kills': given.kills}), flush=True)
+
+
+if __name__ == '__main__':
+    main()
