@@ -246,9 +246,11 @@ class Lerobot:
                 new = new.set_column(new.column_names.index(name), new.schema.field(name), pa.array(values, pa.int64()))
             if not new.equals(table):
                 _write(path, new)
-                row |= {'episode_index': number, 'dataset_from_index': begin, 'dataset_to_index': begin + count}
-                for name in wanted:
-                    row |= {f'stats/{name}/{each}': value for each, value in vector_stats(matrix(new[name])).items()}
+            known = dict(row)
+            row |= {'episode_index': number, 'dataset_from_index': begin, 'dataset_to_index': begin + count}
+            for name in wanted:
+                row |= {f'stats/{name}/{each}': value for each, value in vector_stats(matrix(new[name])).items()}
+            if row != known:  # also where a kill came between its rows and this
                 self._write_row(row)
             begin += count
         for path in (path for row in gone for path in self._files_of(row)):

@@ -1,0 +1,91 @@
+"""Killed anywhere and run again, an export and a drop give the files that they would have given."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from datasets.recorded import House, Mission
+
+from shadowhound_data_logger.datasets.export import drop, export, resumed
+from shadowhound_data_logger.datasets.features import ExportOptions
+
+PATROLS = {'mission_type': 'patrol'}
+
+pytestmark = pytest.mark.long('an export for each file that it writes')
+
+
+class Killed(BaseException):
+    """What no handler expects: as little happens afterwards as after a kill."""
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for part in ('data', 'meta', 'videos')
+            for path in sorted((folder / part).rglob('*')) if path.is_file() and path.suffix != '.part'}  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def house(tmp_path_factory: pytest.TempPathFactory) -> House:
+    made = House(tmp_path_factory.mktemp('house'))
+    for number in range(2):
+        made.record(Mission(f'm{number}', begin_s=100 * number, seconds=2, sensors=('camera', 'odom')))
+    return made
+
+
+def dying(patch: pytest.MonkeyPatch, at: int) -> None:
+    """The process dies when it gives a file its name for the ``at``-th time."""
+    real, done = os.replace, 0
+
+    def replace(*arguments: Any, **more: Any) -> None:
+        nonlocal done
+        done += 1
+        if done == at:
+            raise Killed
+        real(*arguments, **more)
+
+    patch.setattr(os, 'replace', replace)
+
+
+def test_an_export_that_was_killed_goes_on(house: House, tmp_path: Path) -> None:
+    """At every file that it writes: of an episode, of the data set, the last one."""
+    export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
+    wanted = contents(tmp_path / 'whole')
+    for at in range(1, 100):
+        folder = tmp_path / f'set{at}'
+        with pytest.MonkeyPatch.context() as patch:
+            dying(patch, at)
+            try:
+                export(folder, house.source, PATROLS, ExportOptions())
+            except Killed:
+                pass
+            else:
+                break
+        export(folder, house.source, PATROLS, ExportOptions())
+        assert contents(folder) == wanted, at
+    assert at > 15
+
+
+def test_a_drop_that_was_killed_comes_to_its_end(house: House, tmp_path: Path) -> None:
+    """Whoever looks at the data set next finishes it: nothing of the mission is left."""
+    export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
+    drop(tmp_path / 'whole', 'm0')
+    wanted = contents(tmp_path / 'whole')
+    for at in range(1, 100):
+        folder = tmp_path / f'set{at}'
+        export(folder, house.source, PATROLS, ExportOptions())
+        with pytest.MonkeyPatch.context() as patch:
+            dying(patch, at)
+            try:
+                drop(folder, 'm0')
+            except Killed:
+                pass
+            else:
+                break
+        made = resumed(folder)
+        if 'm0' in made.mission_ids:  # before it was noted that it has to go
+            assert at == 1
+            continue
+        assert contents(folder) == wanted, at
+    assert at > 5

@@ -1,0 +1,118 @@
+"""lerobot itself loads what is exported, offline, value by value as it was recorded; where its environment exists."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from datasets.recorded import House, Mission, x_of
+
+from shadowhound_data_logger.datasets.export import export
+from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.datasets.lerobot import Lerobot
+from shadowhound_data_logger.datasets.verify import verify
+from shadowhound_data_logger.lake import decode
+from shadowhound_data_logger.stores.directory import DirectoryStore
+
+PYTHON: Final = Path(os.environ.get('SHADOWHOUND_LEROBOT', '~/.cache/shadowhound/lerobot/bin/python')).expanduser()
+PROGRAM: Final = Path(__file__).with_name('with_lerobot.py')
+PATROLS: Final = {'mission_type': 'patrol'}
+
+
+def late(_sensor: str, number: int) -> int:
+    return number % 7 * 1_000_000
+
+
+pytestmark = [
+    pytest.mark.long('imports torch and lerobot'),
+    pytest.mark.timeout(1500),
+    pytest.mark.skipif(not PYTHON.is_file(), reason=f'there is no lerobot at {PYTHON} (docs/development.md)'),
+]
+
+
+def with_lerobot(folder: Path, *arguments: str) -> None:
+    environ = {'PATH': os.environ['PATH'], 'HOME': str(folder), 'HF_HOME': str(folder / 'hf')}
+    ran = subprocess.run(
+        [str(PYTHON), str(PROGRAM), *arguments], env=environ, capture_output=True, text=True, check=False, timeout=1200
+    )
+    assert ran.returncode == 0, ran.stderr[-3000:]
+
+
+@pytest.fixture(scope='module')
+def house(tmp_path_factory: pytest.TempPathFactory) -> House:
+    made = House(tmp_path_factory.mktemp('house'))
+    for number in range(2):
+        made.record(
+            Mission(
+                f'm{number}', begin_s=100 * number, seconds=2, task=f'walk {number}', jitter_ns=lambda _, n: n % 7 * 1_000_000
+            )
+        )
+    return made
+
+
+def sources_of(folder: Path, house: House) -> list[Any]:
+    """The picture of each frame, decoded from its source."""
+    store = DirectoryStore(house.settings.directory)
+    table = pq.read_table(folder / 'meta/shadowhound_sources.parquet').to_pylist()
+    found = []
+    for mission in Lerobot(folder).mission_ids:
+        rows = [row for row in table if row['episode_mission'] == mission and row['stream'] == 'images.front']
+        for row in sorted(rows, key=lambda row: int(row['frame'])):
+            members = decode.members(store.get(row['bucket'], row['key']), 'tar')
+            found.append(decode.image(next(each.body for each in members if each.stamp_ns == row['stamp_ns'])))
+    return found
+
+
+@pytest.mark.parametrize(
+    'options',
+    [ExportOptions(), ExportOptions(codec='h264', state=('imu', 'joints')), ExportOptions(is_lossless=True)],
+    ids=['av1', 'h264', 'lossless'],
+)
+def test_lerobot_reads_what_was_recorded(house: House, tmp_path: Path, options: ExportOptions) -> None:
+    """Every frame of every kind: numbers as in their sources, pictures as close as the codec keeps them, windows padded right."""
+    found = export(tmp_path / 'set', house.source, PATROLS, options)
+    assert (found.refused, found.waiting) == ({}, {})
+    with_lerobot(tmp_path, str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
+    told = np.load(tmp_path / 'out.npz', allow_pickle=False)
+    count = sum(each['frames'] for each in found.added)
+    assert (int(told['episodes']), len(told['index'])) == (2, count)
+    assert told['index'].tolist() == list(range(count))
+    stamps = told['shadowhound.stamp_ns']
+    column = 0
+    sensor = 'odom' if options.state == ('pose',) else 'imu'
+    published = np.sort(
+        np.concatenate([Mission('', 100 * n, 2, jitter_ns=lambda _, k: k % 7 * 1_000_000).stamps(sensor) for n in range(2)])
+    )
+    newest = published[np.searchsorted(published, stamps, 'right') - 1]
+    assert told['observation.state'][:, column] == pytest.approx([x_of(int(stamp)) for stamp in newest], abs=1e-4)
+    wanted = sources_of(tmp_path / 'set', house)
+    away = np.abs(told['pictures'].astype(int) - np.array(wanted).astype(int))
+    assert away.max() == 0 if options.is_lossless else away.mean() < 6
+    assert told['windows'].shape == (count, 3, 3)
+    assert told['windows'][0, 1] == pytest.approx(told['action'][1])
+    assert set(told['task']) == {'walk 0', 'walk 1'}
+    assert 'action=ACTION' in told['kinds']
+    assert 'observation.state=STATE' in told['kinds']
+
+
+def test_two_exports_are_merged_by_lerobot(house: House, tmp_path: Path) -> None:
+    """Its own function takes them, and our columns are in the episodes still."""
+    for number in range(2):
+        export(tmp_path / f'set{number}', house.source, {'mission': f'm{number}'}, ExportOptions())
+    with_lerobot(tmp_path, '--merge', str(tmp_path / 'all'), str(tmp_path / 'set0'), str(tmp_path / 'set1'))
+    rows = pq.read_table(next((tmp_path / 'all/meta/episodes').rglob('*.parquet'))).to_pylist()
+    assert [row['shadowhound/mission_id'] for row in rows] == ['m0', 'm1']
+    with_lerobot(tmp_path, str(tmp_path / 'out.npz'), str(tmp_path / 'all'))
+    assert int(np.load(tmp_path / 'out.npz')['episodes']) == 2
+
+
+def test_what_was_exported_is_proved(house: House, tmp_path: Path) -> None:
+    """After lerobot has read it, too: it changes nothing."""
+    export(tmp_path / 'set', house.source, PATROLS, ExportOptions())
+    with_lerobot(tmp_path, str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
+    assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None).wrong == []
