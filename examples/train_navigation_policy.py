@@ -145,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name: getattr(options, name) for name in ('robot', 'mission', 'mission_type', 'since', 'until') if getattr(options, name)
     }
     try:
-        frames = MissionDataset(options.folder, size=SIZE, **flags)
+        frames = MissionDataset(options.folder, size=SIZE, causal=True, **flags)
     except DataLoggerError as error:
         print(f'train_navigation_policy: {error}', file=sys.stderr)
         return 1

@@ -239,7 +239,7 @@ def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store
 def _key_of(plan: EpisodePlan, settings: Mapping[str, Any], options: ExportOptions) -> str:
     """What is left of an earlier run is used where it was made in the same way of the same objects and gaps."""
     told = [settings, options.max_stale, options.allow_gaps, sorted(plan.topics.items()), plan.missing, _where(plan),
-            [(name, sorted(track.key.tolist())) for name, track in sorted(plan.tracks.items())]]  # fmt: skip
+            [(name, sorted(track.key.to_pylist())) for name, track in sorted(plan.tracks.items())]]  # fmt: skip
     whole = hashlib.sha256(json.dumps(told, default=str).encode())
     for column in plan.gaps.to_pydict().items():
         whole.update(json.dumps(column, default=str).encode())

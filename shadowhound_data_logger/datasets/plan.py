@@ -29,6 +29,7 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import Known, newest, of_rows, thinned_times, watermarks
 from shadowhound_data_logger.lake.prefetch import Place
+from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.times import moment
@@ -209,6 +210,7 @@ def _tracks(rows: Sequence[Row]) -> tuple[dict[str, Track], dict[str, str]]:
         ours = [row for row in rows if row['sensor'] == sensor]
         kinds = [(row['topic'] or '', row['type'] or '') for row in ours]
         best = max(sorted(set(kinds)), key=kinds.count)
-        tracks[sensor] = Track.of([row for row, kind in zip(ours, kinds, strict=True) if kind == best])
+        mine = [row for row, kind in zip(ours, kinds, strict=True) if kind == best]
+        tracks[sensor] = Track.of(pa.Table.from_pylist(mine, schema=narrow(NEEDED)))
         topics[sensor] = best[0]
     return tracks, topics

@@ -10,6 +10,7 @@ import os
 import sys
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -50,11 +51,12 @@ class MissionDataset:
     def __init__(
         self, source: Bucket | Path | str | None = None, *, anchor: str = 'camera',
         align: Mapping[str, float | Near | Window] | None = None, size: tuple[int, int] | None = None,
-        drop_incomplete: bool = False, **flags: Any,
+        drop_incomplete: bool = False, causal: bool = False, **flags: Any,
     ) -> None:  # fmt: skip
         """``source``: None for the store that the environment names, or a folder of ``shadowhound-data fetch``.
 
-        ``align`` has sensors and how near in time they must be: seconds for the nearest message, or a ``Window``. ``flags`` are
+        ``align`` has sensors and how near in time they must be: seconds for the nearest message, or a ``Window``. With ``causal``
+        no message counts that is later than its frame, as a robot would not have had it yet. ``flags`` are
         those of ``lake.objects``, for the anchor's objects. ``drop_incomplete`` leaves out objects about whose time the catalogue
         knows nothing of an aligned sensor; a stream leaves out single messages as well. Objects without a date are not in it.
         Raises SettingError, StoreError, LakeError.
@@ -63,7 +65,7 @@ class MissionDataset:
 
         if 'sensor' in flags:
             raise SettingError('sensor', flags['sensor'], 'anchor="camera" instead')
-        self.aligned = {name: how if isinstance(how, (Near, Window)) else Near(float(how)) for name, how in (align or {}).items()}
+        self.aligned = {name: _way(name, how, causal=causal) for name, how in (align or {}).items()}
         self._place, asked = selecting.place(source)
         self.left_out = Findings()
         """What of the catalogue is not in it, since it is not part of one; a child that was forked or spawned has none of it."""
@@ -219,6 +221,14 @@ class MissionStream:
         share = self._part[0] * workers + worker, self._part[1] * workers
         epoch, self._epoch = self._epoch, self._epoch + 1
         return self._dataset.streamed(share, self._seed, epoch)
+
+
+def _way(name: str, how: float | Near | Window, *, causal: bool) -> Near | Window:
+    """Raises SettingError for a window into the future of a causal data set."""
+    found = how if isinstance(how, (Near, Window)) else Near(float(how))
+    if causal and isinstance(found, Window) and found.after_s > 0:
+        raise SettingError(f'align[{name!r}]', how, 'a window with after_s=0 in a causal data set')
+    return replace(found, is_causal=True) if causal and isinstance(found, Near) else found
 
 
 def _be_iterable() -> None:

@@ -35,11 +35,14 @@ class Near:
     """At most so far away."""
     fields: tuple[str, ...] = ()
     """Paths of numbers such as ``bms_state.soc``; none: those of ``decode.FIELDS``."""
+    is_causal: bool = False
+    """Only messages at or before the anchor's time count: what a robot would have known then."""
 
     @property
     def reach_ns(self) -> tuple[int, int]:
         """How long before and after the anchor's time a message may be."""
-        return round(self.tolerance_s * SECOND), round(self.tolerance_s * SECOND)
+        tolerance = round(self.tolerance_s * SECOND)
+        return tolerance, 0 if self.is_causal else tolerance
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +91,7 @@ class Selection:
                 continue
             before, after = how.reach_ns
             if isinstance(how, Near) and first == last:
-                best = list(side.nearest(first, before))[:1]
+                best = list(side.nearest(first, before, after))[:1]
                 yield from (side.object(found) for _, found in best)
             else:
                 if isinstance(how, Near):  # of each moment in it, only what is next to it
@@ -170,15 +173,15 @@ class Samples:
         """Its numbers, and how much later it is than the anchor; None where there is none."""
         best: tuple[int, NDArray[np.float64]] | None = None
         if side is not None:
-            tolerance = how.reach_ns[0]
-            for least, number in side.nearest(stamp_ns, tolerance):
+            before, after = how.reach_ns
+            for least, number in side.nearest(stamp_ns, before, after):
                 if best is not None and abs(best[0]) <= least:
                     break
                 found = self._table(side, number, how.fields)
-                if len(found.stamps):
-                    place = _closest(found.stamps, stamp_ns)
+                place = _closest(found.stamps, stamp_ns, after)
+                if place is not None:
                     away = int(found.stamps[place]) - stamp_ns
-                    if abs(away) <= tolerance and (best is None or abs(away) < abs(best[0])):
+                    if -before <= away <= after and (best is None or abs(away) < abs(best[0])):
                         best = away, found.values[place]
         return (None, None) if best is None else (best[1].copy(), best[0])
 
@@ -186,7 +189,8 @@ class Samples:
         best: tuple[int, Object, ArchiveMember | None] | None = None
         if side is None:
             return np.empty((0, 4), np.float32), None
-        for least, number in side.nearest(stamp_ns, how.reach_ns[0]):
+        before, after = how.reach_ns
+        for least, number in side.nearest(stamp_ns, before, after):
             if best is not None and abs(best[0]) <= least:
                 break
             wanted, offset = side.object(number), int(side.offset_ns[number])
@@ -194,7 +198,7 @@ class Samples:
             options: list[ArchiveMember | None] = [*self._members(wanted)] if is_packed else [None]
             for one in options:
                 away = (int(side.start_ns[number]) if one is None else one.stamp_ns + offset) - stamp_ns
-                if abs(away) <= how.reach_ns[0] and (best is None or abs(away) < abs(best[0])):
+                if -before <= away <= after and (best is None or abs(away) < abs(best[0])):
                     best = away, wanted, one
         if best is None:
             return np.empty((0, 4), np.float32), None
@@ -260,8 +264,10 @@ def _is_cloud(side: Track) -> bool:
     return side.kind == 'sensor_msgs/msg/PointCloud2'
 
 
-def _closest(stamps: NDArray[np.int64], stamp_ns: int) -> int:
-    return int(np.argmin(np.abs(stamps - stamp_ns)))
+def _closest(stamps: NDArray[np.int64], stamp_ns: int, after_ns: int) -> int | None:
+    """Of sorted stamps, the one that is nearest, not later than ``after_ns`` after it."""
+    possible = stamps[: int(np.searchsorted(stamps, stamp_ns + after_ns, 'right'))]
+    return int(np.argmin(np.abs(possible - stamp_ns))) if len(possible) else None
 
 
 def _seconds(away_ns: int | None) -> Any:

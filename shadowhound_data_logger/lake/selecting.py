@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger.catalogue.schema import SENSOR, Row
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from shadowhound_data_logger.catalogue.schema import SENSOR
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import query  # first: it turns Daft's telemetry off
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES, extension_of
+from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
@@ -48,8 +51,9 @@ def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], si
         if min(how.reach_ns) < 0 or not sum(how.reach_ns):
             raise SettingError(f'align[{name!r}]', how, 'a time of more than 0 s')
     found = _rows(query.objects(source, findings=findings, sensor=anchor, **flags))
-    decoded = (row for row in found if extension_of(row['key']) in IMAGES | CLOUDS | ARCHIVES)
-    anchors = _tracks(row for row in decoded if _is_possible(row, findings))
+    ends = pc.utf8_lower(pc.replace_substring_regex(found['key'], r'^.*\.([^./]*)$', r'\1'))
+    decoded = found.filter(pc.is_in(ends, value_set=pa.array(sorted(IMAGES | CLOUDS | ARCHIVES))))
+    anchors = tracks_of(_possible(decoded, findings))
     sides = _sides(source, list(anchors.values()), aligned, findings) if anchors else {}
     return Selection(tuple(anchors.values()), dict(aligned), sides, size)
 
@@ -65,13 +69,13 @@ def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Wi
     rows = query.objects(source, findings=findings, since=since, until=until).where(col('sensor').is_in(list(aligned)))
     found = _rows(rows)
     for name in aligned:
-        kinds = {row['type'] for row in found if row['sensor'] == name}
+        kinds = {*pc.unique(found.filter(pc.equal(found['sensor'], name))['type']).to_pylist()}
         if not kinds:
             raise LakeError(f'{name} has no object about the time of the {anchors[0].sensor}',
                             remedy='was it fetched, and is it the name of a sensor? Otherwise remove it from align')  # fmt: skip
         if len(kinds) > 1:
             raise LakeError(f'{name} has messages of {" and of ".join(sorted(map(str, kinds)))}', remedy='restrict the time')
-    return {key: _near(track, anchors, reach) for key, track in _tracks(found).items()}
+    return {key: _near(track, anchors, reach) for key, track in tracks_of(found).items()}
 
 
 def _near(track: Track, anchors: list[Track], reach: int) -> Track:
@@ -82,22 +86,29 @@ def _near(track: Track, anchors: list[Track], reach: int) -> Track:
     return track.only(track.within(first, last))
 
 
-def _rows(frame: Any) -> list[Row]:
+def _rows(frame: Any) -> pa.Table:
     with query.answering():
-        found: list[Row] = frame.where(col('t_start').not_null()).select(*NEEDED).to_pylist()
-    return found
+        return frame.where(col('t_start').not_null()).select(*NEEDED).to_arrow()
 
 
-def _is_possible(row: Row, findings: Findings) -> bool:
+def _possible(rows: pa.Table, findings: Findings) -> pa.Table:
     """An object counts as many samples as its row says: one that says more than there is room for would be all of them."""
-    if 0 <= (row['count'] or 0) <= MOST_MEMBERS:
-        return True
-    findings.add(row['key'], f'its row claims {row["count"]:,} messages', 1)
-    return False
+    counts = pc.fill_null(rows['count'], 0)
+    is_possible = pc.and_(pc.greater_equal(counts, 0), pc.less_equal(counts, MOST_MEMBERS))
+    for row in rows.filter(pc.invert(is_possible)).select(['key', 'count']).to_pylist():
+        findings.add(row['key'], f'its row claims {row["count"]:,} messages', 1)
+    return rows.filter(is_possible)
 
 
-def _tracks(rows: Iterable[Row]) -> dict[tuple[str, str], Track]:
-    grouped: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        grouped.setdefault((row['robot'] or '', row['sensor'] or ''), []).append(row)
-    return {name: Track.of(found) for name, found in sorted(grouped.items())}
+def tracks_of(rows: pa.Table) -> dict[tuple[str, str], Track]:
+    """By robot and sensor."""
+    robots, sensors = (pc.fill_null(rows[name], '') for name in ('robot', 'sensor'))
+    names = {(robot, sensor) for robot in pc.unique(robots).to_pylist() for sensor in pc.unique(sensors).to_pylist()}
+    if len(names) == 1:  # the largest ones: nothing has to be copied
+        return {names.pop(): Track.of(rows)}
+    found = {}
+    for robot, sensor in sorted(names):
+        ours = rows.filter(pc.and_(pc.equal(robots, robot), pc.equal(sensors, sensor)))
+        if len(ours):
+            found[robot, sensor] = Track.of(ours)
+    return found

@@ -1,15 +1,17 @@
 """What one sensor of one robot stored, in the order of time: which objects can hold the message that is nearest to a moment.
 
-Plain arrays, because a data set of a million objects is handed to every worker process.
+Columns of numpy and Arrow, because a data set of a million objects is handed to every worker process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,10 +38,12 @@ class Track:
     robot: str
     sensor: str
     kind: str
-    bucket: NDArray[np.bytes_]
-    key: NDArray[np.bytes_]
+    bucket: pa.Array
+    """Text by a dictionary, as key and sha256 are text."""
+    key: pa.Array
     size: NDArray[np.int64]
-    sha256: NDArray[np.bytes_]
+    sha256: pa.Array
+    """Empty where it is not known."""
     start_ns: NDArray[np.int64]
     end_ns: NDArray[np.int64]
     count: NDArray[np.int64]
@@ -52,27 +56,30 @@ class Track:
     """The latest end of this object and those before it."""
 
     @classmethod
-    def of(cls, rows: Sequence[Mapping[str, Any]]) -> Track:
-        """Of rows of one robot and sensor, at least one, each once even where it is in two parts."""
-        ordered = sorted(rows, key=lambda row: (row['t_start_ns'], row['key']))
-        once = [row for row, before in zip(ordered, [None, *ordered], strict=False) if not _same(row, before)]
+    def of(cls, rows: pa.Table) -> Track:
+        """Of rows of one robot and sensor, at least one, each once even where it is in two parts; the columns are ``NEEDED``."""
+        order = pc.sort_indices(rows, sort_keys=[(name, 'ascending') for name in ('t_start_ns', 'key', 'bucket')])
+        order = order.filter(_is_first(rows, order))
 
         def numbers(name: str, missing: int = 0) -> NDArray[np.int64]:
-            return np.array([missing if row[name] is None else row[name] for row in once], np.int64)
+            return np.asarray(pc.fill_null(_taken(rows, name, order), missing).to_numpy(zero_copy_only=False), np.int64)
 
-        def text(name: str) -> NDArray[np.bytes_]:
-            return np.array([(row[name] or '').encode() for row in once], np.bytes_)
+        def real(name: str) -> NDArray[np.float64]:
+            return np.asarray(_taken(rows, name, order).to_numpy(zero_copy_only=False), np.float64)
+
+        def word(name: str) -> str:
+            return str(rows[name][0].as_py() or '')
 
         start = numbers('t_start_ns')
-        end = np.maximum(
-            start, np.array([row['t_start_ns'] if row['t_end_ns'] is None else row['t_end_ns'] for row in once], np.int64)
-        )
-        pose = np.array([[row[name] for name in ('x', 'y', 'yaw')] for row in once], np.float64)
+        known = pc.coalesce(_taken(rows, 't_end_ns', order), _taken(rows, 't_start_ns', order))
+        end = np.maximum(start, np.asarray(known.to_numpy(zero_copy_only=False), np.int64))
         return cls(
-            robot=once[0]['robot'] or '', sensor=once[0]['sensor'] or '', kind=once[0]['type'] or '', bucket=text('bucket'),
-            key=text('key'), size=numbers('bytes'), sha256=text('sha256'), start_ns=start, end_ns=end,
-            count=np.maximum(numbers('count', 1), 1), offset_ns=numbers('clock_offset_ns'), pose=pose,
-            battery_pct=np.array([row['battery_pct'] for row in once], np.float64), latest_ns=np.maximum.accumulate(end),
+            robot=word('robot'), sensor=word('sensor'), kind=word('type'),
+            bucket=_taken(rows, 'bucket', order).dictionary_encode(), key=_taken(rows, 'key', order), size=numbers('bytes'),
+            sha256=pc.fill_null(_taken(rows, 'sha256', order), ''), start_ns=start, end_ns=end,
+            count=np.maximum(numbers('count', 1), 1), offset_ns=numbers('clock_offset_ns'),
+            pose=np.column_stack([real(name) for name in ('x', 'y', 'yaw')]), battery_pct=real('battery_pct'),
+            latest_ns=np.maximum.accumulate(end),
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -80,15 +87,18 @@ class Track:
 
     def only(self, numbers: NDArray[np.intp]) -> Track:
         """These objects of it, in their order."""
-        kept = {
-            each.name: getattr(self, each.name)[numbers] for each in fields(self) if each.name not in {'robot', 'sensor', 'kind'}
-        }
+        columns = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in {'robot', 'sensor', 'kind'}}
+        kept = {name: column.take(pa.array(numbers)) if isinstance(column, pa.Array) else column[numbers]
+                for name, column in columns.items()}  # fmt: skip
         kept['latest_ns'] = np.maximum.accumulate(kept['end_ns'])
         return replace(self, **kept)
 
     def object(self, number: int) -> Object:
         return Object(
-            self.bucket[number].decode(), self.key[number].decode(), int(self.size[number]), self.sha256[number].decode()
+            self.bucket[int(number)].as_py(),
+            self.key[int(number)].as_py(),
+            int(self.size[number]),
+            self.sha256[int(number)].as_py(),
         )
 
     def stamps_ns(self, number: int) -> NDArray[np.int64]:
@@ -102,9 +112,9 @@ class Track:
         high = int(np.searchsorted(self.start_ns, last_ns, 'right'))
         return low + np.flatnonzero(self.end_ns[low:high] >= first_ns)
 
-    def nearest(self, stamp_ns: int, tolerance_ns: int) -> Iterator[tuple[int, int]]:
-        """(least distance in ns, object) of those that can have a message at most so far from it, the nearest first."""
-        found = self.within(stamp_ns - tolerance_ns, stamp_ns + tolerance_ns)
+    def nearest(self, stamp_ns: int, before_ns: int, after_ns: int) -> Iterator[tuple[int, int]]:
+        """(least distance in ns, object) of those that can have a message so long before it, or after it, the nearest first."""
+        found = self.within(stamp_ns - before_ns, stamp_ns + after_ns)
         away = np.maximum(np.maximum(self.start_ns[found] - stamp_ns, stamp_ns - self.end_ns[found]), 0)
         for place in np.argsort(away, kind='stable'):
             yield int(away[place]), int(found[place])
@@ -125,5 +135,19 @@ class Track:
         return np.asarray(own + (stamp_ns - here) / (there - here) * change)
 
 
-def _same(row: Mapping[str, Any], other: Mapping[str, Any] | None) -> bool:
-    return other is not None and all(row[name] == other[name] for name in ('bucket', 'key', 't_start_ns'))
+def _taken(rows: pa.Table, name: str, order: pa.Array) -> pa.Array:
+    """One column in an order."""
+    found = rows[name].combine_chunks().take(order)
+    return found.combine_chunks() if isinstance(found, pa.ChunkedArray) else found
+
+
+def _is_first(rows: pa.Table, order: pa.Array) -> pa.Array:
+    """Which rows, in this order, are not the same object and time as the one before."""
+    first = np.ones(len(order), bool)
+    if len(order) > 1:
+        same = np.ones(len(order) - 1, bool)
+        for name in ('t_start_ns', 'key', 'bucket'):
+            column = _taken(rows, name, order)
+            same &= pc.equal(column[1:], column[:-1]).to_numpy(zero_copy_only=False).astype(bool)
+        first[1:] = ~same
+    return pa.array(first)

@@ -48,8 +48,9 @@ from shadowhound_data_logger.lake.fetch import Wish
 from shadowhound_data_logger.lake.fetch import fetch as fetch_objects
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import sources_of
+from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.samples import Near, Samples, Selection, Window
-from shadowhound_data_logger.lake.track import Track
+from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.mcap.format import CHUNK, RECORD, record, text
 from shadowhound_data_logger.mcap.index import records
 from shadowhound_data_logger.mcap.messages import unpack
@@ -508,8 +509,10 @@ def samples(shop: Shop) -> Round:
                 return file.getvalue() if wanted.key.endswith('jpg') else contents[int(wanted.key[-6]) % 3]
 
         def track(sensor: str, kind: str, extension: str, number: int) -> Track:
+            import pyarrow as pa
+
             wide = lambda: rng.choice((0, 1, 10**9, -1, *NUMBERS[8:10], -(1 << 63))) if rng.random() < 0.2 else 0  # noqa: E731 - twice below
-            return Track.of([{
+            return Track.of(pa.Table.from_pylist([{
                 'robot': 'thor', 'sensor': sensor, 'type': kind, 'bucket': 'b', 'key': f'k{each}.{extension}',
                 'bytes': 10, 'sha256': None,
                 't_start': None, 't_start_ns': max(-(1 << 63), min((1 << 63) - 1, NOON_NS + each + wide())),
@@ -517,7 +520,7 @@ def samples(shop: Shop) -> Round:
                 'count': rng.choice((None, 1, 2, -5, 20_000)),
                 'x': 0.5, 'y': rng.choice((None, float('inf'), 1.0)), 'yaw': 1e308, 'battery_pct': None,
                 'clock_offset_ns': rng.choice((None, None, 5, (1 << 63) - 1)),
-            } for each in range(number)])  # fmt: skip
+            } for each in range(number)], schema=narrow(NEEDED)))  # fmt: skip
 
         frames, imu = track('camera', 'sensor_msgs/msg/CompressedImage', 'jpg', 3), track('imu', 'sensor_msgs/msg/Imu', 'json', 3)
         aligned = {'imu': rng.choice((Near(0.5), Window(0.5, 4), Near(0.5, ('list',)), Window(1e9, 2)))}

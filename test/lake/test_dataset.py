@@ -75,6 +75,19 @@ def test_a_window_is_the_messages_before_the_frame(tmp_path: Path) -> None:
     assert first['imu'][7] == pytest.approx(imu_reading(NOON_NS))
 
 
+def test_a_causal_data_set_knows_nothing_later(tmp_path: Path) -> None:
+    """Odometry comes a little after each frame: the nearest is that, the causal one is that of the second before."""
+    dataset = MissionDataset(drive(tmp_path), align={'odom': 1.5, 'joints': 0.2}, causal=True)
+    for number in range(1, SECONDS):
+        sample = dataset[number]
+        assert (sample['odom'][0], sample['odom_dt_s']) == (number - 1, LATE_NS / SECOND - 1)
+        assert sample['joints_dt_s'] <= 0
+    assert not dataset[0]['odom_ok']
+    with pytest.raises(SettingError, match='after_s=0'):
+        MissionDataset(drive(tmp_path / 'other'), align={'imu': Window(0.5, rows=8, after_s=0.1)}, causal=True)
+    dataset.close()
+
+
 @pytest.mark.parametrize('frames', ['tar', 'zip'])
 def test_an_archive_is_as_many_samples_as_it_has_frames(tmp_path: Path, frames: str) -> None:
     """Each with its own time, its own neighbours, and a pose between those of the archives."""
