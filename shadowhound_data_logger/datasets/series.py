@@ -24,7 +24,7 @@ from shadowhound_data_logger.bags import naming
 from shadowhound_data_logger.bags.contents import Plain
 from shadowhound_data_logger.bags.manifest import Manifest, SliceEntry
 from shadowhound_data_logger.bags.remote import find_bags, read_manifest
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.encode.definitions import SEPARATOR
 from shadowhound_data_logger.encode.image import encode_png
 from shadowhound_data_logger.encode.payload import Job
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 
 KEEP_BYTES: Final = 16 << 20
 THREADS: Final = 8
+LEAST_SPAN_NS: Final = 2 * SECOND
+"""Of a slice from which a rate is told."""
 AHEAD: Final = 16
 """Pictures that are fetched before they are needed."""
 _MESSAGE_TITLE: Final = re.compile(r'^MSG: ([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)\s*$', re.ASCII)
@@ -230,8 +232,9 @@ class Recordings:
                     continue
                 slices = [each for each in bag.slices if each.counts.get(topic.topic) and self._overlaps(bag, each)]
                 count = sum(each.counts[topic.topic] for each in slices)
-                rates = [(each.counts[topic.topic] - 1) / (each.t_end_ns - each.t_start_ns) * 1e9
-                         for each in slices if each.t_end_ns > each.t_start_ns]  # fmt: skip
+                # A slice's span is that of all its topics: of a short one it says little about one of them.
+                spans = [(each.counts[topic.topic], each.t_end_ns - each.t_start_ns) for each in slices]
+                rates = [found / span * 1e9 for found, span in spans if span >= LEAST_SPAN_NS]
                 yield RecordedSensor(sensor, topic.topic, topic.type, BAGS, count, max(rates, default=0.0))
 
     def _is_of(self, sensor: str, topic: str, kind: str) -> bool:

@@ -1,0 +1,63 @@
+"""Where a bag has more of a sensor than the objects have, the data set is made of the bag, and says so."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from datasets.recorded import TOPICS, House, Mission, cdr_of, x_of
+from lake.gap_parts import tell
+from lake.making import add
+from lake.training import COMPRESSED, ODOMETRY
+
+from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, SliceEntry, topics_of
+from shadowhound_data_logger.catalogue.gaps import complete
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.datasets.export import export
+from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.datasets.lerobot import DATA, Lerobot, matrix
+from shadowhound_data_logger.datasets.verify import verify
+from shadowhound_data_logger.encode.definitions import describe
+from shadowhound_data_logger.mcap.slice_info import Channel
+from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.directory import DirectoryStore
+
+
+def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
+    """The camera at its own rate of a bag, its sources the slices, and all of it proved."""
+    house = House(tmp_path)
+    mission = house.record(Mission('bagged', seconds=2, camera_hz=1.0, odom_hz=2.0, sensors=('camera', 'odom')))
+    dense = Mission('bagged', seconds=2, camera_hz=10.0, odom_hz=50.0)
+    path = tmp_path / 'bagged_0.mcap'
+    writer = SliceWriter(path)
+    for sensor, kind in (('camera', COMPRESSED), ('odom', ODOMETRY)):
+        channel = Channel(TOPICS[sensor], kind, *describe(kind), '')
+        for number, stamp in enumerate(dense.stamps(sensor)):
+            writer.write(channel, stamp + 2_000_000, stamp, number, cdr_of(house.drive._ros, sensor, stamp))
+    info = writer.close()
+    key = 'thor/rosbags/bagged/bagged_0.mcap'
+    manifest = Manifest('bagged', 'thor', None, COMPLETE, (), topics_of([info]), (SliceEntry.of(info, key),))
+    with closing(open_store(house.settings, UploadSettings())) as store:
+        add(store, tmp_path / 'tmp', key, path.read_bytes())
+        add(store, tmp_path / 'tmp', 'thor/rosbags/bagged/manifest.json', manifest.to_json())
+    tell(house.settings, tmp_path, *(
+        complete('thor', 'j', 99, sink='bags', topic=TOPICS[sensor], session=1, grade='exact', received=1, skipped=0,
+                 from_ns=mission.begin_ns - 2 * SECOND, to_ns=mission.end_ns + SECOND) for sensor in ('camera', 'odom')
+    ), name='bags')  # fmt: skip
+    found = export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, ExportOptions())
+    assert (found.refused, found.waiting, found.fps) == ({}, {}, 10)
+    assert {each['from'] for each in found.added[0]['streams'].values()} == {'bags'}
+    made = Lerobot(tmp_path / 'set')
+    table = pq.read_table(made.path(DATA, made.rows[0], 'data'))
+    stamps, published = table['shadowhound.stamp_ns'].to_numpy(), np.array(dense.stamps('odom'))
+    newest = published[np.searchsorted(published, stamps, 'right') - 1]
+    assert matrix(table['observation.state'])[:, 0] == pytest.approx([x_of(int(stamp)) for stamp in newest], abs=1e-4)
+    sources = pq.read_table(tmp_path / 'set/meta/shadowhound_sources.parquet')
+    assert set(sources['key'].to_pylist()) == {key}
+    proved = verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None)
+    assert (proved.wrong, proved.frames) == ([], len(table))
