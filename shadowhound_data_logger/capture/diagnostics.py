@@ -44,7 +44,7 @@ def entries(status: Mapping[str, Any], earlier: Mapping[str, Any]) -> Iterator[E
         yield topic, ERROR, unheard[topic]['text'], {'publishers': unheard[topic]['publishers']}
     yield _bag(status['bag'], earlier['bag'])
     yield _events(status['events'], earlier['events'])
-    yield _spool(status['spool'])
+    yield _spool(status['spool'], earlier['spool'])
     yield _store(status['store'], earlier['store'], stalls.get('delivery', ''))
     yield _clock(status['clock'])
     yield _workers(status, earlier, stalls)
@@ -106,7 +106,10 @@ def _topic(row: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> tup
     return OK, f'{row["rate_hz"]:g} Hz'
 
 
-def _spool(spool: Mapping[str, Any]) -> Entry:
+def _spool(spool: Mapping[str, Any], before: Mapping[str, Any]) -> Entry:
+    evicted = spool['evicted'] - before['evicted']
+    if evicted > 0:
+        return 'spool', ERROR, f'{evicted} objects had to go lately for want of room', spool
     share = spool['bytes'] / spool['max_bytes']
     text = f'{spool["pending"]} objects wait for delivery, {share:.0%} of its limit is used'
     return 'spool', WARN if share > FULL else OK, text, spool

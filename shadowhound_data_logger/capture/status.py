@@ -122,7 +122,8 @@ class Status:
             'paused': self._stages.intake.paused, 'ended': ended, 'middleware': self._middleware(),
             'mission': self._stages.mission.status(), 'bag': self._bag(), 'events': self._events(), 'topics': self._topics(now_s),
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
-            'spool': {'path': str(self._stages.spool.root), **asdict(usage), **asdict(self._settings.spool)},
+            'spool': {'path': str(self._stages.spool.root), **asdict(usage), 'evicted': self._stages.spool.evicted,
+                      **asdict(self._settings.spool)},
             'store': self._store(upload, now_s), 'clock': asdict(self._clock.state()),
             'consumers': {name: {'failures': count, 'last_error': text}
                           for name, (count, text) in self._stages.intake.consumer_failures().items()},

@@ -39,9 +39,10 @@ from shadowhound_data_logger.spool.index import MISSING, Index
 from shadowhound_data_logger.spool.listing import HERE, Heap, heaps, objects, tell_gaps_again
 from shadowhound_data_logger.spool.listing import retry as retry_objects
 from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.spool.status import limits, robots
+from shadowhound_data_logger.spool.status import limits, robots, targets
 from shadowhound_data_logger.spool.status import read as read_status
 from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.stores import open_store
 
 MOST: Final = 1000
 LOOK_S: Final = 0.2
@@ -176,7 +177,7 @@ def _overview(folder: Path, *, as_json: bool) -> ExitCode:
 def _view(folder: Path, found: Sequence[Heap], running: Sequence[str], clock: Clock) -> Iterator[RenderableType]:
     """A table, and what can be done about what is in it."""
     if not found:
-        yield plain(f'Nothing waits in {folder}: all that was spooled has left it.', 'green')
+        yield plain(f'Nothing waits in {folder}; what became of it: shadowhound-data ledger', 'green')
         return
     yield plain(f'In {folder}', 'bold')
     table = plain_table('', ('sensor', 'state', 'objects', 'size', 'oldest'), left=('sensor', 'state'))
@@ -234,6 +235,7 @@ def _opened(folder: Path) -> Iterator[Index]:
 def _drain(folder: Path, *, patience_s: float, as_json: bool) -> ExitCode:
     """The exit code."""
     settings, clock = Settings.load({}, os.environ), SystemClock.of_this_machine()
+    where = _destination(folder, settings)
     # A robot of its own: its session is none of the node's, and what that left open is not for it to settle.
     spool = Spool(folder, limits(folder, settings.spool), clock, f'{settings.robot} drain')
     spool.open()
@@ -246,7 +248,7 @@ def _drain(folder: Path, *, patience_s: float, as_json: bool) -> ExitCode:
         ):
             _wait(spool, uploader, writer, catalogue, patience_s, bar)
             writer.flush(CLOSE_S)
-            said = _drained(folder, spool, uploader.status())
+            said = {'store': where, **_drained(folder, spool, uploader.status())}
     except (OSError, sqlite3.Error) as error:
         raise SpoolError(f'the spool {folder} cannot be used: {error}') from error
     if as_json:
@@ -254,6 +256,17 @@ def _drain(folder: Path, *, patience_s: float, as_json: bool) -> ExitCode:
     else:
         click.echo(_told(said))
     return exit_code(finding=not said['ok'])
+
+
+def _destination(folder: Path, settings: Settings) -> str:
+    """The store of this shell. Raises SpoolError where that is a folder, and the node delivers to a server."""
+    with closing(open_store(settings.store, settings.upload)) as store:
+        where = store.describe()
+    others = [target for target in targets(folder) if target != where]
+    if others and not settings.store.endpoint_url:
+        raise SpoolError(f'nothing was delivered: this shell names no server, and the node of this spool delivers to {others[0]}',
+                         remedy="set the node's AWS_... variables, AWS_ENDPOINT_URL first")  # fmt: skip
+    return where
 
 
 def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalogue: CatalogueWriter, patience_s: float,
@@ -292,7 +305,7 @@ def _drained(folder: Path, spool: Spool, status: UploadStatus) -> dict[str, Any]
 
 
 def _told(said: dict[str, Any]) -> str:
-    lines = [f'{counted(said["delivered"], "object")} delivered and confirmed']
+    lines = [f'{counted(said["delivered"], "object")} delivered to {said["store"]} and confirmed']
     if said['pending']:
         lines.append(f'{counted(said["pending"], "object")} still waiting: {said["last_error"] or "try again later"}')
     if said['held']:

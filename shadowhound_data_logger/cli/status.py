@@ -122,8 +122,8 @@ def _fine(topics: Mapping[str, Any]) -> str:
     """Nothing to be looked at; what nobody can know is not called nothing."""
     heard = [row['accounting'] for row in topics.values() if row['received']]
     if not set(heard) - {EXACT}:
-        return 'Fine: nothing was missed, dropped, rejected or quarantined in this session.'
-    return f'Fine: nothing was dropped, rejected or quarantined in this session; what was missed is {unsure(heard)}.'
+        return 'Fine: nothing missed, dropped, rejected, evicted or quarantined in this session.'
+    return f'Fine: nothing dropped, rejected, evicted or quarantined in this session; what was missed is {unsure(heard)}.'
 
 
 def _head(found: Mapping[str, Any]) -> Text:
@@ -213,7 +213,7 @@ def _disk(spool: Mapping[str, Any]) -> str:
 def _usage(spool: Mapping[str, Any]) -> str:
     """``3 objects wait (oldest 0.4 s), 1 quarantined``."""
     oldest = '' if spool['oldest_age_s'] is None else f' (oldest {duration(spool["oldest_age_s"])})'
-    usage = ''.join(f', {spool[name]:,} {name}' for name in ('held', 'quarantined') if spool[name])
+    usage = ''.join(f', {spool[name]:,} {name}' for name in ('held', 'quarantined', 'evicted') if spool.get(name))
     return f'{spool["pending"]:,} objects wait{oldest}{usage}'
 
 

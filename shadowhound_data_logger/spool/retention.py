@@ -103,11 +103,14 @@ class Shortage:
         self._root = root
         self._lost = 0
         self._lost_ns = self._told_ns = 0
+        self.evicted = 0
+        """Objects that had to go since the spool was opened."""
 
     def note(self, room: RoomNeeded, now_ns: int) -> None:
         """What one commit cost."""
         lost = room.evicted + len(room.given_up)
         if lost:
+            self.evicted += lost
             self._lost += lost
             self._lost_ns = now_ns
             if not 0 <= now_ns - self._told_ns < TELL_EVERY_NS:

@@ -178,6 +178,11 @@ class Spool:
         """Whether the name is taken. Waits for no commit; raises sqlite3.Error."""
         return self._view.has(bucket, key)
 
+    @property
+    def evicted(self) -> int:
+        """Objects that this process gave up for want of room."""
+        return self._shortage.evicted
+
     def states(self, bucket: str, prefix: str) -> dict[str, State]:
         """What became of every object whose key begins so, by key. Waits for no commit; raises sqlite3.Error."""
         return {row['key']: State(row['state']) for row in self._view.with_prefix(bucket, prefix)}

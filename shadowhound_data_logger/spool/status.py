@@ -37,8 +37,8 @@ _TOPIC: Final[dict[str, Any]] = {
 }  # fmt: skip
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
-    'spool': {'path': '', 'pending': 0, 'held': 0, 'quarantined': 0, 'bytes': 0, 'max_bytes': None, 'free_bytes': None,
-              'oldest_age_s': None, 'min_free_bytes': None, 'remember_days': None},
+    'spool': {'path': '', 'pending': 0, 'held': 0, 'quarantined': 0, 'evicted': 0, 'bytes': 0, 'max_bytes': None,
+              'free_bytes': None, 'oldest_age_s': None, 'min_free_bytes': None, 'remember_days': None},
     'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
               'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
     'middleware': {'rmw': '', 'robot': '', 'why': '', 'asked': '', 'network': '', 'receive_bytes': None, 'dropped_datagrams': 0,
@@ -148,8 +148,9 @@ def _of_index(spool: Path, robot: str, now_ns: int, written: Mapping[str, Any] |
     index = Index(path, read_only=True)
     try:
         index.open()
-        limit = written['spool']['max_bytes'] if written else None
-        usage = {'path': str(spool), **asdict(usage_of(index, spool, now_ns)), 'max_bytes': limit}
+        known = written['spool'] if written else {'max_bytes': None, 'evicted': 0}
+        usage = {'path': str(spool), **asdict(usage_of(index, spool, now_ns)),
+                 **{name: known[name] for name in ('max_bytes', 'evicted')}}  # fmt: skip
         return {'spool': usage, 'session': _session(index, robot, written['pid'] if written else 0)}
     except (OSError, sqlite3.Error, SpoolError) as error:
         return {'spool': None, 'session': None, 'problem': f'the spool index {path} cannot be read: {error}'}
@@ -195,6 +196,8 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
     yield from _missed(found['topics'], 'missed_estimated', 'missed in this session, as estimated', '~')
     yield from _other_types(found)
     yield from _left_out(found)
+    if evicted := (found['spool'] or {}).get('evicted', 0):
+        yield f'evicted in this session: {evicted:,} objects, for want of room (spool.max_bytes, spool.min_free_bytes)'
     if store['quarantined']:
         yield f'quarantined in this session: {store["quarantined"]:,} objects'
 

@@ -195,6 +195,16 @@ def test_what_waits_again_before_its_file_was_set_apart(home: Path, *, reopens: 
     spool.close()
 
 
+def test_a_shell_without_the_nodes_server_delivers_nothing(home: Path) -> None:
+    """Else what waits for the server would go to a folder, and count as delivered."""
+    status = {'store': {'target': 'Tower at http://10.0.0.2:8333'}}
+    (home / 'spool' / 'status-thor.json').write_text(json.dumps(status))
+    answer = run('drain')
+    assert isinstance(answer.exception, SpoolError)
+    assert 'delivers to Tower at http://10.0.0.2:8333' in str(answer.exception)
+    assert states(home)['a.jpg'] == 'pending'
+
+
 def test_all_is_delivered_without_a_node(home: Path, seaweed: Tower, monkeypatch: pytest.MonkeyPatch) -> None:
     """To a real server, each object with a row in the catalogue; what is held or refused stays, and is told."""
     for name, value in seaweed.environment().items():

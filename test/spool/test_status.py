@@ -169,6 +169,10 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
         ({'topics': TOPICS}, 'rejected in this session: /camera 1'),
         ({'topics': MANY}, 'missed in this session: /b 4,000, /d 2, /a 1 and 1 more'),
         ({'store': {'quarantined': 4}}, 'quarantined in this session: 4 objects'),
+        (
+            {'spool': {'evicted': 4000}},
+            'evicted in this session: 4,000 objects, for want of room (spool.max_bytes, spool.min_free_bytes)',
+        ),
         ({'store': {'state': 'store_down'}}, 'delivery: store down'),
         ({'store': {'state': 'paused'}}, 'delivery: paused'),
         ({'store': {'blocked_buckets': {'maps': 'there is none'}}}, 'bucket maps takes nothing: there is none'),
