@@ -106,9 +106,11 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
         demo_processes.start_logger(folder, environ) as node,
         demo_run.StoreOutage(tower, (duration_s - outage_s) / 2, outage_s) as outage,
     ):
+        page, address = demo_processes.start_page(folder, environ)
+        console.print(f'Watch it live, while it walks: {address}')
         if outage_s:
             console.print(f'In the middle the S3 server goes away for {outage_s:g} s.\n')
-        with ExitStack() as agents:
+        with page, ExitStack() as agents:
             if with_mission:
                 agent = agents.enter_context(demo_mission.start(folder, environ))
             with demo_report.progress(console, duration_s) as show:

@@ -6,6 +6,7 @@ It stops them itself; should it be killed, the kernel asks them to stop.
 from __future__ import annotations
 
 import ctypes
+import json
 import os
 import random
 import signal
@@ -13,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Final
@@ -139,3 +141,16 @@ def start_logger(folder: Path, environ: Mapping[str, str]) -> Child:
                 node.stop(0.0)
                 raise node.failed('did not start') from None
             time.sleep(0.1)
+
+
+def start_page(folder: Path, environ: Mapping[str, str]) -> tuple[Child, str]:
+    """The live page, and its address. Raises DemoFailed when it does not start."""
+    page = Child('shadowhound_data_logger.cli.main', ['live', '--port', '0', '--json'], environ, folder / 'live.log')
+    end = time.monotonic() + READY_S
+    while True:
+        with suppress(ValueError):  # it has not said all of it
+            return page, str(json.loads(page.output)['url'])
+        if not page.is_running or time.monotonic() > end:
+            page.stop(0.0)
+            raise page.failed('did not start the live page')
+        time.sleep(0.1)

@@ -1,0 +1,232 @@
+"""The page in a real Chromium, of a real node and a simulated robot."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from domains import free_domain
+from e2e.processes import Node, Process, Processes, until
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
+FLAGS = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox']
+RATES = 'rate_scale:=0.2'
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.long('a Chromium, a robot and a node'),
+    pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium'),
+]
+
+
+class Watching:
+    """A node, a robot and the live page of them in a browser."""
+
+    def __init__(self, processes: Processes) -> None:
+        self.processes = processes
+        self.node: Node = processes.node()
+        self.sim = processes.sim(RATES)
+        self.home = self.node.home
+        self.serve(0)
+
+    def serve(self, port: int) -> None:
+        environ = {**self.processes.environ, 'SHADOWHOUND_HOME': str(self.home), 'SHADOWHOUND_ROBOT': self.node.robot}
+        log = self.processes.folder / 'live.log'
+        log.unlink(missing_ok=True)
+        self.live = Process(
+            'live', ['-m', 'shadowhound_data_logger.cli.main', 'live', '--json', '--port', str(port)], log, environ
+        )
+        self.processes.started.append(self.live)
+        self.live.said('"problem"')
+        said = self.live.log
+        self.url: str = json.loads(said[said.index('{') : said.rindex('}') + 1])['url']
+
+    def ledger(self) -> dict[str, Any]:
+        return self.node.ledger()['topics']
+
+
+@pytest.fixture(scope='module')
+def watching(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watching]:
+    pytest.importorskip('rclpy')
+    with free_domain() as domain:
+        processes = Processes(tmp_path_factory.mktemp('live'), domain, f'r{secrets.token_hex(4)}')
+        try:
+            yield Watching(processes)
+        finally:
+            processes.end()
+
+
+@pytest.fixture(scope='module')
+def page(watching: Watching) -> Iterator[Page]:
+    api = pytest.importorskip('playwright.sync_api')
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page(viewport={'width': 1280, 'height': 800})
+        page.set_default_timeout(120_000)
+        page.wrong = []
+        page.asked = []
+        page.on('pageerror', lambda error: page.wrong.append(str(error)))
+        page.on('console', lambda message: page.wrong.append(message.text) if message.type == 'error' else None)
+        page.on('request', lambda request: page.asked.append(request.url))
+        page.goto(watching.url)
+        yield page
+        browser.close()
+
+
+def holds(page: Page, script: str) -> None:
+    """Wait until it is so in the page, which lets nobody else evaluate text (``script-src 'self'``)."""
+    until(lambda: page.evaluate(script), script)
+
+
+def counted(page: Page, kind: str) -> int:
+    return int(page.evaluate(f'shadowhound.count[{json.dumps(kind)}] ?? 0'))
+
+
+def test_everything_is_shown(page: Page) -> None:
+    """Camera, cloud, path, plots and figures come; every request goes to the page's own origin; nothing fails in the browser."""
+    for kind in ('camera', 'cloud', 'odom', 'imu', 'joints', 'battery', 'figures'):
+        holds(page, f'(shadowhound.count[{json.dumps(kind)}] ?? 0) > 3')
+    holds(page, 'shadowhound.drawn.camera?.length > 0 && shadowhound.drawn.cloud?.length > 0')
+    origin = page.url.rstrip('/')
+    assert [url for url in page.asked if not url.startswith((origin, 'blob:'))] == []
+    assert page.wrong == []
+
+
+def test_a_viewer_has_no_buttons_that_act(page: Page) -> None:
+    """Until somebody signs in with the operator's token; then the node answers, and says in its log who asked."""
+    assert page.locator('[data-act]').count() == 0
+
+
+def test_an_operator_acts(page: Page, watching: Watching) -> None:
+    """The answer of the node is on the page, and in the node's log stands who asked; the token is in no address."""
+    token = (watching.home / 'live' / 'operator.token').read_text().strip()
+    page.get_by_role('button', name='Sign in', exact=True).click()
+    page.locator('dialog input[name=token]').fill('not-the-token')
+    page.locator('dialog button.primary').click()
+    page.locator('dialog [role=alert]').wait_for()
+    page.locator('dialog input[name=token]').fill(token)
+    page.locator('dialog button.primary').click()
+    for act, words in (('flush', 'spooled'), ('bag start', ''), ('bag stop', '')):
+        before = page.locator('.answers li').count()
+        page.locator(f'[data-act="{act}"]').click()
+        holds(page, f'document.querySelectorAll(".answers li").length > {before}')
+        answer = page.locator('.answers li').first.inner_text()
+        assert act in answer
+        assert words in answer
+        assert page.locator('.answers li').first.get_attribute('class') != 'bad', answer
+    until(lambda: 'operator at 127.0.0.1: flush' in watching.node.log, 'the log names the operator')
+    assert not any(token in url for url in page.asked)
+    assert token not in watching.live.log
+    page.wrong.clear()  # the browser's own line about the wrong token (401)
+
+
+def test_a_hidden_tab_watches_nothing(page: Page, watching: Watching) -> None:
+    """Its subscriptions end, and begin again when it is seen."""
+    page.evaluate("Object.defineProperty(document, 'hidden', {configurable: true, get: () => true});"
+                  " document.dispatchEvent(new Event('visibilitychange'))")  # fmt: skip
+    quiet = 'async () => { const before = shadowhound.count.imu; await new Promise(done => setTimeout(done, 1500)); return %s }'
+    holds(page, quiet % 'shadowhound.count.imu === before')
+    before = counted(page, 'imu')
+    page.evaluate("delete document.hidden; document.dispatchEvent(new Event('visibilitychange'))")
+    holds(page, f'shadowhound.count.imu > {before + 3}')
+
+
+def test_after_a_kill_the_page_goes_on_by_itself(page: Page, watching: Watching) -> None:
+    """Without a reload and without a new sign-in; meanwhile everything is marked as old, and the ages go on growing."""
+    port = int(watching.url.rstrip('/').rpartition(':')[2])
+    watching.live.signal(signal.SIGKILL)
+    watching.live.wait()
+    holds(page, "document.querySelector('.pill').textContent.includes('no connection')")
+    holds(page, "[...document.querySelectorAll('[data-age=camera]')].every(each => each.classList.contains('old'))")
+    first = int(page.locator('[data-age=camera]').get_attribute('data-ms') or 0)
+    page.wait_for_timeout(1000)
+    assert int(page.locator('[data-age=camera]').get_attribute('data-ms') or 0) >= first + 700
+    before = counted(page, 'camera')
+    watching.serve(port)
+    holds(page, f'shadowhound.count.camera > {before}')
+    page.locator('[data-act="flush"]').wait_for()
+    page.wrong.clear()  # what the browser says of connections that were refused
+
+
+def test_the_figures_are_those_of_the_ledger(page: Page, watching: Watching) -> None:
+    """Once the robot is silent: received, stored and missed of each topic, as ``ledger --json`` has them."""
+    watching.sim.signal(signal.SIGINT)
+    watching.sim.wait()
+    page.locator('[data-act="flush"]').click()
+
+    def shown() -> dict[str, dict[str, str]]:
+        cells = page.locator('td[data-topic][data-field]').evaluate_all(
+            'cells => cells.map(cell => [cell.dataset.topic, cell.dataset.field, cell.textContent])'
+        )
+        found: dict[str, dict[str, str]] = {}
+        for topic, name, text in cells:
+            found.setdefault(topic, {})[name] = text
+        return found
+
+    def same() -> bool:
+        page.wait_for_timeout(200)
+        on_page, ledger = shown(), watching.ledger()
+        return bool(ledger) and all(
+            on_page.get(topic, {}).get(name) == str(row[name])
+            for topic, row in ledger.items()
+            for name in ('received', 'stored', 'missed')
+        )
+
+    until(same, lambda: f'{shown()} is {watching.ledger()}')
+    assert all({'rate', 'age'} <= fields.keys() for fields in shown().values())
+
+
+def test_a_gap_stands_on_the_timeline_at_its_time(page: Page, watching: Watching) -> None:
+    """What was published while the node was away, by the cause restart, and whatever else ``ledger --gaps`` tells."""
+    watching.sim = watching.processes.sim(RATES)
+    received = watching.node.topic('/imu')['received']
+    watching.node.received('/imu', received + 20)
+    watching.node.kill()
+    time.sleep(3.0)  # for this long messages are lost: it is what is tested
+    watching.node = watching.processes.node()
+    received = watching.node.topic('/imu')['received']
+    watching.node.received('/imu', received + 20)
+
+    watching.sim.signal(signal.SIGINT)
+    watching.sim.wait()
+
+    def lacks() -> list[dict[str, Any]]:
+        """What ``ledger --gaps`` has and the page has not."""
+        command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'ledger', '--gaps', '--json']
+        environ = {**watching.processes.environ, 'SHADOWHOUND_HOME': str(watching.home), 'SHADOWHOUND_ROBOT': watching.node.robot}
+        ran = subprocess.run(command, env=environ, capture_output=True, text=True, check=True, timeout=120)
+        known = [gap for gap in json.loads(ran.stdout)['gaps'] if gap['from_ns'] is not None]
+        assert {'restart'} <= {gap['cause'] for gap in known if gap['topic'] == '/imu'}
+        on_page = page.locator('rect.gap').evaluate_all('gaps => gaps.map(gap => ({...gap.dataset}))')
+        return [
+            gap for gap in known
+            if not any(
+                (each['topic'], each['kind'], each['cause']) == (gap['topic'], gap['kind'], gap['cause'])
+                and abs(float(each['from']) - gap['from_ns'] / 1e6) < 1 and abs(float(each['to']) - gap['to_ns'] / 1e6) < 1
+                for each in on_page
+            )
+        ]  # fmt: skip
+
+    until(lambda: not lacks(), lambda: f'the page lacks {lacks()}')
+    assert page.wrong == []
+
+
+@pytest.mark.parametrize(('width', 'scheme'), [(1440, 'light'), (1440, 'dark'), (390, 'light')])
+def test_nothing_is_wider_than_the_screen(page: Page, tmp_path: Path, width: int, scheme: Any) -> None:
+    """On a laptop and on a phone, light and dark."""
+    page.set_viewport_size({'width': width, 'height': 850})
+    page.emulate_media(color_scheme=scheme)
+    holds(page, 'document.documentElement.scrollWidth <= innerWidth')
+    page.wait_for_timeout(500)
+    (tmp_path / f'{width}_{scheme}.png').write_bytes(page.screenshot(full_page=True, timeout=120_000))
