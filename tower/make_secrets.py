@@ -59,7 +59,7 @@ def actions(user: str) -> list[str]:
     if user == 'mlflow':
         return [f'{action}:mlflow' for action in ('Read', 'Write', 'List', 'Tagging')]
     if user == 'spark':
-        return [f'{action}:{bucket}' for bucket in READ_BUCKETS for action in ('Read', 'List')]
+        return [f'{action}:{bucket}' for bucket in READ_BUCKETS for action in ('Read', 'List')] + ['Write:lerobot']
     return [f'{action}:{bucket}/{user}/*' for bucket in ROBOT_BUCKETS for action in ('Read', 'Write')]
 
 

@@ -13,7 +13,7 @@ import click
 from rich.text import Text
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, store_hint, the_store_settings
-from shadowhound_data_logger.cli.output import duration, number, plain, print_json, print_lines, progress, volume
+from shadowhound_data_logger.cli.output import counted, duration, number, plain, print_json, print_lines, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 from shadowhound_data_logger.stores import open_reader
 
@@ -27,6 +27,7 @@ SHOWN: Final = 20
     epilog=examples(
         'fetch thor/camera/20251018/ --to data',
         'fetch --sensor camera --since yesterday --near 2.0,6.5,3 --to data',
+        'fetch s3://lerobot/datasets/go2/go2_patrol --to go2_patrol',
     )
 )
 @click.argument('prefix', required=False)
@@ -40,9 +41,12 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
           as_json: bool) -> ExitCode:  # fmt: skip
     """Download objects, verified.
 
-    Either everything under a PREFIX (thor/camera/20261121/), or what the flags ask for. A second time only what is new is
-    downloaded. Exit code 1 when something could not be fetched.
+    Either everything under a PREFIX (thor/camera/20261121/), or what the flags ask for, or a training set
+    (s3://lerobot/datasets/...), which becomes the folder DIR. A second time only what is new is downloaded. Exit code 1 when
+    something could not be fetched.
     """
+    if prefix is not None and prefix.startswith('s3://') and not flags:
+        return _fetch_dataset(prefix, to, is_json=as_json)
     if (prefix is None) == (not flags):
         raise BadUsage('give either a prefix or flags that choose objects', 'shadowhound-data fetch thor/camera/ --to data')
     with asking():
@@ -80,6 +84,20 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
         print_lines(*_report(found, len(wishes), took_s, to, where))
         tell_left_out(left_out)
     return exit_code(finding=found.failed or len(left_out))
+
+
+def _fetch_dataset(url: str, to: Path, *, is_json: bool) -> ExitCode:
+    with asking():
+        from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset  # noqa: PLC0415
+
+        place = DatasetPlace.of(url)
+    with closing(open_reader(the_store_settings())) as store, progress('looking at what there is') as bar:
+        moved = fetch_dataset(place, to, store, bar.say)
+    if is_json:
+        print_json({'to': str(to), **asdict(moved)})
+    else:
+        print_lines(plain(f'{counted(moved.files, "file")} ({volume(moved.bytes)}) of {place} fetched to {to}.'))
+    return ExitCode.FINE
 
 
 def _asked(flags: Mapping[str, Any], limit: int | None, left_out: Any) -> list[dict[str, Any]]:

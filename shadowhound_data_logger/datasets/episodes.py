@@ -100,6 +100,8 @@ def build(plan: EpisodePlan, options: ExportOptions, fps: int, settings: StoreSe
 def _built(plan: EpisodePlan, options: ExportOptions, fps: int, recordings: Recordings, folder: Path) -> dict[str, Any]:
     if plan.missing:
         raise LakeError(f'the store has nothing of {", ".join(sorted(set(plan.missing)))} in it')
+    if plan.never_told and not options.allow_gaps:
+        raise LakeError(f'{plan.never_told}, and no more will come: --allow-gaps takes it')
     if fps > whole_fps(plan.camera_hz):
         slow = min((each for each in plan.streams if each.part is None), key=lambda each: each.recording.rate_hz)
         raise LakeError(f'{slow.recording.topic} has {slow.recording.rate_hz:.3g} Hz in the {slow.recording.sink}, '
@@ -290,8 +292,8 @@ def _write_rows(streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]],
     columns: dict[str, pa.Array] = {
         'observation.state': vectors(state, pa.float32()),
         'action': vectors(action, pa.float32()),
-        'observation.stale': vectors(np.column_stack([each.sampled.stale for each in streams]).astype(np.float32), pa.float32()),
-        'observation.age_s': vectors(np.column_stack([each.sampled.age_s for each in streams]), pa.float32()),
+        'shadowhound.stale': vectors(np.column_stack([each.sampled.stale for each in streams]).astype(np.float32), pa.float32()),
+        'shadowhound.age_s': vectors(np.column_stack([each.sampled.age_s for each in streams]), pa.float32()),
         'shadowhound.cause': pa.array(told, pa.string()),
         'shadowhound.stamp_ns': pa.array(ticks, pa.int64()),
         'timestamp': pa.array((np.arange(count) / fps).astype(np.float32)),

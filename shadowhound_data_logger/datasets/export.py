@@ -41,6 +41,8 @@ KNOWN: Final = 'exports.json'
 """In SHADOWHOUND_HOME: the folders that were exported to from this machine."""
 LOOK_S: Final = 5.0
 """Between two looks at what has arrived."""
+PATIENCE_S: Final = 3600.0
+"""Waiting ends after so long in which nothing new was heard of what is waited for."""
 TRAIN, VALIDATION = 'train', 'validation'
 
 
@@ -74,7 +76,8 @@ def export(  # noqa: PLR0913 - the flags of the command
 ) -> Exported:  # fmt: skip
     """Add the missions that the flags choose to the data set in this folder, which is made where there is none.
 
-    With ``wait`` it comes back once it is known of each mission what is missing. Raises LakeError, SettingError, StoreError.
+    With ``wait`` it comes back once it is known of each mission what is missing, or nothing new has been heard for an hour.
+    Raises LakeError, SettingError, StoreError.
     """
     findings = Findings() if findings is None else findings
     with writing(folder, is_dry=is_dry):
@@ -82,12 +85,15 @@ def export(  # noqa: PLR0913 - the flags of the command
         options, fps, action = _settled(made, options)
         result = Exported(folder, present=made.mission_ids)
         with closing(open_store(source.settings, UploadSettings())) as store:
+            waited_s, before = 0.0, dict[str, str]()
             while True:
                 missions = _new(made, planning.chosen(source, flags, findings))
                 look = folder / WORK / 'look'
                 plans = list(planning.planned(source, store, missions, options, action, look, findings))
                 late = [each for each in plans if each.waits_for]
-                if not wait or not late:
+                now = {each.mission.mission_id: each.waits_for for each in late}
+                waited_s, before = waited_s + LOOK_S if now == before else 0.0, now
+                if not wait or not late or waited_s >= PATIENCE_S:
                     break
                 say(f'{len(late)} of {len(plans)} missions wait: {late[0].mission.mission_id}: {late[0].waits_for}')
                 sleep(LOOK_S)
@@ -255,7 +261,7 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
         if 'refused' in told:
             result.refused[mission] = told['refused']
             continue
-        split = VALIDATION if int(_hashed(mission)[:8], 16) / 0x1_0000_0000 < options.validation else TRAIN
+        split = split_of(mission, options.validation)
         try:
             made.add(told, work, options, split)
         except LakeError as error:
@@ -276,6 +282,11 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
     for work in (folder / WORK).glob('*-*'):
         if (work / TOLD).is_file():
             rmtree(work)
+
+
+def split_of(mission_id: str, validation: float) -> str:
+    """Whether a mission is to learn from or to check with: by its id alone, so that it stays when others are added."""
+    return VALIDATION if int(_hashed(mission_id)[:8], 16) / 0x1_0000_0000 < validation else TRAIN
 
 
 def _told_before(folder: Path) -> list[dict[str, Any]]:

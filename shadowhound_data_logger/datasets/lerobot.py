@@ -292,8 +292,8 @@ def features_of(told: Mapping[str, Any], options: ExportOptions) -> dict[str, An
         list(COMMAND.names), units=list(COMMAND.units), source=COMMAND.sensor if is_command else f'{DERIVED.sensor}, derived',
         derived=not is_command,
     )  # fmt: skip
-    features['observation.stale'] = _vector(list(streams), about='1 where the newest message is older than it may be')
-    features['observation.age_s'] = _vector(list(streams), about='seconds since the newest message')
+    features['shadowhound.stale'] = _vector(list(streams), about='1 where the newest message is older than it may be')
+    features['shadowhound.age_s'] = _vector(list(streams), about='seconds since the newest message')
     features['shadowhound.cause'] = {'dtype': 'string', 'shape': [1], 'names': None}
     features['shadowhound.stamp_ns'] = {'dtype': 'int64', 'shape': [1], 'names': None}
     features |= {name: {'dtype': kind, 'shape': [1], 'names': None} for name, kind in _COUNTERS.items()}

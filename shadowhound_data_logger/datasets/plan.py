@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,7 +27,7 @@ from shadowhound_data_logger.datasets.series import RecordedSensor, Recordings, 
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.gaps import Known, newest, of_rows, thinned_times, watermarks
+from shadowhound_data_logger.lake.gaps import OBJECTS, RECEIVED_ONLY, Known, newest, of_rows, thinned_times, watermarks
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track
@@ -41,7 +41,8 @@ BEFORE_NS: Final = 10 * SECOND
 LONGEST_BATCH_NS: Final = 3600 * SECOND
 """An object that began so long before may reach into a mission (sensor.batch_s)."""
 END_SLACK_NS: Final = 2 * SECOND
-"""A topic's last message comes so much before the end of a mission that the robot is switched off with."""
+"""A topic's last message comes so much before the end of a mission that the robot is switched off with; a slow topic's two
+periods."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,17 @@ class StreamPlan:
     thinned: tuple[tuple[int, int], ...]
     complete_ns: int
     """Up to here the robot has said what is missing; 0 where it has said nothing."""
+    is_final: bool = False
+    """Whether it will say no more than that: it counts only what came, or the topic ended and the node was started again."""
+
+    def is_told(self, end_ns: int) -> bool:
+        """Whether it is known what is missing up to then."""
+        period_ns = round(SECOND / self.recording.rate_hz) if self.recording.rate_hz else 0
+        return self.complete_ns + max(END_SLACK_NS, 2 * period_ns) >= end_ns
+
+    def said(self, end_ns: int) -> str:
+        """How far the robot has said what is missing, for a sentence."""
+        return f'up to {(end_ns - self.complete_ns) / SECOND:.1f} s before its end' if self.complete_ns else 'nothing'
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +108,19 @@ class EpisodePlan:
         """Why nobody can say yet what is missing; empty where it is known."""
         if not self.mission.end_ns:
             return 'it goes on, or its summary has not arrived'
+        end = self.mission.end_ns
         for stream in self.streams:
-            if stream.complete_ns + END_SLACK_NS < self.mission.end_ns:
-                behind = (self.mission.end_ns - stream.complete_ns) / SECOND
-                said = f'up to {behind:.1f} s before its end' if stream.complete_ns else 'nothing'
-                return f'of {stream.recording.topic} the robot has said {said} what is missing'
+            if not stream.is_final and not stream.is_told(end):
+                return f'of {stream.recording.topic} the robot has said {stream.said(end)} what is missing'
+        return ''
+
+    @property
+    def never_told(self) -> str:
+        """Why nobody will ever know what is missing; empty where it is known, or will be."""
+        end = self.mission.end_ns
+        for stream in self.streams:
+            if stream.is_final and not stream.is_told(end):
+                return f'of {stream.recording.topic} the robot can say {stream.said(end)} what is missing'
         return ''
 
     @property
@@ -182,18 +202,26 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
         if recording is None:
             missing.append(sensor)
             continue
-        streams.append(_stream(name, part, recording, mission, stated))
+        last = int(tracks[sensor].end_ns.max()) if recording.sink == OBJECTS else mission.end_ns
+        streams.append(_stream(name, part, recording, mission, stated, last))
     topics_used = pa.array(sorted({stream.recording.topic for stream in streams}), pa.string())
     return EpisodePlan(mission, tuple(streams), tracks, topics, bags, _about(stated, topics_used, since, until), tuple(missing))
 
 
-def _stream(name: str, part: StatePart | None, recording: RecordedSensor, mission: ChosenMission, stated: pa.Table) -> StreamPlan:
-    mine = stated.filter(pc.and_(pc.equal(stated['topic'], recording.topic), pc.equal(stated['sink'], recording.sink)))
-    rows = mine.to_pylist()
+def _stream(name: str, part: StatePart | None, recording: RecordedSensor, mission: ChosenMission, stated: pa.Table,
+            last_ns: int) -> StreamPlan:  # fmt: skip
+    """``last_ns`` is the stamp of the last of its messages that is in the store."""
+    rows = stated.filter(pc.equal(stated['sink'], recording.sink)).to_pylist()
+    mine = [row for row in rows if row['topic'] == recording.topic]
     begin, end = mission.begin_ns - BEFORE_NS, mission.end_ns + SECOND
-    known = of_rows(mission.robot, recording.sink, recording.topic, begin, end, rows)
-    complete = [row['to_ns'] for row in watermarks(rows) if row['from_ns'] <= mission.end_ns]
-    return StreamPlan(name, part, recording, known, tuple(thinned_times(rows)), max(complete, default=0))
+    known = of_rows(mission.robot, recording.sink, recording.topic, begin, end, mine)
+    marks = watermarks(mine)
+    complete = [row['to_ns'] for row in marks if row['from_ns'] <= mission.end_ns and row['grade'] != RECEIVED_ONLY]
+    plan = StreamPlan(name, part, recording, known, tuple(thinned_times(mine)), max(complete, default=0))
+    arrived = last_ns + END_SLACK_NS >= mission.end_ns
+    sessions = {row['session'] for row in watermarks(rows) if row['from_ns'] <= mission.end_ns <= row['to_ns'] + END_SLACK_NS}
+    is_uncounted = arrived and bool(sessions) and not any(row['session'] in sessions for row in marks)
+    return replace(plan, is_final=is_uncounted or any(row['from_ns'] > mission.end_ns for row in marks))
 
 
 def _about(stated: pa.Table, topics: pa.Array, since: int, until: int) -> pa.Table:

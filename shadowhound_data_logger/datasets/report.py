@@ -55,7 +55,7 @@ def _episode(made: Lerobot, row: EpisodeRow, sheet: Image.Image, top: int) -> No
             picture = picture.resize((max(1, min(170, round(picture.width * height / picture.height))), height))
             sheet.paste(picture, (left, top + 16))
             left += picture.width + GAP
-    columns = ['observation.state', 'observation.stale']
+    columns = ['observation.state', 'shadowhound.stale']
     table = pq.read_table(made.path(DATA, row, 'data'), columns=columns)
     state, stale = (matrix(table[column]) for column in columns)
     assert made.info is not None

@@ -69,6 +69,10 @@ class Mission:
     told_until_s: float = 1.0
     """How long after its end the watermarks reach."""
     sensors: Sequence[str] = ('camera', 'odom', 'imu', 'joints')
+    uncounted: Sequence[str] = ()
+    """Sensors of which the robot cannot tell what is missing: it never speaks of them."""
+    skipped: int = 0
+    """Messages of each sensor that its settings left out, by the watermark."""
 
     @property
     def begin_ns(self) -> int:
@@ -127,8 +131,8 @@ class House:
         until = mission.end_ns + round(until_s * SECOND)
         marks = [
             complete('thor', 'j', 10 + self._parts, sink='objects', topic=TOPICS[sensor], session=1 + round(mission.begin_s),
-                     grade='exact', from_ns=mission.begin_ns - 2 * SECOND, to_ns=until, received=1000, skipped=0)
-            for sensor in mission.sensors
+                     grade='exact', from_ns=mission.begin_ns - 2 * SECOND, to_ns=until, received=1000, skipped=mission.skipped)
+            for sensor in mission.sensors if sensor not in mission.uncounted
         ]  # fmt: skip
         tell(self.settings, self.folder, *mission.gaps, *marks, name=f'part{self._parts}')
         self._parts += 1

@@ -98,8 +98,8 @@ def test_a_robot_sees_nothing_but_its_own(as_user: Connect) -> None:
     assert _is_denied(thor.create_bucket, Bucket='thors-own')
 
 
-def test_spark_reads_everything_and_changes_nothing(as_user: Connect) -> None:
-    """It lists and reads all buckets, and can neither write nor delete."""
+def test_spark_reads_everything_and_changes_nothing_of_a_robot(as_user: Connect) -> None:
+    """It lists and reads all buckets, and can neither write nor delete what robots or MLflow wrote."""
     as_user('thor').put_object(Bucket='sensor-data', Key='thor/for-spark', Body=b'one')
     spark = as_user('spark')
     listed = [entry['Key'] for entry in spark.list_objects_v2(Bucket='sensor-data', Prefix='thor/for-spark')['Contents']]
@@ -107,7 +107,19 @@ def test_spark_reads_everything_and_changes_nothing(as_user: Connect) -> None:
     assert spark.get_object(Bucket='sensor-data', Key='thor/for-spark')['Body'].read() == b'one'
     assert _is_denied(spark.put_object, Bucket='sensor-data', Key='thor/x', Body=b'two')
     assert _is_denied(spark.delete_object, Bucket='sensor-data', Key='thor/for-spark')
+    assert _is_denied(spark.put_object, Bucket='mlflow', Key='1/x', Body=b'two')
     assert {bucket['Name'] for bucket in spark.list_buckets()['Buckets']} == {'sensor-data', 'trajectories', 'lerobot', 'mlflow'}
+
+
+def test_training_sets_are_sparks(as_user: Connect) -> None:
+    """It puts data sets into their bucket, replaces and deletes them; a robot does none of this."""
+    spark, thor, key = as_user('spark'), as_user('thor'), 'datasets/go2/set/meta/info.json'
+    spark.put_object(Bucket='lerobot', Key=key, Body=b'one')
+    for call in (thor.put_object, thor.get_object, thor.delete_object):
+        assert _is_denied(call, Bucket='lerobot', Key=key)
+    assert _is_denied(thor.put_object, Bucket='lerobot', Key='thor/x', Body=b'two')
+    spark.delete_object(Bucket='lerobot', Key=key)
+    assert 'Contents' not in spark.list_objects_v2(Bucket='lerobot', Prefix=key)
 
 
 def test_mlflow_has_its_bucket_alone(as_user: Connect) -> None:
