@@ -7,6 +7,10 @@ Frames come from the store that AWS_ENDPOINT_URL names (or from ``--folder``, wh
 run goes to MLFLOW_TRACKING_URI: parameters, losses, the best checkpoint. What is learnt is speed (m/s) and yaw rate (rad/s)
 from one frame to the next, by the catalogue's poses. The last fifth in the order of time is for validation: neighbours look
 alike.
+
+With ``--export DIR`` it learns from a training set of ``shadowhound-data export lerobot`` instead: the action of each frame. Then
+the missions that are marked as validation are held back, and the run is marked with the digest of the data set, by which
+``shadowhound-data export where`` finds it.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import mlflow
 import numpy as np
@@ -28,7 +32,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from shadowhound_data_logger.errors import DataLoggerError
-from shadowhound_data_logger.lake import MissionDataset
+from shadowhound_data_logger.lake import MissionDataset, log_dataset
 
 EXPERIMENT = 'navigation_policy_training'
 SIZE = (96, 128)
@@ -74,12 +78,50 @@ def motions(stamps_ns: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return found
 
 
+class Frames(Protocol):
+    """Pictures by number."""
+
+    def __getitems__(self, indices: Sequence[int]) -> Sequence[Mapping[str, Any]]: ...
+
+
+class ExportedFrames:
+    """The frames of a training set in memory, 37 KB each, with their actions as labels."""
+
+    def __init__(self, folder: Path) -> None:
+        from PIL import Image  # noqa: PLC0415 - the modules of the extra "datasets"
+
+        from shadowhound_data_logger.datasets.lerobot import Lerobot  # noqa: PLC0415
+
+        made = Lerobot(folder)
+        images: list[np.ndarray] = []
+        labels, held_back = [], []
+        for row in made.rows:
+            pictures = made.pictures(row, made.picture_keys()[0])
+            images += [np.asarray(Image.fromarray(pixels).resize(SIZE[::-1])) for pixels in pictures]
+            labels.append(made.numbers(row, 'action')[:, [0, 2]])
+            held_back += [row['shadowhound/split'] == 'validation'] * row['length']
+        self.images = np.array(images, np.uint8)
+        self.labels = np.concatenate(labels).astype(float)
+        self.held_back = np.array(held_back)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
+        return [{'image': self.images[index]} for index in indices]
+
+    def split(self) -> tuple[np.ndarray, np.ndarray]:
+        """By mission; where none is marked, the last fifth of the frames."""
+        numbers = np.arange(len(self))
+        if self.held_back.any():
+            return numbers[~self.held_back], numbers[self.held_back]
+        return split(self.labels, numbers)
+
+
 class Motions(Dataset[tuple[np.ndarray, np.ndarray]]):
     """Frames by number, and how the robot went on, in standard deviations from the mean."""
 
-    def __init__(
-        self, frames: MissionDataset, labels: np.ndarray, numbers: np.ndarray, scale: tuple[np.ndarray, np.ndarray]
-    ) -> None:
+    def __init__(self, frames: Frames, labels: np.ndarray, numbers: np.ndarray, scale: tuple[np.ndarray, np.ndarray]) -> None:
         self.frames, self.numbers = frames, numbers
         self.labels = ((labels - scale[0]) / scale[1]).astype(np.float32)
 
@@ -145,24 +187,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name: getattr(options, name) for name in ('robot', 'mission', 'mission_type', 'since', 'until') if getattr(options, name)
     }
     try:
-        frames = MissionDataset(options.folder, size=SIZE, causal=True, **flags)
+        frames, labels, (learn, check) = _of_export(options.export) if options.export else _of_missions(options.folder, flags)
     except DataLoggerError as error:
         print(f'train_navigation_policy: {error}', file=sys.stderr)
         return 1
-    labels = motions(frames.stamps_ns, frames.poses)
-    learn, check = split(labels, frames.stamps_ns)
     if len(learn) < 2:
-        print(
-            f'train_navigation_policy: of {len(frames)} frames {len(learn)} have a pose and a next one: too few', file=sys.stderr
-        )
+        print(f'train_navigation_policy: {len(learn)} frames have a motion to learn: too few', file=sys.stderr)
         return 1
     torch.manual_seed(options.seed)
     scale = labels[learn].mean(axis=0), labels[learn].std(axis=0) + 1e-3
     policy = Policy()
     mlflow.set_experiment(EXPERIMENT)
     with mlflow.start_run(run_name=options.name) as run, tempfile.TemporaryDirectory() as folder:
+        if options.export:
+            log_dataset(run, options.export)
         mlflow.log_params({
-            'architecture': 'conv4', 'dataset': ' '.join(f'{name}={value}' for name, value in flags.items()) or 'all',
+            'architecture': 'conv4',
+            'dataset': str(options.export or ' '.join(f'{name}={value}' for name, value in flags.items()) or 'all'),
             'frames': len(learn), 'validation_frames': len(check), 'height': SIZE[0], 'width': SIZE[1],
             'batch': options.batch, 'rate': options.rate, 'epochs': options.epochs, 'seed': options.seed,
         })  # fmt: skip
@@ -180,12 +221,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _of_missions(folder: Path | None, flags: Mapping[str, Any]) -> tuple[Frames, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    frames = MissionDataset(folder, size=SIZE, **flags)
+    labels = motions(frames.stamps_ns, frames.poses)
+    return frames, labels, split(labels, frames.stamps_ns)
+
+
+def _of_export(folder: Path) -> tuple[Frames, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    frames = ExportedFrames(folder)
+    return frames, frames.labels, frames.split()
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='train_navigation_policy', description=__doc__.partition('\n')[0])
     for name, text in (('robot', 'of this robot'), ('mission', 'of a mission or its run, by how the id begins'),
                        ('mission-type', 'such as patrol'), ('since', 'yesterday, 2h, ...'), ('until', 'likewise')):  # fmt: skip
         parser.add_argument(f'--{name}', help=text)
     parser.add_argument('--folder', type=Path, help='fetched objects instead of the store')
+    parser.add_argument('--export', type=Path, metavar='DIR', help='a training set of shadowhound-data export lerobot instead')
     parser.add_argument('--epochs', type=int, default=5)
     parser.add_argument('--batch', type=int, default=16)
     parser.add_argument('--rate', type=float, default=1e-3, help='learning rate')

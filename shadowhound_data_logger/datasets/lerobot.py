@@ -20,9 +20,10 @@ import pyarrow.parquet as pq
 
 from shadowhound_data_logger.datasets.episodes import EPISODE, GAP_SCHEMA, GAPS, PICTURE, ROWS, SOURCE_SCHEMA, SOURCES
 from shadowhound_data_logger.datasets.features import COMMAND, DERIVED, STATE_PARTS, ExportOptions
-from shadowhound_data_logger.datasets.video import feature_info
+from shadowhound_data_logger.datasets.video import feature_info, video_frames
 from shadowhound_data_logger.disk import fingerprint, replacing, sync
 from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.training import DIGEST_FILES, INFO, digest_of
 
 if TYPE_CHECKING:
@@ -85,6 +86,22 @@ class Lerobot:
 
     def picture_keys(self) -> list[str]:
         return [key for key, feature in (self.info or {}).get('features', {}).items() if feature['dtype'] in {'video', 'image'}]
+
+    def numbers(self, row: EpisodeRow, key: str) -> NDArray[Any]:
+        """(frames, numbers) of a feature of an episode."""
+        return matrix(pq.read_table(self.path(DATA, row, 'data'), columns=[key])[key])
+
+    def pictures(self, row: EpisodeRow, key: str) -> Iterator[NDArray[np.uint8]]:
+        """(height, width, 3) RGB of each frame of an episode. Raises LakeError."""
+        if key in self.video_keys():
+            yield from (pixels for _, pixels in video_frames(self.path(VIDEO, row, f'videos/{key}', video_key=key)))
+        else:
+            yield from (decode.image(body) for body in self.bodies(row, key))
+
+    def bodies(self, row: EpisodeRow, key: str) -> Iterator[bytes]:
+        """The pictures of a lossless data set as they were published."""
+        for batch in pq.ParquetFile(self.path(DATA, row, 'data')).iter_batches(batch_size=64, columns=[key]):
+            yield from (value.as_py()['bytes'] for value in batch.column(0))
 
     def _rows(self) -> Iterator[EpisodeRow]:
         assert self.info is not None

@@ -27,7 +27,7 @@ from shadowhound_data_logger.datasets.series import RecordedSensor, Recordings, 
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.gaps import OBJECTS, RECEIVED_ONLY, Known, newest, of_rows, thinned_times, watermarks
+from shadowhound_data_logger.lake.gaps import OBJECTS, Known, newest, of_rows, thinned_times, watermarks
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track
@@ -216,7 +216,7 @@ def _stream(name: str, part: StatePart | None, recording: RecordedSensor, missio
     begin, end = mission.begin_ns - BEFORE_NS, mission.end_ns + SECOND
     known = of_rows(mission.robot, recording.sink, recording.topic, begin, end, mine)
     marks = watermarks(mine)
-    complete = [row['to_ns'] for row in marks if row['from_ns'] <= mission.end_ns and row['grade'] != RECEIVED_ONLY]
+    complete = [row['to_ns'] for row in marks if row['from_ns'] <= mission.end_ns and row['grade'] in {'exact', 'estimated'}]
     plan = StreamPlan(name, part, recording, known, tuple(thinned_times(mine)), max(complete, default=0))
     arrived = last_ns + END_SLACK_NS >= mission.end_ns
     sessions = {row['session'] for row in watermarks(rows) if row['from_ns'] <= mission.end_ns <= row['to_ns'] + END_SLACK_NS}

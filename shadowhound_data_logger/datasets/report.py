@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import pyarrow.parquet as pq
 from PIL import Image, ImageDraw
 
 from shadowhound_data_logger.clock import utc
-from shadowhound_data_logger.datasets.lerobot import DATA, OURS, VIDEO, EpisodeRow, Lerobot, matrix
-from shadowhound_data_logger.datasets.video import video_frames
-from shadowhound_data_logger.lake import decode
+from shadowhound_data_logger.datasets.lerobot import OURS, EpisodeRow, Lerobot
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,33 +46,18 @@ def _episode(made: Lerobot, row: EpisodeRow, sheet: Image.Image, top: int) -> No
     wanted = sorted({round(share * (row['length'] - 1)) for share in np.linspace(0, 1, FRAMES)})
     left, height = GAP, HEIGHT - 50
     for key in made.picture_keys()[:1]:
-        for pixels in _frames(made, row, key, wanted):
+        for pixels in (pixels for number, pixels in enumerate(made.pictures(row, key)) if number in wanted):
             picture = Image.fromarray(pixels)
             picture = picture.resize((max(1, min(170, round(picture.width * height / picture.height))), height))
             sheet.paste(picture, (left, top + 16))
             left += picture.width + GAP
-    columns = ['observation.state', 'shadowhound.stale']
-    table = pq.read_table(made.path(DATA, row, 'data'), columns=columns)
-    state, stale = (matrix(table[column]) for column in columns)
+    state, stale = (made.numbers(row, key) for key in ('observation.state', 'shadowhound.stale'))
     assert made.info is not None
     names = made.info['features']['observation.state']['names']
     if 'pose.x' in names:
         path = state[:, [names.index('pose.x'), names.index('pose.y')]]
         _path(pen, path, np.asarray(stale.any(axis=1)), (WIDTH - 220, top + 16, WIDTH - GAP, top + HEIGHT - 34))
     _bars(pen, stale, row['length'] / made.info['fps'], top + HEIGHT - 30)
-
-
-def _frames(made: Lerobot, row: EpisodeRow, key: str, wanted: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
-    if key in made.video_keys():
-        path = made.path(VIDEO, row, f'videos/{key}', video_key=key)
-        yield from (pixels for number, (_, pixels) in enumerate(video_frames(path)) if number in wanted)
-    else:
-        file, number = pq.ParquetFile(made.path(DATA, row, 'data')), 0
-        for batch in file.iter_batches(batch_size=64, columns=[key]):
-            for value in batch.column(0):
-                if number in wanted:
-                    yield decode.image(value.as_py()['bytes'])
-                number += 1
 
 
 def _path(pen: ImageDraw.ImageDraw, path: NDArray[Any], stale: NDArray[np.bool_], box: tuple[int, int, int, int]) -> None:

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -21,10 +21,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from shadowhound_data_logger.datasets.episodes import EPISODE
-from shadowhound_data_logger.datasets.lerobot import DATA, DIGESTS, FILES, OURS, SOURCE_TABLE, VIDEO, EpisodeRow, Lerobot
+from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, OURS, SOURCE_TABLE, EpisodeRow, Lerobot
 from shadowhound_data_logger.datasets.series import pictures_of
 from shadowhound_data_logger.datasets.transfer import DatasetPlace
-from shadowhound_data_logger.datasets.video import likeness, video_frames
+from shadowhound_data_logger.datasets.video import likeness
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake import decode
@@ -32,9 +32,6 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.training import INFO
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.untrusted import is_path
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 THREADS: Final = 16
 FRAMES: Final = 5
@@ -143,7 +140,8 @@ def _frames(made: Lerobot, row: EpisodeRow, key: str, sources: pa.Table, store: 
         asked = {(each['bucket'], each['key'], each['stamp_ns'], each['sha256']) for each in told.values()}
         pictures = pictures_of(store, asked, row[f'{OURS}{stream}/topic'], Path(work))
     count = 0
-    for number, content in _shown(made, row, key):
+    shown: Iterator[Any] = made.pictures(row, key) if key in made.video_keys() else made.bodies(row, key)
+    for number, content in enumerate(shown):
         count += 1
         if number not in told:
             continue
@@ -166,18 +164,6 @@ def _frames(made: Lerobot, row: EpisodeRow, key: str, sources: pa.Table, store: 
             )
     if count != length:
         found.wrong.append(f'episode {row["episode_index"]}: {key} has {count} frames, the episode {length}')
-
-
-def _shown(made: Lerobot, row: EpisodeRow, key: str) -> Iterator[tuple[int, NDArray[np.uint8] | bytes]]:
-    if key in made.video_keys():
-        path = made.path(VIDEO, row, f'videos/{key}', video_key=key)
-        yield from ((number, pixels) for number, (_, pixels) in enumerate(video_frames(path)))
-        return
-    number = 0
-    for batch in pq.ParquetFile(made.path(DATA, row, 'data')).iter_batches(batch_size=64, columns=[key]):
-        for value in batch.column(0):
-            yield number, value.as_py()['bytes']
-            number += 1
 
 
 # -- which data sets saw an object ---------------------------------------------------------------------------------------------

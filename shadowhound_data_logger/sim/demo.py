@@ -33,6 +33,8 @@ from shadowhound_data_logger.stores import open_store
 MARKER: Final = '.shadowhound-demo'
 """In a folder that the demo made and may replace."""
 LEAST_S: Final = 5.0
+AT_THE_DOCK_S: Final = 3.0
+"""The robot publishes for so long after its mission: so it is known what is missing up to the end (docs/datasets.md)."""
 NO_PROXY: Final = ('NO_PROXY', 'no_proxy')
 
 
@@ -114,7 +116,13 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
             if with_mission:
                 agent = agents.enter_context(demo_mission.start(folder, environ))
             with demo_report.progress(console, duration_s) as show:
-                record = demo_run.patrol(folder, node, outage, environ, duration_s, show)
+
+                def look(reading: demo_run.SpoolReading) -> None:
+                    show(reading)
+                    if with_mission and reading.t > duration_s - AT_THE_DOCK_S:
+                        agent.ask_to_stop()
+
+                record = demo_run.patrol(folder, node, outage, environ, duration_s, look)
             run_id = demo_mission.end(agent) if with_mission else ''
         began = time.monotonic()
         node.stop(demo_processes.STOP_S)

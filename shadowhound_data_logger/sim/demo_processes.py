@@ -93,10 +93,14 @@ class Child:
         lines = self.log.read_text(encoding='utf-8', errors='replace').splitlines()
         return [line for line in lines if any(mark in line for mark in FAILURES)]
 
-    def stop(self, timeout_s: float) -> None:
-        """SIGINT, and SIGKILL after ``timeout_s``; idempotent."""
+    def ask_to_stop(self) -> None:
+        """SIGINT; idempotent."""
         if self.is_running:
             self._process.send_signal(signal.SIGINT)
+
+    def stop(self, timeout_s: float) -> None:
+        """SIGINT, and SIGKILL after ``timeout_s``; idempotent."""
+        self.ask_to_stop()
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -129,7 +133,8 @@ def environment(home: Path, tower: Mapping[str, str], domain: int) -> dict[str, 
 
 def start_logger(folder: Path, environ: Mapping[str, str]) -> Child:
     """The node, once its spool can be read. Raises DemoFailed when it does not start."""
-    arguments = ['--ros-args', '-p', f'shutdown.drain_s:={DRAIN_S}', '-p', f'upload.backoff_s:={BACKOFF_S}']
+    settings = (f'shutdown.drain_s:={DRAIN_S}', f'upload.backoff_s:={BACKOFF_S}', 'bag.record:=mission')
+    arguments = ['--ros-args', *(word for each in settings for word in ('-p', each))]
     node = Child('shadowhound_data_logger.capture.sensor_logger_node', arguments, environ, folder / 'node.log')
     end = time.monotonic() + READY_S
     while True:

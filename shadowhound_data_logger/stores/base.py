@@ -105,7 +105,7 @@ def joined(content: Content, most: int | None) -> bytes:
             if size > info.size:
                 raise too_large(info.bucket, info.key, info.size)
             pieces.append(piece)
-        return pieces[0] if len(pieces) == 1 else b''.join(pieces)
+        return bytes(pieces[0]) if len(pieces) == 1 else b''.join(pieces)  # obstore's are no bytes to json
 
 
 def too_large(bucket: str, key: str, most: int) -> ObjectRefused:
