@@ -107,8 +107,7 @@ class Settings:
         _check_events(groups['events'])
         if given:
             name, value = next(iter(given.items()))
-            known = sorted({'robot', 'sensors', *GROUPS, *(sensor.name for sensor in sensors)})
-            raise SettingError(name, value, f'only a known name: {_near(name, sensors, known)}')
+            raise SettingError(name, value, f'only a known name: {_near(name, sensors)}')
         folder = home(environ)
         return cls(robot=robot, home=folder, sensors=sensors, store=store_settings(environ, folder), **groups)
 
@@ -294,10 +293,13 @@ def _check(name: str, value: Any, default: Any, metadata: Mapping[str, Any]) -> 
     return value
 
 
-def _near(name: str, sensors: Sequence[SensorSettings], known: list[str]) -> str:
-    """The names that could have been meant: those of the same group, else the groups."""
-    prefix = name.partition('.')[0]
-    kind = GROUPS.get(prefix) or (SensorSettings if prefix in {sensor.name for sensor in sensors} else None)
+def _near(name: str, sensors: Sequence[SensorSettings]) -> str:
+    """The names that could have been meant: those of the same group, else the groups, and how a sensor becomes one."""
+    prefix, dot, last = name.partition('.')
+    names = {sensor.name for sensor in sensors}
+    kind = GROUPS.get(prefix) or (SensorSettings if prefix in names else None)
     if kind is None:
-        return ', '.join(known)
+        known = ', '.join(sorted({'robot', 'sensors', *GROUPS, *names}))
+        is_of_sensor = dot and last in {spec.name for spec in fields(SensorSettings) if spec.metadata}
+        return f"{known}; if {prefix} is a sensor, add it to 'sensors'" if is_of_sensor else known
     return ', '.join(f'{prefix}.{spec.name}' for spec in fields(kind) if spec.metadata)

@@ -89,7 +89,7 @@ def test_a_wrong_value_stops_the_start(name: str, value: object, allowed: str) -
 
 @pytest.mark.parametrize(('name', 'near'), [
     ('camera.rate', 'camera.rate_hz'), ('spool.max_byte', 'spool.max_bytes'), ('cammera.rate_hz', 'camera'), ('rate', 'sensors'),
-    ('camera.name', 'camera.topics'), ('camera', 'camera.rate_hz'),
+    ('camera.name', 'camera.topics'), ('camera', 'camera.rate_hz'), ('thermal.topics', "add it to 'sensors'"),
 ])  # fmt: skip
 def test_an_unknown_parameter_stops_the_start(name: str, near: str) -> None:
     """The error names the parameter, its value and those that could have been meant."""

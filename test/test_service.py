@@ -49,9 +49,9 @@ def test_refused_settings_are_not_tried_again(service: dict[str, str]) -> None:
 
 
 def test_the_secrets_are_in_the_file_that_the_guide_makes(service: dict[str, str]) -> None:
-    """docs/thor.md creates the file of the unit, with mode 0600, and no secret stands in the unit."""
+    """docs/thor.md creates the file of the unit, for its user alone, and no secret stands in the unit."""
     guide = (ROOT / 'docs' / 'thor.md').read_text(encoding='utf-8')
-    assert f'install -m 0600 /dev/null {service["EnvironmentFile"]}' in guide
+    assert f'install -m 0600 -o {service["User"]} /dev/null {service["EnvironmentFile"]}' in guide
     assert not [name for name in service if name == 'Environment']
 
 

@@ -248,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     print(f'users {", ".join(users)}: {options.folder / "secrets"}/NAME.env is what each puts into its environment (mode 600)')
     if options.rotate or options.retire:
-        print('MLflow knows it; the S3 server reads it on SIGHUP: docker compose kill -s HUP s3')
+        print('MLflow knows it; the S3 server reads it on SIGHUP: docker compose -f tower/compose.yaml kill -s HUP s3')
     return 0
 
 

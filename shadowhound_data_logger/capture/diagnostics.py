@@ -109,7 +109,7 @@ def _topic(row: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> tup
 def _spool(spool: Mapping[str, Any], before: Mapping[str, Any]) -> Entry:
     evicted = spool['evicted'] - before['evicted']
     if evicted > 0:
-        return 'spool', ERROR, f'{evicted} objects had to go lately for want of room', spool
+        return 'spool', ERROR, f'{evicted} objects were evicted lately: the disk or the spool is full', spool
     share = spool['bytes'] / spool['max_bytes']
     text = f'{spool["pending"]} objects wait for delivery, {share:.0%} of its limit is used'
     return 'spool', WARN if share > FULL else OK, text, spool

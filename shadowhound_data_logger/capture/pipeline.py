@@ -40,7 +40,7 @@ from shadowhound_data_logger.capture.unheard import Unheard
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.clock_watch import ClockWatch
-from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.config import DEFAULT_SENSORS, Settings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import dated
@@ -182,7 +182,10 @@ class Pipeline:
 
     def describe(self) -> str:
         """What goes where, in one line."""
-        return f'logging {" ".join(self.intake.topics)} to {self._store.describe()}, spool {self.spool.root}'
+        listed = {sensor.name for sensor in self._settings.sensors}
+        others = [name for name, own in DEFAULT_SENSORS.items() if name not in listed and own.get('enabled', True)]
+        left_out = f'; not logged, because sensors does not list them: {", ".join(others)}' if others else ''
+        return f'logging {" ".join(self.intake.topics)} to {self._store.describe()}, spool {self.spool.root}{left_out}'
 
     def close(self) -> None:
         """Close the open batches, make all durable, deliver for at most ``shutdown.drain_s``, leave the rest in the spool."""

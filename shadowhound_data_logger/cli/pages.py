@@ -189,7 +189,34 @@ VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ('SHADOWHOUND_HOME', '`~/.shadowhound`', 'Holds `spool/` and, without a server, `store/`.'),
     ('SHADOWHOUND_ROBOT', '', 'The name of the robot, where the parameter `robot` is empty.'),
 )
-"""Name, default, meaning of each variable that the node and the command line read."""
+"""Name, default, meaning of each variable that config.py reads for the node and the command line."""
+OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
+    ('SHADOWHOUND_PARAMETERS', '', 'The parameter file: read by the systemd unit and the doctor, not by the node itself.'),
+    ('SHADOWHOUND_LIVE_BIND', '`127.0.0.1`', 'Where the live page listens: read by its systemd unit.'),
+    (
+        'AWS_SHARED_CREDENTIALS_FILE',
+        '`~/.aws/credentials`',
+        'The keys, where the two variables are not set; read again when the server refuses them ([how](thor.md#5-credentials)).',
+    ),
+    ('AWS_PROFILE', '`default`', 'The section of that file.'),
+    ('AWS_CA_BUNDLE', "the system's", 'Certificate of your own authority, for the S3 server ([TLS](thor.md#tls)).'),
+    ('REQUESTS_CA_BUNDLE', '', 'The same, for the S3 server and MLflow.'),
+    (
+        'MLFLOW_TRACKING_URI',
+        'SQLite in `$SHADOWHOUND_HOME`',
+        'The MLflow server, such as `http://TOWER_IP:5001` ([missions](missions.md)).',
+    ),
+    ('MLFLOW_TRACKING_USERNAME', '', 'Who logs there; else `~/.mlflow/credentials` says it.'),
+    ('MLFLOW_TRACKING_PASSWORD', '', 'And the password.'),
+    ('MLFLOW_TRACKING_SERVER_CERT_PATH', '', 'Certificate of your own authority, for MLflow.'),
+    ('MLFLOW_S3_ENDPOINT_URL', '`AWS_ENDPOINT_URL`', 'Where artifacts are, if the MLflow server does not proxy them.'),
+    ('ROS_DOMAIN_ID', '`0`', "The robot driver's."),
+    ('RMW_IMPLEMENTATION', 'that of ROS', "The robot's middleware ([thor.md](thor.md#4-middleware))."),
+    ('FASTRTPS_DEFAULT_PROFILES_FILE', '', 'The profile of Fast DDS 2 (Humble, Jazzy).'),
+    ('FASTDDS_DEFAULT_PROFILES_FILE', '', 'The profile of Fast DDS 3 (Kilted).'),
+    ('CYCLONEDDS_URI', '', 'Interfaces, peers and buffers of Cyclone DDS.'),
+)
+"""Those that libraries and the systemd units read."""
 
 
 @click.command()
@@ -230,7 +257,8 @@ def parameters() -> str:
     for section in SECTIONS:
         parts += [f'\n## {section.title}\n', f'{section.text}\n\n' if section.text else '', _row(*COLUMNS)]
         parts += ['|---' * len(COLUMNS) + '|\n', *(described[name] for name in section.names)]
-    parts += [OWN, *_sensors(), ENVIRONMENT, *(_row(f'`{name}`', default, text) for name, default, text in VARIABLES)]
+    variables = (_row(f'`{name}`', default, text) for name, default, text in (*VARIABLES, *OTHER_VARIABLES))
+    parts += [OWN, *_sensors(), ENVIRONMENT, *variables]
     return ''.join(parts)
 
 
@@ -249,7 +277,7 @@ def _described() -> dict[str, str]:
             'all those below',
             'names',
             '',
-            'The sensors. One that is not among those below needs its `topics` at least.',
+            'The sensors to log; this replaces the default. Other names also need `topics` ([how](extending.md#add-a-sensor)).',
         ),
     }
     for prefix, kind in ((SENSOR, SensorSettings), *GROUPS.items()):

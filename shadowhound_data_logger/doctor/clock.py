@@ -46,8 +46,8 @@ def _kept() -> Result:
     if adjtimex is None or adjtimex(ctypes.create_string_buffer(TIMEX_BYTES)) == TIME_ERROR:  # all zero: it is only read
         return info(
             'clock.kept',
-            'nobody keeps the clock of this machine (NTP)',
-            'it drifts by seconds a day',
+            'no time service (NTP) is running on this machine',
+            'its clock drifts by seconds a day',
             'sudo apt install chrony ; timedatectl',
         )
     return ok('clock.kept', 'the clock is kept by NTP')

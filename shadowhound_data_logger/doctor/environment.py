@@ -22,6 +22,8 @@ SHARED: Final = ('AWS_ENDPOINT_URL', *KEYS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_EN
 """Where the node and this shell should agree; AWS's keys among them are compared, never shown."""
 PLACEHOLDERS: Final = ('<', 'TOWER_IP', 'from Tower', '...')
 """What is in the variables of somebody who pasted the guide as it is."""
+OF_THE_NODE: Final = 'set -a; . /etc/shadowhound/logger.env; set +a'
+"""Gives a shell the variables of the node's service."""
 _BARE: Final = re.compile(r'[\w.-]+:\d{2,5}/?')
 """A host and its port, which are not a URL."""
 
@@ -50,22 +52,35 @@ def _store(context: Context) -> Iterator[Result]:
     if pasted:
         yield error(
             'environment.placeholder',
-            f'{" and ".join(pasted)} still has the words of the manual',
-            'it was pasted, and not filled in',
+            f'{" and ".join(pasted)} still has a placeholder of the manual',
+            'it was pasted and not filled in',
             f'export {pasted[0]}=...  # with what Tower gave you',
         )
     if not endpoint:
         if any(problem.data['name'] == 'AWS_ENDPOINT_URL' for problem in context.refused):
             return
-        yield warning(
-            'environment.endpoint',
-            'AWS_ENDPOINT_URL is not set',
-            f'without it nothing leaves this machine: data go to {context.settings.store.directory}',
-            'export AWS_ENDPOINT_URL=http://TOWER_IP:9000',
-        )
+        yield _no_endpoint(context)
         return
     yield ok('environment.endpoint', f'AWS_ENDPOINT_URL is {endpoint}')
     yield _credentials(context)
+
+
+def _no_endpoint(context: Context) -> Result:
+    """It may be set for the node alone, whose status file says where it delivers: then the network is not checked, but works."""
+    servers = [target for target in status.targets(context.settings.spool_path) if '://' in target]
+    if servers:
+        return warning(
+            'environment.endpoint',
+            f'AWS_ENDPOINT_URL is not set in this shell; the node delivers to {servers[0]}',
+            'without the variables of the node, the network and the store are not checked',
+            f'{OF_THE_NODE}  # or wherever the node has AWS_ENDPOINT_URL and its keys from',
+        )
+    return warning(
+        'environment.endpoint',
+        'AWS_ENDPOINT_URL is not set',
+        f'without it nothing leaves this machine: data is stored in {context.settings.store.directory}',
+        'export AWS_ENDPOINT_URL=http://TOWER_IP:9000',
+    )
 
 
 def _credentials(context: Context) -> Result:
@@ -181,13 +196,15 @@ def _node(context: Context) -> Iterator[Result]:
     if not found['running']:
         return
     theirs = variables(context.root, found['pid'])
-    other = [name for name in SHARED if theirs and _value(theirs, name) != _value(context.environ, name)]
+    # Without an endpoint here, 'environment.endpoint' has said so, and the keys with it.
+    compared = [name for name in SHARED if context.settings.store.endpoint_url or not name.startswith('AWS_')]
+    other = [name for name in compared if theirs and _value(theirs, name) != _value(context.environ, name)]
     if other:
         yield warning(
             'environment.node',
             f'the node (process {found["pid"]}) has another {" and ".join(other)} than this shell',
             'it was started elsewhere, or before a change: what works here need not work there',
-            'start the node again: sudo systemctl restart shadowhound-data-logger',
+            f'{OF_THE_NODE}  # if this shell is right instead: sudo systemctl restart shadowhound-data-logger',
         )
     elif theirs:
         yield ok('environment.node', 'the node was started with the same addresses and keys')

@@ -97,14 +97,14 @@ def _over(index: Index, tree: Tree, settings: SpoolSettings, needed: int, there:
 
 
 class Shortage:
-    """Says that objects had to go: when that begins, once a minute while it lasts, and when it is over."""
+    """Logs that objects were evicted: when that begins, once a minute while it lasts, and when it is over."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
         self._lost = 0
         self._lost_ns = self._told_ns = 0
         self.evicted = 0
-        """Objects that had to go since the spool was opened."""
+        """Objects that were evicted since the spool was opened."""
 
     def note(self, room: RoomNeeded, now_ns: int) -> None:
         """What one commit cost."""
@@ -115,9 +115,7 @@ class Shortage:
             self._lost_ns = now_ns
             if not 0 <= now_ns - self._told_ns < TELL_EVERY_NS:
                 self._told_ns = now_ns
-                log.warning(
-                    'the spool %s is full: %d objects had to go so far, the least important first', self._root, self._lost
-                )
+                log.warning('the spool %s is full: evicted %d objects so far, the least important first', self._root, self._lost)
         elif self._lost and not 0 <= now_ns - self._lost_ns < TELL_EVERY_NS:
-            log.info('the spool %s has had room for a minute; %d objects had to go', self._root, self._lost)
+            log.info('the spool %s has had room for a minute; %d objects were evicted', self._root, self._lost)
             self._lost = self._told_ns = 0

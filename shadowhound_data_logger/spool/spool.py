@@ -180,7 +180,7 @@ class Spool:
 
     @property
     def evicted(self) -> int:
-        """Objects that this process gave up for want of room."""
+        """Objects that this process evicted because the disk or the spool was full."""
         return self._shortage.evicted
 
     def states(self, bucket: str, prefix: str) -> dict[str, State]:

@@ -197,7 +197,7 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
     yield from _other_types(found)
     yield from _left_out(found)
     if evicted := (found['spool'] or {}).get('evicted', 0):
-        yield f'evicted in this session: {evicted:,} objects, for want of room (spool.max_bytes, spool.min_free_bytes)'
+        yield f'evicted in this session: {evicted:,} objects; disk or spool is full (spool.min_free_bytes, spool.max_bytes)'
     if store['quarantined']:
         yield f'quarantined in this session: {store["quarantined"]:,} objects'
 

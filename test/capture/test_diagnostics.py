@@ -116,7 +116,7 @@ def test_a_topic(values: dict[str, Any], level: Any, words: str) -> None:
         ('clock', {'clock__last_step_age_s': 59.0}, WARN, 'stepped by 3.5 s 59 s ago'),
         ('clock', {'clock__last_step_s': None, 'clock__last_step_age_s': None}, OK, 'set'),
         ('spool', {'spool__bytes': 80}, OK, '80%'),
-        ('spool', {'spool__evicted': 5}, ERROR, '3 objects had to go lately'),
+        ('spool', {'spool__evicted': 5}, ERROR, '3 objects were evicted lately'),
         ('spool', {'spool__bytes': 81}, WARN, '81% of its limit'),
         ('store', {'store__state': 'not_draining'}, OK, 'not draining'),
         ('store', {'store__state': 'store_down'}, WARN, 'store down: refused'),

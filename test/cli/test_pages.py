@@ -76,6 +76,15 @@ def test_every_environment_variable_is_on_it() -> None:
     assert read == {name for name, _, _ in VARIABLES}
 
 
+def test_every_variable_of_the_guide_is_on_it() -> None:
+    """docs/thor.md, the launch files and the units name no variable that the page does not have."""
+    names = r'\b(?:AWS|SHADOWHOUND|MLFLOW|ROS|RMW|REQUESTS|FAST(?:RTPS|DDS)|CYCLONEDDS)_[A-Z_]*[A-Z]\b'
+    root = DOCS.parent
+    files = (DOCS / 'thor.md', *(root / 'launch_configs').glob('*.service'))
+    told = {name for file in files for name in re.findall(names, file.read_text(encoding='utf-8'))}
+    assert {name for name in told if f'| `{name}` |' not in parameters()} == {'ROS_DISTRO'} & told
+
+
 def test_every_table_is_whole() -> None:
     """The rows of a table have as many cells as its head."""
     for table in re.findall(r'(?:^\|.*\n)+', parameters() + commands(), re.MULTILINE):

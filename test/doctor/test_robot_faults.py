@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import sqlite3
 import subprocess
 import sys
@@ -189,12 +190,18 @@ def unheard(scene: Scene) -> None:
     scene.run_node(middleware=beside(unheard=rows), workers={'front': {}})
 
 
+def endpoint_of_the_node(scene: Scene) -> None:
+    without('AWS_ENDPOINT_URL')(scene)
+    scene.run_node(store={'target': 'the S3 server at http://tower:9000', 'state': 'idle'})
+
+
 def failing_front(scene: Scene) -> None:
     scene.run_node(middleware=beside(), workers={'front': {'failing': True, 'failures': 3, 'last_error': 'it ended by signal 9'}})
 
 
 FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
     'no endpoint': (without('AWS_ENDPOINT_URL'), 'environment', 'environment.endpoint', ('export AWS_ENDPOINT_URL=http://',)),
+    'an endpoint of the node alone': (endpoint_of_the_node, 'environment', 'environment.endpoint', ('shadowhound/logger.env',)),
     'no keys': (without('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY'), 'environment', 'environment.credentials',
                 ('export AWS_ACCESS_KEY_ID=', 'aws configure')),
     'half a pair': (without('AWS_SECRET_ACCESS_KEY'), 'environment', 'environment.credentials', ('AWS_SECRET_ACCESS_KEY=',)),
@@ -295,6 +302,13 @@ def test_a_parameter_file_for_another_node(robot: Scene, tmp_path: Path) -> None
     path.write_text('sensor_loger_node:\n  ros__parameters: {camera: {rate_hz: 2.0}}\n')
     context = make_context(robot.environ, role=robot.role, parameter_file=path, root=robot.root)
     expect([each for each in environment.check(context) if each.is_finding], 'environment.parameters', '/**:')
+
+
+def test_every_check_is_on_the_page() -> None:
+    """docs/doctor.md has a row that says what it asks and what it finds."""
+    page = (Path(__file__).parents[2] / 'docs' / 'doctor.md').read_text(encoding='utf-8')
+    rows = ' '.join(re.findall(r'^\| (`.*?) \|', page.partition('## The checks')[2], re.MULTILINE))
+    assert [check.name for check in CHECKS if f'`{check.name}`' not in rows] == []
 
 
 def test_a_healthy_robot_gives_no_finding(robot: Scene) -> None:

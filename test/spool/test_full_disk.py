@@ -80,8 +80,8 @@ def test_a_shortage_is_told_when_it_begins_and_ends(opened: Open, clock: FakeClo
     settle(spool, spool.pending(1)[0], State.DELIVERED)
     settle(spool, spool.pending(1)[0], State.DELIVERED)
     told = [re.split('[:;] ', record.getMessage())[-1] for record in caplog.records]
-    assert told == [f'{count} objects had to go so far, the least important first' for count in (1, 61)] + [
-        '95 objects had to go'
+    assert told == [f'evicted {count} objects so far, the least important first' for count in (1, 61)] + [
+        '95 objects were evicted'
     ]
 
 

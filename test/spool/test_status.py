@@ -171,7 +171,7 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
         ({'store': {'quarantined': 4}}, 'quarantined in this session: 4 objects'),
         (
             {'spool': {'evicted': 4000}},
-            'evicted in this session: 4,000 objects, for want of room (spool.max_bytes, spool.min_free_bytes)',
+            'evicted in this session: 4,000 objects; disk or spool is full (spool.min_free_bytes, spool.max_bytes)',
         ),
         ({'store': {'state': 'store_down'}}, 'delivery: store down'),
         ({'store': {'state': 'paused'}}, 'delivery: paused'),
