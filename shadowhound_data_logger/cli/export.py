@@ -96,6 +96,9 @@ def _missions(command: _Command) -> _Command:
 @click.option('--allow-gaps', is_flag=True, help='Take such missions, and those of which nobody knows what is missing.')
 @click.option('--validation', type=click.FloatRange(0.0, 0.9), default=0.0, show_default=True, metavar='SHARE',
               help='Share of the missions that are marked as validation.')  # fmt: skip
+@click.option('--arm', default='', metavar='NAME', help='Take an arm along, whose topics are below /NAME.')
+@click.option('--clock', type=click.Path(path_type=Path), metavar='FILE',
+              help='Events of which robot and arm told the time, beside those recorded: CSV with robot_ns,arm_ns.')  # fmt: skip
 @click.option('--wait', is_flag=True, help='Wait until it is known of each mission what is missing.')
 @click.option('--dry-run', is_flag=True, help='Only say what would be exported.')
 @click.option('--workers', type=click.IntRange(1, 64), default=1, show_default=True, metavar='N', help='Episodes at a time.')
@@ -141,8 +144,12 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, wait:
 
 
 def _options(how: Mapping[str, Any]) -> ExportOptions:
+    from shadowhound_data_logger.datasets.clocks import pairs_of  # noqa: PLC0415
     from shadowhound_data_logger.datasets.features import ExportOptions  # noqa: PLC0415
 
+    if how['arm']:
+        check_name(how['arm'], '--arm')
+    pairs = tuple((int(robot), int(arm)) for robot, arm in pairs_of(how['clock'])) if how['clock'] else ()
     fps = how['fps']
     if fps != 'auto' and not fps.isdecimal():
         raise BadUsage(f'--fps {fps} is refused', 'allowed is auto, or a whole number of frames a second')
@@ -151,6 +158,7 @@ def _options(how: Mapping[str, Any]) -> ExportOptions:
         codec=how['codec'], is_lossless=how['lossless'], resample=_pairs('--resample', how['resample'], str),
         max_age_s=_pairs('--max-age', how['max_age'], float), max_gap_s=how['max_gap'], max_stale=how['max_stale'],
         allow_gaps=how['allow_gaps'], validation=how['validation'],
+        arm=how['arm'], clock_pairs=pairs,
     )  # fmt: skip
 
 

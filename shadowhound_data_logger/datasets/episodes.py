@@ -21,8 +21,9 @@ import pyarrow.parquet as pq
 
 from shadowhound_data_logger.catalogue.gaps import GAPS as STATEMENTS
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.datasets.features import LINEAR, ExportOptions
-from shadowhound_data_logger.datasets.plan import EpisodePlan, StreamPlan
+from shadowhound_data_logger.datasets.clocks import ClockOffset
+from shadowhound_data_logger.datasets.features import ARM_ACTION, ARM_TOPICS, LINEAR, ExportOptions
+from shadowhound_data_logger.datasets.plan import ArmPlan, EpisodePlan, StreamPlan
 from shadowhound_data_logger.datasets.series import Recordings, Series
 from shadowhound_data_logger.datasets.ticks import (
     LATE,
@@ -85,7 +86,14 @@ def build(plan: EpisodePlan, options: ExportOptions, fps: int, settings: StoreSe
     folder.mkdir(parents=True)
     store = open_store(settings, UploadSettings())
     try:
-        with Recordings(Place(settings), store, plan.tracks, plan.topics, plan.span_ns, plan.bags, folder / 'tmp') as recordings:
+        place, work = Place(settings), folder / 'tmp'
+        with ExitStack() as stack:
+            of_robot = Recordings(place, store, plan.tracks, plan.topics, plan.span_ns, plan.bags, work)
+            recordings = {False: stack.enter_context(of_robot)}
+            if plan.arm is not None:
+                span = plan.arm.span_ns(*plan.span_ns)
+                of_arm = Recordings(place, store, plan.arm.tracks, plan.arm.topics, span, plan.bags, work)
+                recordings[True] = stack.enter_context(of_arm)
             found = _built(plan, options, fps, recordings, folder)
     except (LakeError, BagDamaged, Rejected, ObjectRefused) as error:
         found = {'refused': error.what}
@@ -97,9 +105,14 @@ def build(plan: EpisodePlan, options: ExportOptions, fps: int, settings: StoreSe
     return found
 
 
-def _built(plan: EpisodePlan, options: ExportOptions, fps: int, recordings: Recordings, folder: Path) -> dict[str, Any]:
+def _built(
+    plan: EpisodePlan, options: ExportOptions, fps: int, recordings: Mapping[bool, Recordings], folder: Path
+) -> dict[str, Any]:
+    """``recordings`` are those of the robot, and with True those of the arm."""
     if plan.missing:
         raise LakeError(f'the store has nothing of {", ".join(sorted(set(plan.missing)))} in it')
+    if plan.arm is not None:
+        _check_clock(plan.arm, fps)
     if plan.never_told and not options.allow_gaps:
         raise LakeError(f'{plan.never_told}, and no more will come: --allow-gaps takes it')
     if fps > whole_fps(plan.camera_hz):
@@ -109,7 +122,7 @@ def _built(plan: EpisodePlan, options: ExportOptions, fps: int, recordings: Reco
     series = _read(plan, options, recordings)
     ticks = _ticks(plan, series, fps)
     streams = [_sampled(each, one, ticks, fps, options) for each, one in zip(plan.streams, series, strict=True)]
-    causes = [_causes(each, ticks) for each in streams]
+    causes = [_causes(each, ticks, plan.arm) for each in streams]
     told = _told(plan, streams, causes, ticks, fps)
     if (why := _refusal(told, options)) and not options.allow_gaps:
         return {**told, 'refused': why}
@@ -125,7 +138,20 @@ def _built(plan: EpisodePlan, options: ExportOptions, fps: int, recordings: Reco
     return told
 
 
-def _read(plan: EpisodePlan, options: ExportOptions, recordings: Recordings) -> list[Series]:
+def _check_clock(arm: ArmPlan, fps: int) -> None:
+    """Raises LakeError where a value of the arm may belong to another tick."""
+    if arm.clock is None:
+        raise LakeError(arm.why)
+    if arm.clock.uncertainty_ns > SECOND // fps // 2:
+        raise LakeError(f"the offset of the arm's clock is known to {arm.clock.uncertainty_ns / 1e6:.1f} ms, "
+                        f'half a tick is {SECOND / fps / 2e6:.1f} ms')  # fmt: skip
+
+
+def _is_of_arm(stream: StreamPlan) -> bool:
+    return stream.recording.sensor in ARM_TOPICS
+
+
+def _read(plan: EpisodePlan, options: ExportOptions, recordings: Mapping[bool, Recordings]) -> list[Series]:
     """Each stream's own series; what two streams need of one sensor is read once."""
     known: dict[tuple[str, tuple[str, ...]], Series] = {}
     found = []
@@ -133,7 +159,9 @@ def _read(plan: EpisodePlan, options: ExportOptions, recordings: Recordings) -> 
         fields = each.part.fields if each.part else ()
         name = each.recording.sensor, fields
         if name not in known:
-            known[name] = recordings.series(each.recording, fields)
+            known[name] = recordings[_is_of_arm(each)].series(each.recording, fields)
+            if _is_of_arm(each) and plan.arm is not None and plan.arm.clock is not None:
+                known[name] = _moved(known[name], plan.arm.clock, plan.span_ns)
         one = known[name]
         if not len(one):
             raise LakeError(f'{each.recording.topic} has no message in it')
@@ -143,9 +171,18 @@ def _read(plan: EpisodePlan, options: ExportOptions, recordings: Recordings) -> 
         good = np.isfinite(one.values).all(axis=1)
         if not good.any():
             raise LakeError(f'{each.recording.topic} has no finite numbers in it')
-        one = Series(one.recording, one.stamps[good], one.values[good], one.file[good], one.files, one.names)
+        own = None if one.own_stamps is None else one.own_stamps[good]
+        one = Series(one.recording, one.stamps[good], one.values[good], one.file[good], one.files, one.names, own_stamps=own)
         found.append(_derived(one, options) if each.part.is_derived else one)
     return found
+
+
+def _moved(series: Series, clock: ClockOffset, span: tuple[int, int]) -> Series:
+    """By the robot's clock."""
+    stamps = clock.robot_ns(series.stamps)
+    inside = (stamps >= span[0]) & (stamps <= span[1])
+    return Series(series.recording, stamps[inside], series.values[inside], series.file[inside], series.files, series.names,
+                  own_stamps=series.stamps[inside])  # fmt: skip
 
 
 def _derived(poses: Series, options: ExportOptions) -> Series:
@@ -181,9 +218,11 @@ def _sampled(plan: StreamPlan, series: Series, ticks: NDArray[np.int64], fps: in
     return _Stream(plan, series, Sampled(found.message, earlier, found.age_s, found.stale), values)
 
 
-def _causes(stream: _Stream, ticks: NDArray[np.int64]) -> dict[int, str]:
-    """Tick -> why its newest message is too old."""
+def _causes(stream: _Stream, ticks: NDArray[np.int64], arm: ArmPlan | None) -> dict[int, str]:
+    """Tick -> why its newest message is too old. The journal speaks of messages by their own clock."""
     stamps = stream.series.stamps[stream.sampled.message]
+    if arm is not None and arm.clock is not None and _is_of_arm(stream.plan):
+        stamps, ticks = arm.clock.other_ns(stamps), arm.clock.other_ns(ticks)
     return {
         int(tick): cause_of(stream.plan.known, stream.plan.thinned, int(stamps[tick]), int(ticks[tick]))
         for tick in np.flatnonzero(stream.sampled.stale)
@@ -196,6 +235,7 @@ def _told(plan: EpisodePlan, streams: Sequence[_Stream], causes: Sequence[Mappin
     return {
         'mission_id': mission.mission_id, 'run_id': mission.run_id, 'robot': mission.robot, 'mission_type': mission.mission_type,
         'task': mission.task, 'frames': len(ticks), 'fps': fps, 'first_tick_ns': int(ticks[0]),
+        **({'clock': plan.arm.clock.told()} if plan.arm is not None and plan.arm.clock is not None else {}),
         'last_tick_ns': int(ticks[-1]), 'begins_late_s': round((int(ticks[0]) - mission.begin_ns) / SECOND, 3),
         'streams': {
             each.plan.name: {
@@ -204,15 +244,17 @@ def _told(plan: EpisodePlan, streams: Sequence[_Stream], causes: Sequence[Mappin
                 'stale_share': round(float(each.sampled.stale.mean()), 6),
                 'longest_gap_s': round(float(each.sampled.age_s[each.sampled.stale].max(initial=0.0)), 3),
                 'causes': dict(sorted(Counter(why.values()).items())), 'names': list(_names(each)),
-                'known': _grades(each, ticks),
+                'known': _grades(each, plan.arm, ticks),
             }
             for each, why in zip(streams, causes, strict=True)
         },
     }  # fmt: skip
 
 
-def _grades(stream: _Stream, ticks: NDArray[np.int64]) -> list[str]:
+def _grades(stream: _Stream, arm: ArmPlan | None, ticks: NDArray[np.int64]) -> list[str]:
     """How well it is known what is missing, from the first tick to the last."""
+    if arm is not None and arm.clock is not None and _is_of_arm(stream.plan):
+        ticks = arm.clock.other_ns(ticks)
     return sorted({each.grade or UNKNOWN for each in stream.plan.known.between(int(ticks[0]), int(ticks[-1])).stretches})
 
 
@@ -223,7 +265,8 @@ def _names(stream: _Stream) -> tuple[str, ...]:
     if len(part.names) == width:
         return part.names
     named = stream.series.names if len(stream.series.names) == width else tuple(f'joint_{place}' for place in range(width))
-    return tuple(f'{name}.pos' for name in named)
+    prefix = 'arm_' if _is_of_arm(stream.plan) else ''
+    return tuple(f'{prefix}{name}.pos' for name in named)
 
 
 def _refusal(told: Mapping[str, Any], options: ExportOptions) -> str:
@@ -284,7 +327,7 @@ def _write_rows(streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]],
                 options: ExportOptions, folder: Path) -> None:  # fmt: skip
     count = len(ticks)
     state = np.hstack([each.values for each in streams if each.plan.name.startswith('state.')]).astype(np.float32)
-    action = next(each.values for each in streams if each.plan.name == 'action').astype(np.float32)
+    action = np.hstack([each.values for each in _of_action(streams)]).astype(np.float32)
     told = [''] * count
     for each, why in zip(streams, causes, strict=True):
         for tick, word in why.items():
@@ -312,6 +355,13 @@ def _write_rows(streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]],
             writer.write_table(some)
 
 
+def _of_action(streams: Sequence[_Stream]) -> list[_Stream]:
+    """The arm's first, as LeKiwi has them."""
+    return sorted(
+        (each for each in streams if each.plan.name in {'action', ARM_ACTION}), key=lambda each: each.plan.name == 'action'
+    )
+
+
 def _raw(stream: _Stream, begin: int, end: int) -> pa.Array:
     found = []
     for tick in range(begin, end):
@@ -332,21 +382,25 @@ def _sources(mission_id: str, stream: _Stream, ticks: NDArray[np.int64]) -> Iter
     frames = np.arange(len(ticks))
     is_line = sampled.other >= 0
     used = np.where(is_line, sampled.other + 1, sampled.message)
-    yield _source_rows(mission_id, stream, frames, series.stamps[used], series.file[used], ticks)
+    own = series.stamps if series.own_stamps is None else series.own_stamps
+    held = (ticks - series.stamps[used]) / SECOND
+    yield _source_rows(mission_id, stream, frames, own[used], series.file[used], held)
     if is_line.any():
         other = sampled.other[is_line]
-        yield _source_rows(mission_id, stream, frames[is_line], series.stamps[other], series.file[other], ticks[is_line])
+        held = (ticks[is_line] - series.stamps[other]) / SECOND
+        yield _source_rows(mission_id, stream, frames[is_line], own[other], series.file[other], held)
     if series.previous is not None:
         earlier = series.previous[sampled.message]
-        yield _source_rows(mission_id, stream, frames, earlier[:, 0], earlier[:, 1], ticks)
+        held = (ticks - earlier[:, 0]) / SECOND
+        yield _source_rows(mission_id, stream, frames, earlier[:, 0], earlier[:, 1], held)
 
 
 def _source_rows(mission_id: str, stream: _Stream, frames: NDArray[np.int64], stamps: NDArray[np.int64],
-                 files: NDArray[np.int64], ticks: NDArray[np.int64]) -> pa.Table:  # fmt: skip
+                 files: NDArray[np.int64], held: NDArray[np.float64]) -> pa.Table:  # fmt: skip
     known = stream.series.files
     named = {name: pa.array([getattr(known[int(number)], name) for number in files]) for name in ('bucket', 'key', 'sha256')}
     return pa.table({
         EPISODE: pa.array([mission_id] * len(frames)), 'frame': pa.array(frames, pa.int64()),
         'stream': pa.array([stream.plan.name] * len(frames)), **named, 'stamp_ns': pa.array(stamps, pa.int64()),
-        'held_s': pa.array((ticks - stamps) / SECOND, pa.float64()),
+        'held_s': pa.array(held, pa.float64()),
     }, schema=SOURCE_SCHEMA)  # fmt: skip

@@ -30,6 +30,7 @@ from shadowhound_data_logger.disk import flock, replacing
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.track import Track
 from shadowhound_data_logger.lake.training import INFO
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores import open_store
@@ -245,11 +246,16 @@ def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store
 def _key_of(plan: EpisodePlan, settings: Mapping[str, Any], options: ExportOptions) -> str:
     """What is left of an earlier run is used where it was made in the same way of the same objects and gaps."""
     told = [settings, options.max_stale, options.allow_gaps, sorted(plan.topics.items()), plan.missing, _where(plan),
-            [(name, sorted(track.key.to_pylist())) for name, track in sorted(plan.tracks.items())]]  # fmt: skip
+            [(name, sorted(track.key.to_pylist())) for name, track in sorted(_tracks_of(plan).items())],
+            plan.arm and (plan.arm.why, plan.arm.clock and plan.arm.clock.told())]  # fmt: skip
     whole = hashlib.sha256(json.dumps(told, default=str).encode())
     for column in plan.gaps.to_pydict().items():
         whole.update(json.dumps(column, default=str).encode())
     return whole.hexdigest()[:16]
+
+
+def _tracks_of(plan: EpisodePlan) -> dict[str, Track]:
+    return {**plan.tracks, **(plan.arm.tracks if plan.arm else {})}
 
 
 def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings: Mapping[str, Any], result: Exported,

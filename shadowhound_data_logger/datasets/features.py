@@ -51,6 +51,14 @@ COMMAND: Final = StatePart(
 DERIVED: Final = StatePart('odometry', 'odom', _POSE, COMMAND.names, COMMAND.units, is_derived=True)
 ACTIONS: Final = {'auto': None, 'cmd_vel': COMMAND, 'odometry': DERIVED}
 """By the word that ``--action`` takes; with ``auto``, the command topic in a data set whose first mission has it."""
+ARM_JOINTS, ARM_COMMANDS, ARM_CLOCK = 'arm_joints', 'arm_commands', 'arm_clock'
+"""What an arm's sensors are called here, whatever they are called where they were recorded: they are found by topic."""
+ARM_TOPICS: Final = {ARM_JOINTS: 'joint_states', ARM_COMMANDS: 'joint_commands', ARM_CLOCK: 'clock'}
+"""Below the arm's namespace: sensor_msgs/JointState twice, sensor_msgs/TimeReference."""
+ARM_STATE: Final = StatePart('arm', ARM_JOINTS, ('position',), (), ('rad',))
+ARM_COMMAND: Final = StatePart('arm', ARM_COMMANDS, ('position',), (), ('rad',))
+ARM_ACTION: Final = 'action.arm'
+"""The stream of the arm's part of the action."""
 HOLD, LINEAR = 'hold', 'linear'
 AV1, H264 = 'av1', 'h264'
 
@@ -74,6 +82,10 @@ class ExportOptions:
     max_stale: float = 0.05
     allow_gaps: bool = False
     validation: float = 0.0
+    arm: str = ''
+    """The namespace of an arm's topics, and the robot by which it is recorded where it has a machine of its own."""
+    clock_pairs: tuple[tuple[int, int], ...] = ()
+    """(ns of the robot, ns of the arm) of events of which both told the time, beside those that were recorded."""
 
     def __post_init__(self) -> None:
         """Raises SettingError."""
@@ -95,7 +107,7 @@ class ExportOptions:
         return {
             'state': list(self.state), 'cameras': list(self.cameras), 'codec': self.codec, 'lossless': self.is_lossless,
             'resample': dict(sorted((self.resample or {}).items())), 'max_age_s': dict(sorted((self.max_age_s or {}).items())),
-            'max_gap_s': self.max_gap_s,
+            'max_gap_s': self.max_gap_s, **({'arm': self.arm} if self.arm else {}),
         }  # fmt: skip
 
 

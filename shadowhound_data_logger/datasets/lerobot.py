@@ -19,7 +19,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shadowhound_data_logger.datasets.episodes import EPISODE, GAP_SCHEMA, GAPS, PICTURE, ROWS, SOURCE_SCHEMA, SOURCES
-from shadowhound_data_logger.datasets.features import COMMAND, DERIVED, STATE_PARTS, ExportOptions
+from shadowhound_data_logger.datasets.features import (
+    ARM_ACTION,
+    ARM_COMMANDS,
+    ARM_STATE,
+    COMMAND,
+    DERIVED,
+    STATE_PARTS,
+    ExportOptions,
+)
 from shadowhound_data_logger.datasets.video import feature_info, video_frames
 from shadowhound_data_logger.disk import fingerprint, replacing, sync
 from shadowhound_data_logger.errors import LakeError
@@ -298,23 +306,36 @@ def features_of(told: Mapping[str, Any], options: ExportOptions) -> dict[str, An
     state: list[str] = []
     units: list[str] = []
     origins: list[str] = []
-    for word in options.state:
-        names, part = streams[f'state.{word}']['names'], STATE_PARTS[word]
+    arm = {ARM_STATE.name: ARM_STATE} if options.arm else {}
+    for word, part in {**arm, **{word: STATE_PARTS[word] for word in options.state}}.items():
+        names = streams[f'state.{word}']['names']
         state += names
         units += part.units if len(part.units) == len(names) else part.units[:1] * len(names)
         origins += [f'{part.sensor}, derived' if part.is_derived else part.sensor] * len(names)
     features['observation.state'] = _vector(state, units=units, source=origins)
-    is_command = streams['action']['sensor'] == COMMAND.sensor
-    features['action'] = _vector(
-        list(COMMAND.names), units=list(COMMAND.units), source=COMMAND.sensor if is_command else f'{DERIVED.sensor}, derived',
-        derived=not is_command,
-    )  # fmt: skip
+    features['action'] = _action_feature(streams)
     features['shadowhound.stale'] = _vector(list(streams), about='1 where the newest message is older than it may be')
     features['shadowhound.age_s'] = _vector(list(streams), about='seconds since the newest message')
     features['shadowhound.cause'] = {'dtype': 'string', 'shape': [1], 'names': None}
     features['shadowhound.stamp_ns'] = {'dtype': 'int64', 'shape': [1], 'names': None}
     features |= {name: {'dtype': kind, 'shape': [1], 'names': None} for name, kind in _COUNTERS.items()}
     return features
+
+
+def _action_feature(streams: Mapping[str, Any]) -> dict[str, Any]:
+    """The arm's numbers first; ``derived`` where one of them was not commanded."""
+    base = streams['action']['sensor'] == COMMAND.sensor
+    names, units = list(COMMAND.names), list(COMMAND.units)
+    sources, is_derived = [COMMAND.sensor if base else f'{DERIVED.sensor}, derived'], not base
+    if ARM_ACTION in streams:
+        of_arm = streams[ARM_ACTION]
+        commanded = of_arm['sensor'] == ARM_COMMANDS
+        names, units = [*of_arm['names'], *names], [*ARM_STATE.units * len(of_arm['names']), *units]
+        sources, is_derived = (
+            [of_arm['topic'] if commanded else f'{of_arm["topic"]}, derived', *sources],
+            is_derived or not commanded,
+        )
+    return _vector(names, units=units, source=', '.join(sources), derived=is_derived)
 
 
 def _vector(names: list[str], **info: Any) -> dict[str, Any]:
@@ -340,6 +361,7 @@ def _ours(told: Mapping[str, Any], split: str) -> EpisodeRow:
     named = ('mission_id', 'run_id', 'robot', 'mission_type', 'first_tick_ns', 'last_tick_ns', 'begins_late_s')
     row: EpisodeRow = {f'{OURS}{name}': told[name] for name in named}
     row[f'{OURS}split'] = split
+    row |= {f'{OURS}clock/{name}': value for name, value in told.get('clock', {}).items()}
     for stream, each in told['streams'].items():
         row |= {f'{OURS}{stream}/{name}': each[name] for name in ('from', 'topic', 'stale_share', 'longest_gap_s')}
         row[f'{OURS}{stream}/causes'] = json.dumps(each['causes'])

@@ -8,14 +8,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.catalogue.schema import Row
 from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.datasets.clocks import NEAR_NS, ClockOffset, measured
 from shadowhound_data_logger.datasets.features import (
     ACTIONS,
+    ARM_ACTION,
+    ARM_CLOCK,
+    ARM_COMMAND,
+    ARM_COMMANDS,
+    ARM_JOINTS,
+    ARM_STATE,
+    ARM_TOPICS,
     COMMAND,
     DERIVED,
     STATE_PARTS,
@@ -24,6 +33,7 @@ from shadowhound_data_logger.datasets.features import (
     camera_name,
 )
 from shadowhound_data_logger.datasets.series import RecordedSensor, Recordings, bags_of
+from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -86,6 +96,24 @@ class StreamPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class ArmPlan:
+    """An arm beside the robot in one mission, and how its times become the robot's."""
+
+    tracks: Mapping[str, Track]
+    topics: Mapping[str, str]
+    clock: ClockOffset | None
+    why: str = ''
+    """Why its clock is not known."""
+
+    def span_ns(self, begin_ns: int, end_ns: int) -> tuple[int, int]:
+        """By both clocks: bags tell when messages came, by the robot's."""
+        if self.clock is None:
+            return begin_ns, end_ns
+        begin, end = self.clock.other_ns(np.array([begin_ns, end_ns]))
+        return min(begin_ns, int(begin)), max(end_ns, int(end))
+
+
+@dataclass(frozen=True, slots=True)
 class EpisodePlan:
     """A mission, and all that has to be known to make an episode of it. Can be sent to another process."""
 
@@ -98,6 +126,7 @@ class EpisodePlan:
     """The statements of the gap journal that were believed."""
     missing: tuple[str, ...] = ()
     """Sensors that are wanted and of which there is nothing."""
+    arm: ArmPlan | None = None
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -172,6 +201,7 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
              stated: pa.Table, work: Path, findings: Findings) -> EpisodePlan:  # fmt: skip
     if not mission.end_ns:
         return EpisodePlan(mission, (), {}, {}, (), stated.slice(0, 0))
+    arm = None
     since, until = mission.begin_ns - BEFORE_NS, mission.end_ns
     parts = [STATE_PARTS[word] for word in options.state]
     actions = [COMMAND, DERIVED] if action == 'auto' else [ACTIONS[action]]
@@ -204,8 +234,73 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
             continue
         last = int(tracks[sensor].end_ns.max()) if recording.sink == OBJECTS else mission.end_ns
         streams.append(_stream(name, part, recording, mission, stated, last))
+    if options.arm:
+        arm, more = _arm_streams(source, store, mission, options, bags=bags, stated=stated, work=work, findings=findings)
+        streams = (
+            [each for each in more if each.name != ARM_ACTION] + streams + [each for each in more if each.name == ARM_ACTION]
+        )
+        missing += [] if more or arm.why else [f'/{options.arm}/{ARM_TOPICS[ARM_JOINTS]}']
     topics_used = pa.array(sorted({stream.recording.topic for stream in streams}), pa.string())
-    return EpisodePlan(mission, tuple(streams), tracks, topics, bags, _about(stated, topics_used, since, until), tuple(missing))
+    return EpisodePlan(mission, tuple(streams), tracks, topics, bags, _about(stated, topics_used, since, until),
+                       tuple(missing), arm)  # fmt: skip
+
+
+def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, options: ExportOptions, *, bags: Sequence[Manifest],  # noqa: PLR0913
+                 stated: pa.Table, work: Path, findings: Findings) -> tuple[ArmPlan, list[StreamPlan]]:  # fmt: skip
+    """What an arm recorded in the mission's time by its own clock; no streams where that is not known."""
+    since, until = mission.begin_ns - BEFORE_NS, mission.end_ns
+    topics = {sensor: f'/{options.arm}/{name}' for sensor, name in ARM_TOPICS.items()}
+
+    def tracks(begin: int, end: int, *sensors: str) -> dict[str, Track]:
+        rows = query.objects(source, findings=findings, since=utc(begin - LONGEST_BATCH_NS), until=utc(end + 1000))
+        wanted = [topics[sensor] for sensor in sensors]
+        owners = sorted({mission.robot, options.arm})
+        with query.answering():
+            mine = col('topic').is_in(wanted) & col('robot').is_in(owners) & col('t_start').not_null()
+            found = rows.where(mine).select(*NEEDED, 'topic').to_pylist()
+        told = {sensor: [row for row in found if row['topic'] == topics[sensor]] for sensor in sensors}
+        return {sensor: _track_of(some) for sensor, some in told.items() if some}
+
+    place, wide = Place(source.settings), (since - NEAR_NS, until + NEAR_NS)
+    pairs = [np.array(options.clock_pairs, np.int64).reshape(-1, 2)]
+    with Recordings(place, store, tracks(*wide, ARM_CLOCK), topics, wide, bags, work) as recordings:
+        if (recorded := recordings.best(ARM_CLOCK)) is not None:
+            series = recordings.series(recorded, ('time_ref.sec', 'time_ref.nanosec'))
+            told = series.values.astype(np.int64)
+            pairs.append(np.column_stack([series.stamps, told[:, 0] * SECOND + told[:, 1]]))
+    try:
+        clock = measured(np.concatenate(pairs), mission.begin_ns, mission.end_ns)
+    except LakeError as error:
+        return ArmPlan({}, topics, None, error.what), []
+    begin, end = (int(each) for each in clock.other_ns(np.array([since, until])))
+    arm = ArmPlan(tracks(begin, end, ARM_JOINTS, ARM_COMMANDS), topics, clock)
+    streams = []
+    with Recordings(place, store, arm.tracks, topics, arm.span_ns(since, until), bags, work) as recordings:
+        joints = recordings.best(ARM_JOINTS)
+        commands = recordings.best(ARM_COMMANDS)
+    if joints is None:
+        return arm, []
+    parts = [(f'state.{ARM_STATE.name}', ARM_STATE, joints)]
+    parts.append((ARM_ACTION, ARM_COMMAND, commands) if commands else (ARM_ACTION, ARM_STATE, joints))
+    for name, part, recording in parts:
+        track = arm.tracks.get(recording.sensor)
+        if (
+            recording.sink == OBJECTS and track is not None and track.robot != mission.robot
+        ):  # what was brought in is all there is
+            known = of_rows(track.robot, OBJECTS, recording.topic, begin, end + SECOND, ())
+            streams.append(StreamPlan(name, part, recording, known, (), mission.end_ns))
+        else:
+            moved = replace(mission, begin_ns=begin + BEFORE_NS, end_ns=end)
+            last = int(track.end_ns.max()) if recording.sink == OBJECTS and track is not None else end
+            streams.append(_stream(name, part, recording, moved, stated, last))
+    return arm, streams
+
+
+def _track_of(rows: Sequence[Row]) -> Track:
+    """Of one machine, the one that has most: an arm may be recorded by its own and by the robot."""
+    owners = [row['robot'] for row in rows]
+    best = max(sorted(set(owners)), key=owners.count)
+    return Track.of(pa.Table.from_pylist([row for row in rows if row['robot'] == best], schema=narrow(NEEDED)))
 
 
 def _stream(name: str, part: StatePart | None, recording: RecordedSensor, mission: ChosenMission, stated: pa.Table,

@@ -85,7 +85,7 @@ class Series:
 
     recording: RecordedSensor
     stamps: NDArray[np.int64]
-    """ns since 1970, sorted."""
+    """ns since 1970 by the robot's clock, sorted."""
     values: NDArray[np.float64]
     """(messages, numbers); of pictures (messages, 0)."""
     file: NDArray[np.int64]
@@ -97,6 +97,8 @@ class Series:
     """Of values that are derived from two messages, (messages, 2): stamp of the earlier one, and its place in ``files``."""
     picture: Callable[[int], tuple[bytes, str]] = field(default=lambda _: (b'', ''))
     """Content and extension (``jpg``, ``png``) of a message of a camera."""
+    own_stamps: NDArray[np.int64] | None = None
+    """By the clock of the machine that they are of, where that is another one."""
 
     def __len__(self) -> int:
         return len(self.stamps)

@@ -1,0 +1,104 @@
+"""How far another machine's clock is from the robot's, and how well that is known: from events of which both told the time.
+
+Such an event is a pair of times: ``sensor_msgs/TimeReference`` (``header.stamp`` by the robot's clock, ``time_ref`` by the
+other), or a line of a file. Between pairs the other clock runs evenly, up to ``MOST_DRIFT`` away from the robot's.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
+from shadowhound_data_logger.errors import LakeError, SettingError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MOST_DRIFT: Final = 200e-6
+"""Of two quartz clocks: each is within 100 ppm of its rate, most are within 30."""
+NEAR_NS: Final = 600 * SECOND
+"""Pairs that are farther from an episode say nothing of it."""
+LEAST_SPAN_NS: Final = 5 * SECOND
+"""Of pairs from which a drift is told: over less, a tenth of a millisecond of noise would be 20 ppm."""
+LEAST_PAIRS: Final = 5
+SHARE: Final = 95
+"""Percent of the pairs that lie within the uncertainty."""
+COLUMNS: Final = ('robot_ns', 'arm_ns')
+
+
+@dataclass(frozen=True, slots=True)
+class ClockOffset:
+    """The other clock is ``offset_ns + drift * (t - at_ns)`` ahead of the robot's at the robot's time ``t`` (ns since 1970)."""
+
+    at_ns: int
+    offset_ns: int
+    drift: float
+    uncertainty_ns: int
+    """At the worst tick of the episode."""
+    pairs: int
+
+    def robot_ns(self, other_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The robot's times of times of the other clock."""
+        away = other_ns - self.at_ns - self.offset_ns
+        return np.asarray(other_ns - self.offset_ns - np.rint(away * (self.drift / (1 + self.drift))).astype(np.int64))
+
+    def other_ns(self, robot_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The other way round."""
+        return np.asarray(robot_ns + self.offset_ns + np.rint((robot_ns - self.at_ns) * self.drift).astype(np.int64))
+
+    def told(self) -> dict[str, Any]:
+        """As ``meta/episodes`` has it."""
+        return asdict(self)
+
+
+def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffset:
+    """Of an episode; ``pairs`` is (n, 2), the robot's time and the other's of each event. Raises LakeError where nobody knows.
+
+    The uncertainty is how far 95 % of the pairs are from the line through them, and ``MOST_DRIFT`` for the time from the
+    nearest pair to the end of the episode; where the pairs are too few or too near to each other for a line, from all of them.
+    What both directions of a network delay alike is in it; a delay of one direction alone cannot be seen in pairs.
+    """
+    robot = pairs[:, 0]
+    near = pairs[(robot >= begin_ns - NEAR_NS) & (robot <= end_ns + NEAR_NS)]
+    if not len(near):
+        raise LakeError("the offset of the arm's clock is not known: no event of which both machines told the time")
+    near = near[np.argsort(near[:, 0], kind='stable')]
+    at = int(near[len(near) // 2, 0])
+    times, ahead = (near[:, 0] - at).astype(np.float64), near[:, 1] - near[:, 0]
+    middle = int(np.median(ahead))
+    rest = (ahead - middle).astype(np.float64)
+    drift = offset = 0.0
+    is_line = len(near) >= LEAST_PAIRS and times[-1] - times[0] >= LEAST_SPAN_NS
+    if is_line:
+        drift, offset = np.polyfit(times, rest, 1)
+        if abs(drift) > MOST_DRIFT:
+            raise LakeError(f"the arm's clock is not known: it would run {drift * 1e6:.0f} ppm too fast, or it was set meanwhile")
+    spread = float(np.percentile(np.abs(rest - offset - drift * times), SHARE))
+    if is_line:
+        beyond = max(0, int(near[0, 0]) - begin_ns, end_ns - int(near[-1, 0]))
+    else:  # no line: whatever the clock may have done since the farthest of them
+        beyond = max(abs(int(near[0, 0]) - end_ns), abs(begin_ns - int(near[-1, 0])))
+    return ClockOffset(at, middle + round(float(offset)), float(drift), round(spread + MOST_DRIFT * beyond), len(near))
+
+
+def pairs_of(path: Path) -> NDArray[np.int64]:
+    """(n, 2) of a CSV file with the columns ``robot_ns`` and ``arm_ns``, ns since 1970. Raises SettingError."""
+    try:
+        with path.open(newline='', encoding='utf-8') as file:
+            rows = csv.DictReader(file)
+            found = [tuple(int(row[name]) for name in COLUMNS) for row in rows]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SettingError('--clock', path, f'a CSV file with the columns {",".join(COLUMNS)} ({error})') from error
+    return _sane(found, path)
+
+
+def _sane(found: Sequence[tuple[int, ...]], path: Path) -> NDArray[np.int64]:
+    if any(not EARLIEST_SANE_NS <= value < 1 << 62 for pair in found for value in pair):
+        raise SettingError('--clock', path, 'times in ns since 1970')
+    return np.array(found, np.int64).reshape(-1, 2)
