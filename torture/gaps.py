@@ -192,15 +192,12 @@ def absent(came: Came, first: Mapping[str, tuple[int, int]]) -> dict[str, list[L
     }
 
 
-def stalls(came: Came) -> list[tuple[int, int]]:
-    """When the publisher sent nothing though it was time: two messages that follow each other lie further apart."""
+def stalls(publisher: Publisher) -> list[tuple[int, int]]:
+    """When the publisher sent nothing though it was time."""
     found: list[tuple[int, int]] = []
     for stream in STREAMS:
-        numbers, period_ns = came[stream.topic], round(stream.period_s * SECOND)
-        found += [
-            (numbers[one] + period_ns, numbers[two])
-            for one, two in pairwise(sorted(numbers)) if two == one + 1 and numbers[two] - numbers[one] > period_ns + LATE_NS
-        ]  # fmt: skip
+        period_ns = round(stream.period_s * SECOND)
+        found += [(begin + period_ns, end) for begin, end in publisher.pauses_numbered(stream.topic, period_ns + LATE_NS)]
     return sorted(found)
 
 
@@ -235,14 +232,13 @@ def together(real: Sequence[Loss], said: Sequence[Loss], near_ns: int) -> list[t
     return groups
 
 
-def audit(found: Found, node: Node, roots: Iterable[Path], who: str) -> None:
-    """One node's journal against what it stored."""
+def audit(found: Found, node: Node, roots: Iterable[Path], who: str, still: Sequence[tuple[int, int]]) -> None:
+    """One node's journal against what it stored; ``still`` is when the publisher was."""
     rows = ledger.journal(node.home / 'spool', ROBOT)
     found.say('every loss has a time', f'{who}: {[row for row in rows if row.from_ns is None]}',
               holds=all(row.from_ns is not None for row in rows))  # fmt: skip
     said = journaled([row for row in rows if row.from_ns is not None])
     came = stored(roots)
-    still = stalls(came)
     real = absent(came, {topic: (first, said[topic][0].from_ns) for topic, first in began(node).items() if said.get(topic)})
     for stream in STREAMS:
         near_ns = round(stream.period_s * SECOND) + LATE_NS
@@ -432,6 +428,7 @@ def campaign(folder: Path, disturbances: int, rng: random.Random) -> Found:
             time.sleep(max(STEADY_S, EVICTED_S - (time.time_ns() - began_ns) / SECOND))
             for stream in STREAMS:
                 publisher.halt_numbered(stream.topic)
+            still = stalls(publisher)
             quiet((scene.node, small))
             for each in (scene.node, small):
                 each.stop()
@@ -441,10 +438,10 @@ def campaign(folder: Path, disturbances: int, rng: random.Random) -> Found:
                 found.say('the ledger balances at every commit', '; '.join(reader.unbalanced[:3]), holds=not reader.unbalanced)
         finally:
             processes.end()
-        audit(found, scene.node, [scene.node.home / 'store' / 'sensor-data' / ROBOT], 'disturbed')
+        audit(found, scene.node, [scene.node.home / 'store' / 'sensor-data' / ROBOT], 'disturbed', still)
         own, filled = found.done, [each for each in found.done if each.what == 'filled']
         found.done = [Done('evicted', began_ns - 60 * SECOND, time.time_ns()), *filled]
-        audit(found, small, [small.home / 'spool' / 'ready' / 'sensor-data' / ROBOT], 'without room')
+        audit(found, small, [small.home / 'spool' / 'ready' / 'sensor-data' / ROBOT], 'without room', still)
         found.done = own
     found.counts = scene.counts
     for cause in ('transport', 'restart', 'paused', 'no_room', 'damaged'):

@@ -5,7 +5,9 @@ from __future__ import annotations
 import struct
 import threading
 import time
+from array import array
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from typing import Any
 
 
@@ -30,15 +32,18 @@ class Numbered:
     def __init__(self, write: Callable[[str, bytes], None]) -> None:
         self._write = write
         self._sent: dict[str, int] = {}
+        self._times: dict[str, array[int]] = {}
         self._running: dict[str, tuple[threading.Event, threading.Thread]] = {}
 
     @staticmethod
     def takes(order: Mapping[str, Any]) -> bool:
         """Whether such an order is for it."""
-        return order['do'] in {'begin_numbered', 'halt_numbered'}
+        return order['do'] in {'begin_numbered', 'halt_numbered', 'pauses_numbered'}
 
-    def obey(self, order: Mapping[str, Any]) -> int | None:
-        """How many were sent, where no more are."""
+    def obey(self, order: Mapping[str, Any]) -> int | list[tuple[int, int]] | None:
+        """How many were sent, where no more are; or when nothing was sent for longer than asked, wall clock in ns."""
+        if order['do'] == 'pauses_numbered':
+            return [pair for pair in pairwise(self._times[order['topic']]) if pair[1] - pair[0] > order['longer_ns']]
         if order['do'] == 'halt_numbered':
             return self._halt(order['topic'])
         self._begin(order['topic'], order['name'], order['size'], order['period_s'])
@@ -60,9 +65,11 @@ class Numbered:
         due = time.monotonic()
         while not over.wait(max(0.0, due - time.monotonic())):
             number = self._sent.get(topic, 0)
+            at_ns = time.time_ns()
             try:
                 self._write(topic, message(name, number, size))
             except TimeoutError:
                 continue
             due += period_s
             self._sent[topic] = number + 1
+            self._times.setdefault(topic, array('q')).append(at_ns)

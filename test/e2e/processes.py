@@ -192,6 +192,10 @@ class Publisher(Process):
         """No more of them; how many were sent."""
         return int(self._tell(do='halt_numbered', topic=topic))
 
+    def pauses_numbered(self, topic: str, longer_ns: int) -> list[tuple[int, int]]:
+        """When it sent none of them for longer than that: from one to the next, wall clock in ns."""
+        return [(begin, end) for begin, end in json.loads(self._tell(do='pauses_numbered', topic=topic, longer_ns=longer_ns))]
+
     def heard(self, topic: str, node: Node, message: bytes) -> None:
         """Publish the message until the node received it, so that whatever follows comes after the match."""
         self.matched(topic)

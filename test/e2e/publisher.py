@@ -79,8 +79,8 @@ def publish_evenly(publisher: Any, kind: Any, period_s: float, size: int, stoppe
         due += period_s
 
 
-def answer(value: int | None = None) -> None:
-    sys.stdout.write('done\n' if value is None else f'done {value}\n')
+def answer(value: object = None) -> None:
+    sys.stdout.write('done\n' if value is None else f'done {json.dumps(value)}\n')
     sys.stdout.flush()
 
 
