@@ -80,7 +80,7 @@ def _bag(_: click.Context, __: click.Parameter, name: str) -> str | Path:
 
 
 _robot = click.option(
-    '--robot', envvar='SHADOWHOUND_ROBOT', default='thor', show_default=True, callback=robot_name, help='Whose bags.'
+    '--robot', envvar='SHADOWHOUND_ROBOT', default='thor', show_default=True, callback=robot_name, help='Robot of the bags.'
 )
 _bag_or_folder = click.argument('bag', metavar='BAG|DIR', callback=_bag)
 
@@ -94,14 +94,14 @@ _bag_or_folder = click.argument('bag', metavar='BAG|DIR', callback=_bag)
 def bag() -> None:
     """Find, download, check, cut and upload bags.
 
-    BAG is the name of a bag of the store, as `bag list` tells it. The store is the S3 server that AWS_ENDPOINT_URL names, else
+    BAG is the name of a bag in the store, as `bag list` shows it. The store is the S3 server that AWS_ENDPOINT_URL names, else
     the folder SHADOWHOUND_HOME/store. A bag in a folder is named by a path with a slash in it: ./patrol_20251018_120000
     """
 
 
 @bag.command('list', epilog=examples('bag list --since yesterday', 'bag list --robot tachi --json'))
 @click.option(
-    '--since', default='', metavar='TIME', help='Those that began since: yesterday, 2025-10-18, 2025-10-18T12:00, 90min, 2d.'
+    '--since', default='', metavar='TIME', help='Begun at or after TIME: yesterday, 2025-10-18, 2025-10-18T12:00, 90min, 2d.'
 )
 @_robot
 @as_json
@@ -113,9 +113,10 @@ def bag_list(*, since: str, robot: str, as_json: bool) -> ExitCode:
     complete   all slices are known, with their checksums
     gaps       the same, but messages were dropped while it recorded: bag info says which
     recovered  the same, after a crash or power cut: bag info says what is missing
-    foreign    not from this package: nobody says what should be in it
+    foreign    not made by this package: what should be in it is not known
 
-    Exit code 1 when something is wrong with one of them, or the store is away: then only what is on this machine is listed.
+    Exit code 1 when something is wrong with a bag, or when the store cannot be reached: then only what is on this machine is
+    listed.
     """  # noqa: D301 - click's mark for lines that stay as they are
     begin_ns = moment('--since', since, SystemClock.of_this_machine().wall_ns()) if since else 0
     with the_store(STORE_THREADS) as store:
@@ -124,7 +125,7 @@ def bag_list(*, since: str, robot: str, as_json: bool) -> ExitCode:
             rows = bag_overview(store, robot, the_home(), since_ns=begin_ns)
         except StoreUnavailable as error:
             rows, away = bag_overview(MemoryStore(name='no store'), robot, the_home(), since_ns=begin_ns), str(error)
-            click.echo(f'The store is away, so this is what is on this machine: {away}', err=True)
+            click.echo(f'The store cannot be reached, so this is what is on this machine: {away}', err=True)
     if as_json:
         print_json([with_dates(asdict(row)) for row in rows])
     elif not rows:
@@ -167,10 +168,10 @@ def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> ExitCode:
 def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> ExitCode:
     """Check that a bag is there as it was recorded.
 
-    Exit code 0 only when every file is, and the bag is not growing.
+    Exit code 0 only when every file is sound and the bag is not growing.
 
-    In the store sizes and checksums are compared, and nothing is downloaded but each slice's summary; in a folder everything is
-    read. --deep reads everything in the store as well, and unpacks every chunk.
+    In the store, sizes and checksums are compared, and only the summary of each slice is downloaded; --deep reads everything and
+    unpacks every chunk. In a folder everything is read.
     """
     with progress('read', of='bytes') as bar:
         if isinstance(bag, Path):
@@ -188,13 +189,15 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> Exi
 
 @bag.command('fetch', epilog=examples('bag fetch patrol_20251018_120000 --to bags'))
 @click.argument('bag', metavar='BAG')
-@click.option('--to', type=click.Path(path_type=Path, file_okay=False), required=True, help='The folder above that of the bag.')
+@click.option(
+    '--to', type=click.Path(path_type=Path, file_okay=False), required=True, help='Folder in which the folder BAG is made.'
+)
 @_robot
 @as_json
 def bag_fetch(*, bag: str, to: Path, robot: str, as_json: bool) -> ExitCode:
     """Download a bag, verified.
 
-    It becomes TO/BAG. Run it again after it was interrupted: files that are already complete are skipped. A bag that is still
+    It becomes TO/BAG. Run it again after an interruption: files that are already complete are skipped. A bag that is still
     growing gets a metadata.yaml of what there is, so that players open it; fetch it again later for the rest.
     """
     with the_store(STORE_THREADS) as store, progress('fetched', of='bytes') as bar:
@@ -222,24 +225,26 @@ def bag_fetch(*, bag: str, to: Path, robot: str, as_json: bool) -> ExitCode:
     ),
 )
 @_bag_or_folder
-@click.option('--start', default='', metavar='TIME', help='From then on  [default: the start of the bag]')
-@click.option('--end', default='', metavar='TIME', help='Before then  [default: the end of the bag]')
-@click.option('--topics', '--topic', multiple=True, metavar='TOPIC', help='Only these: repeat it, or put commas between them.')
-@click.option('--regex', default='', help='Also topics in which this regular expression is found.')
-@click.option('-o', '--output', type=click.Path(path_type=Path), required=True, help='The new folder, which becomes a bag.')
+@click.option('--start', default='', metavar='TIME', help='From this time on  [default: the start of the bag]')
+@click.option('--end', default='', metavar='TIME', help='Before this time  [default: the end of the bag]')
+@click.option(
+    '--topics', '--topic', multiple=True, metavar='TOPIC', help='Only these topics: repeat it, or separate them with commas.'
+)
+@click.option('--regex', default='', help='Also topics whose name matches this regular expression.')
+@click.option('-o', '--output', type=click.Path(path_type=Path), required=True, help='New folder for the bag.')
 @_robot
 @as_json
 def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str, as_json: bool, **wanted: str) -> ExitCode:
     """Copy a span of time or some topics into a new bag.
 
     \b
-    TIME   2025-10-18T12:00:05.5   a date, UTC where it names no zone
+    TIME   2025-10-18T12:00:05.5   a date, UTC unless it names a zone
            12.5                    seconds since the start of the bag
            -30                     seconds before its end
            1760788805.5            seconds since 1970
 
-    It goes by the time at which messages were received, as ros2 bag play does. Of a bag in the store only the chunks that hold
-    something of it are read. Exit code 1 when a slice of that time is not there.
+    Times are those at which messages were received, as in ros2 bag play. Of a bag in the store, only the chunks that are needed
+    are read. Exit code 1 when a slice of that time is missing.
     """  # noqa: D301 - click's mark for lines that stay as they are
     names = tuple(name.strip() for each in topics for name in each.split(',') if name.strip())
     choice = Choice(topics=names, **wanted)
@@ -258,8 +263,8 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
 @bag.command('upload', epilog=examples('bag upload my_bag', 'bag upload my_bag --name patrol_2 --tar-gz'))
 @click.argument('folder', metavar='DIR', type=click.Path(path_type=Path))
 @click.option('--name', default='', help='The name of the bag in the store  [default: that of DIR]')
-@click.option('--tar-gz', is_flag=True, help='As one ROBOT/rosbags/NAME.tar.gz instead of its files.')
-@click.option('--now', is_flag=True, help='Past the spool: nothing is left behind when it does not get through in time.')
+@click.option('--tar-gz', is_flag=True, help='Store one ROBOT/rosbags/NAME.tar.gz instead of the files.')
+@click.option('--now', is_flag=True, help='Bypass the spool: nothing is kept here if Tower does not take it in time.')
 @click.option('--deadline', type=click.FloatRange(0.0, 1e7), default=600.0, show_default=True, help='Seconds to wait for Tower.')
 @_robot
 @as_json
@@ -268,9 +273,9 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
 
     SQLite or MCAP, as rosbag2 wrote it: its files as they are, and a manifest with their checksums.
 
-    It goes through the spool of this machine and waits until the store has it. When Tower is away for longer than the deadline
-    the bag stays in the spool, safe, and is delivered by the node that runs here, or by the next upload; exit code 1 says so.
-    DIR itself is never touched.
+    The bag goes through the spool of this machine, and the command waits until the store has it. If Tower cannot be reached
+    before the deadline, the exit code is 1 and the bag stays safely in the spool: the node that runs here, or the next upload,
+    delivers it. DIR itself is never changed.
     """
     folder = folder.absolute()
     settings, clock = Settings.load({'robot': robot}, os.environ), SystemClock.of_this_machine()
@@ -296,17 +301,17 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
 @click.argument('folder', metavar='DIR', type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option('--settle', type=click.FloatRange(0.0, 86_400.0), default=10.0, show_default=True, help='Seconds without a change.')
 @click.option('--remove', is_flag=True, help='Remove a bag from DIR once the store has confirmed every file of it.')
-@click.option('--once', is_flag=True, help='Look, wait for what is still changing, look again, and end. For a timer.')
+@click.option('--once', is_flag=True, help='Look, wait for what is still changing, look again, and end: for a timer.')
 @_robot
 @as_json
 def bag_watch(*, folder: Path, settle: float, once: bool, robot: str, as_json: bool, remove: bool) -> ExitCode:
-    """Upload every bag that is finished in DIR, until Ctrl-C.
+    """Upload each finished bag in DIR, until Ctrl-C.
 
-    Those that `ros2 bag record` writes, for one; each is sent once.
+    For example those of `ros2 bag record`. Each is sent once.
 
-    Finished is a folder in DIR with a metadata.yaml and all that it names, unchanged for --settle seconds. What was sent stands
-    in DIR/.shadowhound-bags.json: it is not sent again after a restart. With --once exit code 1 says that something is not in
-    the store yet.
+    A bag is finished when it is a folder in DIR with a metadata.yaml and all files that it names, unchanged for --settle seconds.
+    DIR/.shadowhound-bags.json lists what was sent, so that a restart does not send it again. With --once, exit code 1 means that
+    a bag is not in the store yet.
     """
     settings = Settings.load({'robot': robot}, os.environ)
     watching = Watch(folder.absolute(), settings, SystemClock.of_this_machine(), settle_s=settle, is_removing=remove)
@@ -326,18 +331,20 @@ def bag_watch(*, folder: Path, settle: float, once: bool, robot: str, as_json: b
 @click.argument('name')
 @click.option('--duration', type=click.FloatRange(0.1, 86_400.0), required=True,
               help='Seconds from the first message; Ctrl-C ends it earlier.')  # fmt: skip
-@click.option('--topic', '--topics', 'topics', multiple=True, help='Record it; more by repeating it, or with commas.')
-@click.option('--regex', default='', help='Record also topics in which it is found; ".*" is all of them.')
-@click.option('--deadline', type=click.FloatRange(0.0, 1e6), default=DEADLINE_S, show_default=True, help='Seconds for Tower.')
+@click.option('--topic', '--topics', 'topics', multiple=True, help='Topic to record: repeat it, or separate them with commas.')
+@click.option('--regex', default='', help='Also topics whose name matches this regular expression; ".*" is all of them.')
+@click.option(
+    '--deadline', type=click.FloatRange(0.0, 1e6), default=DEADLINE_S, show_default=True, help='Seconds to wait for Tower.'
+)
 @_robot
 @as_json
 def bag_record(*, topics: tuple[str, ...], as_json: bool, **wanted: Any) -> ExitCode:
     """Record topics into a bag and upload it.
 
-    It becomes NAME_YYYYMMDD_HHMMSS; without a topic it has those that the node logs by default.
+    The bag is NAME_YYYYMMDD_HHMMSS; without --topic it has the topics that the node logs by default.
 
-    It needs ROS 2, but not its rosbag2, and no node that runs. Slices leave while it records. When Tower is away the bag waits in
-    the spool, and exit code 1 says so.
+    It needs ROS 2, but neither rosbag2 nor a running node. Slices are uploaded while it records. If Tower cannot be reached, the
+    bag waits in the spool, and the exit code is 1.
     """
     names = [name.strip() for each in topics for name in each.split(',') if name.strip()]
     duration, deadline = wanted.pop('duration'), wanted.pop('deadline')

@@ -64,7 +64,7 @@ def robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str |
         raise BadUsage(error.what, error.remedy or error.DEFAULT_REMEDY) from error
 
 
-as_json = click.option('--json', 'as_json', is_flag=True, help='Print it as JSON.')
+as_json = click.option('--json', 'as_json', is_flag=True, help='Print JSON.')
 spool_folder = click.option(
     '--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool  [default: $SHADOWHOUND_HOME/spool]'
 )

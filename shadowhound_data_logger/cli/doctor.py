@@ -62,15 +62,21 @@ def _is_of(check: str, name: str) -> bool:
 
 @click.command(epilog=examples('doctor', 'doctor --only s3 --only clock', 'doctor --fix'))
 @click.option('--role', type=click.Choice([role.value for role in Role]), help='What this machine is  [default: guessed]')
-@click.option('--only', 'checks', multiple=True, metavar='CHECK', callback=_selected, help='Ask this alone; may be repeated.')
+@click.option(
+    '--only', 'checks', multiple=True, metavar='CHECK', callback=_selected, help='Run only this check; may be repeated.'
+)
 @as_json
-@click.option('--fix', is_flag=True, help='Do what is safe (modes of files, missing buckets); the rest is for you to paste.')
-@click.option('--timeout', type=click.FloatRange(0.5, 600.0), default=TIMEOUT_S, show_default=True, help='Seconds for all of it.')
+@click.option(
+    '--fix', is_flag=True, help='Repair what is safe (modes of files, missing buckets); the rest is printed for you to paste.'
+)
+@click.option(
+    '--timeout', type=click.FloatRange(0.5, 600.0), default=TIMEOUT_S, show_default=True, help='Seconds for all checks.'
+)
 @click.option('--params-file', type=click.Path(path_type=Path, dir_okay=False, exists=True), envvar='SHADOWHOUND_PARAMETERS',
-              help="The node's parameter file  [default: the defaults]")  # fmt: skip
+              help="The node's parameter file  [default: none]")  # fmt: skip
 @click.option('--namespace', default='/', help='The namespace of the node, as in -r __ns:=/tachi.')
-@click.option('--rate', 'rates', multiple=True, metavar='TOPIC=HZ', callback=_rates, help='Expect another rate; may be repeated.')
-@click.option('-v', '--verbose', is_flag=True, help='Show what is fine as well.')
+@click.option('--rate', 'rates', multiple=True, metavar='TOPIC=HZ', callback=_rates, help='Expect this rate; may be repeated.')
+@click.option('-v', '--verbose', is_flag=True, help='Also show what is fine.')
 def doctor(  # noqa: PLR0913 - one for each option
     *, role: str | None, checks: tuple[Check, ...], as_json: bool, fix: bool, timeout: float, params_file: Path | None,
     namespace: str, rates: dict[str, float], verbose: bool,
@@ -79,8 +85,8 @@ def doctor(  # noqa: PLR0913 - one for each option
 
     It checks this machine, its network, Tower and ROS.
 
-    Leaves probe objects of 64 bytes under ROBOT/_doctor/ in the store and in the missions of MLflow; changes nothing
-    else without --fix. Exit code 1 on errors and warnings, 0 when there are none.
+    It leaves probe objects of 64 bytes under ROBOT/_doctor/ in the store and in the missions of MLflow; without --fix it
+    changes nothing else. Exit code 1 on errors and warnings, 0 when there are none.
     """
     try:
         context = make(

@@ -74,7 +74,7 @@ def _missions(command: _Command) -> _Command:
 )
 @click.argument('name')
 @_missions
-@click.option('--to', metavar='DIR|s3://...', help='Where  [default: the folder NAME]')
+@click.option('--to', metavar='DIR|s3://...', help='Target  [default: the folder NAME]')
 @click.option(
     '--fps', default='auto', show_default=True, metavar='N', help='Frames a second; auto: the rate of the slowest camera.'
 )
@@ -83,9 +83,9 @@ def _missions(command: _Command) -> _Command:
 @click.option('--action', type=click.Choice(['auto', 'cmd_vel', 'odometry']), default='auto', show_default=True,
               help='The logged commands, or velocities derived from odometry.')  # fmt: skip
 @click.option(
-    '--camera', 'cameras', default='camera', show_default=True, metavar='NAMES', help='Sensors whose pictures are taken.'
+    '--camera', 'cameras', default='camera', show_default=True, metavar='NAMES', help='Sensors whose pictures are used.'
 )
-@click.option('--codec', type=click.Choice(['av1', 'h264']), default='av1', show_default=True, help='Of the videos.')
+@click.option('--codec', type=click.Choice(['av1', 'h264']), default='av1', show_default=True, help='Codec of the videos.')
 @click.option('--lossless', is_flag=True, help='Keep the pictures as they were published, instead of videos.')
 @click.option('--resample', multiple=True, metavar='SENSOR=HOW', help='hold (default) or linear: between the last two messages.')
 @click.option('--max-age', multiple=True, metavar='SENSOR=S', help='Older messages are stale  [default: 1.5 periods]')
@@ -93,13 +93,13 @@ def _missions(command: _Command) -> _Command:
               help='Refuse missions in which a stream is silent for longer.')  # fmt: skip
 @click.option('--max-stale', type=click.FloatRange(0.0, 1.0), default=0.05, show_default=True, metavar='SHARE',
               help='Refuse missions in which more of the frames are stale for a stream.')  # fmt: skip
-@click.option('--allow-gaps', is_flag=True, help='Take such missions, and those of which nobody knows what is missing.')
+@click.option('--allow-gaps', is_flag=True, help='Also take such missions, and those of which it is not known what is missing.')
 @click.option('--validation', type=click.FloatRange(0.0, 0.9), default=0.0, show_default=True, metavar='SHARE',
               help='Share of the missions that are marked as validation.')  # fmt: skip
-@click.option('--arm', default='', metavar='NAME', help='Take an arm along, whose topics are below /NAME.')
+@click.option('--arm', default='', metavar='NAME', help='Also export an arm, whose topics are below /NAME.')
 @click.option('--clock', type=click.Path(path_type=Path), metavar='FILE',
-              help='Events of which robot and arm told the time, beside those recorded: CSV with robot_ns,arm_ns.')  # fmt: skip
-@click.option('--wait', is_flag=True, help='Wait until it is known of each mission what is missing.')
+              help='Events that both robot and arm timed, in addition to those recorded: CSV with robot_ns,arm_ns.')  # fmt: skip
+@click.option('--wait', is_flag=True, help='Wait until it is known what each mission lacks.')
 @click.option('--dry-run', is_flag=True, help='Only say what would be exported.')
 @click.option('--workers', type=click.IntRange(1, 64), default=1, show_default=True, metavar='N', help='Episodes at a time.')
 @as_json
@@ -107,7 +107,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, wait:
                    as_json: bool, **how: Any) -> ExitCode:  # fmt: skip
     """Add missions to the LeRobot data set NAME (v3.0).
 
-    A mission that is in it already stays as it is. Exit code 1 when a mission was refused or waits: the report says why.
+    Missions that are already in it stay as they are. Exit code 1 when a mission was refused or waits: the report says why.
     """
     with _exporting():
         from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415
@@ -220,7 +220,7 @@ def _report(result: Exported, where: str, *, is_dry: bool) -> Iterator[Text]:
 def export_verify(*, place: str, is_all: bool, is_read: bool, as_json: bool) -> ExitCode:
     """Prove that a data set is as it was written.
 
-    Its files are whole, its sources unchanged, its pictures those of their sources.
+    It checks that the files are whole, the sources unchanged, and the pictures those of their sources.
 
     Exit code 1 when something is wrong.
     """
@@ -254,12 +254,12 @@ def _proof(found: Proved, place: str) -> Iterator[Text]:
 @export.command('where', epilog=examples('export where sensor-data/thor/camera/20261121/120000_front.jpg'))
 @click.argument('key')
 @click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
-              help='Look there  [default: all that this machine exported, and the bucket lerobot]')  # fmt: skip
+              help='Search only here  [default: all that this machine exported, and the bucket lerobot]')  # fmt: skip
 @as_json
 def export_where(*, key: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
     """Find the data sets and models that saw an object.
 
-    Models by the runs of MLflow that lake.log_dataset marked.
+    Models are found by the MLflow runs that lake.log_dataset marked.
     """
     with _exporting():
         from shadowhound_data_logger.lake.training import runs_trained_on  # noqa: PLC0415
@@ -302,7 +302,7 @@ def _seen(key: str, places: tuple[str, ...]) -> Iterator[Seen]:
 @export.command('drop', epilog=examples('export drop mission_20261121_120000_ab12', 'export drop MISSION --in go2_patrol'))
 @click.argument('mission')
 @click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
-              help='Out of these alone  [default: all that this machine exported, and the bucket lerobot]')  # fmt: skip
+              help='Only from this data set  [default: all that this machine exported, and the bucket lerobot]')  # fmt: skip
 @as_json
 def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
     """Take the episode of a mission out of data sets.

@@ -1,4 +1,4 @@
-"""``shadowhound-data fetch``: objects into a folder, by prefix or by question; killed, it goes on where it was."""
+"""``shadowhound-data fetch``: objects into a folder, by prefix or by query; after an interruption it resumes."""
 
 from __future__ import annotations
 
@@ -32,18 +32,24 @@ SHOWN: Final = 20
 )
 @click.argument('prefix', required=False)
 @question
-@click.option('--limit', type=click.IntRange(1), metavar='N', help='At most so many objects of a question, the earliest.')
-@click.option('--to', type=click.Path(file_okay=False, path_type=Path), required=True, metavar='DIR', help='Where: DIR/KEY.')
-@click.option('--bucket', default='sensor-data', show_default=True, help='Of a prefix.')
-@click.option('--verify', is_flag=True, help='Read again what is there already.')
+@click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N matching objects, the earliest first.')
+@click.option(
+    '--to',
+    type=click.Path(file_okay=False, path_type=Path),
+    required=True,
+    metavar='DIR',
+    help='Target folder; objects are written to DIR/KEY.',
+)
+@click.option('--bucket', default='sensor-data', show_default=True, help='Bucket of PREFIX.')
+@click.option('--verify', is_flag=True, help='Read and compare the files that are already there.')
 @as_json
 def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to: Path, bucket: str, verify: bool,
           as_json: bool) -> ExitCode:  # fmt: skip
     """Download objects, verified.
 
-    Either everything under a PREFIX (thor/camera/20261121/), or what the flags ask for, or a training set
-    (s3://lerobot/datasets/...), which becomes the folder DIR. A second time only what is new is downloaded. Exit code 1 when
-    something could not be fetched.
+    Either everything under a PREFIX (thor/camera/20261121/), or what the flags select, or a training set
+    (s3://lerobot/datasets/...), which becomes the folder DIR. Run again, it downloads only what is new. Exit code 1 when
+    something could not be fetched; that nothing matches is no error.
     """
     if prefix is not None and prefix.startswith('s3://') and not flags:
         return _fetch_dataset(prefix, to, is_json=as_json)
@@ -112,7 +118,7 @@ def _asked(flags: Mapping[str, Any], limit: int | None, left_out: Any) -> list[d
 
 def _report(found: Any, asked: int, took_s: float, to: Path, where: str) -> Iterator[Text]:
     if not asked:
-        yield plain(f'There is nothing to fetch {where}.{store_hint()}')
+        yield plain(f'No objects {where} match: nothing to fetch.{store_hint()}')
         return
     rate = f', {volume(found.bytes / took_s)}/s' if found.moved and took_s else ''
     yield plain(f'{number(found.moved)} objects ({volume(found.bytes)}) downloaded to {to} in {duration(took_s)}{rate}; '

@@ -44,7 +44,7 @@ DAY_NS: Final = 24 * 3600 * SECOND
 MOST_COVERED_NS: Final = 400 * DAY_NS
 WORDS: Final = {**KINDS, UNLISTED: "not in the store's own catalogue; `lake reindex` adds those that are there"}
 COLUMNS: Final = ('robot', 'days', 'first', 'last', 'files', 'size', 'compacted', 'to compact', 'superseded')
-_robot = click.option('--robot', metavar='NAME', help='Of this robot alone.')
+_robot = click.option('--robot', metavar='NAME', help='Only of this robot.')
 
 
 @click.group(epilog=examples('lake status', 'lake compact'))
@@ -88,7 +88,7 @@ def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
 @click.option('--before', metavar='DATE', help='Days earlier than this  [default: today, UTC]')
 @click.option('--keep', is_flag=True, help='Delete nothing.')
 @click.option('--grace', type=click.FloatRange(0.0), default=60.0, show_default=True, metavar='MIN',
-              help='How long superseded files stay: somebody may be reading them.')  # fmt: skip
+              help='Minutes for which superseded files stay, because somebody may be reading them.')  # fmt: skip
 @as_json
 def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: float, as_json: bool) -> ExitCode:
     """Merge the many files of each past day into one.
@@ -120,17 +120,17 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
     if kept:
         click.echo(f'{number(kept)} superseded files are still there: a later run deletes them.')
     if any(day.denied for day in found):
-        click.echo('These credentials may not delete: that costs room, and nothing else.')
+        click.echo('These credentials may not delete: the files only take up space.')
     return tell_left_out(left_out)
 
 
 @lake.command('reindex', epilog=examples('lake reindex --robot thor'))
-@click.option('--robot', metavar='NAME', required=True, help='Whose objects.')
+@click.option('--robot', metavar='NAME', required=True, help='Robot of the objects.')
 @as_json
 def lake_reindex(*, robot: str, as_json: bool) -> ExitCode:
     """Add objects that the catalogue lacks.
 
-    It lists the store, and asks for each object that has no row.
+    It lists the store, and reads the metadata of each object that has no row.
     """
     with asking():
         from shadowhound_data_logger.lake import reindex as library  # noqa: PLC0415
@@ -155,7 +155,7 @@ def lake_reindex(*, robot: str, as_json: bool) -> ExitCode:
 @lake.command('verify', epilog=examples('lake verify --since 7d', 'lake verify --robot thor --deep'))
 @question
 @click.option('--catalogue', type=click.Path(exists=True, file_okay=False, path_type=Path), metavar='DIR',
-              help='Of another store, as `fetch ROBOT/_catalog/ --to DIR` brought it.')  # fmt: skip
+              help='Catalogue of another store, downloaded by `fetch ROBOT/_catalog/ --to DIR`.')  # fmt: skip
 @click.option('--deep', is_flag=True, help='Read every object back.')
 @as_json
 def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool, as_json: bool) -> ExitCode:
@@ -163,8 +163,9 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
 
     It asks for every object, its size and its checksum.
 
-    All objects, or those that the flags ask for. Of a store that was moved, name the catalogue of the old one as well: what the
-    new one lost of its own is found only so. Exit code 1 when something is not as the catalogue says, or when it says nothing.
+    All objects, or those that the flags select. If data was moved to another store, name the catalogue of the old one as well:
+    only it shows what the new one lost along with its rows. Exit code 1 when something is not as the catalogue says, or when no
+    object was selected.
     """
     if catalogue and 'success' in flags:
         raise BadUsage('a catalogue does not say which missions failed', 'leave out --failed and --succeeded, or --catalogue')
@@ -200,14 +201,14 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
     epilog=examples('lake coverage --since yesterday', 'lake coverage --topic /imu --map imu.png'),
 )
 @_robot
-@click.option('--topic', metavar='NAME', help='Of this topic alone.')
+@click.option('--topic', metavar='NAME', help='Only of this topic.')
 @click.option('--sink', type=click.Choice(['objects', 'bags', 'events']), default='objects', show_default=True,
-              help='Of what was stored by the sensors, recorded in bags, or kept by events.')  # fmt: skip
+              help='Messages stored by the sensors, recorded in bags, or kept by events.')  # fmt: skip
 @click.option(
-    '--since', metavar='TIME', default='1d', show_default=True, help='From then on: yesterday, 2h, 2026-11-20T12:30 (UTC).'
+    '--since', metavar='TIME', default='1d', show_default=True, help='From TIME on: yesterday, 2h, 2026-11-20T12:30 (UTC).'
 )
-@click.option('--until', metavar='TIME', default='now', show_default=True, help='Until before that.')
-@click.option('--map', 'chart', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw it, a line a topic.')
+@click.option('--until', metavar='TIME', default='now', show_default=True, help='Before TIME.')
+@click.option('--map', 'chart', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw it, one line for each topic.')
 @as_json
 def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str, until: str, chart: Path | None,
                   as_json: bool) -> ExitCode:  # fmt: skip
@@ -215,8 +216,8 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
 
     By topic and hour, with the causes, and what is not known yet.
 
-    Below a topic's watermark everything is known: it is stored, downsampled by the settings, or in a gap. Above it, and while the
-    robot was off or cannot be reached, nobody knows.
+    Up to a topic's watermark everything is known: it is stored, downsampled by the settings, or in a gap. After it, and while the
+    robot was off or could not be reached, it is not known.
     """
     with asking():
         from shadowhound_data_logger.lake import gaps as library  # noqa: PLC0415 - pyarrow takes a moment
@@ -258,7 +259,7 @@ def _covered(found: Sequence[Coverage]) -> Iterator[RenderableType]:
     from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED  # noqa: PLC0415
 
     if not found:
-        yield plain('Nothing is known: no robot has told of its gaps yet. It does so each minute while it delivers.')
+        yield plain('Nothing is known yet: no robot has uploaded its gap journal. A node does so each minute while it delivers.')
         return
     table = plain_table('', ('robot', 'topic', 'hour (UTC)', 'stored', 'downsampled', 'gaps', 'not known yet', 'why'),
                         ('robot', 'topic', 'hour (UTC)', 'why'))  # fmt: skip
@@ -282,7 +283,7 @@ def _covered(found: Sequence[Coverage]) -> Iterator[RenderableType]:
     yield table
     for each in (each for each in found if each.known.untimed):
         count = sum(gap.count or 0 for gap in each.known.untimed)
-        yield plain(f'{each.known.robot} {each.known.topic}: {number(count)} messages were lost at times that nobody knows.')
+        yield plain(f'{each.known.robot} {each.known.topic}: {number(count)} messages were lost at unknown times.')
 
 
 def _share(part: float, whole: float) -> str:
@@ -317,7 +318,7 @@ def _verdict(said: Mapping[str, Any]) -> Text:
     how = 'every byte read back' if said['deep'] else 'by size and checksum'
     if said['unreachable']:
         left = plain(f': {said["unreachable"]}. {number(said["known"] - said["asked"])} objects are not asked for.')
-        return Text.assemble(('The store is away', 'yellow'), left)
+        return Text.assemble(('The store cannot be reached', 'yellow'), left)
     if not said['known']:
         return Text.assemble(('Nothing is verified', 'yellow'), f': the catalogue has no such objects.{store_hint()}')
     if said['ok']:

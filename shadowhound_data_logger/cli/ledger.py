@@ -56,22 +56,23 @@ ACCOUNTING: Final = {
 @spool_folder
 @click.option('--verify', 'ask', is_flag=True, help='Ask the store for every delivered object: is it there, with its checksum?')
 @click.option('--deep', is_flag=True, help='Verify by reading every object back.')
-@click.option('--again', is_flag=True, help='Verify from the beginning, also where a run was interrupted.')
-@click.option('--gaps', 'when', is_flag=True, help='When messages were lost, how many, why, and in which mission.')
-@click.option('--topic', default='', metavar='TOPIC', help='With --gaps: of this topic.')
-@click.option('--since', default='', metavar='TIME', help='With --gaps: that end then or later: yesterday, 2h, 2026-11-20T12:30.')
-@click.option('--until', default='', metavar='TIME', help='With --gaps: that begin then or earlier.')
+@click.option('--again', is_flag=True, help='Verify from the beginning, even if a run was interrupted.')
+@click.option('--gaps', 'when', is_flag=True, help='Show when messages were lost, how many, why, and in which mission.')
+@click.option('--topic', default='', metavar='TOPIC', help='With --gaps: only of this topic.')
 @click.option(
-    '--cause', default='', metavar='WORD', help='With --gaps: for this cause or of this kind: restart, missed, no_room.'
+    '--since', default='', metavar='TIME', help='With --gaps: that end at or after TIME: yesterday, 2h, 2026-11-20T12:30.'
 )
+@click.option('--until', default='', metavar='TIME', help='With --gaps: that begin at or before TIME.')
+@click.option('--cause', default='', metavar='WORD', help='With --gaps: only of this cause or kind: restart, missed, no_room.')
 def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: bool, when: bool, topic: str, since: str,  # noqa: PLR0913 - one an option
            until: str, cause: str) -> ExitCode:  # fmt: skip
     """Account for every message: stored, or lost and why.
 
     ~ is an estimate, - is not known.
 
-    Reads the spool while the node runs and when it does not. Exit code 1 when the ledger does not balance, or when the store
-    does not hold what was delivered; an interrupted --verify goes on where it was. Times are UTC.
+    Works whether or not the node runs. Exit code 1 when the ledger does not balance, or when the store does not hold what was
+    delivered; an interrupted --verify resumes where it stopped. --verify and --deep need the AWS_... variables of the node.
+    Times are UTC.
     """
     folder = the_spool(spool)
     if when:

@@ -1,4 +1,4 @@
-"""``shadowhound-data live``: serves the page on which the robot, its data and what is missing can be watched."""
+"""``shadowhound-data live``: serves the page that shows the robot, its data and what is missing."""
 
 from __future__ import annotations
 
@@ -27,26 +27,34 @@ PORT = 8765
 
 
 @click.command(epilog=examples('live', 'live --bind 0.0.0.0', 'live --bind 0.0.0.0 --tls tower.crt tower.key'))
-@click.option('--bind', default='127.0.0.1', show_default=True, metavar='ADDRESS', help='Listen there.')
-@click.option('--port', type=click.IntRange(0, 65535), default=PORT, show_default=True, help='0: any that is free.')
-@click.option('--tls', nargs=2, type=click.Path(path_type=Path, dir_okay=False), metavar='CERTIFICATE KEY', help='Serve https.')
+@click.option('--bind', default='127.0.0.1', show_default=True, metavar='ADDRESS', help='Address to listen on.')
 @click.option(
-    '--name', 'names', multiple=True, metavar='HOST', help='A further name of this machine in the address; may be repeated.'
+    '--port', type=click.IntRange(0, 65535), default=PORT, show_default=True, help='Port to listen on; 0 takes a free one.'
+)
+@click.option(
+    '--tls',
+    nargs=2,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar='CERTIFICATE KEY',
+    help='Serve https with these files.',
+)
+@click.option(
+    '--name', 'names', multiple=True, metavar='HOST', help='Another name of this machine in addresses; may be repeated.'
 )
 @click.option('--uploads-mbps', type=click.FloatRange(0.0, 10_000.0), default=4.0, show_default=True,
-              help='What uploads are left, in Mbit/s, while somebody watches over the network; 0: no cap.')  # fmt: skip
+              help='Limit of uploads in Mbit/s while somebody watches over the network; 0: no limit.')  # fmt: skip
 @click.option('--new-tokens', is_flag=True, help='Make new tokens first: everybody has to sign in again.')
-@click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Whose  [default: the one that ran here]')
+@click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Robot to show  [default: the one that ran here]')
 @spool_folder
 @as_json
 def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[str, ...], uploads_mbps: float, new_tokens: bool,  # noqa: PLR0913 - one an option
          robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
-    """Serve a page to watch robot and data on.
+    """Serve a page that shows robot and data.
 
     It shows in a browser what the robot sees now, its data, and what is missing.
 
-    It ends with Ctrl-C. On 127.0.0.1 whoever is on this machine may watch; anywhere else a token is asked for. Acting (bags,
-    events, flush, pause) always needs the token of the operator. The tokens are in files, in SHADOWHOUND_HOME/live.
+    Ctrl-C ends it. On 127.0.0.1 everybody on this machine may watch; other addresses need a token. Actions (bags, events, flush,
+    pause) always need the operator's token. The tokens are files in SHADOWHOUND_HOME/live.
     """
     try:
         from shadowhound_data_logger.live.access import make_tokens  # noqa: PLC0415 - loaded by this verb alone

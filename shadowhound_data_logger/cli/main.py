@@ -59,7 +59,7 @@ class Verbs(click.Group):
                 formatter.write_dl([(verb.name or '', verb.get_short_help_str(room)) for verb in verbs])
 
     def format_epilog(self, _: click.Context, formatter: click.HelpFormatter) -> None:
-        for part in (examples('doctor', 'status --watch', 'bag fetch --help'), CODES):
+        for part in (examples('doctor', 'status --watch', 'query --sensor camera --since 2h'), CODES):
             formatter.write_paragraph()
             formatter.write_text(part)
 
@@ -67,7 +67,7 @@ class Verbs(click.Group):
 @click.group(cls=Verbs, context_settings={'help_option_names': ['-h', '--help']})
 @click.version_option(package_name='shadowhound_data_logger', prog_name=PROGRAM)
 def cli() -> None:
-    """What became of a robot's data: ask its spool and its store.
+    """See, find and move the data of a robot, in its spool and in the store.
 
     SHADOWHOUND_HOME is the folder of the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT the robot (default: the one that ran
     here), AWS_ENDPOINT_URL the S3 server (default: the folder SHADOWHOUND_HOME/store). Most verbs print JSON with --json.

@@ -54,7 +54,7 @@ _mission = click.argument('folder', metavar='ID', callback=_folder)
 def missions() -> None:
     """Show and send missions logged on this machine.
 
-    ID is a mission's id or that of its MLflow run, or how one begins.
+    ID is the id of a mission or of its MLflow run, or the beginning of one.
     """
 
 
@@ -63,7 +63,7 @@ def missions() -> None:
 def list_(*, as_json: bool) -> ExitCode:
     """List the missions, the newest last.
 
-    Exit code 1 when one that is over is not sent.
+    Exit code 1 when a mission that is over was not sent.
     """
     where = the_home()
     found = overviews(where)
@@ -100,7 +100,7 @@ def show(*, folder: MissionFolder, as_json: bool) -> ExitCode:
 def resume(*, deadline: float, experiment: str | None) -> ExitCode:
     """Send what is not sent yet, and wait for it.
 
-    Exit code 1 when something is left after the deadline; it is tried for ten more minutes in the background.
+    Exit code 1 when something is left after the deadline; sending continues for ten more minutes in the background.
     """
     where = the_home()
     if not _late(overviews(where)):
@@ -126,7 +126,7 @@ def resume(*, deadline: float, experiment: str | None) -> ExitCode:
 def export_(*, folder: MissionFolder, kind: str, to: IO[str]) -> ExitCode:
     """Write one mission to JSON or CSV.
 
-    All points, events and parameters, as they were logged on this machine; MLflow is not asked.
+    All points, events and parameters, as they were logged on this machine, without MLflow.
     """
     found = export(folder)
     if kind == 'json':

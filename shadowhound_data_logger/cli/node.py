@@ -1,4 +1,4 @@
-"""``shadowhound-data node``: has the node that runs on this machine do something, whatever middleware it speaks."""
+"""``shadowhound-data node``: controls the node that runs on this machine, whatever middleware it speaks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LIVE: Final = {True: 'at a start', False: 'yes'}
 
 def _of_node(verb: F) -> F:
     """The options that each verb has."""
-    whose = 'Whose node  [default: the only one that runs here]'
+    whose = 'Robot of the node  [default: the only one that runs here]'
     for option in (
         as_json,
         click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help=whose),
@@ -40,7 +40,8 @@ def node() -> None:
 
     These verbs do what its services and parameters do.
 
-    It is asked through a socket in its spool, by its own user alone. Exit code 1 when it refuses, fails, or does not run.
+    They talk to the node through a socket in the spool: run them as the node's user. Exit code 1 when the node refuses, fails, or
+    does not run.
     """
 
 
@@ -68,12 +69,12 @@ _add(bag, 'resume', 'bag resume', 'Record again.')
 
 @node.command(epilog=examples('node event', "node event slipped --note 'wet floor'"))
 @click.argument('name', default='manual')
-@click.option('--note', default='', help='What it was, for its manifest.')
+@click.option('--note', default='', help='What happened, for the manifest.')
 @_of_node
 def event(*, name: str, note: str, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:
     """Save the seconds before and after now as a bag.
 
-    It prints its name. An event that is still going on is prolonged instead.
+    It prints the name of the bag. If an event is under way, that one is extended instead.
     """
     return _ask(spool, robot, 'event', as_json=as_json, name=name, note=note)
 

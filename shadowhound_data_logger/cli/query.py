@@ -36,16 +36,18 @@ _OBJECTS: Final = {'bucket', 'key'}
 @click.argument('sql', required=False)
 @question
 @click.option('--order', metavar='COLUMN', help="What to sort by, such as 't_start desc'  [default: t_start]")
-@click.option('--limit', type=click.IntRange(1), metavar='N', help='At most so many rows.')
+@click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N rows.')
 @click.option('--format', 'kind', type=click.Choice(['table', 'csv', 'json', 'keys']), default='table', show_default=True)
 @as_json
 @click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')
-@click.option('--map', 'ground', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw where the objects lie.')
+@click.option(
+    '--map', 'ground', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw where the objects were recorded.'
+)
 def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str, as_json: bool,  # noqa: PLR0913 - one an option
           sheet: Path | None, ground: Path | None) -> ExitCode:  # fmt: skip
     """Search what is stored, by flags or SQL.
 
-    All flags that are given must hold; times are UTC.
+    An object must match all flags; times are UTC.
 
     SQL knows the views objects, missions, topics, gaps and watermarks, restricted by the flags.
 
@@ -109,7 +111,7 @@ def _table(found: Any, where: str, *, is_objects: bool, is_limited: bool) -> Ite
 def _verdict(found: Any, shown: int, where: str, *, is_objects: bool) -> str:
     what = 'objects' if is_objects else 'rows'
     if not len(found):
-        return f'No {what} in {where}.{store_hint()}'
+        return f'No {what} in {where} match the query.{store_hint()}'
     text = f'{number(len(found))} {what}'
     if is_objects:
         text += f', {volume(sum(found["bytes"].to_pylist()))}'

@@ -1,4 +1,4 @@
-"""The flags with which ``query`` and ``fetch`` ask the catalogue, and the library behind them, which a robot does not have."""
+"""The flags with which ``query`` and ``fetch`` search the catalogue, and the library behind them, which a robot does not have."""
 
 from __future__ import annotations
 
@@ -18,19 +18,21 @@ if TYPE_CHECKING:
 
 EXTRA: Final = {'daft', 'matplotlib', 'obstore', 'pyarrow'}
 FLAGS: Final = {
-    'robot': click.option('--robot', metavar='NAME', help='Of this robot.'),
-    'sensor': click.option('--sensor', metavar='NAME', help='Of this sensor: camera, lidar, odom, ...'),
-    'topic': click.option('--topic', metavar='NAME', help='Of this topic.'),
+    'robot': click.option('--robot', metavar='NAME', help='Only of this robot.'),
+    'sensor': click.option('--sensor', metavar='NAME', help='Only of this sensor: camera, lidar, odom, ...'),
+    'topic': click.option('--topic', metavar='NAME', help='Only of this topic.'),
     'since': click.option(
-        '--since', metavar='TIME', help='Begun then or later: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).'
+        '--since', metavar='TIME', help='Begun at or after TIME: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).'
     ),
-    'until': click.option('--until', metavar='TIME', help='Begun before that.'),
-    'near': click.option('--near', metavar='X,Y,R', help='At most R metres from X,Y in the odometry frame.'),
-    'mission': click.option('--mission', metavar='ID', help='Of this mission: its id or that of its run, or how one begins.'),
-    'mission_type': click.option('--mission-type', metavar='TYPE', help='Of missions of this type.'),
-    'failed': click.option('--failed', 'success', flag_value=False, type=bool, default=None, help='Of missions that failed.'),
+    'until': click.option('--until', metavar='TIME', help='Begun before TIME.'),
+    'near': click.option('--near', metavar='X,Y,R', help='Within R metres of X,Y in the odometry frame.'),
+    'mission': click.option('--mission', metavar='ID', help='Only of missions whose id, or whose run id, begins with ID.'),
+    'mission_type': click.option('--mission-type', metavar='TYPE', help='Only of missions of this type.'),
+    'failed': click.option(
+        '--failed', 'success', flag_value=False, type=bool, default=None, help='Only of missions that failed.'
+    ),
     'succeeded': click.option(
-        '--succeeded', 'success', flag_value=True, type=bool, default=None, help='Of missions that succeeded.'
+        '--succeeded', 'success', flag_value=True, type=bool, default=None, help='Only of missions that succeeded.'
     ),
     'where': click.option('--where', metavar='SQL', help="A condition, such as 'battery_pct < 30'."),
 }
@@ -52,7 +54,7 @@ def question(command: _Command) -> _Command:
 
 
 def question_text(flags: Mapping[str, Any]) -> str:
-    """The question, to stand over a picture."""
+    """The query, as the title of a picture."""
     told = {**flags, 'success': {True: 'succeeded', False: 'failed'}.get(flags.get('success'), '')}  # type: ignore[arg-type]
     return ', '.join(
         str(told[name]) if name in {'sensor', 'success'} else f'{name} {told[name]}' for name in NAMES if told.get(name)

@@ -59,7 +59,7 @@ STYLES: Final = {State.HELD.value: 'yellow', State.QUARANTINED.value: 'red'}
 def spool(context: click.Context, *, spool: Path | None, as_json: bool) -> ExitCode:
     """Show what is not in the store yet, and why.
 
-    It reads the spool while a node runs and when none does. Exit code 1 when something is quarantined.
+    Works whether or not a node runs. Exit code 1 when something is quarantined.
     """
     context.obj = folder = the_spool(spool).absolute()
     return ExitCode.FINE if context.invoked_subcommand else _overview(folder, as_json=as_json)
@@ -70,9 +70,11 @@ def spool(context: click.Context, *, spool: Path | None, as_json: bool) -> ExitC
     epilog=examples('spool list --state quarantined', 'spool list sensor-data/thor/camera/'),
 )
 @click.argument('prefix', default='', metavar='[BUCKET/PREFIX]')
-@click.option('--state', type=click.Choice([state.value for state in HERE]), help='Only these.')
+@click.option('--state', type=click.Choice([state.value for state in HERE]), help='Only objects in this state.')
 @click.option('--sensor', help='Only of this sensor.')
-@click.option('--limit', type=click.IntRange(1), default=MOST, show_default=True, help='So many at most, the oldest first.')
+@click.option(
+    '--limit', type=click.IntRange(1), default=MOST, show_default=True, help='At most N objects, the oldest first.', metavar='N'
+)
 @as_json
 @click.pass_obj
 def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, limit: int, as_json: bool) -> ExitCode:
@@ -98,15 +100,15 @@ def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, l
 
 @spool.command(epilog=examples('spool drain', 'spool --spool /mnt/dead_robot/spool drain'))
 @click.option('--patience', type=click.FloatRange(1.0, 1e6), default=60.0, show_default=True,
-              help='Seconds in which nothing gets on after which it gives up.')  # fmt: skip
+              help='Give up after this many seconds without progress.')  # fmt: skip
 @as_json
 @click.pass_obj
 def drain(folder: Path, *, patience: float, as_json: bool) -> ExitCode:
     """Upload everything that waits, without a node.
 
-    For before a robot is put away, or for the disk of one that is broken. The store is the one that the environment names. Each
-    object is verified as by the node, and gets its row in the catalogue.
-    Exit code 1 when something of that is left or refused. Ctrl-C loses nothing.
+    Use it before a robot is put away, or with the disk of a broken one. It needs the AWS_... variables of the node: without them
+    the store is a folder. Each object is verified as by the node, and gets its row in the catalogue. Exit code 1 when an object
+    is left or refused. Ctrl-C loses nothing.
     """
     _check(folder)
     return _drain(folder, patience_s=patience, as_json=as_json)
@@ -122,7 +124,7 @@ def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bo
 
     All of them, or those that are named.
 
-    A node that runs tries them at once; without one, `shadowhound-data spool drain` does.
+    A running node tries them at once; without one, run `shadowhound-data spool drain`.
     """
     try:
         done = retry_objects(folder, reason=reason, names=frozenset(names))
@@ -144,8 +146,8 @@ def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bo
 def tell_gaps(folder: Path, *, as_json: bool) -> ExitCode:
     """Send the gap journal to the store again.
 
-    For a store that lost some of its files. A node that runs does so within a minute (catalogue.period_s). What is older than
-    spool.remember_days cannot be told again.
+    For a store that lost parts of it. A running node sends it within a minute (catalogue.period_s). Gaps older than
+    spool.remember_days cannot be sent again.
     """
     _check(folder)
     try:
@@ -156,7 +158,7 @@ def tell_gaps(folder: Path, *, as_json: bool) -> ExitCode:
     if as_json:
         print_json({'rows': rows})
     else:
-        click.echo(f'{number(rows)} rows of the gap journal are told again with the next part')
+        click.echo(f'{counted(rows, "row")} of the gap journal will be sent again with the next part')
     return ExitCode.FINE
 
 

@@ -40,18 +40,21 @@ HEADS: Final = {'running': ('running', 'green'), 'not_answering': ('NOT ANSWERIN
 
 
 @click.command(epilog=examples('status', 'status --watch'))
-@click.option('--watch', is_flag=True, help='Go on until Ctrl-C: a live view, or with --json one line each time.')
+@click.option('--watch', is_flag=True, help='Repeat until Ctrl-C: a live view, or with --json one line each time.')
 @click.option(
-    '--interval', type=click.FloatRange(0.05, 3600.0), default=1.0, show_default=True, help='Seconds between two looks.'
+    '--interval', type=click.FloatRange(0.05, 3600.0), default=1.0, show_default=True, help='Seconds between two updates.'
 )
 @as_json
-@click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Whose node  [default: the one that runs here]')
+@click.option(
+    '--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Robot of the node  [default: the one that runs here]'
+)
 @spool_folder
 def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, spool: Path | None) -> ExitCode:
     """Show what the node on this machine does now.
 
     Rates and ages of its topics, its queue, spool, store and workers; when no node runs, what is in its spool. Exit code 1 when
-    something needs attention: the node does not run, the store is away, messages were lost. With --watch it is 0.
+    something needs attention: the node does not run, the store cannot be reached, messages were lost, objects were evicted. With
+    --watch it is 0.
     """
     folder, clock = the_spool(spool), SystemClock.of_this_machine()
 

@@ -58,8 +58,8 @@ def test_by_question(home: Path) -> None:
     told = json.loads(run(home, '--sensor', 'odom', '--since', '2026-10-28T12:00:01', '--limit', '2', '--json').output)
     assert (told['asked'], told['moved']) == (2, 2)
     assert files(home) == sorted(row('odom', stamp_ns)['key'] for stamp_ns in TIMES[1:3])
-    assert 'nothing to fetch in the bucket sensor-data' in run(home, '--sensor', 'lidar').output
-    assert 'nothing to fetch under thor/lidar/ in the bucket x' in run(home, 'thor/lidar/', '--bucket', 'x').output
+    assert 'No objects in the bucket sensor-data' in run(home, '--sensor', 'lidar').output
+    assert 'No objects under thor/lidar/ in the bucket x' in run(home, 'thor/lidar/', '--bucket', 'x').output
 
 
 def test_what_cannot_be_fetched_is_a_finding(home: Path) -> None:

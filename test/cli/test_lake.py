@@ -90,7 +90,7 @@ def test_coverage_as_a_table(told: Path) -> None:
         ['thor', '/odom', '10-28', '12:00', '-', '100', '%', '-', '-'],
         ['thor', '/odom', '10-28', '13:00', '-', '-', '-', '100', '%'],
     ]
-    assert 'thor /odom: 12 messages were lost at times that nobody knows.' in found.stdout
+    assert 'thor /odom: 12 messages were lost at unknown times.' in found.stdout
 
 
 def test_coverage_for_programs(told: Path) -> None:

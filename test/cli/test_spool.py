@@ -144,7 +144,7 @@ def test_gaps_are_told_again(home: Path) -> None:
     """The next part begins anew."""
     assert said('tell-gaps') == {'rows': 1}
     answer = run('tell-gaps')
-    assert (answer.return_value, answer.stdout) == (0, '1 rows of the gap journal are told again with the next part\n')
+    assert (answer.return_value, answer.stdout) == (0, '1 row of the gap journal will be sent again with the next part\n')
 
 
 def test_a_file_that_is_gone_does_not_wait(home: Path) -> None:
