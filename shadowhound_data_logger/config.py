@@ -27,6 +27,7 @@ from shadowhound_data_logger.options import (
     CatalogueSettings,
     ClockSettings,
     EventSettings,
+    KeepSettings,
     MissionSettings,
     QueueSettings,
     SensorSettings,
@@ -45,6 +46,7 @@ __all__ = [
     'CatalogueSettings',
     'ClockSettings',
     'EventSettings',
+    'KeepSettings',
     'MissionSettings',
     'QueueSettings',
     'SensorSettings',
@@ -82,6 +84,7 @@ class Settings:
     capture: CaptureSettings
     queue: QueueSettings
     spool: SpoolSettings
+    keep: KeepSettings
     upload: UploadSettings
     shutdown: ShutdownSettings
     clock: ClockSettings

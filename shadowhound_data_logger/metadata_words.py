@@ -50,6 +50,11 @@ REPEATS_UNTIL_NS: Final = 'repeats_until_ns'
 GAP_VERSION: Final = 'gap_version'
 """Up to which change of the journal in the index all is told (``spool/gaps.py``), in the last part of those of one moment."""
 
+# What stays on the robot until somebody asks for it.
+SHIP: Final = 'ship'
+ON_REQUEST: Final = 'on_request'
+"""The one value of ``ship``."""
+
 # A file of a bag.
 BAG: Final = 'bag'
 SLICE: Final = 'slice'

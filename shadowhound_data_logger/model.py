@@ -9,6 +9,8 @@ from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 
+from shadowhound_data_logger import metadata_words as words
+
 
 class Sample(NamedTuple):
     """One message as it was taken: its time and its serialized form (CDR with the 4-byte encapsulation header)."""
@@ -89,6 +91,15 @@ class DataObject:
     """The wanted key with its time left open (``keys.dated``), should that not be known yet."""
     catalogues: tuple[int, ...] = ()
     """A part of the catalogue: the ids of the objects that it has rows of. It is left out where another part has one of them."""
+    tells: tuple[tuple[int, str], ...] = ()
+    """A part of the table of what is kept: the ids and states of its rows. It is left out where another part has one of them."""
+    answers: tuple[str, int, str] | None = None
+    """An answer to a request: its id, the answer's number and the state that it tells. It is left out where that was given."""
+
+    @property
+    def is_on_request(self) -> bool:
+        """Whether it stays on the robot until somebody asks for it."""
+        return self.metadata.get(words.SHIP) == words.ON_REQUEST
 
 
 class State(str, Enum):
@@ -100,6 +111,8 @@ class State(str, Enum):
     EVICTED = 'evicted'
     QUARANTINED = 'quarantined'
     DEDUPLICATED = 'deduplicated'
+    KEPT = 'kept'
+    """Stays on the robot's disk until somebody asks for it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,8 @@ BATCHED: Final = ('json', *ARCHIVES)
 """Formats that can hold several messages."""
 CAPTURES: Final = ('always', 'mission')
 RECORDS: Final = ('service', 'mission', 'always')
+ALWAYS, ON_REQUEST = 'always', 'on_request'
+SHIPS: Final = (ALWAYS, ON_REQUEST)
 COMPRESSIONS: Final = ('zstd', 'none')
 RMW_AUTO, RMW_ROBOT, RMW_FASTRTPS = 'auto', 'robot', 'fastrtps'
 COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
@@ -57,6 +59,9 @@ class SensorSettings:
     )
     expected_hz: float = _setting(
         0.0, 'Rate at which it is published, to estimate losses where messages have no numbers; 0 learns it.', low=0.0, high=1e5
+    )
+    ship: str = _setting(
+        ALWAYS, 'Upload its objects always, or keep them on the robot and upload those that are asked for.', choices=SHIPS
     )
     counter: str = _setting(
         '', 'Field that counts messages or milliseconds, such as tick, to estimate losses from it instead of from stamps.'
@@ -103,6 +108,16 @@ class SpoolSettings:
     remember_days: float = _setting(
         3.0, 'Days for which the keys of delivered objects are remembered, for ledger --verify.', low=1.0, high=3650.0
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeepSettings:
+    """What stays on the robot until somebody asks for it (``ship: on_request``)."""
+
+    max_bytes: int = _setting(500 * GIBI, 'Most bytes to keep on the robot; beyond it the oldest objects are evicted.', low=MEBI)
+    days: float = _setting(14.0, 'Days to keep them.', low=0.01, high=3650.0)
+    missions: tuple[str, ...] = _setting(('',), 'Types of missions of which everything is uploaded always.')
+    poll_s: float = _setting(10.0, 'Seconds between two looks at what is asked for.', low=0.5, high=3600.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,6 +189,9 @@ class BagSettings:
     slice_bytes: int = _setting(256 * MEBI, 'Most bytes in one file of a bag.', low=MEBI)
     compression: str = _setting('zstd', 'Compression of the bag.', choices=COMPRESSIONS)
     priority: int = _setting(8, '0 is uploaded first and evicted last; 9 is uploaded last and evicted first.', low=0, high=9)
+    ship: str = _setting(
+        ALWAYS, 'Upload bags always, or keep them on the robot and upload the slices that are asked for.', choices=SHIPS
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,6 +245,7 @@ GROUPS: Final[dict[str, type]] = {
     'capture': CaptureSettings,
     'queue': QueueSettings,
     'spool': SpoolSettings,
+    'keep': KeepSettings,
     'upload': UploadSettings,
     'shutdown': ShutdownSettings,
     'clock': ClockSettings,

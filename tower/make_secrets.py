@@ -31,6 +31,8 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 READ_BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
 ROBOT_BUCKETS = ('sensor-data', 'trajectories')
+MAILBOXES = 'sensor-data/_requests'
+"""What is asked of robots: a robot reads its own."""
 ADMIN = ('Admin', 'Read', 'Write', 'List', 'Tagging')
 NAME = re.compile(r'[a-z0-9][a-z0-9_-]{0,62}')
 """A robot's name leads its keys, and is part of a pattern here: no wildcard may be in it."""
@@ -59,8 +61,13 @@ def actions(user: str) -> list[str]:
     if user == 'mlflow':
         return [f'{action}:mlflow' for action in ('Read', 'Write', 'List', 'Tagging')]
     if user == 'spark':
-        return [f'{action}:{bucket}' for bucket in READ_BUCKETS for action in ('Read', 'List')] + ['Write:lerobot']
-    return [f'{action}:{bucket}/{user}/*' for bucket in ROBOT_BUCKETS for action in ('Read', 'Write')]
+        return [
+            *(f'{action}:{bucket}' for bucket in READ_BUCKETS for action in ('Read', 'List')),
+            'Write:lerobot',
+            f'Write:{MAILBOXES}/*',
+        ]
+    own = [f'{action}:{bucket}/{user}/*' for bucket in ROBOT_BUCKETS for action in ('Read', 'Write')]
+    return [*own, f'Read:{MAILBOXES}/{user}/*']
 
 
 def new_key() -> dict[str, str]:

@@ -28,18 +28,19 @@ OWN_USERS = ('tower', 'mlflow', 'spark')
 ACCOUNT = '000000000000'
 """Of every user of a SeaweedFS server, in a policy's ARN."""
 OLD_VERSION_DAYS = 30
+NO_REQUESTS = b'{"format":1,"entries":[]}'
 UNFINISHED_DAYS = 7
 """A robot that stays away for longer begins a large upload anew."""
 
 
 def policy(bucket: str, robots: Sequence[str]) -> str:
-    """These users may not delete, whatever their actions say: SeaweedFS's ``Write`` includes it."""
+    """These users may not delete, nor may Spark, whatever their actions say: SeaweedFS's ``Write`` includes it."""
     return json.dumps({
         'Version': '2012-10-17',
         'Statement': [{
             'Sid': 'RobotsDoNotDelete',
             'Effect': 'Deny',
-            'Principal': {'AWS': [f'arn:aws:iam::{ACCOUNT}:user/{name}' for name in robots]},
+            'Principal': {'AWS': [f'arn:aws:iam::{ACCOUNT}:user/{name}' for name in (*robots, 'spark')]},
             'Action': ['s3:DeleteObject', 's3:DeleteObjectVersion'],
             'Resource': [f'arn:aws:s3:::{bucket}/*'],
         }],
@@ -55,6 +56,16 @@ def rules(bucket: str) -> dict[str, Any]:
     if bucket in ROBOT_BUCKETS:
         found += [{'ID': 'old-versions', 'NoncurrentVersionExpiration': {'NoncurrentDays': OLD_VERSION_DAYS}, **everything}]
     return {'Rules': found}
+
+
+def make_mailbox(s3: Any, robot: str) -> None:
+    """The object in which others ask a robot for what it keeps; one that is there stays."""
+    key = f'_requests/{robot}/inbox.json'
+    try:
+        s3.put_object(Bucket='sensor-data', Key=key, Body=NO_REQUESTS, ContentType='application/json', IfNoneMatch='*')
+    except ClientError as error:
+        if error.response['ResponseMetadata']['HTTPStatusCode'] not in {409, 412}:
+            raise
 
 
 def robots_of(users: Path) -> list[str]:
@@ -99,6 +110,8 @@ def prepare(s3: Any, robots: Sequence[str]) -> list[str]:
                 step(Bucket=bucket)
             except ClientError as error:
                 missing.append(f'{bucket}: the server does not take {what}: {error.response["Error"].get("Code")}')
+    for robot in robots:
+        make_mailbox(s3, robot)
     return missing
 
 

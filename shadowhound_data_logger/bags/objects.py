@@ -31,14 +31,18 @@ def ros_distro() -> str:
     return os.environ.get('ROS_DISTRO', '')
 
 
-def slice_object(state: BagState, info: SliceInfo, priority: int) -> DataObject:
-    """A closed slice; its messages count in the accounts of the bags, or of the events, whose own priority goes first."""
+def slice_object(state: BagState, info: SliceInfo, priority: int, *, is_kept: bool = False) -> DataObject:
+    """A closed slice; its messages count in the accounts of the bags, or of the events, whose own priority goes first.
+
+    ``is_kept``: it stays on the robot until somebody asks for it, unless it is an event's.
+    """
     is_event = state.event is not None
     file, (start_ns, end_ns) = state.final(info.path.name), _times(state, info.t_start_ns, info.t_end_ns)
     metadata = {
         **_marks(state), words.SLICE: str(slice_number(state.bag, file)), words.MESSAGES: str(info.messages),
         **({words.T_START_NS: str(start_ns), words.T_END_NS: str(end_ns)} if _is_dated(state) else {}),
         **_clock_marks(state, info.t_start_ns, info.t_end_ns),
+        **({words.SHIP: words.ON_REQUEST} if is_kept and not is_event else {}),
     }  # fmt: skip
     return DataObject(
         bucket=BUCKET, key=key_of(state.robot, state.bag, file), body=FileBody(info.path, info.bytes, info.sha256),

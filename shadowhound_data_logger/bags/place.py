@@ -32,12 +32,15 @@ class BagPlace:
     """
 
     def __init__(self, root: Path, robot: str, clock: Clock, writer: SpoolWriter, hold_s: float = 0.0,
-                 offsets: Callable[[], Mapping[str, int]] = dict) -> None:  # fmt: skip
+                 offsets: Callable[[], Mapping[str, int]] = dict, *,
+                 keeps: Callable[[BagState], bool] = lambda _: False) -> None:  # fmt: skip
         """``root`` is the robot's folder of bags; bags go through ``writer`` into its spool, under names that none has there.
 
         ``hold_s`` and ``offsets`` as in ``Dating``: how long a bag waits for its date, and what is known of other boots.
+        ``keeps`` says whether the slices of a bag stay on the robot until somebody asks for them.
         """
         self.root = root
+        self.keeps = keeps
         self.robot = robot
         self.clock = clock
         self.writer = writer

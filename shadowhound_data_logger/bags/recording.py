@@ -270,7 +270,9 @@ class Recording:
             self._place.writer.put(rows=[rows], wait=False)
 
     def _put_slice(self, info: SliceInfo, *rows: RecordingRows) -> None:
-        self._place.writer.put(slice_object(self.state, info, self._settings.priority), rows=rows, wait=False)
+        self._place.writer.put(
+            slice_object(self.state, info, self._settings.priority, is_kept=self._place.keeps(self.state)), rows=rows, wait=False
+        )
 
     def _note_lost(self) -> None:
         """The manifest names what was dropped since the slice before, all of it in or after the newest slice."""

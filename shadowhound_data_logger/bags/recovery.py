@@ -248,7 +248,7 @@ class BagRecovery:
             self._note(state, Missing(path.name, str(error), None))
             return
         rows = state.add_slice(info)
-        item = slice_object(state, info, self._priority)
+        item = slice_object(state, info, self._priority, is_kept=self._place.keeps(state))
         if item.key in self._handed:
             return
         if self._place.spool.knows(item.bucket, item.key, content_sha256(item.body)):

@@ -7,7 +7,7 @@ import logging
 import os
 import sqlite3
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -29,6 +29,7 @@ from shadowhound_data_logger.capture.events import EventBuffer
 from shadowhound_data_logger.capture.front import Front
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.interface import Interface
+from shadowhound_data_logger.capture.keeping import Keeping, keeps_bag
 from shadowhound_data_logger.capture.middleware import Middleware
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_observer import MissionObserver
@@ -45,7 +46,9 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import dated
 from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.options import ON_REQUEST
 from shadowhound_data_logger.ros.reader import endpoints
+from shadowhound_data_logger.ship.requests import RequestServer
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import SINKS
@@ -89,8 +92,7 @@ class Pipeline:
         self._ros = ros
         self._record = record = ClockRecord(settings.spool_path, settings.robot)
         self._clock = ClockWatch(SystemClock.of_this_machine(), settings.clock.hold_s, record.steps)
-        self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot)
-        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, self._clock)
+        self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot, settings.keep)
         self._redating = Redating(self.spool, self._clock, record, settings.robot)
         self._node = ros.node
         self._day = self._today()
@@ -124,10 +126,13 @@ class Pipeline:
         settings = self._settings
         self.writer = SpoolWriter(self.spool)
         self.uploader = Uploader(self.spool, self._store, settings.upload, self.writer.settle)
-        self.writer.on_commit(spooled=self.uploader.wake, settled=self.uploader.settled)
+        self._requests = self._make_request_server()
+        keeps = self._requests is not None
+        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, self._clock, keeps=keeps)
+        self.writer.on_commit(spooled=self.uploader.wake, settled=self._settled if keeps else self.uploader.settled)
         accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         place = BagPlace(settings.home / BAGS / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
-                      self._record.offsets)  # fmt: skip
+                         self._record.offsets, keeps=partial(keeps_bag, settings.bag, settings.keep))  # fmt: skip
         recovery = BagRecovery(place, settings.bag.priority)
         self.event_buffer = EventBuffer(node, settings, place, recovery, types)
         # Who listens to the robot; what is wanted besides the sensors' topics is shared with those further down.
@@ -142,12 +147,12 @@ class Pipeline:
         self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
         self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)
-        marks = self.mission.mark, track.mark, self._redating.date
+        marks = self.mission.mark, track.mark, Keeping(settings.keep, sensors).mark, self._redating.date
         self.pool = EncodePool(settings.robot, queue, sensors, types, self.writer, marks, self.mission.observe)
         self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
                                        self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,
-                                       self._ros.front, self._make_unheard())  # fmt: skip
+                                       self._ros.front, self._make_unheard(), self._requests)  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
         self._commands = Commands(stages, self._parameters, self._status, settings.robot, self._ros.name)
         self._interface = Interface(self._node, self._commands.answer) if not self._ros.middleware.is_foreign else None
@@ -165,6 +170,9 @@ class Pipeline:
         opened.callback(self.uploader.close, 0.5)
         opened.callback(self.mission.close)
         opened.callback(self._finish)
+        if self._requests is not None:
+            self._requests.open()
+            opened.callback(self._requests.close, 1.0)
         if self._interface is not None:
             self._interface.open()
             opened.callback(self._interface.close)
@@ -262,6 +270,20 @@ class Pipeline:
         self.intake.update(settings.sensors)
         self.uploader.set_max_mbps(settings.upload.max_mbps)
         self.event_buffer.update(settings.events)
+
+    def _make_request_server(self) -> RequestServer | None:
+        """None where nothing is kept until somebody asks for it."""
+        settings = self._settings
+        ships = {settings.bag.ship, *(sensor.ship for sensor in settings.sensors)}
+        if ON_REQUEST not in ships and not self.spool.has_kept():
+            return None
+        return RequestServer(self.spool, self._store, settings.keep, settings.robot, self._clock,
+                             put=partial(self.writer.put, wait=False), released=self.uploader.wake)  # fmt: skip
+
+    def _settled(self, ids: Collection[int]) -> None:
+        self.uploader.settled(ids)
+        if self._requests is not None:
+            self._requests.wake()
 
     def _make_unheard(self) -> Unheard | None:
         """None where nobody listens through another RMW beside the node."""

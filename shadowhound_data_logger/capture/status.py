@@ -32,6 +32,7 @@ from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.disk import replacing
+from shadowhound_data_logger.ship.requests import RequestServer
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
 from shadowhound_data_logger.spool.account_rows import Totals
 from shadowhound_data_logger.spool.accounts import BAG, EVENT
@@ -67,12 +68,15 @@ class Stages:
     front: Front | None = None
     unheard: Unheard | None = None
     """None where the node listens through the RMW of the robot."""
+    requests: RequestServer | None = None
+    """None where nothing is kept until somebody asks for it."""
 
     @property
     def workers(self) -> Sequence[Worker]:
         """All threads of the node but the main one."""
         own = [self.intake.worker, self.writer.worker, self.mission.worker, self.control.worker]
         own += [self.front.worker] if self.front is not None else []
+        own += [self.requests.worker] if self.requests is not None else []
         return *own, *self.pool.workers, *self.uploader.workers, *self.recorder.workers, *self.event_buffer.workers
 
 

@@ -84,6 +84,15 @@ class TableSchema:
 
 
 OBJECTS: Final = TableSchema(SENSOR, COLUMNS, REQUIRED, {'shadowhound.catalog': str(FORMAT_VERSION)})
+ON_ROBOT, LOST = 'robot', 'lost'
+"""The values of ``where``."""
+KEPT: Final = TableSchema('_kept', {**COLUMNS, 'where': STRING}, (*REQUIRED, 'where'), {'shadowhound.kept': str(FORMAT_VERSION)})
+"""What robots keep until somebody asks for it: rows as of the catalogue, and ``where`` each object is.
+
+``robot``: on the robot's disk. ``lost``: it was evicted there, or refused. A row of the same object in the catalogue, which says
+that the store has it, supersedes both, and ``lost`` supersedes ``robot``, whatever comes first. Readers of the catalogue that
+know nothing of this table see only what the store has.
+"""
 GAPS_FOLDER: Final = '_gaps'
 """Of the gap journal's parts."""
 
@@ -92,8 +101,8 @@ Row = dict[str, Any]
 
 
 def is_row(bucket: str, key: str) -> bool:
-    """Whether an object belongs into the catalogue: all do but its own files and those of the gap journal."""
-    return bucket != BUCKET or key.split('/')[1:2] not in ([SENSOR], [GAPS_FOLDER])
+    """Whether an object belongs into the catalogue: all do but its own files, those of the gap journal and of what is kept."""
+    return bucket != BUCKET or key.split('/')[1:2] not in ([SENSOR], [GAPS_FOLDER], [KEPT.folder])
 
 
 def date_of(row: Row) -> str:

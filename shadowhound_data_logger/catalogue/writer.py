@@ -17,7 +17,7 @@ from typing import Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue import parts
 from shadowhound_data_logger.catalogue.gaps import GAP, GAPS, WITHDRAWN, Statement, complete, date_of, name_of, statement
-from shadowhound_data_logger.catalogue.schema import BUCKET, OBJECTS, SENSOR, Row, row_of
+from shadowhound_data_logger.catalogue.schema import BUCKET, KEPT, LOST, OBJECTS, ON_ROBOT, SENSOR, Row, TableSchema, row_of
 from shadowhound_data_logger.clock import Clock, utc
 from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.errors import NameRefused
@@ -31,6 +31,9 @@ MOST_ROWS: Final = 2000
 """At a time: 60 ms of CPU, and 10 MB of memory meanwhile. While there are more, the next ones come with the next look."""
 SOON_S: Final = 5.0
 """After a mission: until then its last objects are usually delivered."""
+KEPT_S: Final = 5.0
+"""Between two parts of what is kept: somebody may ask for it as soon as it is known."""
+_WHERE: Final = {'kept': ON_ROBOT, 'lost': LOST}
 PRIORITY: Final = 1
 """As a mission's summary: a part has what the store holds already."""
 
@@ -42,7 +45,8 @@ class CatalogueWriter:
     """
 
     def __init__(self, spool: Path, settings: CatalogueSettings, robot: str, clock: Clock,
-                 monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
+                 monotonic: Callable[[], float] = time.monotonic, *, keeps: bool = False) -> None:  # fmt: skip
+        """``keeps``: objects are kept here until somebody asks for them, and who may ask is told of them soon."""
         self._spool = spool
         self._settings = settings
         self._robot = robot
@@ -52,6 +56,10 @@ class CatalogueWriter:
         self._handed: list[frozenset[int]] = []
         """The ids of the rows of each part that is on its way."""
         self._gaps = _GapParts(spool, robot, clock)
+        self._keeps = keeps
+        self._kept_due_s = monotonic()
+        self._told: list[frozenset[tuple[int, str]]] = []
+        """The same of each part of what is kept."""
 
     def due(self) -> list[DataObject]:
         """The parts of a period that is over, at first of what an earlier process left.
@@ -60,7 +68,10 @@ class CatalogueWriter:
         """
         now_s = self._monotonic()
         if now_s < self._due_s:
-            return []
+            if not self._keeps or now_s < self._kept_due_s:
+                return []
+            self._kept_due_s = now_s + KEPT_S
+            return self._kept_parts()
         made = self.parts()
         if sum(len(part.catalogues) for part in made) < MOST_ROWS and not self._gaps.has_more:
             self._due_s = now_s + self._settings.period_s
@@ -91,15 +102,38 @@ class CatalogueWriter:
         rows = [(item.id, row_of(item.bucket, item.key, item.size, item.content_type, item.metadata)) for item in new]
         made = [self._part(robot, date, found) for robot, date, found in parts.by_folder(rows)]
         self._handed += [frozenset(part.catalogues) for part in made]
-        return [*made, *self._gaps.parts()]
+        return [*made, *self._gaps.parts(), *self._kept_parts()]
 
-    def _part(self, robot: str | None, date: str, found: list[tuple[int, Row]]) -> DataObject:
+    def _kept_parts(self) -> list[DataObject]:
+        """Parts of the table of what is kept, of what is in none yet nor handed out. Raises SpoolError or sqlite3.Error."""
+        if not self._settings.enabled:
+            return []
+        with closing(Index(self._spool / 'index.db', read_only=True)) as index:
+            index.open()
+            listed = index.untold(MOST_ROWS)
+        there = {(item.id, state) for state, item in listed}
+        self._told = [told for told in self._told if told <= there]
+        handed = frozenset[tuple[int, str]]().union(*self._told)
+        new = [(state, item) for state, item in listed if (item.id, state) not in handed]
+        rows = [
+            (place, {**row_of(item.bucket, item.key, item.size, item.content_type, item.metadata), 'where': _WHERE[state]})
+            for place, (state, item) in enumerate(new)
+        ]
+        made = []
+        for robot, date, found in parts.by_folder(rows):
+            told = tuple((new[place][1].id, new[place][0]) for place, _ in found)
+            part = self._part(robot, date, found, KEPT)
+            made.append(replace(part, catalogues=(), tells=told))
+            self._told.append(frozenset(told))
+        return made
+
+    def _part(self, robot: str | None, date: str, found: list[tuple[int, Row]], of: TableSchema = OBJECTS) -> DataObject:
         robot, rows = self._named(robot), [row for _, row in found]
         now_ns = self._clock.wall_ns()
         name = f'{utc(now_ns):%Y%m%dT%H%M%S}_{self._clock.boot_id[:8]}'
         times = [row['t_start_ns'] for row in rows if row['t_start'] is not None] or [now_ns]
         return DataObject(
-            bucket=BUCKET, key=OBJECTS.part_key(robot, date, name), body=parts.encode(rows), content_type=parts.CONTENT_TYPE,
+            bucket=BUCKET, key=of.part_key(robot, date, name), body=parts.encode(rows, of), content_type=parts.CONTENT_TYPE,
             sensor=SENSOR, topic=None, type='', samples=0, t_start_ns=min(times), t_end_ns=max(times), priority=PRIORITY,
             protected=True, metadata={words.ROBOT: robot, words.COUNT: str(len(rows))},
             catalogues=tuple(number for number, _ in found),

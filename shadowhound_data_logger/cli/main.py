@@ -23,6 +23,7 @@ from shadowhound_data_logger.cli.live import live
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.node import node
 from shadowhound_data_logger.cli.output import tell_error
+from shadowhound_data_logger.cli.pull import pull
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.cli.spool import spool
 from shadowhound_data_logger.cli.status import status
@@ -31,7 +32,7 @@ from shadowhound_data_logger.errors import DataLoggerError, SettingError
 SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
     'On every machine': (doctor,),
     'On the robot': (status, ledger, spool, node, live),
-    'On Tower and Spark': (query, fetch, bag, lake, export),
+    'On Tower and Spark': (query, fetch, pull, bag, lake, export),
     'Missions': (missions,),
 }
 """The verbs by who needs them, in the order of the help."""

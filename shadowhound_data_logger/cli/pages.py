@@ -109,6 +109,11 @@ SECTIONS: Final = (
         ('spool.max_bytes', 'spool.min_free_bytes', 'SENSOR.priority', 'spool.remember_days'),
     ),
     Section(
+        'Keep on the robot, and upload what is asked for',
+        'What is `on_request` stays on the disk of the robot until somebody asks for it ([keep](keep.md)).',
+        ('SENSOR.ship', 'bag.ship', 'keep.max_bytes', 'keep.days', 'keep.missions', 'keep.poll_s'),
+    ),
+    Section(
         'Upload fast, or leave the network to others',
         '',
         ('upload.max_mbps', 'upload.threads', 'upload.backoff_s', 'upload.read_timeout_s', 'shutdown.drain_s'),

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from shadowhound_data_logger.catalogue.gaps import GAPS
-from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
+from shadowhound_data_logger.catalogue.schema import KEPT, OBJECTS, TableSchema
 from shadowhound_data_logger.errors import AccessDenied
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
@@ -41,7 +41,7 @@ from shadowhound_data_logger.lake.live_files import (
     robots,
 )
 from shadowhound_data_logger.lake.reading import arrow_schema, whole
-from shadowhound_data_logger.lake.scan import unrepeated
+from shadowhound_data_logger.lake.scan import superseding, unrepeated
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -88,7 +88,7 @@ def compact(  # noqa: PLR0913 - what is handed in
     findings = Findings() if findings is None else findings
     end = before or f'{now():%Y-%m-%d}'
     with ThreadPoolExecutor(THREADS) as pool:
-        for name, of in product([robot] if robot else robots(source), (OBJECTS, GAPS)):
+        for name, of in product([robot] if robot else robots(source), (OBJECTS, GAPS, KEPT)):
             for date in (date for date in dates_of(source, name, findings, of) if date < end):
                 deadline_s = monotonic() + MOST_S
                 for day in days(source, [name], [date], pool, findings, of=of):
@@ -109,7 +109,7 @@ def _merge(source: Bucket, store: ObjectStore, day: Day, of: TableSchema, findin
             return nothing
         sources = frozenset().union(*(day.sources.get(entry.key, {name_of(entry.key)}) for entry in merged))
         key = compacted_key(day.robot, day.date, sources, is_backfilled=day.is_backfilled, of=of)
-        rows = in_order(unrepeated(rows)) if of is OBJECTS else folded(rows).sort_by(_BY_TOPIC)
+        rows = folded(rows).sort_by(_BY_TOPIC) if of is GAPS else in_order(superseding(rows) if of is KEPT else unrepeated(rows))
         body = _encoded(rows, of, sources)
     except MemoryError:
         findings.add(folder_of(day.robot, day.date, of), 'there is not enough memory to compact it')

@@ -116,6 +116,12 @@ def sql(query: str, source: Bucket | None = None, *, findings: Findings | None =
         return daft.sql(query, register_globals=False, **views)
 
 
+def chosen(rows: pa.Table, where: str) -> pa.Table:
+    """The rows for which a condition holds. Raises LakeError for what is not SQL or names no column."""
+    with answering():
+        return daft.from_arrow(rows).where(daft.sql_expr(where)).to_arrow()
+
+
 def default_source(settings: StoreSettings | None = None) -> Bucket:
     """The bucket with the catalogue in the store that the environment names."""
     return Bucket(settings or store_settings(os.environ, home(os.environ)), schema.BUCKET)

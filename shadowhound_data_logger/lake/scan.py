@@ -129,6 +129,20 @@ def unrepeated(table: pa.Table) -> pa.Table:
     return table if len(first) == len(table) else table.take(first.combine_chunks().sort())
 
 
+def superseding(rows: pa.Table, stored: pa.Table | None = None) -> pa.Table:
+    """Of the table of what is kept the rows that count: of an object that is lost its ``lost`` row, of one that is stored none.
+
+    ``stored`` are the keys of the catalogue's rows; without them all are kept that the table itself does not supersede. Whatever
+    is given again, alone or with others, gives what all at once would have given.
+    """
+    if stored is not None and len(stored):
+        rows = rows.join(stored.select(KEY), keys=list(KEY), join_type='left anti').combine_chunks().select(rows.column_names)
+    ordered = rows.sort_by([('bucket', 'ascending'), ('key', 'ascending'), ('where', 'ascending')])  # lost before robot
+    numbered = ordered.append_column('_row', pa.array(range(len(ordered)), pa.int64()))
+    first = numbered.group_by(list(KEY)).aggregate([('_row', 'min')])['_row_min']
+    return ordered if len(first) == len(ordered) else ordered.take(first.combine_chunks().sort())
+
+
 def _columns(pushdowns: Pushdowns) -> tuple[str, ...]:
     """In the order of the schema: those of the answer, and those that a filter looks at."""
     names = arrow_schema().names

@@ -32,6 +32,8 @@ log = logging.getLogger(__name__)
 
 _NO_LINK: Final = frozenset({errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS})
 """Another file system, one without links, or a file of another user: copied."""
+_STAYS: Final = frozenset({State.PENDING, State.HELD, State.KEPT})
+"""States of a new object whose file stays."""
 _UNREADABLE: Final = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EACCES, errno.EIO})
 """The source's own fault: tried again it would bar the way to all that is committed with it."""
 
@@ -122,7 +124,7 @@ class Adding:
 
     def add(self, item: DataObject, *, fits: bool) -> None:
         """Row of one object."""
-        state, reason = (State.HELD, item.held) if item.held else (State.PENDING, None)
+        state, reason = (State.HELD, item.held) if item.held else (State.KEPT if item.is_on_request else State.PENDING, None)
         if not fits and not item.protected:
             state, reason = State.EVICTED, NO_ROOM
         elif not is_staged(self._tree, item.body):
@@ -136,14 +138,14 @@ class Adding:
                 self._add_repeat(replace(item, body=holder.body), key, {**metadata, **holder.said})
                 return
             metadata |= self._repeats.stored(item, key, sha256)
-        if state in {State.PENDING, State.HELD} and isinstance(item.body, bytes):
+        if state in _STAYS and isinstance(item.body, bytes):
             item = self._staged(item)  # it looked like a repeat, of what another process has evicted meanwhile
             self._sync()
         number = self._index.insert(item, key, sha256, state, reason, metadata, self._now_ns)
         if words.GAP_VERSION in item.metadata:
             self._index.gaps.set_told(item.metadata[words.ROBOT], int(item.metadata[words.GAP_VERSION]))
         path = self._tree.part(number)
-        if state in {State.PENDING, State.HELD} and isinstance(item.body, FileBody):
+        if state in _STAYS and isinstance(item.body, FileBody):
             said = description(item, key, sha256, metadata)
             self._taking.append((number, item.body.path, said if said != self._said.get(item.body.path) else None))
             path = self._tree.path(state, reason, item.bucket, key)
@@ -177,7 +179,7 @@ class Adding:
         for item, state in self._added:
             if state is State.PENDING:
                 pending.append(replace(item, path=self._tree.waiting(item.id, item.bucket, item.key)))
-            elif state is State.HELD:
+            elif state in {State.HELD, State.KEPT}:
                 self._tree.place(self._tree.part(item.id), item.path)
         return pending
 

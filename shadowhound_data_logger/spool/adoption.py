@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 GROUP_FILES: Final = 256
 """Files adopted in one transaction: one at a time, 100,000 of them would take minutes of syncing."""
-_IN_SPOOL: Final = frozenset({State.PENDING.value, State.HELD.value, State.QUARANTINED.value})
+_IN_SPOOL: Final = frozenset({State.PENDING.value, State.HELD.value, State.QUARANTINED.value, State.KEPT.value})
 _LARGEST: Final = (1 << 63) - 1
 
 
@@ -143,7 +143,9 @@ def place_said(tree: Tree, part: Path) -> Path | None:
     bucket, key, held = _word(said, 'bucket', ''), _word(said, 'key', ''), _word(said, 'held', '')
     if not _can_be_named(bucket, key) or fingerprint(part)[1] != said.get('sha256'):
         return None
-    place = tree.path(State.HELD if held else State.PENDING, held, bucket, key)
+    metadata = said.get('metadata')
+    is_kept = isinstance(metadata, dict) and metadata.get(words.SHIP) == words.ON_REQUEST
+    place = tree.path(State.HELD if held else State.KEPT if is_kept else State.PENDING, held, bucket, key)
     return None if os.path.lexists(place) else place
 
 

@@ -1,4 +1,4 @@
-"""Binding: gives held objects their final names; from then on they may be shipped.
+"""Binding: gives held objects their final names; from then on they may be shipped, as may kept ones that are released.
 
 All of it is one step in the index. Before its transaction ends the files lie as ``incoming/<id>.part`` and describe themselves as
 what they become, so that a death leaves them where recovery looks for the file of any row: it puts back what was not
@@ -42,8 +42,33 @@ def bind(index: Index, tree: Tree, bindings: Sequence[Binding], now_ns: int) -> 
                 renew(index, row['id'], tree.part(row['id']))
         if before:
             tree.sync_incoming()
-    bound = [row for old in before if (row := index.full_row(old['id'])) is not None]
-    return [spooled(row, tree.waiting(row['id'], row['bucket'], row['key'])) for row in bound]
+    return _placed(index, tree, before)
+
+
+def release(index: Index, tree: Tree, wanted: Sequence[tuple[int, int]]) -> list[SpooledObject]:
+    """Make what is still kept pending, with these priorities. As of ``bind``, which gives the reasons."""
+    before: list[_Row] = []
+    with index.transaction(undo=lambda: _put_back(tree, before)):
+        for number, priority in wanted:
+            row = index.full_row(number)
+            if row is not None and row['state'] == State.KEPT.value and _to_part(tree, row):
+                before.append(row)
+                index.release(number, priority)
+                renew(index, number, tree.part(number))
+        if before:
+            tree.sync_incoming()
+    return _placed(index, tree, before)
+
+
+def _placed(index: Index, tree: Tree, before: Sequence[_Row]) -> list[SpooledObject]:
+    """It is durable: give the files their names; returns what may be shipped."""
+    pending = []
+    for row in (row for old in before if (row := index.full_row(old['id'])) is not None):
+        if row['state'] == State.KEPT.value:
+            tree.place(tree.part(row['id']), tree.path(State.KEPT, None, row['bucket'], row['key']))
+        elif row['state'] == State.PENDING.value:
+            pending.append(spooled(row, tree.waiting(row['id'], row['bucket'], row['key'])))
+    return pending
 
 
 def renew(index: Index, number: int, path: Path) -> None:
@@ -85,12 +110,12 @@ def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:
 
 def _to_part(tree: Tree, row: _Row) -> bool:
     """Whether a held file does not lie under its provisional name any more. One that is gone is the uploader's to notice."""
-    path = _held_path(tree, row)
+    path = _own_path(tree, row)
     return tree.place(path, tree.part(row['id'])) or tree.size(path) is None
 
 
-def _held_path(tree: Tree, row: _Row) -> Path:
-    return tree.path(State.HELD, row['reason'], row['bucket'], row['key'])
+def _own_path(tree: Tree, row: _Row) -> Path:
+    return tree.path(State(row['state']), row['reason'], row['bucket'], row['key'])
 
 
 def _change(index: Index, row: _Row, binding: Binding, now_ns: int) -> None:
@@ -99,7 +124,8 @@ def _change(index: Index, row: _Row, binding: Binding, now_ns: int) -> None:
     created_ns = row['created_ns']
     if created_ns < EARLIEST_SANE_NS <= now_ns:  # spooled before the clock was set: for how long it waits is told from this
         created_ns = binding.t_end_ns if EARLIEST_SANE_NS <= binding.t_end_ns <= now_ns else now_ns
-    index.set_bound(key, binding, metadata, created_ns)
+    state = State.KEPT if metadata.get(words.SHIP) == words.ON_REQUEST else State.PENDING
+    index.set_bound(key, binding, metadata, created_ns, state)
 
 
 def _put_back(tree: Tree, before: Sequence[_Row]) -> None:
@@ -107,7 +133,7 @@ def _put_back(tree: Tree, before: Sequence[_Row]) -> None:
     for row in before:
         with suppress(OSError):
             _describe(tree.part(row['id']), row)
-        tree.place(tree.part(row['id']), _held_path(tree, row))
+        tree.place(tree.part(row['id']), _own_path(tree, row))
 
 
 def _describe(path: Path, row: _Row) -> None:

@@ -5,6 +5,7 @@
     ready/<bucket>/<key>               waits for delivery under its final name
     held/<reason>/<bucket>/<key>       has no final name yet
     quarantine/<reason>/<bucket>/<key> will not be delivered as it is
+    kept/<bucket>/<key>                stays here until somebody asks for it
 
 Each file carries its description as the extended attribute ``user.shadowhound`` where the file system has such, so that
 a lost index can be rebuilt from the tree.
@@ -42,7 +43,8 @@ _PART: Final = re.compile(r'[1-9][0-9]{0,17}\.part')
 _SESSION: Final = re.compile(r'[1-9][0-9]{0,17}')
 _BODY: Final = re.compile(r'([1-9][0-9]{0,17})-[0-9a-f]{32}\.body')
 """Of a file at a time: it may be larger than the memory."""
-_FOLDERS: Final = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine'}
+_FOLDERS: Final = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine', State.KEPT: 'kept'}
+_WITHOUT_REASON: Final = frozenset({State.PENDING, State.KEPT})
 
 
 class Tree:
@@ -71,7 +73,7 @@ class Tree:
 
     def path(self, state: State, reason: str | None, bucket: str, key: str) -> Path:
         """Where the bytes of an object in this state lie; they lie nowhere once it is delivered or evicted."""
-        reasons = () if state is State.PENDING else (_UNSAFE.sub('_', reason or '') or 'unknown',)
+        reasons = () if state in _WITHOUT_REASON else (_UNSAFE.sub('_', reason or '') or 'unknown',)
         return self.root.joinpath(_FOLDERS[state], *reasons, bucket, key)
 
     def new_body(self, session: int) -> Path:
@@ -172,10 +174,10 @@ class Tree:
         """(session, path) of every file that is about to become a part."""
         return ((int(found[1]), path) for path in sorted(self.incoming.iterdir()) if (found := _BODY.fullmatch(path.name)))
 
-    def is_ready(self, bucket: str, key: str, size: int) -> bool:
-        """Whether the file of a pending object lies whole in its place; without a Path, for a start asks it of each one."""
+    def is_in_place(self, state: State, bucket: str, key: str, size: int) -> bool:
+        """Whether the file of a pending or kept object lies whole in its place; without a Path: a start asks it of each one."""
         try:
-            status = os.lstat(f'{self.root}/{_FOLDERS[State.PENDING]}/{bucket}/{key}')
+            status = os.lstat(f'{self.root}/{_FOLDERS[state]}/{bucket}/{key}')
         except (FileNotFoundError, NotADirectoryError):
             return False
         return status.st_size == size and stat.S_ISREG(status.st_mode)
@@ -194,7 +196,7 @@ class Tree:
         """
         for state, name in _FOLDERS.items():
             folder = self.root / name
-            depth = 1 if state is State.PENDING else 2
+            depth = 1 if state in _WITHOUT_REASON else 2
             for parent, _, names in os.walk(folder):
                 relative = Path(parent).relative_to(folder).parts
                 if not names or len(relative) < depth:

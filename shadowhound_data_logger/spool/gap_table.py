@@ -230,7 +230,20 @@ class GapTable:
             query = "SELECT topic FROM tally WHERE state IN ('pending', 'held') AND samples > 0"
             for (account,) in self._db.execute(query):
                 waiting.setdefault(account, 0)
+        for account, stamp in self._kept():
+            waiting[account] = min(stamp, waiting.get(account, stamp))
         return waiting
+
+    def _kept(self) -> Iterator[tuple[str, int]]:
+        """Account -> about the first stamp of what is kept here: of that, nothing is in the store."""
+        there = [account for (account,) in self._db.execute("SELECT topic FROM tally WHERE state = 'kept' AND samples > 0")]
+        if not there:
+            return
+        oldest = dict(self._db.execute(
+            'SELECT ifnull(contents.topic, one.topic), min(t_start_ns) FROM (SELECT id, topic, t_start_ns FROM objects'  # noqa: S608
+            f" INDEXED BY kept WHERE state = 'kept' ORDER BY id LIMIT {MOST_WAITING})"
+            ' AS one LEFT JOIN contents USING (id) GROUP BY 1').fetchall())  # fmt: skip
+        yield from ((account, oldest.get(account, 0)) for account in there)
 
     def _values(self, state: str, column: str) -> Iterator[str]:
         """Those that a column of objects in a state has, by one step in the index for each."""

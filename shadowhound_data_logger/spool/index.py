@@ -38,6 +38,7 @@ from shadowhound_data_logger.model import (
 )
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.gap_table import GapTable
+from shadowhound_data_logger.spool.request_table import RequestTable
 from shadowhound_data_logger.spool.schema import (
     CATALOGUE,
     IMPLAUSIBLE,
@@ -57,7 +58,10 @@ COMPACT_STATES: Final = (State.DELIVERED, State.DEDUPLICATED, State.EVICTED)
 BUSY_TIMEOUT_S: Final = 10.0
 MISSING: Final = 'missing'
 """Reason of a quarantined object whose file is gone."""
-_IN_SPOOL: Final = "state IN ('pending', 'held', 'quarantined')"
+_IN_SPOOL: Final = "state IN ('pending', 'held', 'quarantined', 'kept')"
+_MAY_GO: Final = """state = 'kept' AND NOT protected
+  AND NOT EXISTS (SELECT 1 FROM requested WHERE requested.id = objects.id AND outcome IN ('kept', 'pending'))"""
+"""What is kept, and nobody is waiting for."""
 _IN_SPOOL_COUNTED: Final = f"""
 SELECT ifnull(topic, '') AS name, state, count(*), sum(bytes), sum(samples) FROM objects WHERE {_IN_SPOOL} GROUP BY name, state
 UNION ALL SELECT contents.topic, state, 0, 0, sum(contents.samples) FROM contents JOIN objects USING (id)
@@ -147,6 +151,11 @@ class Index:
     def gaps(self) -> GapTable:
         """The gap journal in it."""
         return GapTable(self._db)
+
+    @property
+    def requests(self) -> RequestTable:
+        """What was asked for of what is kept."""
+        return RequestTable(self._db)
 
     @property
     def is_current(self) -> bool:
@@ -274,11 +283,11 @@ class Index:
         return found + below
 
     def in_spool(self) -> list[sqlite3.Row]:
-        """Rows of what is pending, held or quarantined, as it was spooled."""
+        """Rows of what is pending, held, kept or quarantined, as it was spooled."""
         return self._rows(f'{_IN_SPOOL} ORDER BY id')
 
     def is_in_spool(self, number: int) -> bool:
-        """Whether an object is pending, held or quarantined."""
+        """Whether an object is pending, held, kept or quarantined."""
         return bool(self._rows(f'id = ? AND {_IN_SPOOL}', (number,)))
 
     def is_quarantined(self, number: int) -> bool:
@@ -289,7 +298,7 @@ class Index:
         return self._rows("state = 'quarantined' AND reason = ifnull(?, reason) AND reason <> ? ORDER BY id", (reason, MISSING))
 
     def keys_in_spool(self, bucket: str, prefix: str) -> frozenset[str]:
-        """Keys that begin so, of what is pending, held or quarantined and whose file is not known to be gone."""
+        """Keys that begin so, of what is pending, held, kept or quarantined and whose file is not known to be gone."""
         rows = self._db.execute(
             f'SELECT key FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND {_IN_SPOOL} AND reason IS NOT ?',  # noqa: S608
             (bucket, prefix, _after(prefix), MISSING),
@@ -307,7 +316,7 @@ class Index:
         return {**dict(row), 'counts': counts}
 
     def listed(self, state: State | None, sensor: str | None, prefix: str) -> Iterator[tuple[Any, ...]]:
-        """(bucket, key, sensor, state, reason, bytes, created_ns) of what is pending, held or quarantined, as it was spooled.
+        """(bucket, key, sensor, state, reason, bytes, created_ns) of what is in the spool, as it was spooled.
 
         ``prefix`` is how ``bucket/key`` begins.
         """
@@ -352,9 +361,9 @@ class Index:
         Only what is still in the spool moves, but for one case: an object that was evicted while it was on its way, and
         that the store confirmed all the same, is delivered.
         """
-        movable = (State.PENDING, State.HELD, State.EVICTED if state is State.DELIVERED else State.HELD)
+        movable = (State.PENDING, State.HELD, State.KEPT, State.EVICTED if state is State.DELIVERED else State.HELD)
         self._db.executemany(
-            'UPDATE objects SET state = ?, reason = ?, settled_ns = ? WHERE id = ? AND state IN (?, ?, ?)',
+            'UPDATE objects SET state = ?, reason = ?, settled_ns = ? WHERE id = ? AND state IN (?, ?, ?, ?)',
             ((state.value, reason, now_ns, number, *(each.value for each in movable)) for number in ids),
         )
 
@@ -367,12 +376,12 @@ class Index:
         return [HeldObject(number, bucket, key, json.loads(metadata), start_ns, end_ns, created_ns)
                 for number, bucket, key, metadata, start_ns, end_ns, created_ns in rows]  # fmt: skip
 
-    def set_bound(self, key: str, binding: Binding, metadata: Mapping[str, str], created_ns: int) -> None:
-        """A held object waits for delivery under its final key."""
+    def set_bound(self, key: str, binding: Binding, metadata: Mapping[str, str], created_ns: int, state: State) -> None:
+        """A held object has its final key: it waits for delivery, or is kept."""
         self._db.execute(
-            "UPDATE objects SET state = 'pending', reason = NULL, key = ?, metadata = ?, t_start_ns = ?, t_end_ns = ?,"
+            'UPDATE objects SET state = ?, reason = NULL, key = ?, metadata = ?, t_start_ns = ?, t_end_ns = ?,'
             ' created_ns = ? WHERE id = ?',
-            (key, json.dumps(dict(metadata)), binding.t_start_ns, binding.t_end_ns, created_ns, binding.id),
+            (state.value, key, json.dumps(dict(metadata)), binding.t_start_ns, binding.t_end_ns, created_ns, binding.id),
         )
 
     def pending(self, limit: int, *, oldest: bool, without: Sequence[str] = ()) -> list[sqlite3.Row]:
@@ -421,8 +430,22 @@ class Index:
         where = "state IN ('pending', 'held') AND NOT protected"
         return dict(self._db.execute(f'SELECT priority, sum(bytes) FROM objects WHERE {where} GROUP BY priority'))  # noqa: S608
 
+    def may_go(self, limit: int, before_ns: int | None = None) -> list[sqlite3.Row]:
+        """What is kept and nobody asked for, the oldest first; only what was spooled before then, where that is given."""
+        before = '' if before_ns is None else 'AND created_ns < ?'
+        return self._rows(f'{_MAY_GO} {before} ORDER BY id LIMIT ?', (*(() if before_ns is None else (before_ns,)), limit))
+
+    def kept_bytes(self) -> int:
+        """Of all that stays here until somebody asks for it."""
+        return int(self._db.execute("SELECT ifnull(sum(bytes), 0) FROM tally WHERE state = 'kept'").fetchone()[0])
+
+    def release(self, number: int, priority: int) -> bool:
+        """A kept object waits for delivery, with this priority, and is not evicted any more; whether it was kept."""
+        query = "UPDATE objects SET state = 'pending', protected = 1, priority = ? WHERE id = ? AND state = 'kept'"
+        return self._db.execute(query, (priority, number)).rowcount > 0
+
     def payload_bytes(self) -> int:
-        """Bytes of all payload that lies in the spool: files that went missing take no room."""
+        """Bytes of all payload that lies in the spool, without what is kept: files that went missing take no room."""
         present = "SELECT ifnull(sum(bytes), 0) FROM tally WHERE state IN ('pending', 'held', 'quarantined')"
         missing = "SELECT ifnull(sum(bytes), 0) FROM objects WHERE state = 'quarantined' AND reason = 'missing'"
         return int(self._db.execute(f'SELECT ({present}) - ({missing})').fetchone()[0])
@@ -435,7 +458,7 @@ class Index:
         """The files of these objects are gone, whoever took them; returns for how many that is new."""
         cursor = self._db.executemany(
             "UPDATE objects SET state = 'quarantined', reason = 'missing', settled_ns = ? WHERE id = ?"
-            " AND state IN ('pending', 'held', 'quarantined')", ((now_ns, number) for number in ids),
+            " AND state IN ('pending', 'held', 'quarantined', 'kept')", ((now_ns, number) for number in ids),
         )  # fmt: skip
         return max(cursor.rowcount, 0)
 
@@ -455,7 +478,8 @@ class Index:
         rows = self._db.execute(
             'SELECT id, bucket, key, sensor, state, bytes, sha256, settled_ns FROM objects INDEXED BY settled'
             " WHERE state IN ('delivered', 'deduplicated', 'evicted') AND settled_ns < ?"
-            ' AND NOT EXISTS (SELECT 1 FROM uncatalogued WHERE uncatalogued.id = objects.id) ORDER BY settled_ns LIMIT ?',
+            ' AND NOT EXISTS (SELECT 1 FROM uncatalogued WHERE uncatalogued.id = objects.id)'
+            ' AND NOT EXISTS (SELECT 1 FROM untold WHERE untold.id = objects.id) ORDER BY settled_ns LIMIT ?',
             (before_ns, COMPACT_STEP),
         ).fetchall()
         folders: dict[tuple[str, str, str], int] = {}
@@ -516,10 +540,30 @@ class Index:
         self._db.executemany('DELETE FROM uncatalogued WHERE id = ?', ((number,) for number in ids))
         return True
 
+    def untold(self, limit: int) -> list[tuple[str, UncataloguedObject]]:
+        """What the table of what is kept lacks: ``kept`` or ``lost``, and the object; the oldest first."""
+        rows = self._db.execute(
+            'SELECT untold.state, id, bucket, key, bytes, content_type, metadata FROM untold JOIN objects USING (id)'
+            ' ORDER BY id LIMIT ?', (limit,),
+        )  # fmt: skip
+        return [(state, UncataloguedObject(number, bucket, key, size, content_type, json.loads(metadata)))
+                for state, number, bucket, key, size, content_type, metadata in rows]  # fmt: skip
+
+    def take_untold(self, told: Collection[tuple[int, str]]) -> bool:
+        """As ``take_uncatalogued``, of rows of the table of what is kept."""
+        if not told:
+            return True
+        query = 'SELECT count(*) FROM untold WHERE id = ? AND state = ?'
+        if not all(self._db.execute(query, each).fetchone()[0] for each in told):
+            return False
+        self._db.executemany('DELETE FROM untold WHERE id = ? AND state = ?', told)
+        return True
+
     def clear_uncatalogued(self) -> None:
-        """No part will have what is delivered by now, nor the gaps."""
+        """No part will have what is delivered or kept by now, nor the gaps."""
         with self.transaction():
             self._db.execute('DELETE FROM uncatalogued')
+            self._db.execute('DELETE FROM untold')
             self.gaps.set_all_told()
 
     def has_waiting(self, bucket: str, prefix: str, *, sensor: str, priority: int) -> bool:

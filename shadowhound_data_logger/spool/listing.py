@@ -15,7 +15,7 @@ from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 
-HERE: Final = (State.PENDING, State.HELD, State.QUARANTINED)
+HERE: Final = (State.PENDING, State.HELD, State.QUARANTINED, State.KEPT)
 """States of objects whose bytes lie in the spool."""
 
 

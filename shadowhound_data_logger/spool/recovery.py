@@ -136,18 +136,19 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
         if state is State.QUARANTINED and row['reason'] == MISSING:
             continue
         json.loads(row['metadata'])  # damage that SQLite does not see; later it would stop all delivery
-        if state is State.PENDING and tree.is_ready(row['bucket'], row['key'], row['bytes']):
+        if state in {State.PENDING, State.KEPT} and tree.is_in_place(state, row['bucket'], row['key'], row['bytes']):
             continue
         path = where = tree.path(state, row['reason'], row['bucket'], row['key'])
         if tree.size(path) is None:
             # Last its own place again: another process may just have moved it there.
-            places = (tree.part(row['id']), tree.path(State.PENDING, None, row['bucket'], row['key']), path)
+            ready, kept = (tree.path(of, None, row['bucket'], row['key']) for of in (State.PENDING, State.KEPT))
+            places = (tree.part(row['id']), ready, kept, path)
             found = next((place for place in places if tree.size(place) is not None), None) or staged.pop_content(row)
             if found is None:
                 missing.append(row['id'])
                 continue
             where = found
-            if state is State.QUARANTINED and found == places[1] and tree.size(found) == row['bytes']:
+            if state is State.QUARANTINED and found == ready and tree.size(found) == row['bytes']:
                 # Moved there by hand, to be tried again; or quarantined when the power went, and then a try costs nothing.
                 with index.transaction():
                     index.set_found(row['id'])

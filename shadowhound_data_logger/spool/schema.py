@@ -7,6 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.gaps import FORGOTTEN, UNTIMED
@@ -114,6 +115,51 @@ CREATE TABLE missing (
 ``owner`` is the robot's name, of the node, or that of ``bag record``.
 """
 _LOST: Final = f"('{State.EVICTED.value}', '{State.QUARANTINED.value}')"
+_IS_ON_REQUEST: Final = (
+    f"CASE WHEN json_valid(NEW.metadata) THEN json_extract(NEW.metadata, '$.{words.SHIP}') = '{words.ON_REQUEST}' ELSE 0 END"
+)
+_KEEP: Final = f"""
+CREATE INDEX kept ON objects (id, bytes) WHERE state = 'kept';
+CREATE TABLE untold (id INTEGER NOT NULL, state TEXT NOT NULL, PRIMARY KEY (id, state)) WITHOUT ROWID;
+CREATE TRIGGER kept_here AFTER INSERT ON objects WHEN NEW.state = 'kept' BEGIN
+  INSERT OR IGNORE INTO untold VALUES (NEW.id, 'kept');
+END;
+CREATE TRIGGER kept_again AFTER UPDATE OF state ON objects WHEN NEW.state = 'kept' AND OLD.state <> NEW.state BEGIN
+  INSERT OR IGNORE INTO untold VALUES (NEW.id, 'kept');
+END;
+CREATE TRIGGER kept_lost AFTER UPDATE OF state ON objects
+    WHEN NEW.state IN {_LOST} AND OLD.state <> NEW.state AND {_IS_ON_REQUEST} BEGIN
+  INSERT OR IGNORE INTO untold VALUES (NEW.id, 'lost');
+END;
+CREATE TRIGGER kept_forgotten AFTER DELETE ON objects BEGIN
+  DELETE FROM untold WHERE id = OLD.id;
+END;
+CREATE TABLE requests (
+  id TEXT NOT NULL PRIMARY KEY, requester TEXT NOT NULL, priority INTEGER NOT NULL, made_ns INTEGER NOT NULL,
+  expires_ns INTEGER NOT NULL, received_ns INTEGER NOT NULL, wanted TEXT NOT NULL, state TEXT NOT NULL, why TEXT NOT NULL,
+  objects INTEGER NOT NULL, bytes INTEGER NOT NULL, answers INTEGER NOT NULL, told TEXT NOT NULL, told_ns INTEGER NOT NULL)
+  WITHOUT ROWID;
+CREATE TABLE requested (
+  request TEXT NOT NULL, id INTEGER NOT NULL, bytes INTEGER NOT NULL, outcome TEXT NOT NULL,
+  PRIMARY KEY (request, id)) WITHOUT ROWID;
+CREATE INDEX requested_objects ON requested (id);
+CREATE TRIGGER answered AFTER UPDATE OF state ON objects
+    WHEN OLD.state <> NEW.state AND EXISTS (SELECT 1 FROM requested WHERE requested.id = NEW.id) BEGIN
+  UPDATE requested SET outcome = NEW.state WHERE id = NEW.id;
+END;
+"""  # noqa: S608 - own constants only
+"""What stays on the robot until somebody asks for it, and who asked (request_table.py).
+
+``untold`` are the rows that the table of what is kept in the store lacks: (id, ``kept`` or ``lost``).
+"""
+_KEPT_IS_A_STATE: Final = f"""
+PRAGMA writable_schema = ON;
+UPDATE sqlite_master SET sql = replace(sql, '''deduplicated'')', '''deduplicated'', ''kept'')')
+  WHERE type = 'table' AND name = 'objects';
+PRAGMA writable_schema = RESET;
+{_KEEP}
+"""  # noqa: S608 - own constants only
+"""One more value that a CHECK allows changes no row (https://www.sqlite.org/lang_altertable.html#otheralter)."""
 
 
 def _gap_of(row: str, topic: str, samples: str) -> str:
@@ -291,6 +337,7 @@ CREATE TABLE sessions (
 {_COMPACT_OBJECTS}
 {_GAPS_TOLD}
 {_RECORDINGS}
+{_KEEP}
 PRAGMA user_version = {SCHEMA_VERSION};
 """  # noqa: S608 - own constants only
 MIGRATIONS: Final = {
@@ -299,7 +346,7 @@ MIGRATIONS: Final = {
     3: _OTHER_TYPES,
     4: f'{_ESTIMATES} {_REGRADED}',
     5: _JOURNALED,
-    6: f'{_COMPACTED} {_RECORDINGS}',
+    6: f'{_COMPACTED} {_RECORDINGS} {_KEPT_IS_A_STATE}',
 }
 """Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
 _AS_NOW: Final = """
@@ -375,13 +422,16 @@ _NUMBERS: Final = {
     'compact_objects': ('folder', 'id', 'state', 'bytes', 'settled_s'),
     'gaps_told': ('version', 'again'),
     'recordings': (),
+    'untold': ('id',),
+    'requests': ('priority', 'made_ns', 'expires_ns', 'received_ns', 'objects', 'bytes', 'answers', 'told_ns'),
+    'requested': ('id', 'bytes'),
     'slices': ('number', 'bytes', 't_start_ns', 't_end_ns', 'messages'),
     'missing': ('place', 'messages'),
     'sqlite_sequence': ('seq',),
 }
 _COUNTS: Final = frozenset({'id', 'samples', 'bytes', 'received', 'skipped', 'stored', 'published', 'objects', 'seq', 'session',
                             'messages', 'estimated', 'unknown', 'count', 'merged', 'version', 'folder', 'again', 'number',
-                            'place'})  # fmt: skip
+                            'place', 'answers'})  # fmt: skip
 """Never below 0, and no more than can be counted. Times and the numbers of messages are whatever a publisher says."""
 _MOST: Final = 1 << 53
 _TEXTS: Final = {
@@ -399,12 +449,16 @@ _TEXTS: Final = {
     'compact_objects': ('name',),
     'gaps_told': ('robot',),
     'recordings': ('owner', 'folder', 'said', 'channels'),
+    'untold': ('state',),
+    'requests': ('id', 'requester', 'wanted', 'state', 'why', 'told'),
+    'requested': ('request', 'outcome'),
     'slices': ('owner', 'folder', 'sha256', 'counts'),
     'missing': ('owner', 'folder', 'file', 'what', 'topic', 'reason'),
     'sqlite_sequence': ('name',),
 }
 _JSON: Final = {
     'accounts': ('rejected', 'dropped'), 'publishers': ('missed',), 'estimates': ('missed',), 'objects': ('metadata',),
+    'requests': ('wanted',),
 }  # fmt: skip
 _UNSAFE: Final = (
     "length(key) > 1024 OR length(bucket) > 64 OR bucket GLOB '*[^A-Za-z0-9_.-]*' OR bucket IN ('', '.', '..')"

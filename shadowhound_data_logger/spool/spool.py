@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.clock import SECOND, Clock
-from shadowhound_data_logger.config import SpoolSettings
+from shadowhound_data_logger.config import KeepSettings, SpoolSettings
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, RecordingRows, SpooledObject, State
@@ -35,7 +35,8 @@ from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index, lost, spooled
 from shadowhound_data_logger.spool.recovery import any_alive, open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
-from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, fits, make_room
+from shadowhound_data_logger.spool.request_table import KeptObject, Progress, RequestRow
+from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, evict_old, fits, make_room
 from shadowhound_data_logger.spool.session import Session, carry
 from shadowhound_data_logger.spool.usage import SpoolUsage, usage_of
 
@@ -50,6 +51,7 @@ FULL_ROWS_NS: Final = 3600 * SECOND
 """For so long the index keeps all that it knows of an object that left the spool; then its key, size, checksum and state."""
 MOST_OBJECTS: Final = 32
 """To be committed at a time: their rows take some 5 ms, for which other processes wait."""
+KEEP: Final = KeepSettings()
 LAST: Final = '\x7f'
 """After everything that a key has."""
 _LEFT: Final = frozenset({State.DELIVERED, State.DEDUPLICATED, State.EVICTED})
@@ -63,11 +65,12 @@ class Spool:
     ``_lock`` guards the writing connection and makes a commit and its renames one step for ``pending``.
     """
 
-    def __init__(self, root: Path, settings: SpoolSettings, clock: Clock, robot: str) -> None:
+    def __init__(self, root: Path, settings: SpoolSettings, clock: Clock, robot: str, keep: KeepSettings = KEEP) -> None:
         self.root = root
         self.accounts = Accounts()
         self.recovery = Recovery()
         self._settings = settings
+        self._keep = keep
         self._clock = clock
         self._robot = robot
         self._tree = Tree(root)
@@ -236,6 +239,64 @@ class Spool:
         with flock(self.root / 'recovery.lock'), self._lock:
             return self._ballast.work(lambda: binding.bind(self._index, self._tree, bindings, self._clock.wall_ns()))
 
+    # -- what is kept until somebody asks for it -------------------------------------------------------------------
+
+    @property
+    def unkept(self) -> int:
+        """Objects that this process could not keep, because nothing that is kept may be evicted."""
+        return self._shortage.unkept
+
+    def has_kept(self) -> bool:
+        """Whether anything is kept, or anybody waits for an answer; waits for no commit. Raises sqlite3.Error."""
+        return self._view.kept_bytes() > 0 or bool(self._view.requests.open_ids())
+
+    def requests(self) -> list[RequestRow]:
+        """All that is known of what was asked for; waits for no commit. Raises sqlite3.Error."""
+        return self._view.requests.rows()
+
+    def progress(self, request: str) -> Progress:
+        """What became of what a request found; waits for no commit. Raises sqlite3.Error."""
+        return self._view.requests.progress(request)
+
+    def next_requested(self, request: str, limit: int) -> list[tuple[int, int]]:
+        """(id, bytes) of what a request still waits for and nobody has released, the oldest first. Raises sqlite3.Error."""
+        return self._view.requests.waiting(request, limit)
+
+    def released(self) -> tuple[int, int]:
+        """Requested objects that wait for delivery, and their bytes. Raises sqlite3.Error."""
+        return self._view.requests.released()
+
+    def kept(self) -> Iterator[KeptObject]:
+        """What is kept of this robot, and what was released and is on its way. Waits for no commit; raises sqlite3.Error."""
+        with closing(Index(self.root / 'index.db', read_only=True)) as index:
+            index.open()
+            yield from index.requests.here(self._robot)
+
+    def accept(self, row: RequestRow, chosen: Iterable[int]) -> RequestRow:
+        """Make a request a row, with what it chose of what is kept; returns the row as it is then. Raises as ``commit``."""
+        with self._lock, self._index.transaction():
+            return self._index.requests.accept(row, chosen)
+
+    def close_request(self, request: str, state: str, why: str = '') -> None:
+        """End a request; what it has not released is free to go. Raises as ``commit``."""
+        with self._lock, self._index.transaction():
+            self._index.requests.close(request, state, why)
+
+    def forget_requests(self, before_ns: int) -> None:
+        """Drop those that were answered before then. Raises as ``commit``."""
+        with self._lock, self._index.transaction():
+            self._index.requests.forget(before_ns)
+
+    def release(self, wanted: Sequence[tuple[int, int]]) -> list[SpooledObject]:
+        """Let kept objects (id, priority) wait for delivery, all or none. As ``bind``, what is not kept any more is left out."""
+        with flock(self.root / 'recovery.lock'), self._lock:
+            return self._ballast.work(lambda: binding.release(self._index, self._tree, wanted))
+
+    def evict_old(self) -> int:
+        """Evict what was kept for long enough, some of it at a time; returns how many objects. Raises OSError, sqlite3.Error."""
+        with self._lock:
+            return evict_old(self._index, self._tree, self._keep, self._clock.wall_ns())
+
     def pending_count(self) -> int:
         """Waits for no commit."""
         return sum(row[2] for row in self._view.tally() if row[1] == State.PENDING.value)
@@ -334,7 +395,7 @@ class Spool:
                 rows: Sequence[RecordingRows]) -> list[SpooledObject]:  # fmt: skip
         now_ns = self._clock.wall_ns()
         leaving = sum(outcome.item.size + OVERHEAD_BYTES for outcome in outcomes if outcome.state is not State.QUARANTINED)
-        room = make_room(self._index, self._tree, self._settings, objects, leaving, now_ns)
+        room = make_room(self._index, self._tree, self._settings, self._keep, objects, leaving, now_ns)
         self._shortage.note(room, now_ns)
         stored = _count(objects)
         snapshot = self.accounts.snapshot(stored)
@@ -344,7 +405,7 @@ class Spool:
                 staged_objects = adding.stage(objects, room.given_up)
                 with self._index.transaction(undo=adding.discard):
                     for place, item in enumerate(staged_objects):
-                        if self._index.take_uncatalogued(item.catalogues):
+                        if self._takes(item):
                             adding.add(item, fits=place not in room.given_up)
                     for outcome in outcomes:
                         self._index.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
@@ -359,6 +420,13 @@ class Spool:
                 raise
             self.accounts.store(stored)
             return adding.place()
+
+    def _takes(self, item: DataObject) -> bool:
+        """Whether nothing else says what an object of bookkeeping says; in the transaction with its row."""
+        index = self._index
+        if item.answers is not None and not index.requests.take_answer(*item.answers, self._clock.wall_ns()):
+            return False
+        return index.take_uncatalogued(item.catalogues) and index.take_untold(item.tells)
 
     def _settle(self, outcomes: Iterable[Outcome]) -> None:
         """Let the files follow their rows."""

@@ -38,6 +38,7 @@ _TOPIC: Final[dict[str, Any]] = {
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
     'spool': {'path': '', 'pending': 0, 'held': 0, 'quarantined': 0, 'evicted': 0, 'bytes': 0, 'max_bytes': None,
+              'kept': 0, 'kept_bytes': 0,
               'free_bytes': None, 'oldest_age_s': None, 'min_free_bytes': None, 'remember_days': None},
     'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
               'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},

@@ -19,11 +19,14 @@ class SpoolUsage:
     held: int
     quarantined: int
     bytes: int
-    """Payload on disk."""
+    """Payload on disk, without what is kept."""
     free_bytes: int
     """Left on the file system."""
     oldest_age_s: float | None
     """How long the oldest pending object has waited; None when none waits, or it was spooled before the clock was set."""
+    kept: int = 0
+    """Objects that stay here until somebody asks for them."""
+    kept_bytes: int = 0
 
 
 def usage_of(index: Index, folder: Path, now_ns: int) -> SpoolUsage:
@@ -34,4 +37,5 @@ def usage_of(index: Index, folder: Path, now_ns: int) -> SpoolUsage:
     age_s = None if oldest_ns is None or unknown else max(0.0, round((now_ns - oldest_ns) / SECOND, 1))
     disk = os.statvfs(folder)
     return SpoolUsage(count[State.PENDING], count[State.HELD], count[State.QUARANTINED], index.payload_bytes(),
-                 disk.f_bavail * disk.f_frsize, age_s)  # fmt: skip
+                 disk.f_bavail * disk.f_frsize, age_s, count[State.KEPT],
+                 sum(row[3] for row in tally if row[1] == State.KEPT.value))  # fmt: skip

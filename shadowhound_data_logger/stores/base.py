@@ -78,6 +78,15 @@ class ObjectStore(Protocol):
     def content(self, bucket: str, key: str, start: int = 0) -> Content:
         """The content from ``start`` on."""
 
+    def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
+        """The whole content and its version (an ETag); None where it has this version still. As ``get`` otherwise."""
+
+    def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
+        """Put other content in the place of this version; False where another one is there meanwhile. The key must exist.
+
+        The one thing that is ever overwritten: a mailbox. Raises ObjectRefused (``missing``) where there is no such object.
+        """
+
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
         """The objects whose keys begin so, in key order, without ``sha256`` and metadata; none where there is no such bucket."""
 

@@ -7,6 +7,7 @@ survives ``cp``, ``tar`` and any file system, and unlike a file beside the objec
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import uuid
@@ -99,6 +100,22 @@ class DirectoryStore:
     def content(self, bucket: str, key: str, start: int = 0) -> Content:
         with self._reading(bucket, key):
             return Content(self._info(bucket, key), self._pieces(bucket, key, start))
+
+    def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
+        body = self.get(bucket, key, most)
+        found = hashlib.sha256(body).hexdigest()
+        return None if found == version else (body, found)
+
+    def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
+        with self._reading(bucket, key), flock(self._directory / PARTS / 'replace.lock', mode=0o666):
+            if hashlib.sha256(self._path(bucket, key).read_bytes()).hexdigest() != version:
+                return False
+            with self._part() as part:
+                _write(part, iter((body,)))
+                self._beside(bucket, key).unlink(missing_ok=True)
+                part.replace(self._path(bucket, key))
+            sync(self._path(bucket, key).parent)
+        return True
 
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
         folder = prefix.rpartition('/')[0]

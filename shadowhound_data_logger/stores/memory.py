@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime, timezone
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bandwidth import Pace
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.stores.base import Content, joined
+from shadowhound_data_logger.stores.base import Content, joined, too_large
 from shadowhound_data_logger.stores.content import (
     CHUNK_BYTES,
     check_read,
@@ -75,6 +77,28 @@ class MemoryStore:
     def content(self, bucket: str, key: str, start: int = 0) -> Content:
         info, body = self._held(bucket, key)
         return Content(info, (body[place : place + CHUNK_BYTES] for place in range(start, len(body), CHUNK_BYTES)))
+
+    def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
+        self._fail(None)
+        info, body = self._held(bucket, key)
+        if info.etag == version:
+            return None
+        if len(body) > most:
+            raise too_large(bucket, key, most)
+        return body, info.etag
+
+    def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
+        self._fail(None)
+        self._held(bucket, key)
+        sha256 = hashlib.sha256(body).hexdigest()
+        with self._lock:
+            held, _ = self._objects[bucket, key]
+            if held.etag != version:
+                return False
+            metadata = {**held.metadata, words.SHA256: sha256}
+            new = dataclasses.replace(held, size=len(body), sha256=sha256, metadata=metadata, etag=sha256)
+            self._objects[bucket, key] = new, body
+        return True
 
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
         with self._lock:

@@ -104,6 +104,14 @@ class S3Store:
         check_read(bucket, key)
         return self._asking(lambda: self._s3.content(bucket, key, start))
 
+    def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
+        check_read(bucket, key)
+        return self._asking(lambda: self._s3.changed(bucket, key, version, most))
+
+    def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
+        check_target(bucket, key)
+        return self._asking(lambda: self._s3.replace(bucket, key, body, version))
+
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
         check_read(bucket, 'any')
         yield from sorted(self._s3.list(bucket, prefix), key=attrgetter('key'))

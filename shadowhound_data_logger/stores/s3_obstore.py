@@ -130,6 +130,12 @@ class ObstoreStore:
 
         return self._ask(bucket, key, read)
 
+    def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
+        return self._plain.changed(bucket, key, version, most)
+
+    def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
+        return self._plain.replace(bucket, key, body, version)
+
     def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
         folder, _, begin = prefix.rpartition('/')
         if not begin:

@@ -28,6 +28,7 @@ from shadowhound_data_logger.stores.s3_http import AGENT, ContentRequests
 OLDEST_BOTOCORE: Final = (1, 36)
 """The first with If-None-Match on PUT and the checksum settings; Debian's of Humble and Jazzy are older."""
 FORBIDDEN: Final = 403
+NOT_MODIFIED: Final = 304
 RANGE_NOT_SATISFIABLE: Final = 416
 """Nothing is behind the first byte that was asked for."""
 META: Final = 'x-amz-meta-'
@@ -148,6 +149,32 @@ class S3Requests:
         kind = headers.get('content-type', '')
         info = ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, kind)
         return Content(info, self._pieces(bucket, key, body), body.close)
+
+    def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
+        """The whole object and its ETag; None where that is ``version``."""
+        with self._asking(bucket, key, self._http) as http:
+            try:
+                headers, body = http.get(bucket, key, unless=version)
+            except ClientError as error:
+                if status_of(error) == NOT_MODIFIED:
+                    return None
+                raise
+            with closing(body):
+                size = self._whole_size(headers, bucket, key, None)
+                found = Content(ObjectInfo(bucket, key, size, None), self._pieces(bucket, key, body))
+                return joined(found, most), headers['etag']
+
+    def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
+        """One PUT with ``If-Match``; False where another version is there, or another put under way."""
+        with self._asking(bucket, key, self._client) as client:
+            try:
+                answer = client.put_object(Bucket=bucket, Key=key, Body=body, IfMatch=version, ContentType='application/json')
+            except ClientError as error:
+                if status_of(error) in {409, 412}:
+                    return False
+                raise
+        self.confirm(answer, bucket, key)
+        return True
 
     def range(self, bucket: str, key: str, begin: int, end: int) -> bytes:
         """From the first byte to before the last one; fewer where it ends before."""

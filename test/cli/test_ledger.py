@@ -35,7 +35,16 @@ def a_topic(**figures: Any) -> dict[str, Any]:
 
 
 def a_ledger(balanced: bool = True, **topics: dict[str, Any]) -> dict[str, Any]:
-    counts = {'spooled': 60, 'pending': 0, 'held': 0, 'delivered': 60, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0}
+    counts = {
+        'spooled': 60,
+        'pending': 0,
+        'held': 0,
+        'delivered': 60,
+        'evicted': 0,
+        'quarantined': 0,
+        'deduplicated': 0,
+        'kept': 0,
+    }
     named = {f'/{name}'.replace('__', '/'): row for name, row in topics.items()}
     return {'robot': 'thor', 'balanced': balanced, 'topics': named, 'objects': counts, 'bytes': counts}
 

@@ -53,7 +53,7 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
                 'gaps': {'missed': {'transport': 2}, 'rejected': {'truncated': 1}, 'dropped': {'queue_full': 1},
                          'quarantined': {'refused': 1}},
                 'other_types': {}, 'stored': 3, 'open': 1, 'stored_in': {
-                    'delivered': 1, 'pending': 1, 'held': 0, 'evicted': 0, 'quarantined': 1, 'deduplicated': 0,
+                    'delivered': 1, 'pending': 1, 'held': 0, 'evicted': 0, 'quarantined': 1, 'deduplicated': 0, 'kept': 0,
                 },
             },
             '/imu': {
@@ -63,17 +63,17 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
                                       'missed_estimated': None, 'missed_by': {}}},
                 'skipped': 0, 'rejected': {}, 'dropped': {}, 'gaps': {}, 'other_types': {}, 'stored': 0, 'open': 5,
                 'stored_in': {
-                    'delivered': 0, 'pending': 0, 'held': 0, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0,
+                    'delivered': 0, 'pending': 0, 'held': 0, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0, 'kept': 0,
                 },
             },
         },
         'bags': {},
         'events': {},
         'objects': {
-            'spooled': 4, 'delivered': 1, 'pending': 1, 'held': 1, 'evicted': 0, 'quarantined': 1, 'deduplicated': 0,
+            'spooled': 4, 'delivered': 1, 'pending': 1, 'held': 1, 'evicted': 0, 'quarantined': 1, 'deduplicated': 0, 'kept': 0,
         },
         'bytes': {
-            'spooled': 9, 'delivered': 5, 'pending': 1, 'held': 0, 'evicted': 0, 'quarantined': 3, 'deduplicated': 0,
+            'spooled': 9, 'delivered': 5, 'pending': 1, 'held': 0, 'evicted': 0, 'quarantined': 3, 'deduplicated': 0, 'kept': 0,
         },
         'clock': {'is_set': None, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'held': 1},
     }  # fmt: skip

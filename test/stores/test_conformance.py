@@ -247,3 +247,42 @@ def test_any_content_survives(store: ObjectStore, spool: Spool, bucket: str, con
     item = spool(f'any/{hashlib.sha256(content).hexdigest()}', content)
     assert store.put(item) in set(Put)
     assert store.get(bucket, item.key) == content
+
+
+def test_a_mailbox_is_replaced_by_one_at_a_time(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """Who read a version that is gone replaces nothing, and who knows the newest one is told that nothing changed."""
+    store.put(spool('other', b'x'))
+    with pytest.raises(ObjectRefused) as missing:
+        store.changed(bucket, 'inbox.json', '', 100)
+    assert missing.value.data['reason'] == 'missing'
+    store.put(spool('inbox.json', b'one'))
+    found = store.changed(bucket, 'inbox.json', '', 100)
+    assert found
+    body, version = found
+    assert body == b'one'
+    assert store.changed(bucket, 'inbox.json', version, 100) is None
+    assert store.replace(bucket, 'inbox.json', b'three', version)
+    assert not store.replace(bucket, 'inbox.json', b'four', version)
+    found = store.changed(bucket, 'inbox.json', version, 100)
+    assert found
+    assert found[0] == b'three'
+    assert store.get(bucket, 'inbox.json') == b'three'
+    with pytest.raises(ObjectRefused) as large:
+        store.changed(bucket, 'inbox.json', version, 4)
+    assert large.value.data['reason'] == 'size'
+
+
+def test_no_write_is_lost_in_a_race(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """Each of many writers, all at once, adds its line to what it read."""
+    store.put(spool('inbox.json', b'0'))
+
+    def add(number: int) -> None:
+        while True:
+            found = store.changed(bucket, 'inbox.json', '', 1000)
+            assert found
+            if store.replace(bucket, 'inbox.json', found[0] + b',%d' % number, found[1]):
+                return
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(add, range(1, 13)))
+    assert sorted(map(int, bytes(store.get(bucket, 'inbox.json')).split(b','))) == list(range(13))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,9 @@ from tower_scripts import make_secrets, prepare
 
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import AccessDenied, ForeignObject
+from shadowhound_data_logger.lake import pull
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.mailbox import KeptFilter, decode_inbox
 from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
@@ -141,3 +146,34 @@ def test_preparing_again_does_no_harm(server: Tower, as_user: Connect, monkeypat
     assert _is_denied(as_user('tachi').delete_object, Bucket='sensor-data', Key='tachi/any')
     rules = as_user('tower').get_bucket_lifecycle_configuration(Bucket='sensor-data')['Rules']
     assert {rule['ID'] for rule in rules} == {'unfinished-uploads', 'old-versions'}
+
+
+def test_a_mailbox_is_read_by_its_robot_and_written_by_spark(server: Tower, as_user: Connect,
+                                                             monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """The robot may neither write nor delete its own, nor read another one's; Spark may not delete, and loses no race."""
+    thor, spark, place = as_user('thor'), as_user('spark'), {'Bucket': 'sensor-data', 'Key': '_requests/thor/inbox.json'}
+    assert thor.get_object(**place)['Body'].read() == prepare.NO_REQUESTS
+    assert _is_denied(thor.put_object, **place, Body=b'{}')
+    assert _is_denied(thor.delete_object, **place)
+    assert _is_denied(as_user('tachi').get_object, **place)
+    assert _is_denied(spark.delete_object, **place)
+    assert _is_denied(spark.put_object, Bucket='sensor-data', Key='thor/_answers/x/1.json', Body=b'{}')
+    source = Bucket(server.store_settings('spark'), 'sensor-data')
+    robot, other = (
+        S3Store(server.store_settings('thor'), UploadSettings()),
+        S3Store(server.store_settings('spark'), UploadSettings()),
+    )
+    with closing(robot), closing(other):
+        robot.open()
+        other.open()
+        with ThreadPoolExecutor(6) as pool:
+            wants = [KeptFilter(sensor=f'camera{number}') for number in range(12)]
+            asked = set(pool.map(lambda want: pull.ask(other, source, 'thor', want, by='spark').id, wants))
+        found = robot.changed('sensor-data', place['Key'], '', 1 << 20)
+        assert found
+        assert {entry['id'] for entry in decode_inbox(found[0])} == asked
+        assert robot.changed('sensor-data', place['Key'], found[1], 1 << 20) is None
+    for name, value in server.environment().items():
+        monkeypatch.setenv(name, value)
+    assert prepare.main(['--robot', 'thor']) == 0
+    assert thor.get_object(**place)['Body'].read() == found[0]

@@ -1,0 +1,183 @@
+"""``shadowhound-data pull``: asks a robot for what it keeps, and tells what becomes of that."""
+
+from __future__ import annotations
+
+import getpass
+import re
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any, Final
+
+import click
+
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
+from shadowhound_data_logger.cli.output import number, plain, plain_table, print_json, print_page, volume
+from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
+from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.mailbox import BAG_SENSOR, DEFAULT_PRIORITY, LONGEST_NS, MOST_KEYS, KeptFilter
+from shadowhound_data_logger.times import moment
+from shadowhound_data_logger.untrusted import visible
+
+_BAG: Final = re.compile(r'[A-Za-z0-9_.*?-]+')
+
+
+@click.command(
+    epilog=examples(
+        'pull --sensor camera --near=-0.6,3.1,2 --since yesterday --wait',
+        'pull --bag patrol_20261120_090000 --since 2026-11-20T09:04 --until 2026-11-20T09:06',
+        'pull --list',
+    )
+)
+@question
+@click.option('--bag', metavar='NAME', help="Slices of this bag; '*' stands for any letters. A slice is sent whole.")
+@click.option('--priority', type=click.IntRange(0, 9), default=DEFAULT_PRIORITY, show_default=True, help='0 is sent first.')
+@click.option('--expires', metavar='AGE', default='7d', show_default=True, help='Ask for so long, such as 2h or 30d.')
+@click.option('--by', metavar='NAME', help='Who asks  [default: the user]')
+@click.option('--wait', 'is_waiting', is_flag=True, help='Wait for the last answer.')
+@click.option('--dry-run', is_flag=True, help='Say what it would ask for.')
+@click.option('--list', 'is_listing', is_flag=True, help='Say what is asked for, and how far that is.')
+@click.option('--cancel', metavar='ID', help='Take a request back.')
+@as_json
+def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: str, by: str | None, is_waiting: bool,  # noqa: PLR0913 - one an option
+         dry_run: bool, is_listing: bool, cancel: str | None, as_json: bool) -> ExitCode:  # fmt: skip
+    """Ask a robot for what it keeps (ship: on_request).
+
+    It says how many objects and bytes that are, and asks through the store; the robot looks every ten seconds.
+
+    Exit code 1 where something of it is lost, or the robot refused.
+    """
+    with asking():
+        from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415 - pyarrow takes a while
+        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+        source, left_out = default_source(the_store_settings()), quietly()
+        robot = flags.get('robot') or _only_robot(source)
+        name = by or re.sub(r'[^A-Za-z0-9_.-]', '_', getpass.getuser())
+        if not is_name(name):
+            raise BadUsage(f'--by {name!r} is not a name', 'use letters, digits, "_", "-" and "."')
+        with the_store() as store:
+            if is_listing:
+                return _list(lake.listed(store, source, robot), is_json=as_json)
+            if cancel is not None:
+                lake.cancel(store, source, robot, cancel, by=name)
+                click.echo(f'Asked {robot} to leave request {cancel}.', err=True)
+                return ExitCode.FINE
+            want = _want(source, robot, flags, bag, left_out)
+            found = lake.kept(source, robot, want, left_out)
+            said = {'robot': robot, 'objects': len(found), 'bytes': sum(found['bytes'].to_pylist()), 'want': want.to_json()}
+            if not as_json:
+                click.echo(f'{robot} keeps {number(said["objects"])} such objects, {volume(said["bytes"])}.')
+            answer: dict[str, Any] | None = None
+            said['id'] = None
+            if not dry_run and len(found):
+                request = lake.ask(store, source, robot, want, by=name, priority=priority, expiry_ns=_expiry_ns(expires))
+                said['id'] = request.id
+                if not as_json:
+                    click.echo(f'Asked for them: request {request.id}.')
+                if is_waiting:
+                    answer = lake.wait(source, robot, request.id, tell=_Told(is_quiet=as_json), made_ns=request.made_ns)
+    if as_json:
+        print_json({**said, 'answer': answer})
+    code = tell_left_out(left_out)
+    return exit_code(finding=code is not ExitCode.FINE or (answer is not None and _is_finding(answer)))
+
+
+class _Told:
+    """Says each answer once, on standard error."""
+
+    def __init__(self, *, is_quiet: bool) -> None:
+        self._is_quiet = is_quiet
+        self._number = 0
+
+    def __call__(self, answer: Mapping[str, Any] | None) -> None:
+        if answer is not None and not self._is_quiet and answer.get('number', 0) != self._number:
+            self._number = answer.get('number', 0)
+            click.echo(visible(_sentence(answer)), err=True)
+
+
+def _sentence(answer: Mapping[str, Any]) -> str:
+    """What an answer says."""
+    outcomes = answer.get('outcomes')
+    known = outcomes if isinstance(outcomes, dict) else {}
+    parts = [f'{state} {each.get("objects")}' for state, each in known.items() if isinstance(each, dict)]
+    why = f' ({answer["why"]})' if answer.get('why') else ''
+    return f'{answer.get("time")}  {answer["state"]}{why}: of {answer.get("objects")} objects {", ".join(parts) or "none"}'
+
+
+def _is_finding(answer: Mapping[str, Any]) -> bool:
+    """Whether something of a request did not come, or never will."""
+    return answer['state'] != 'done' or bool(answer.get('lost'))
+
+
+def _list(found: Sequence[Any], *, is_json: bool) -> ExitCode:
+    if is_json:
+        print_json([asdict(one) for one in found])
+        return ExitCode.FINE
+    table = plain_table('', ('request', 'by', 'priority', 'state', 'objects', 'delivered'), {'request', 'by', 'state'})
+    table.title = None
+    for one in found:
+        answer = one.answer or {}
+        sent = (
+            answer.get('outcomes', {}).get('delivered', {}).get('objects', 0) if isinstance(answer.get('outcomes'), dict) else 0
+        )
+        cells = (one.id, one.by, one.priority, one.state, answer.get('objects', '-'), sent if answer else '-')
+        table.add_row(*(plain(str(cell)) for cell in cells))
+    print_page(*([table] if found else ['Nothing is asked for.']))
+    return ExitCode.FINE
+
+
+def _want(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, left_out: Any) -> KeptFilter:
+    """What the flags ask for, in words that a robot understands; what it does not is resolved to keys here."""
+    now_ns = time.time_ns()
+    from shadowhound_data_logger.lake.select import wanted  # noqa: PLC0415
+
+    asked = wanted(now_ns, **{name: value for name, value in flags.items() if name not in {'where', 'success'}})
+    sensor, keys = asked.sensor, tuple[str, ...]()
+    if bag is not None:
+        if not _BAG.fullmatch(bag) or sensor not in {None, BAG_SENSOR}:
+            raise BadUsage(
+                f'--bag {bag!r} is not the name of a bag, or another sensor is asked for', '`shadowhound-data bag list`'
+            )
+        sensor, keys = BAG_SENSOR, (f'{robot}/rosbags/{bag}/*',)
+    want = KeptFilter(
+        sensor=sensor, topic=asked.topic, since_ns=asked.since_ns, until_ns=asked.until_ns, near=asked.near,
+        mission=asked.mission, mission_type=asked.mission_type, keys=keys,
+    )  # fmt: skip
+    if not want.to_json() and 'where' not in flags:
+        raise BadUsage('nothing says what to ask for', "name a --sensor, a --bag or a time; --bag '*' is all bags")
+    if 'success' in flags:
+        raise BadUsage('a robot does not know how missions ended', 'name the --mission')
+    if 'where' in flags:
+        want = replace(want, keys=_keys(source, robot, want, flags['where'], left_out))
+    return want
+
+
+def _keys(source: Any, robot: str, want: KeptFilter, where: str, left_out: Any) -> tuple[str, ...]:
+    """The keys of what SQL chooses."""
+    from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415
+    from shadowhound_data_logger.lake import query  # noqa: PLC0415
+
+    keys = query.chosen(lake.kept(source, robot, want, left_out), where)['key'].to_pylist()
+    if len(keys) > MOST_KEYS:
+        raise BadUsage(
+            f'--where chooses {len(keys):,} objects: more than {MOST_KEYS:,} cannot be asked for by name', 'ask for less'
+        )
+    return tuple(keys)
+
+
+def _expiry_ns(text: str) -> int:
+    now_ns = time.time_ns()
+    age_ns = now_ns - moment('expires', text, now_ns)
+    if not 0 < age_ns <= LONGEST_NS:
+        raise BadUsage(f'--expires {text!r} is not an age of at most 90 days', 'such as 2h or 7d')
+    return age_ns
+
+
+def _only_robot(source: Any) -> str:
+    from shadowhound_data_logger.lake import live_files  # noqa: PLC0415
+
+    found = live_files.robots(source)
+    if len(found) != 1:
+        raise BadUsage(f'there are {len(found)} robots in {source.describe()}', 'name one: --robot NAME')
+    return str(found[0])

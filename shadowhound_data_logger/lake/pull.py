@@ -1,0 +1,247 @@
+"""Asks a robot for what it keeps: which objects those are, the mailbox that it polls, and the answers that it gives.
+
+Requesters share a mailbox (mailbox.py): each reads it, and replaces it on the condition that nobody else did meanwhile.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from shadowhound_data_logger.catalogue.schema import KEPT, ON_ROBOT
+from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.live_files import days
+from shadowhound_data_logger.lake.reading import arrow_schema, tables
+from shadowhound_data_logger.lake.scan import KEY, folders, superseding
+from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.mailbox import (
+    DEFAULT_EXPIRY_NS,
+    DEFAULT_PRIORITY,
+    MAILBOX_BUCKET,
+    MOST_INBOX_BYTES,
+    KeptFilter,
+    PullCancel,
+    PullRequest,
+    RequestRefused,
+    answers_prefix,
+    decode_inbox,
+    encode_inbox,
+    inbox_key,
+    read_entry,
+)
+from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.retry import steadily
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.untrusted import from_json
+
+FINAL: Final = frozenset({'done', 'expired', 'cancelled', 'refused'})
+"""States after which a request gets no answer any more."""
+TRIES: Final = 60
+"""To be the one who replaces the mailbox: with a hundred at it, one in a hundred wins each time."""
+PAUSE_S: Final = 0.2
+"""The longest pause between two tries; it doubles ten times."""
+MOST_ANSWER_BYTES: Final = 1 << 20
+_DAY_NS: Final = 24 * 3600 * 10**9
+
+
+@dataclass(frozen=True, slots=True)
+class PullState:
+    """A request, as the mailbox and the answers have it."""
+
+    id: str
+    by: str
+    state: str
+    """``asked`` until the robot has answered; then what its newest answer says."""
+    priority: int | None
+    want: dict[str, Any]
+    answer: dict[str, Any] | None
+    """The newest one."""
+
+    @property
+    def is_over(self) -> bool:
+        return self.state in FINAL
+
+
+def kept(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa.Table:
+    """Rows of what a robot keeps and the filter takes, with the columns of ``catalogue.schema.KEPT``. Raises StoreError."""
+    early = Wanted(robot=robot, since_ns=None if want.since_ns is None else want.since_ns - _DAY_NS, until_ns=want.until_ns)
+    with ThreadPoolExecutor(THREADS) as pool:
+        found = days(source, [robot], early.dates(time.time_ns()), pool, findings, early.has_date, KEPT)
+    entries = [entry for day in found for entry in day.entries]
+    rows = pa.concat_tables([arrow_schema(KEPT).empty_table(), *tables(source, entries, tuple(KEPT.columns), findings, of=KEPT)])
+    stored = [entry for day in folders(source, early, findings) for entry in day.entries]
+    keys = pa.concat_tables([arrow_schema().empty_table().select(KEY), *tables(source, stored, KEY, findings)])
+    rows = superseding(rows, keys)
+    rows = rows.filter(pc.equal(rows['where'], ON_ROBOT))
+    return rows.filter(pa.array([_takes(want, row) for row in rows.to_pylist()], pa.bool_()))
+
+
+def _takes(want: KeptFilter, row: dict[str, Any]) -> bool:
+    metadata = {name: row[name] for name in ('mission_id', 'run_id', 'mission_type') if row[name] is not None}
+    if row['x'] is not None and row['y'] is not None:
+        metadata['pose'] = f'{row["x"]} {row["y"]} 0 odom'
+    begin_ns = row['t_start_ns'] or 0
+    return want.takes(row['key'], row['sensor'] or '', row['topic'], begin_ns, row['t_end_ns'] or begin_ns, metadata)
+
+
+def ask(store: ObjectStore, source: Bucket, robot: str, want: KeptFilter, *, by: str, priority: int = DEFAULT_PRIORITY,
+        expiry_ns: int = DEFAULT_EXPIRY_NS) -> PullRequest:  # fmt: skip
+    """Put a request into the mailbox of a robot; the same one is put there once. Raises StoreError, LakeError."""
+    now_ns = time.time_ns()
+    request = PullRequest(robot=robot, by=by, made_ns=now_ns, expires_ns=now_ns + expiry_ns, want=want, priority=priority)
+    _checked(robot, request.to_json())
+
+    def add(entries: list[Any]) -> list[Any] | None:
+        nonlocal request
+        left = _unanswered(source, robot, entries)
+        for asked in _requests(robot, left):
+            if asked.id == request.id and not any(entry.get('cancel') == asked.id for entry in left):
+                request = asked
+                return None
+        return [*(entry for entry in left if request.id not in {entry.get('id'), entry.get('cancel')}), request.to_json()]
+
+    _change(store, robot, add)
+    return request
+
+
+def cancel(store: ObjectStore, source: Bucket, robot: str, request: str, *, by: str) -> None:
+    """Take a request back. Raises StoreError, LakeError."""
+    said = PullCancel(id=request, by=by, made_ns=time.time_ns()).to_json()
+    _checked(robot, said)
+    _change(store, robot, lambda entries: [*_unanswered(source, robot, entries), said])
+
+
+def listed(store: ObjectStore, source: Bucket, robot: str) -> list[PullState]:
+    """What is asked of a robot, and how far that is: the mailbox's entries. Raises StoreError, LakeError."""
+    found = []
+    entries, _ = _read(store, robot)
+    for request in _requests(robot, entries):
+        answer = newest_answer(source, robot, request.id)
+        state = 'asked' if answer is None else str(answer.get('state'))
+        found.append(PullState(request.id, request.by, state, request.priority, request.want.to_json(), answer))
+    return found
+
+
+def newest_answer(source: Bucket, robot: str, request: str) -> dict[str, Any] | None:
+    """The newest answer to a request; None before the first one. What is none is left out. Raises StoreError."""
+    numbers = []
+    for entry in source.list(answers_prefix(robot, request)):
+        name = entry.key.rpartition('/')[2].removesuffix('.json')
+        if name.isascii() and name.isdigit() and len(name) < 10:
+            numbers.append(int(name))
+    for number in sorted(numbers, reverse=True):
+        try:
+            answer = from_json(source.get(f'{answers_prefix(robot, request)}{number}.json', MOST_ANSWER_BYTES), MOST_ANSWER_BYTES)
+        except (ObjectRefused, ValueError):
+            continue
+        if isinstance(answer, dict) and answer.get('id') == request and isinstance(answer.get('state'), str):
+            return answer
+    return None
+
+
+def wait(source: Bucket, robot: str, request: str, *, tell: Callable[[dict[str, Any] | None], None] = lambda _: None,
+         every_s: float = 2.0, made_ns: int = 0) -> dict[str, Any]:  # fmt: skip
+    """The last answer to a request that was made then, once there is one; ``tell`` hears of the newest. Raises StoreError."""
+    while True:
+        answer = newest_answer(source, robot, request)
+        tell(answer)
+        if answer is not None and _is_last(answer, made_ns):
+            return answer
+        time.sleep(every_s)
+
+
+def _is_last(answer: dict[str, Any], made_ns: int) -> bool:
+    """Whether it ends a request that was made then; one that ended may be made again."""
+    answered = answer.get('made_ns')
+    return answer['state'] in FINAL and type(answered) is int and answered >= made_ns
+
+
+def _requests(robot: str, entries: Iterable[Any]) -> list[PullRequest]:
+    found = []
+    for entry in entries:
+        try:
+            read = read_entry(robot, entry)
+        except RequestRefused:
+            continue
+        if isinstance(read, PullRequest):
+            found.append(read)
+    return found
+
+
+def _checked(robot: str, entry: dict[str, Any]) -> None:
+    try:
+        read_entry(robot, entry)
+    except RequestRefused as error:
+        raise LakeError(f'the robot would refuse the request: {error}', remedy='ask for less, or in other words') from error
+
+
+def _unanswered(source: Bucket, robot: str, entries: Sequence[Any]) -> list[Any]:
+    """Without requests that have their last answer, or expired a day ago, and what takes those back."""
+    requests = _requests(robot, entries)
+    with ThreadPoolExecutor(THREADS) as pool:
+        answers = list(pool.map(lambda request: newest_answer(source, robot, request.id), requests))
+    now_ns = time.time_ns()
+    waiting = {
+        request.id for request, answer in zip(requests, answers, strict=True)
+        if not (answer is not None and _is_last(answer, request.made_ns))
+        and request.expires_ns + _DAY_NS > now_ns
+    }  # fmt: skip
+    return [entry for entry in entries if isinstance(entry, dict) and entry.get('id', entry.get('cancel')) in waiting]
+
+
+def _read(store: ObjectStore, robot: str) -> tuple[list[Any], str]:
+    """The entries of the mailbox, which is made where it is not there, and its version."""
+    try:
+        found = steadily(lambda: store.changed(MAILBOX_BUCKET, inbox_key(robot), '', MOST_INBOX_BYTES))
+    except ObjectRefused as error:
+        if error.data.get('reason') != 'missing':
+            raise
+        make(store, robot)
+        found = steadily(lambda: store.changed(MAILBOX_BUCKET, inbox_key(robot), '', MOST_INBOX_BYTES))
+    assert found is not None
+    try:
+        return decode_inbox(found[0]), found[1]
+    except RequestRefused as error:
+        where = f'{MAILBOX_BUCKET}/{inbox_key(robot)}'
+        raise LakeError(f'{where}: {error}', remedy='somebody damaged it: put an empty one in its place') from error
+
+
+def make(store: ObjectStore, robot: str) -> None:
+    """The empty mailbox of a robot, where there is none. Raises StoreError."""
+    body = encode_inbox([])
+    with tempfile.TemporaryDirectory(prefix='shadowhound-inbox-') as folder:
+        path = Path(folder, 'inbox.json')
+        path.write_bytes(body)
+        store.put(SpooledObject(
+            id=0, bucket=MAILBOX_BUCKET, key=inbox_key(robot), path=path, size=len(body),
+            sha256=hashlib.sha256(body).hexdigest(), content_type='application/json', metadata={}, priority=5, created_ns=0,
+        ))  # fmt: skip
+
+
+def _change(store: ObjectStore, robot: str, change: Callable[[list[Any]], list[Any] | None]) -> None:
+    """Replace the entries by what ``change`` makes of them, None for nothing, however many others do so at once."""
+    for attempt in range(TRIES):
+        entries, version = _read(store, robot)
+        changed = change(entries)
+        if changed is None:
+            return
+        try:
+            body = encode_inbox(changed)
+        except RequestRefused as error:
+            raise LakeError(str(error), remedy='wait until some requests are answered, or cancel one') from error
+        if steadily(lambda: store.replace(MAILBOX_BUCKET, inbox_key(robot), body, version)):  # noqa: B023 - called at once
+            return
+        time.sleep(random.uniform(0.0, PAUSE_S * 2.0 ** min(attempt, 4)))
+    raise LakeError('others changed the mailbox each time', remedy='try it again')

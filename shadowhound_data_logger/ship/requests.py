@@ -1,0 +1,275 @@
+"""Serves what is asked for of what the robot keeps: polls the mailbox, makes requests rows, releases objects, answers.
+
+A request is a row before anything is done about it, and each answer is spooled in the transaction that notes it. Objects are
+released a few at a time, so that requests share the link by their priorities: no requester waits for another one to be done.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.clock import SECOND, Clock, iso
+from shadowhound_data_logger.config import KeepSettings
+from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError
+from shadowhound_data_logger.mailbox import (
+    MAILBOX_BUCKET,
+    MOST_INBOX_BYTES,
+    PullCancel,
+    PullRequest,
+    RequestRefused,
+    answer_key,
+    decode_inbox,
+    inbox_key,
+    read_entry,
+)
+from shadowhound_data_logger.model import DataObject, SpooledObject
+from shadowhound_data_logger.spool.request_table import ACTIVE, CANCELLED, DONE, EXPIRED, REFUSED, RequestRow
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.worker import Worker
+
+log = logging.getLogger(__name__)
+
+STEP_S: Final = 0.25
+"""Between two releases while something is asked for."""
+WINDOW: Final = 64
+"""Released objects that wait for delivery at most: what is asked for later has its turn after these."""
+WINDOW_BYTES: Final = 8 << 20
+"""The same in bytes, but one object always may go."""
+TELL_S: Final = 30.0
+"""Between two answers of how far a request is."""
+MOST_REQUESTS: Final = 4096
+"""That are remembered at a time."""
+AT_A_TIME: Final = 64
+"""New requests of one look: each is tried on all that is kept."""
+REMEMBER_NS: Final = 30 * 24 * 3600 * SECOND
+"""For so long after its last answer."""
+TIDY_S: Final = 60.0
+ANSWERS: Final = '_answers'
+"""The sensor of answers."""
+
+
+class RequestServer:
+    """Serves the requests for what a robot keeps.
+
+    Life: New; open once; ``wake`` from any thread; close once. Owns the thread ``requests``; what it asks of the spool is durable
+    when it returns, so a death at any moment leaves nothing half done.
+    """
+
+    def __init__(self, spool: Spool, store: ObjectStore, settings: KeepSettings, robot: str, clock: Clock, *,  # noqa: PLR0913 - each is a neighbour
+                 put: Callable[[DataObject], None], released: Callable[[Sequence[SpooledObject]], None],
+                 monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
+        """``put`` takes answers to be spooled, ``released`` hears of objects that may be shipped."""
+        self._spool = spool
+        self._store = store
+        self._settings = settings
+        self._robot = robot
+        self._clock = clock
+        self._put = put
+        self._released = released
+        self._monotonic = monotonic
+        self._version = ''
+        self._poll_at_s = self._tidy_at_s = 0.0
+        self._answering: dict[str, int] = {}
+        """Request -> the number of its answer that is on its way into the spool."""
+        self._served: dict[str, float] = {}
+        """Requester -> bytes released, weighed by priority."""
+        self._wakes = threading.Event()
+        self.refused = Counter[str]()
+        """Entries and mailboxes that were refused, by reason."""
+        self.worker = Worker('requests', self._round, patience_s=120.0)
+
+    def open(self) -> None:
+        self.worker.start()
+
+    def close(self, deadline_s: float) -> None:
+        """End the thread; idempotent."""
+        self.worker.stop()
+        self._wakes.set()
+        self.worker.join(deadline_s)
+
+    def wake(self) -> None:
+        """Something was delivered: there may be room for more."""
+        self._wakes.set()
+
+    def _round(self) -> None:
+        busy = self.step()
+        self._wakes.wait(STEP_S if busy else min(1.0, self._settings.poll_s))
+        self._wakes.clear()
+
+    def step(self) -> bool:
+        """One look at everything; whether it released anything. Raises OSError or sqlite3.Error where the spool is of no use."""
+        now_s = self._monotonic()
+        if now_s >= self._poll_at_s:
+            self._poll_at_s = now_s + self._settings.poll_s
+            self._poll()
+        rows = self._spool.requests()
+        now_ns = self._clock.wall_ns()
+        for row in rows:
+            if row.is_open and row.expires_ns <= now_ns:
+                self._spool.close_request(row.id, EXPIRED)
+        is_busy = self._release([row for row in rows if row.is_open and row.expires_ns > now_ns])
+        for row in self._spool.requests():
+            if row.told != row.state or row.is_open:
+                self._answer(row)
+        if now_s >= self._tidy_at_s:
+            self._tidy_at_s = now_s + TIDY_S
+            self._spool.forget_requests(now_ns - REMEMBER_NS)
+            while self._spool.evict_old():
+                pass
+        return is_busy
+
+    # -- what is asked for -----------------------------------------------------------------------------------------
+
+    def _poll(self) -> None:
+        """Look into the mailbox; a store that is away, or has none, is asked again."""
+        try:
+            found = self._store.changed(MAILBOX_BUCKET, inbox_key(self._robot), self._version, MOST_INBOX_BYTES)
+            if found is not None and self._read(found[0]):
+                self._version = found[1]
+        except ObjectRefused as error:
+            if error.data.get('reason') != 'missing':
+                self._refuse('too_large' if error.data.get('reason') == 'size' else 'unreadable', str(error))
+        except AccessDenied as error:
+            self._refuse('denied', f'the mailbox may not be read: {error}')
+        except StoreError as error:
+            log.debug('the mailbox cannot be read now: %s', error)
+
+    def _read(self, body: bytes) -> bool:
+        """Whether all of it is done, for as long as it does not change. Raises StoreError."""
+        try:
+            entries = decode_inbox(body)
+        except RequestRefused as error:
+            self._refuse(error.reason, str(error))
+            return True
+        known = {row.id: row for row in self._spool.requests()}
+        new, cancels = [], []
+        for entry in entries:
+            try:
+                read = read_entry(self._robot, entry)
+            except RequestRefused as error:
+                self._refuse(error.reason, f'an entry of the mailbox is refused: {error}')
+                continue
+            row = known.get(read.id)
+            if isinstance(read, PullCancel):
+                cancels.append(read)
+            elif row is None or (not row.is_open and row.told == row.state and read.made_ns > row.made_ns):
+                new.append(read)
+        if len(known) + len(new) > MOST_REQUESTS:
+            self._refuse('too_many', 'too many requests are remembered')
+            new = new[: max(0, MOST_REQUESTS - len(known))]
+        known |= {row.id: row for row in self._accept(new[:AT_A_TIME], known)}
+        for cancel in cancels:
+            row = known.get(cancel.id)
+            if row is not None and row.is_open and cancel.made_ns > row.made_ns:
+                self._spool.close_request(cancel.id, CANCELLED)
+        return len(new) <= AT_A_TIME
+
+    def _accept(self, new: Sequence[PullRequest], known: Mapping[str, RequestRow]) -> Iterator[RequestRow]:
+        """Each is a row with what it chose; what is kept is looked through once. Raises StoreError."""
+        if not new:
+            return
+        answers = {request.id: known[request.id].answers if request.id in known else self._answers_before(request.id)
+                   for request in new}  # fmt: skip
+        chosen: dict[str, list[int]] = {request.id: [] for request in new}
+        for item in self._spool.kept():
+            for request in new:
+                if request.want.takes(item.key, item.sensor, item.topic, item.t_start_ns, item.t_end_ns, item.metadata):
+                    chosen[request.id].append(item.id)
+        now_ns = self._clock.wall_ns()
+        for request in new:
+            is_late = request.expires_ns <= now_ns
+            row = self._spool.accept(RequestRow(
+                id=request.id, requester=request.by, priority=request.priority, made_ns=request.made_ns,
+                expires_ns=request.expires_ns, received_ns=now_ns, wanted=json.dumps(request.want.to_json()),
+                state=REFUSED if is_late else ACTIVE, why='it has expired already' if is_late else '',
+                answers=answers[request.id],
+            ), [] if is_late else chosen[request.id])  # fmt: skip
+            log.info('%s asks for %d objects that are kept (request %s)', row.requester, row.objects, row.id)
+            yield row
+
+    def _answers_before(self, request: str) -> int:
+        """Answers that the store has from before the index was lost. Raises StoreError."""
+        number = 0
+        while self._store.head(MAILBOX_BUCKET, answer_key(self._robot, request, number + 1)) is not None:
+            number += 1
+        return number
+
+    def _refuse(self, reason: str, text: str) -> None:
+        self.refused[reason] += 1
+        if self.refused[reason] == 1:
+            log.warning('%s; further ones are only counted', text)
+
+    # -- what is sent ----------------------------------------------------------------------------------------------
+
+    def _release(self, rows: Sequence[RequestRow]) -> bool:
+        """Let the next objects wait for delivery; whether there are any."""
+        count, size = self._spool.released()
+        if not rows or count > WINDOW // 2 or size > WINDOW_BYTES // 2:
+            return False
+        room, room_bytes = WINDOW - count, WINDOW_BYTES - size
+        queues = {row.id: deque(self._spool.next_requested(row.id, room)) for row in rows}
+        chosen: dict[int, int] = {}
+        while len(chosen) < room and (row := self._next([row for row in rows if queues[row.id]])) is not None:
+            number, size = queues[row.id].popleft()
+            if (count or chosen) and size > room_bytes:
+                break
+            if number not in chosen:
+                chosen[number] = row.priority
+                room_bytes -= size
+                self._served[row.requester] += size / (10 - row.priority)
+        if chosen:
+            self._released(self._spool.release(list(chosen.items())))
+        return bool(chosen)
+
+    def _next(self, rows: Sequence[RequestRow]) -> RequestRow | None:
+        """Of the requester who was served least, the most important request, of these the oldest."""
+        if not rows:
+            return None
+        asking = {row.requester for row in rows}
+        least = min((self._served[name] for name in asking if name in self._served), default=0.0)
+        for name in asking:
+            self._served.setdefault(name, least)
+        first = min(asking, key=lambda name: (self._served[name], name))
+        return min((row for row in rows if row.requester == first), key=lambda row: (row.priority, row.received_ns, row.id))
+
+    # -- what is answered ------------------------------------------------------------------------------------------
+
+    def _answer(self, row: RequestRow) -> None:
+        """Spool the next answer of a request, if one is due."""
+        if self._answering.get(row.id, 0) > row.answers:
+            return
+        progress = self._spool.progress(row.id)
+        if row.is_open and progress.is_over:
+            self._spool.close_request(row.id, DONE)
+            row = replace(row, state=DONE)
+        if not row.is_open and progress.outcomes.get('pending'):
+            return  # what was released goes on its way, and the last answer tells of it
+        now_ns = self._clock.wall_ns()
+        if row.told == row.state and (not row.is_open or now_ns - row.told_ns < TELL_S * SECOND):
+            return
+        number = row.answers + 1
+        self._answering[row.id] = number
+        said: dict[str, Any] = {
+            'format': 1, 'id': row.id, 'number': number, 'robot': self._robot, 'by': row.requester,
+            'state': 'accepted' if row.is_open and not row.told else 'sending' if row.is_open else row.state,
+            'time': iso(now_ns), 'made_ns': row.made_ns, 'expires': iso(row.expires_ns), 'why': row.why,
+            'want': json.loads(row.wanted),
+            'objects': row.objects, 'bytes': row.bytes,
+            'outcomes': {state: {'objects': count, 'bytes': size} for state, (count, size) in progress.outcomes.items()},
+            'lost': [{'key': key, 'state': state, 'reason': reason, 'when': iso(settled_ns) if settled_ns else None}
+                     for key, state, reason, settled_ns in progress.lost],
+        }  # fmt: skip
+        self._put(DataObject(
+            bucket=MAILBOX_BUCKET, key=answer_key(self._robot, row.id, number), body=json.dumps(said, indent=1).encode(),
+            content_type='application/json', sensor=ANSWERS, topic=None, type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns,
+            priority=0, protected=True, metadata={words.ROBOT: self._robot}, answers=(row.id, number, row.state),
+        ))  # fmt: skip

@@ -1,0 +1,165 @@
+"""A researcher asks a robot for what it keeps, and gets it: a spool, a folder as the store, and the command line between them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from spool.making import NOON_NS, FakeClock, assert_whole, make, receive
+
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.catalogue.writer import CatalogueWriter
+from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
+from shadowhound_data_logger.lake import pull as lake
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.compact import compact
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.mailbox import KeptFilter
+from shadowhound_data_logger.model import Outcome, State
+from shadowhound_data_logger.ship.requests import RequestServer
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.stores.directory import DirectoryStore
+
+
+class Field:
+    """A robot in the field, and the store that it reaches."""
+
+    def __init__(self, home: Path) -> None:
+        self.clock = FakeClock()
+        self.clock.now_ns = NOON_NS + 3600 * SECOND
+        self.now_s = 0.0
+        self.settings = StoreSettings(directory=home / 'store')
+        self.store = DirectoryStore(self.settings.directory)
+        self.source = Bucket(self.settings, 'sensor-data')
+        self.spool = Spool(home / 'spool', SpoolSettings(min_free_bytes=0), self.clock, 'thor', KeepSettings(max_bytes=1 << 20))
+        self.spool.open()
+        self.catalogue = CatalogueWriter(home / 'spool', CatalogueSettings(), 'thor', self.clock, lambda: self.now_s, keeps=True)
+        self.server = RequestServer(self.spool, self.store, KeepSettings(), 'thor', self.clock, put=self.commit,
+                                    released=lambda _: None, monotonic=lambda: self.now_s)  # fmt: skip
+
+    def commit(self, *items: Any) -> None:
+        self.spool.commit(items)
+
+    def records(self, *numbers: int, size: int = 1000) -> None:
+        items = [
+            make(f'thor/camera/20251018/{number:06d}_front.jpg', bytes([number]) * size, t_start_ns=NOON_NS + number * SECOND,
+                 t_end_ns=NOON_NS + number * SECOND,
+                 metadata={words.ROBOT: 'thor', words.POSE: f'{number} 0 0 odom', words.SHIP: words.ON_REQUEST})
+            for number in numbers
+        ]  # fmt: skip
+        receive(self.spool, len(items))
+        self.spool.commit(items)
+        self.passes()
+
+    def passes(self) -> None:
+        """Ten seconds: the robot looks into its mailbox, tells what it has, and delivers."""
+        self.now_s += 10
+        self.clock.now_ns += 10 * SECOND
+        self.server.step()
+        for _ in range(3):
+            self.commit(*self.catalogue.due())
+            while items := self.spool.pending(100):
+                for item in items:
+                    self.store.put(item)
+                self.spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
+            self.now_s += 10
+            self.server.step()
+
+    def kept(self, **want: Any) -> list[int]:
+        """The numbers of what the store says that the robot keeps."""
+        found = lake.kept(self.source, 'thor', KeptFilter(**want), Findings())
+        return sorted(int(key[-16:-10]) for key in found['key'].to_pylist())
+
+
+@pytest.fixture
+def field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Field]:
+    made = Field(tmp_path)
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
+    yield made
+    made.spool.close()
+
+
+def run(*arguments: str, code: int = 0) -> Any:
+    """A verb's JSON."""
+    done = CliRunner().invoke(cli, [*arguments, '--json'], standalone_mode=False)
+    assert done.exception is None, done.exception
+    assert done.return_value == code, done.output
+    return json.loads(done.stdout)
+
+
+def test_a_pull_from_asking_to_arrival(field: Field) -> None:
+    """The rows arrive before the bytes; what is asked for comes, verified, and is not on the robot any more."""
+    field.records(*range(6))
+    assert field.kept() == [0, 1, 2, 3, 4, 5]
+    assert run('query', '--sensor', 'camera') == []
+    said = run('pull', '--sensor', 'camera', '--near', '3,0,1', '--by', 'ada')
+    assert (said['robot'], said['objects'], said['bytes'], said['answer']) == ('thor', 3, 3000, None)
+    assert [one['state'] for one in run('pull', '--list')] == ['asked']
+    field.passes()
+    assert [(one['state'], one['by']) for one in run('pull', '--list')] == [('done', 'ada')]
+    assert run('pull', '--sensor', 'camera', '--near', '3,0,1', '--dry-run')['objects'] == 0
+    assert field.kept() == [0, 1, 5]
+    field.now_s += 60
+    field.passes()
+    assert [row['key'][-16:-10] for row in run('query', '--sensor', 'camera')] == ['000002', '000003', '000004']
+    assert_whole(field.spool.root)
+
+
+def test_waiting_ends_with_the_last_answer(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of a request that another one made; a new one prunes it."""
+    field.records(1, 2)
+    monkeypatch.setattr(lake.time, 'sleep', lambda _: field.passes())
+    first = run('pull', '--sensor', 'camera', '--until', '2025-10-18T12:00:02Z', '--wait')
+    assert first['answer']['outcomes'] == {'delivered': {'objects': 1, 'bytes': 1000}}
+    second = run('pull', '--sensor', 'camera', '--where', 'x > 1.5', '--wait')
+    assert second['answer']['want'] == {'sensor': 'camera', 'keys': ['thor/camera/20251018/000002_front.jpg']}
+    assert [one['id'] for one in run('pull', '--list')] == [second['id']]
+
+
+def test_what_is_lost_on_the_robot_is_told(field: Field) -> None:
+    """A row of a loss supersedes that of what was kept, before and after compaction, and so does that of an arrival."""
+    field.records(*range(8), size=200 << 10)
+    assert field.kept() == [3, 4, 5, 6, 7]
+    run('pull', '--sensor', 'camera', '--until', '2025-10-18T12:00:04Z')
+    field.passes()
+    assert field.kept() == [4, 5, 6, 7]
+    for _ in range(2):
+        list(compact(field.source, field.store, before='2025-10-19', grace=None))
+        assert field.kept() == [4, 5, 6, 7]
+    field.records(8, 9, size=200 << 10)
+    assert field.kept() == [5, 6, 7, 8, 9]
+
+
+def test_a_request_is_taken_back(field: Field) -> None:
+    """The robot answers that it was, and what it has not sent stays."""
+    field.records(1)
+    request = run('pull', '--sensor', 'camera')['id']
+    done = CliRunner().invoke(cli, ['pull', '--cancel', request], standalone_mode=False)
+    assert done.exception is None
+    field.server._poll_at_s = 1e9  # the robot is away while it is asked and told otherwise
+    field.passes()
+    field.server._poll_at_s = 0.0
+    field.passes()
+    assert field.kept() == [1]
+    answer = lake.newest_answer(field.source, 'thor', request)
+    assert answer
+    assert (answer['state'], answer['outcomes']) == ('cancelled', {'unsent': {'objects': 1, 'bytes': 1000}})
+
+
+@pytest.mark.parametrize('arguments', [
+    (), ('--where', 'nonsense('), ('--bag', '../x'), ('--sensor', 'camera', '--expires', '100d'), ('--cancel', 'x'),
+    ('--failed',), ('--sensor', 'camera', '--by', '../x'),
+])  # fmt: skip
+def test_what_cannot_be_asked_for_is_said(field: Field, arguments: tuple[str, ...]) -> None:
+    """Before anything is written."""
+    field.records(1)
+    done = CliRunner().invoke(cli, ['pull', *arguments], standalone_mode=False)
+    assert done.exception is not None
+    assert run('pull', '--list') == []

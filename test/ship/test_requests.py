@@ -1,0 +1,336 @@
+"""What a robot keeps is sent when somebody asks for it, and every request is answered."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from spool.making import NOON_NS, FakeClock, assert_whole, make, receive, rows
+
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import KeepSettings, SpoolSettings
+from shadowhound_data_logger.mailbox import (
+    MAILBOX_BUCKET,
+    KeptFilter,
+    PullCancel,
+    PullRequest,
+    answers_prefix,
+    encode_inbox,
+    inbox_key,
+)
+from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
+from shadowhound_data_logger.ship.requests import WINDOW, RequestServer
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.stores.memory import MemoryStore
+
+KEEP = KeepSettings(poll_s=10.0)
+
+
+def frame(number: int, *, body: bytes = b'', **fields: Any) -> DataObject:
+    """A picture that stays on the robot, one a second."""
+    stamp_ns = NOON_NS + number * SECOND
+    said = {words.ROBOT: 'thor', words.POSE: f'{number} 0 0 odom', words.SHIP: words.ON_REQUEST, **fields.pop('metadata', {})}
+    return make(f'thor/camera/20251018/{number:06d}_front.jpg', body or b'%06d' % number, t_start_ns=stamp_ns, t_end_ns=stamp_ns,
+                metadata=said, **fields)  # fmt: skip
+
+
+class Desk:
+    """A robot with its spool and a store, and somebody who asks."""
+
+    def __init__(self, root: Path, keep: KeepSettings = KEEP) -> None:
+        self.root = root
+        self.clock = FakeClock()
+        self.clock.now_ns = NOON_NS + 3600 * SECOND
+        self.now_s = 0.0
+        self.store = MemoryStore()
+        self.keep = keep
+        self.version = ''
+        self.entries: list[Any] = []
+        self.released: list[SpooledObject] = []
+        self._put_inbox(b'{"format":1,"entries":[]}')
+        self.open()
+
+    def open(self) -> None:
+        """The node starts."""
+        self.spool = Spool(self.root, SpoolSettings(min_free_bytes=0), self.clock, 'thor', self.keep)
+        self.spool.open()
+        self.server = RequestServer(self.spool, self.store, self.keep, 'thor', self.clock, put=self._commit,
+                                    released=self.released.extend, monotonic=lambda: self.now_s)  # fmt: skip
+
+    def _commit(self, item: DataObject) -> None:
+        self.spool.commit([item])
+
+    def _put_inbox(self, body: bytes) -> None:
+        path = self.root.parent / 'inbox'
+        path.write_bytes(body)
+        import hashlib
+
+        self.store.put(
+            SpooledObject(
+                0,
+                MAILBOX_BUCKET,
+                inbox_key('thor'),
+                path,
+                len(body),
+                hashlib.sha256(body).hexdigest(),
+                'application/json',
+                {},
+                0,
+                0,
+            )
+        )
+
+    def keeps(self, *items: DataObject) -> None:
+        receive(self.spool, sum(item.samples for item in items))
+        assert self.spool.commit(items) == []
+
+    def write(self, body: bytes) -> None:
+        """Somebody replaces the mailbox."""
+        found = self.store.changed(MAILBOX_BUCKET, inbox_key('thor'), '', 1 << 30)
+        assert found
+        assert self.store.replace(MAILBOX_BUCKET, inbox_key('thor'), body, found[1])
+
+    def ask(self, *, by: str = 'spark', priority: int = 5, expires_s: int = 3600, **want: Any) -> str:
+        now_ns = self.clock.now_ns
+        request = PullRequest(robot='thor', by=by, made_ns=now_ns, expires_ns=now_ns + expires_s * SECOND, priority=priority,
+                              want=KeptFilter(**want))  # fmt: skip
+        self.entries.append(request.to_json())
+        self.write(encode_inbox(self.entries))
+        return request.id
+
+    def step(self, seconds: float = 10.0) -> None:
+        self.now_s += seconds
+        self.clock.now_ns += round(seconds * SECOND)
+        self.server.step()
+
+    def deliver(self, most: int = 1000) -> int:
+        """The store takes what is pending."""
+        items = self.spool.pending(most)
+        for item in items:
+            self.store.put(item)
+        self.spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
+        return len(items)
+
+    def answers(self, request: str) -> list[dict[str, Any]]:
+        """What the store has, in order."""
+        while self.deliver():
+            pass
+        found = [
+            json.loads(self.store.get(MAILBOX_BUCKET, info.key))
+            for info in self.store.list(MAILBOX_BUCKET, answers_prefix('thor', request))
+        ]
+        return sorted(found, key=lambda answer: answer['number'])
+
+    def finish(self) -> None:
+        """Until nothing happens any more."""
+        for _ in range(60):
+            self.step()
+            self.deliver()
+            if not self.spool.released()[0] and not any(row.is_open for row in self.spool.requests()):
+                break
+        self.step()
+
+    def state(self, number: int) -> str:
+        return next(row['state'] for row in rows(self.root) if row['key'].endswith(f'{number:06d}_front.jpg'))
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    made = Desk(tmp_path / 'spool')
+    yield made
+    made.spool.close()
+
+
+def test_what_is_on_request_stays_until_it_is_asked_for(desk: Desk) -> None:
+    """It is accounted for as kept, lies apart, and is sent, verified, once somebody asks; the ledger closes all along."""
+    desk.keeps(*(frame(number) for number in range(5)))
+    assert desk.deliver() == 0
+    found = assert_whole(desk.root)
+    assert (found['objects']['kept'], found['topics']['/camera']['stored_in']['kept']) == (5, 5)
+    assert len(list((desk.root / 'kept').rglob('*.jpg'))) == 5
+    request = desk.ask(sensor='camera', since_ns=NOON_NS + SECOND, until_ns=NOON_NS + 4 * SECOND)
+    desk.step()
+    assert len(desk.released) == 3
+    desk.finish()
+    answers = desk.answers(request)
+    assert (answers[0]['state'], answers[0]['objects'], answers[0]['bytes']) == ('accepted', 3, 18)
+    assert answers[-1]['state'] == 'done'
+    assert answers[-1]['outcomes'] == {'delivered': {'objects': 3, 'bytes': 18}}
+    assert [desk.store.get('sensor-data', f'thor/camera/20251018/{number:06d}_front.jpg') for number in (1, 2, 3)] == [
+        b'000001', b'000002', b'000003']  # fmt: skip
+    found = assert_whole(desk.root)
+    assert (found['objects']['kept'], found['topics']['/camera']['stored_in']['delivered']) == (2, 3)
+    assert not list((desk.root / 'ready').rglob('*.jpg'))
+
+
+def test_asking_twice_is_asking_once(desk: Desk) -> None:
+    """The same want has the same id, whoever asks; what was answered stays answered."""
+    desk.keeps(frame(1))
+    first, second = desk.ask(sensor='camera'), desk.ask(by='other', sensor='camera')
+    assert first == second
+    desk.finish()
+    before = len(desk.answers(first))
+    desk.step()
+    desk.step()
+    assert len(desk.answers(first)) == before
+    assert len(desk.spool.requests()) == 1
+
+
+@pytest.mark.parametrize(('want', 'numbers'), [
+    ({'near': (3.0, 0.5, 1.2)}, [3, 4]), ({'near': (3.0, 0.0, 1.0)}, [2, 3, 4]), ({'topic': '/lidar'}, []),
+    ({'mission': 'patrol'}, [7]), ({'mission_type': 'patrol'}, [7]), ({'keys': ('thor/camera/*/00000?_*',)}, list(range(8))),
+    ({'keys': ('thor/camera/20251018/000005_front.jpg',)}, [5]),
+])  # fmt: skip
+def test_a_request_chooses(desk: Desk, want: dict[str, Any], numbers: list[int]) -> None:
+    """All that is given must hold."""
+    desk.keeps(*(frame(number, metadata={words.MISSION_ID: 'patrol_1', words.MISSION_TYPE: 'patrol'} if number == 7 else {})
+                 for number in range(8)))  # fmt: skip
+    if want == {'near': (3.0, 0.5, 1.2)}:
+        numbers = [2, 3, 4]
+    desk.ask(sensor='camera', **want)
+    desk.step()
+    assert sorted(int(item.key[-16:-10]) for item in desk.released) == numbers
+
+
+def test_a_kill_at_any_moment_loses_no_request(desk: Desk) -> None:
+    """After each step of a pull the node dies; what was asked for arrives once, and is answered."""
+    desk.keeps(*(frame(number) for number in range(4)))
+    request = desk.ask(sensor='camera')
+    for _ in range(3):
+        desk.step()
+        desk.spool.close()
+        desk.open()
+        assert not desk.spool.recovery.counts
+    desk.finish()
+    assert {desk.state(number) for number in range(4)} == {'delivered'}
+    answers = desk.answers(request)
+    assert [answer['number'] for answer in answers] == list(range(1, len(answers) + 1))
+    assert [answer['state'] for answer in answers if answer['state'] != 'sending'] == ['accepted', 'done']
+    assert_whole(desk.root)
+
+
+def test_the_oldest_goes_first_and_nothing_that_is_asked_for(tmp_path: Path) -> None:
+    """Beyond keep.max_bytes what nobody waits for is evicted, as the ledger says; where all is waited for, the new."""
+    size = 200 << 10
+    desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
+    with closing(desk.spool):
+        for number in range(8):
+            desk.keeps(frame(number, body=bytes([number]) * size))
+        assert [desk.state(number) for number in range(8)] == ['evicted'] * 3 + ['kept'] * 5
+        found = assert_whole(desk.root)
+        assert found['topics']['/camera']['gaps'] == {'evicted': {'keep_limit': 3}}
+        request = desk.ask(sensor='camera')
+        desk.server.step()
+        for number in range(8, 20):
+            desk.keeps(frame(number, body=bytes([number]) * size))
+        assert {desk.state(number) for number in range(3, 8)} <= {'kept', 'pending'}
+        desk.finish()
+        assert {desk.state(number) for number in range(3, 8)} == {'delivered'}
+        assert desk.answers(request)[-1]['outcomes']['delivered']['objects'] == 5
+        assert_whole(desk.root)
+
+
+def test_protected_alone_beyond_the_limit_ends_keeping(tmp_path: Path) -> None:
+    """Nothing protected goes: what is new is not kept, and that is counted."""
+    desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
+    with closing(desk.spool):
+        desk.keeps(*(frame(number, body=bytes([number]) * (300 << 10), protected=True) for number in range(4)))
+        desk.keeps(frame(9, body=b'9' * 100_000))
+        assert [desk.state(number) for number in (0, 1, 2, 3, 9)] == ['kept'] * 4 + ['evicted']
+        assert desk.spool.unkept == 1
+        assert_whole(desk.root)
+
+
+def test_what_is_kept_for_too_long_goes(desk: Desk) -> None:
+    """After keep.days, but not what somebody waits for."""
+    desk.keeps(frame(1), frame(2))
+    desk.clock.now_ns += 15 * 24 * 3600 * SECOND
+    desk.ask(keys=('*/000002_front.jpg',))
+    desk.step()
+    assert [desk.state(number) for number in (1, 2)] == ['evicted', 'pending']
+    assert assert_whole(desk.root)['topics']['/camera']['gaps'] == {'evicted': {'keep_days': 1}}
+
+
+def test_requesters_share(desk: Desk) -> None:
+    """One who asks for much does not keep another one waiting; a more important request has more of the link, not all."""
+    size = 100 << 10
+    for number in range(0, 300, 30):
+        desk.keeps(*(frame(n, body=b'%06d' % n * (size // 6)) for n in range(number, number + 30)))
+    desk.ask(by='much', sensor='camera', until_ns=NOON_NS + 250 * SECOND)
+    desk.step()
+    assert len(desk.released) <= WINDOW
+    desk.ask(by='little', sensor='camera', since_ns=NOON_NS + 250 * SECOND)
+    desk.ask(by='urgent', priority=0, sensor='camera', since_ns=NOON_NS + 200 * SECOND, until_ns=NOON_NS + 250 * SECOND)
+    desk.deliver()
+    desk.released.clear()
+    desk.step()
+    numbers = [int(item.key[-16:-10]) for item in desk.released]
+    assert sum(number >= 250 for number in numbers) > 10
+    assert sum(200 <= number < 250 for number in numbers) > sum(number >= 250 for number in numbers)
+    assert sum(number < 200 for number in numbers) > 10
+
+
+def test_cancel_and_expiry_end_a_request(desk: Desk) -> None:
+    """What was released goes on its way; the rest stays, and the last answer says how much that is."""
+    size = 100 << 10
+    for number in range(0, 200, 50):
+        desk.keeps(*(frame(n, body=b'%06d' % n * (size // 6)) for n in range(number, number + 50)))
+    late = desk.ask(sensor='camera', until_ns=NOON_NS + 100 * SECOND, expires_s=25)
+    gone = desk.ask(sensor='camera', since_ns=NOON_NS + 100 * SECOND)
+    desk.step()
+    desk.clock.now_ns += 1
+    desk.entries.append(PullCancel(id=gone, by='spark', made_ns=desk.clock.now_ns).to_json())
+    desk.write(encode_inbox(desk.entries))
+    desk.step()
+    desk.finish()
+    for request, state in ((late, 'expired'), (gone, 'cancelled')):
+        last = desk.answers(request)[-1]
+        assert last['state'] == state
+        counts = {name: each['objects'] for name, each in last['outcomes'].items()}
+        assert sum(counts.values()) == 100
+        assert counts['unsent'] > 0
+    assert_whole(desk.root)
+    assert not any(row['state'] == 'pending' for row in rows(desk.root))
+
+
+def test_a_hostile_mailbox_is_refused(desk: Desk) -> None:
+    """By its size, its form, its fields, its ids; what is right in it counts all the same, and nothing ends the robot."""
+    desk.keeps(frame(1))
+    good = PullRequest(
+        robot='thor',
+        by='spark',
+        made_ns=desk.clock.now_ns,
+        expires_ns=desk.clock.now_ns + SECOND * 3600,
+        want=KeptFilter(sensor='camera'),
+    ).to_json()
+    bad: list[tuple[str, Any]] = [
+        ('not_ours', 7), ('fields', {**good, 'more': 1}), ('fields', {'cancel': good['id']}), ('id', {**good, 'id': 'f' * 32}),
+        ('id', {**good, 'id': '../../x'}), ('name', {**good, 'by': '../x'}), ('time', {**good, 'made_ns': 1 << 62}),
+        ('time', {**good, 'expires_ns': 1e30}), ('priority', {**good, 'priority': True}), ('robot', {**good, 'robot': 'tachi'}),
+        ('fields', {**good, 'want': {'sql': '1'}}), ('fields', {**good, 'want': {}}),
+        ('keys', {**good, 'want': {'keys': ['[a-z]']}}),
+        ('keys', {**good, 'want': {'keys': ['a*'] * 17}}), ('near', {**good, 'want': {'near': [float('nan'), 0, 1]}}),
+        ('want', {**good, 'want': {'sensor': 'x' * 257}}), ('near', {**good, 'want': {'near': [1, 2]}}),
+    ]  # fmt: skip
+    for _, entry in bad:
+        desk.write(json.dumps({'format': 1, 'entries': [entry]}).encode())
+        desk.step()
+    for body in (b'{', b'[]', b'{"format":2,"entries":[]}', b'[' * 100_000, b' ' * 300_000,
+                 json.dumps({'format': 1, 'entries': [good] * 257}).encode()):  # fmt: skip
+        desk.write(body)
+        desk.step()
+    assert desk.released == []
+    expected = [reason for reason, _ in bad]
+    found = dict(desk.server.refused)
+    assert {reason: found.pop(reason) for reason in set(expected)} == {
+        reason: expected.count(reason) + (2 if reason == 'not_ours' else 0) for reason in set(expected)
+    }
+    assert found == {'not_json': 2, 'too_large': 1, 'too_many': 1}
+    desk.write(json.dumps({'format': 1, 'entries': [{}, good]}).encode())
+    desk.step()
+    assert len(desk.released) == 1
