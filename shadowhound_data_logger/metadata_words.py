@@ -60,3 +60,5 @@ BAG: Final = 'bag'
 SLICE: Final = 'slice'
 MESSAGES: Final = 'messages'
 EVENT: Final = 'event'
+# A recording that was imported: the SHA-256 of the file that it came from.
+IMPORTED_FROM: Final = 'imported_from'

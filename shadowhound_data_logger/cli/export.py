@@ -32,6 +32,7 @@ from shadowhound_data_logger.stores import open_reader
 if TYPE_CHECKING:
     from shadowhound_data_logger.datasets.export import Exported
     from shadowhound_data_logger.datasets.features import ExportOptions
+    from shadowhound_data_logger.datasets.imports import Demonstration
     from shadowhound_data_logger.datasets.verify import Proved, Seen
 
 SCHEME: Final = 's3://'
@@ -185,9 +186,9 @@ def _exporting() -> Iterator[None]:
         with asking():
             yield
     except ModuleNotFoundError as error:
-        if error.name != 'av':
+        if error.name not in {'av', 'h5py'}:
             raise
-        raise BadUsage('av is not installed', "pip install 'shadowhound_data_logger[datasets]'") from error
+        raise BadUsage(f'{error.name} is not installed', "pip install 'shadowhound_data_logger[datasets]'") from error
 
 
 def _report(result: Exported, where: str, *, is_dry: bool) -> Iterator[Text]:
@@ -240,6 +241,62 @@ def export_verify(*, place: str, is_all: bool, is_read: bool, as_json: bool) -> 
     else:
         print_lines(*_proof(found, place))
     return exit_code(finding=found.wrong)
+
+
+_arm = click.option('--arm', default='soarm', show_default=True, metavar='NAME', help='Whose recording it is.')
+_times = click.option('--times', type=click.Path(path_type=Path), metavar='FILE',
+                      help="When each episode began, by the arm's clock: CSV with episode,begin_ns.")  # fmt: skip
+
+
+@export.command('import-lerobot', epilog=examples('export import-lerobot so100_fetch --arm soarm --times begins.csv --degrees'))
+@click.argument('folder', type=click.Path(file_okay=False, path_type=Path), metavar='DIR')
+@_arm
+@_times
+@click.option('--degrees', 'is_degrees', is_flag=True, help='Its joints are in degrees: make radians of them.')
+@as_json
+def export_import_lerobot(*, folder: Path, arm: str, times: Path | None, is_degrees: bool, as_json: bool) -> ExitCode:
+    """Store an arm's LeRobotDataset (v2.1, v3.0) as its recording.
+
+    Joints and actions; its videos stay where they are.
+    """
+    with _exporting():
+        from shadowhound_data_logger.datasets import imports as library  # noqa: PLC0415
+    begins = library.times_of(times) if times else {}
+    return _import(library.of_lerobot(folder, begins, is_degrees=is_degrees), arm, is_json=as_json)
+
+
+@export.command('import-hdf5', epilog=examples('export import-hdf5 episode_0.hdf5 episode_1.hdf5 --times begins.csv --fps 50'))
+@click.argument('files', type=click.Path(dir_okay=False, path_type=Path), metavar='FILE...', nargs=-1, required=True)
+@_arm
+@_times
+@click.option('--fps', type=click.FloatRange(0.1, 10000), default=50.0, show_default=True, help='Samples a second.')
+@click.option('--joints', default='', metavar='NAMES', help="Of qpos, in their order  [default: ALOHA's fourteen]")
+@as_json
+def export_import_hdf5(*, files: tuple[Path, ...], arm: str, times: Path | None, fps: float, joints: str,
+                       as_json: bool) -> ExitCode:  # fmt: skip
+    """Store HDF5 demonstrations (ACT, ALOHA) as the recording of an arm.
+
+    The n-th file is episode n, from 0. Joints and actions; pictures stay where they are.
+    """
+    with _exporting():
+        from shadowhound_data_logger.datasets import imports as library  # noqa: PLC0415
+    begins = library.times_of(times) if times else {}
+    return _import(library.of_hdf5(files, begins, fps=fps, joints=_words(joints)), arm, is_json=as_json)
+
+
+def _import(demonstrations: Iterator[Demonstration], arm: str, *, is_json: bool) -> ExitCode:
+    from shadowhound_data_logger.datasets import imports as library  # noqa: PLC0415
+
+    check_name(arm, '--arm')
+    with _exporting(), the_store() as store:
+        found = library.bring(demonstrations, arm, store)
+    if is_json:
+        print_json(asdict(found))
+    else:
+        there = f', {number(found.present)} were there already' if found.present else ''
+        print_lines(plain(f'{counted(found.episodes, "episode")} of {arm} with {number(found.samples)} samples: '
+                          f'{counted(found.objects, "object")} stored{there}.'))  # fmt: skip
+    return ExitCode.FINE
 
 
 def _proof(found: Proved, place: str) -> Iterator[Text]:

@@ -55,6 +55,8 @@ ARM_JOINTS, ARM_COMMANDS, ARM_CLOCK = 'arm_joints', 'arm_commands', 'arm_clock'
 """What an arm's sensors are called here, whatever they are called where they were recorded: they are found by topic."""
 ARM_TOPICS: Final = {ARM_JOINTS: 'joint_states', ARM_COMMANDS: 'joint_commands', ARM_CLOCK: 'clock'}
 """Below the arm's namespace: sensor_msgs/JointState twice, sensor_msgs/TimeReference."""
+JOINT_STATE: Final = 'sensor_msgs/msg/JointState'
+"""Positions in radians; of a recording that was imported without a unit the type is another one."""
 ARM_STATE: Final = StatePart('arm', ARM_JOINTS, ('position',), (), ('rad',))
 ARM_COMMAND: Final = StatePart('arm', ARM_COMMANDS, ('position',), (), ('rad',))
 ARM_ACTION: Final = 'action.arm'

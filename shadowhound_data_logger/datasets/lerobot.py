@@ -25,8 +25,10 @@ from shadowhound_data_logger.datasets.features import (
     ARM_STATE,
     COMMAND,
     DERIVED,
+    JOINT_STATE,
     STATE_PARTS,
     ExportOptions,
+    StatePart,
 )
 from shadowhound_data_logger.datasets.video import feature_info, video_frames
 from shadowhound_data_logger.disk import fingerprint, replacing, sync
@@ -310,7 +312,7 @@ def features_of(told: Mapping[str, Any], options: ExportOptions) -> dict[str, An
     for word, part in {**arm, **{word: STATE_PARTS[word] for word in options.state}}.items():
         names = streams[f'state.{word}']['names']
         state += names
-        units += part.units if len(part.units) == len(names) else part.units[:1] * len(names)
+        units += _units(part, names, streams[f'state.{word}'])
         origins += [f'{part.sensor}, derived' if part.is_derived else part.sensor] * len(names)
     features['observation.state'] = _vector(state, units=units, source=origins)
     features['action'] = _action_feature(streams)
@@ -330,12 +332,18 @@ def _action_feature(streams: Mapping[str, Any]) -> dict[str, Any]:
     if ARM_ACTION in streams:
         of_arm = streams[ARM_ACTION]
         commanded = of_arm['sensor'] == ARM_COMMANDS
-        names, units = [*of_arm['names'], *names], [*ARM_STATE.units * len(of_arm['names']), *units]
+        names, units = [*of_arm['names'], *names], [*_units(ARM_STATE, of_arm['names'], of_arm), *units]
         sources, is_derived = (
             [of_arm['topic'] if commanded else f'{of_arm["topic"]}, derived', *sources],
             is_derived or not commanded,
         )
     return _vector(names, units=units, source=', '.join(sources), derived=is_derived)
+
+
+def _units(part: StatePart, names: Sequence[str], stream: Mapping[str, Any]) -> Sequence[str]:
+    if part is ARM_STATE and stream['type'] != JOINT_STATE:
+        return ['as recorded'] * len(names)
+    return part.units if len(part.units) == len(names) else part.units[:1] * len(names)
 
 
 def _vector(names: list[str], **info: Any) -> dict[str, Any]:
