@@ -41,7 +41,7 @@ def test_every_verb_and_option_exists() -> None:
     for where, match in told(COMMAND):
         command: click.Command | None = cli.commands.get(match['verb'])
         words = match['rest'].split()
-        if isinstance(command, click.Group) and words and re.fullmatch('[a-z]+', words[0]):
+        if isinstance(command, click.Group) and words and re.fullmatch('[a-z][a-z0-9-]*', words[0]):
             command = command.commands.get(words[0])
         if command is None:
             wrong.append(f'{where}: {match[0]}')
