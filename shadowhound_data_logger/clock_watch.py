@@ -36,7 +36,7 @@ class ClockState:
 
 
 class ClockWatch:
-    """A Clock that tells how far it can be trusted. New; ``look`` once a second on one thread, the rest on any.
+    """A Clock that knows how far it can be trusted. New; ``look`` once a second on one thread, the rest on any.
 
     ``_lock`` guards what the last look found. ``steps`` are those that earlier processes have counted.
     """

@@ -46,7 +46,7 @@ class WorkerStatus:
 
 
 class Worker:
-    """One owned daemon thread that calls ``step`` until it is stopped.
+    """Calls ``step`` on a daemon thread of its own until it is stopped.
 
     ``step`` does one round and returns; it may block for as long as closing may wait, and accounts for what it holds
     whatever ends it. Life: New; start once; ``look`` a few times a second, from one thread; stop once.

@@ -46,7 +46,9 @@ def is_plain(told: Description | None, slices: Sequence[str]) -> bool:
 
 
 class Plain:
-    """The slices of an MCAP bag as one row of messages. A slice is opened when something of it is wanted, by its summary first.
+    """Reads the slices of an MCAP bag as one row of messages.
+
+    A slice is opened when something of it is wanted, by its summary first.
 
     Life: New; used by one thread. ``told`` saves opening slices of which it says that they are of another time.
     """
@@ -95,7 +97,7 @@ def _times(told: Description | None, sources: Sequence[Ranged]) -> list[BagPart 
 
 
 class Packed:
-    """A bag that is not plain MCAP: SQLite, or compressed outside the storage. Its files are those that the metadata name.
+    """Reads a bag that is not plain MCAP: SQLite, or compressed outside the storage. Its files are those that the metadata name.
 
     SQLite knows one stamp alone, when a message came; it stands for both.
     """

@@ -65,7 +65,9 @@ MOST_BYTES: Final = 256 << 20
 
 @dataclass(slots=True)
 class BagState:
-    """A bag on this disk. Life: ``begin`` one, or read it by one of the ``of_...``. One thread at a time.
+    """What is known of a bag on this disk that is not whole yet.
+
+    Life: ``begin`` one, or read it by one of the ``of_...``. One thread at a time.
 
     What changes it returns what the index has to be told.
     """

@@ -35,7 +35,7 @@ MAX_QOS: Final = 1000
 
 
 class EventConsumer(Consumer):
-    """What the ring and the conditions get of what was taken: the messages themselves. It counts nothing and copies nothing."""
+    """Hands messages to the ring and the conditions; it counts nothing and copies nothing."""
 
     def __init__(self, node: Node, settings: EventSettings, ring: Ring, claims: Claims) -> None:
         watched = [(node.resolve_topic_name(each.topic), each) for each in conditions(settings.conditions)]

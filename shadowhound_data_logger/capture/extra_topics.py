@@ -33,7 +33,10 @@ STANDARD: Final = {
 
 
 class ExtraTopics:
-    """The topics of one consumer with a choice. New; ``refresh`` while it listens, ``end`` when it does no more."""
+    """Subscribes to the topics that one consumer wants and no sensor takes.
+
+    New; ``refresh`` while it listens, ``end`` when it does no more.
+    """
 
     def __init__(self, around: Surroundings, consumers: Sequence[Consumer], types: Mapping[str, str]) -> None:
         """The first of ``consumers`` is the one; what has a subscription of its own here goes to the others as well.

@@ -56,7 +56,10 @@ PACKAGE: Final = str(Path(__file__).resolve().parents[2])
 
 
 class Front:
-    """The node's side. Life: New; open once; ``stop``, and ``close`` when there is time to wait. Owns the thread ``front``."""
+    """Starts the front process for the node and watches it.
+
+    Life: New; open once; ``stop``, and ``close`` when there is time to wait. Owns the thread ``front``.
+    """
 
     def __init__(self, arguments: Sequence[str], environ: Mapping[str, str]) -> None:
         """``arguments`` are those of ROS that the node was started with, ``environ`` is what it was before we changed it."""
@@ -109,7 +112,10 @@ class Front:
 
 
 class PublicNode:
-    """The front's side: the ROS node that stands for the logger's own. Made once the node answers; ``look`` every second."""
+    """Offers the logger's services in the front process: a ROS node with the logger's public name.
+
+    Made once the node answers; ``look`` every second.
+    """
 
     def __init__(self, connection: Connection, node: Node) -> None:
         """Raises NodeUnavailable."""

@@ -41,7 +41,7 @@ GRACE_S: Final = 2 * POLL_S
 
 
 class KeepRule(Protocol):
-    """Decides over one message at a time, in the order of arrival."""
+    """Decides which messages are kept, one at a time, in the order of arrival."""
 
     def keep(self, stamp_ns: int, cdr: bytes) -> bool:
         """Whether this message is stored."""
@@ -97,7 +97,7 @@ def rule_for(sensor: SensorSettings, *, has_header: bool, last_kept_ns: int) -> 
 
 
 class Batcher:
-    """The open batch of one topic: one message each, or whole windows of ``batch_s`` in UTC.
+    """Collects the open batch of one topic: one message each, or whole windows of ``batch_s`` in UTC.
 
     A late sample (of a second publisher with another clock, say) joins the open batch; a clock that was set begins a new one.
     """
@@ -151,7 +151,7 @@ class Batcher:
 
 
 class Sampler(Consumer):
-    """What is logged of the sensors' topics. New; ``take`` what the intake drained."""
+    """Chooses which messages of the sensors' topics are logged, and batches them. New; ``take`` what the intake drained."""
 
     def __init__(self, sensors: Mapping[str, SensorSettings], accounts: Accounts, types: MessageTypes, clock: Clock,
                  queue: BatchQueue) -> None:  # fmt: skip

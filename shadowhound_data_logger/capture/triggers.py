@@ -115,7 +115,7 @@ class Logged(NamedTuple):
 
 
 class JournalTail:
-    """What comes new into the journal of a mission. New; ``new`` again and again. One thread."""
+    """Reads what is added to the journal of a mission. New; ``new`` again and again. One thread."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -303,7 +303,7 @@ def _proof(found: Proved, place: str) -> Iterator[Text]:
     for wrong in found.wrong[:SHOWN]:
         yield plain(f'  {wrong}', 'red')
     said = f'{number(len(found.wrong))} things are wrong' if found.wrong else 'all is as it was written'
-    like = '' if not found.frames else f', {number(found.frames)} frames compared (least SSIM {found.least_likeness:.3f})'
+    like = '' if not found.frames else f', {number(found.frames)} frames compared (least SSIM {found.least_ssim:.3f})'
     yield plain(f'{place}: {counted(found.episodes, "episode")}, {counted(found.files, "file")}, '
                 f'{counted(found.sources, "source")}{like}: {said}.')  # fmt: skip
 

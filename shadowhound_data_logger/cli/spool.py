@@ -36,7 +36,7 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus, delivering
 from shadowhound_data_logger.spool.index import MISSING, Index
-from shadowhound_data_logger.spool.listing import HERE, Heap, heaps, objects, tell_gaps_again
+from shadowhound_data_logger.spool.listing import HERE, SensorUsage, objects, tell_gaps_again, usage_by_sensor
 from shadowhound_data_logger.spool.listing import retry as retry_objects
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import limits, robots, targets
@@ -165,18 +165,18 @@ def tell_gaps(folder: Path, *, as_json: bool) -> ExitCode:
 def _overview(folder: Path, *, as_json: bool) -> ExitCode:
     clock = SystemClock.of_this_machine()
     with _opened(folder) as index:
-        found = heaps(index)
+        found = usage_by_sensor(index)
     running = [name for name in robots(folder) if read_status(folder, name, clock)['running']]
-    quarantined = sum(heap.objects for heap in found if heap.state == State.QUARANTINED.value)
+    quarantined = sum(usage.objects for usage in found if usage.state == State.QUARANTINED.value)
     if as_json:
-        said = [{**asdict(heap), 'oldest': iso(heap.oldest_ns)} for heap in found]
+        said = [{**asdict(usage), 'oldest': iso(usage.oldest_ns)} for usage in found]
         print_json({'spool': str(folder), 'running': running, 'heaps': said, 'quarantined': quarantined})
     else:
         print_page(*_view(folder, found, running, clock))
     return exit_code(finding=quarantined)
 
 
-def _view(folder: Path, found: Sequence[Heap], running: Sequence[str], clock: Clock) -> Iterator[RenderableType]:
+def _view(folder: Path, found: Sequence[SensorUsage], running: Sequence[str], clock: Clock) -> Iterator[RenderableType]:
     """A table, and what can be done about what is in it."""
     if not found:
         yield plain(f'Nothing waits in {folder}; what became of it: shadowhound-data ledger', 'green')
@@ -184,15 +184,15 @@ def _view(folder: Path, found: Sequence[Heap], running: Sequence[str], clock: Cl
     yield plain(f'In {folder}', 'bold')
     table = plain_table('', ('sensor', 'state', 'objects', 'size', 'oldest'), left=('sensor', 'state'))
     now_ns = clock.wall_ns()
-    for heap in found:
-        is_known = EARLIEST_SANE_NS <= heap.oldest_ns <= now_ns
-        age = duration((now_ns - heap.oldest_ns) / SECOND) if is_known else '-'
-        table.add_row(plain(heap.sensor), _state(heap.state, heap.reason), number(heap.objects), volume(heap.bytes), age)
+    for usage in found:
+        is_known = EARLIEST_SANE_NS <= usage.oldest_ns <= now_ns
+        age = duration((now_ns - usage.oldest_ns) / SECOND) if is_known else '-'
+        table.add_row(plain(usage.sensor), _state(usage.state, usage.reason), number(usage.objects), volume(usage.bytes), age)
     if len(found) > 1:
         table.add_section()
-        table.add_row('all', '', number(sum(heap.objects for heap in found)), volume(sum(heap.bytes for heap in found)), '')
+        table.add_row('all', '', number(sum(usage.objects for usage in found)), volume(sum(usage.bytes for usage in found)), '')
     yield table
-    for advice in _advice({(heap.state, heap.reason) for heap in found}, running):
+    for advice in _advice({(usage.state, usage.reason) for usage in found}, running):
         yield from ('', advice)
 
 

@@ -64,7 +64,7 @@ EpisodeRow = dict[str, Any]
 
 
 class Lerobot:
-    """A data set that is there, or becomes one. One process at a time writes it (``export.py`` holds the lock)."""
+    """Reads and writes one data set in LeRobot's layout. One process at a time writes it (``export.py`` holds the lock)."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -110,7 +110,10 @@ class Series:
 
 
 class Recordings:
-    """What there is of one mission. Enter once; ``series`` any number of times, while it is entered; one thread."""
+    """Finds and reads what was recorded of one mission.
+
+    Enter once; ``series`` any number of times, while it is entered; one thread.
+    """
 
     def __init__(self, place: Place, store: ObjectStore, tracks: Mapping[str, Track], topics: Mapping[str, str],
                  span_ns: tuple[int, int], bags: Sequence[Manifest], work: Path) -> None:  # fmt: skip

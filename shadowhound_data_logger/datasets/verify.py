@@ -24,7 +24,7 @@ from shadowhound_data_logger.datasets.episodes import EPISODE
 from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, OURS, SOURCE_TABLE, EpisodeRow, Lerobot
 from shadowhound_data_logger.datasets.series import pictures_of
 from shadowhound_data_logger.datasets.transfer import DatasetPlace
-from shadowhound_data_logger.datasets.video import likeness
+from shadowhound_data_logger.datasets.video import ssim
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake import decode
@@ -49,7 +49,7 @@ class Proved:
     files: int = 0
     sources: int = 0
     frames: int = 0
-    least_likeness: float = 1.0
+    least_ssim: float = 1.0
     wrong: list[str] = field(default_factory=list)
 
 
@@ -156,8 +156,8 @@ def _frames(made: Lerobot, row: EpisodeRow, key: str, sources: pa.Table, store: 
             if content != body:
                 found.wrong.append(f'episode {row["episode_index"]}, frame {number} of {key} is not its source, byte for byte')
             continue
-        alike = likeness(content, decode.image(body))
-        found.least_likeness = min(found.least_likeness, alike)
+        alike = ssim(content, decode.image(body))
+        found.least_ssim = min(found.least_ssim, alike)
         if alike < ALIKE:
             found.wrong.append(
                 f'episode {row["episode_index"]}, frame {number} of {key} is not like its source (SSIM {alike:.2f})'

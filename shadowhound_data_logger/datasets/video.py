@@ -90,7 +90,7 @@ def feature_info(codec: str, fps: int, size: tuple[int, int]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def likeness(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
+def ssim(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
     """The mean structural similarity of two pictures' luminance in blocks of 8 x 8, 1 for equal ones.
 
     Wang, Bovik, Sheikh, Simoncelli: Image quality assessment, IEEE TIP 13 (2004), with even weights.

@@ -26,7 +26,10 @@ TEXT: Final = 300
 
 
 class MlflowRest:
-    """One server. Raises TrackingUnavailable without an answer, TrackingRefused (data: status, code, text) after others."""
+    """Asks one MLflow server by REST.
+
+    Raises TrackingUnavailable without an answer, TrackingRefused (data: status, code, text) after others.
+    """
 
     def __init__(self, service: TowerService, environ: Mapping[str, str], home: Path) -> None:
         """``home`` is the user's, where MLflow's clients look for a user and a password that are not in the environment."""

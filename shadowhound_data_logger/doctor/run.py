@@ -32,7 +32,10 @@ _Message = tuple[str, 'Result | None']
 
 @dataclass(slots=True)
 class Running:
-    """A check at work. Its thread adopts the children that it starts, and the runner kills them when it gives the check up."""
+    """A check that is running.
+
+    Its thread adopts the children that it starts, and the runner kills them when it gives the check up.
+    """
 
     check: Check
     until_s: float = 0.0

@@ -32,7 +32,7 @@ MOST_BYTES: Final = 1 << 14
 
 
 class Question(NamedTuple):
-    """What a server answers to anybody, where it answers at all."""
+    """A gRPC question to one of SeaweedFS's servers, without keys."""
 
     server: str
     port: int

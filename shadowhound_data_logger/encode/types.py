@@ -86,7 +86,7 @@ class CounterField(NamedTuple):
 
 
 class MessageTypes:
-    """Definitions by type name (``sensor_msgs/msg/Imu``), read when first asked for, then kept.
+    """Finds message definitions by type name (``sensor_msgs/msg/Imu``), read when first asked for, then kept.
 
     Looked for in ``<prefix>/share/<package>/msg/<Name>.msg`` of each prefix (the entries of AMENT_PREFIX_PATH, in their
     order), else among the standard messages that ``rosbags`` ships. What was not found once stays unknown for the life

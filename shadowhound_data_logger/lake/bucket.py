@@ -29,7 +29,9 @@ _Answer = TypeVar('_Answer')
 
 @dataclass(frozen=True, slots=True)
 class Bucket:
-    """The questions of ``stores/base.py`` about one bucket, each with some tries. Thread-safe; its repr shows no secret.
+    """Reads and lists one bucket, by the calls of ``stores/base.py``, each with some tries.
+
+    Thread-safe; its repr shows no secret.
 
     Nothing but a StoreError leaves, or SettingError for settings that no request can be sent with.
     """

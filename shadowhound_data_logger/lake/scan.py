@@ -39,7 +39,10 @@ _ROW: Final = (*KEY, 't_start_ns')
 
 
 class Catalogue(DataSource):
-    """The rows of one bucket's catalogue that can be wanted. Stateless but for what it leaves out: each run lists anew."""
+    """Reads the rows of one bucket's catalogue that may match a query.
+
+    Stateless, except for what it leaves out: each run lists anew.
+    """
 
     def __init__(self, source: Bucket, wanted: Wanted, findings: Findings) -> None:
         self._source = source

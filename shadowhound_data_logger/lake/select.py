@@ -1,4 +1,4 @@
-"""What is asked of the catalogue: which objects, of when, of where; and the dates whose parts can hold them.
+"""What a query selects: which objects, from when, from where; and the dates whose parts can hold them.
 
 An object belongs to the moment at which it begins (``t_start``, UTC), as its row belongs to the folder of that date.
 """
@@ -22,7 +22,7 @@ MOST_FOLDERS: Final = 400
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
-    """All that is given must hold; None asks for nothing."""
+    """What a query selects: everything that is given must hold; None means any."""
 
     robot: str | None = None
     sensor: str | None = None
@@ -67,7 +67,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
     topic: str | None = None, mission: str | None = None, mission_type: str | None = None, success: bool | None = None,
     where: str | None = None,
 ) -> Wanted:  # fmt: skip
-    """The question in these words. Raises SettingError for one that is none."""
+    """The query with these flags. Raises SettingError for an invalid one."""
     return Wanted(
         robot=robot, sensor=sensor, topic=topic, mission=mission, mission_type=mission_type, success=success, where=where,
         since_ns=None if since is None else moment('since', since, now_ns),

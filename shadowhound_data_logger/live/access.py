@@ -43,7 +43,7 @@ class TokenRefused(DataLoggerError):
 
 @dataclass(frozen=True, slots=True)
 class SignIn:
-    """Who asks."""
+    """The role of somebody who sends requests."""
 
     role: str
     nonce: str = ''
@@ -89,7 +89,7 @@ def _read(path: Path) -> str:
 
 
 class Access:
-    """Decides about requests. Used by the event loop alone.
+    """Decides who may do what. Used by the event loop alone.
 
     ``is_open``: whoever reaches the page may watch, which holds for a page that listens on the loopback alone.
     """

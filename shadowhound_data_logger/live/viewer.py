@@ -48,7 +48,7 @@ class _Lane:
 
 
 class Viewer:
-    """The queue of one browser. Used by the event loop alone.
+    """Decides what one browser is sent, and when. Used by the event loop alone.
 
     ``offer`` what comes; ``next_frame`` until it is None, then wait for ``ready``; ``acknowledge`` what the browser says.
     """

@@ -60,7 +60,7 @@ _INDEX_ENTRY: Final = 16
 
 @dataclass(slots=True)
 class SliceScan:
-    """What is whole in a file, and how it becomes a slice: write the repairs, cut it off at ``end``, append the ending."""
+    """Finds what is whole in a file, and how it becomes a slice: write the repairs, cut it off at ``end``, append the ending."""
 
     contents: Contents = field(default_factory=Contents)
     end: int = 0

@@ -23,7 +23,10 @@ Pictures = Callable[[MissionFolder, str], 'Mapping[str, str] | None']
 
 
 class Drawing:
-    """One process at a time that makes pictures. Life: New; ``of`` any number; close once. Not thread-safe."""
+    """Has the pictures of a mission made by a process, one at a time.
+
+    Life: New; ``of`` any number; close once. Not thread-safe.
+    """
 
     def __init__(self, *, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._monotonic = monotonic

@@ -28,7 +28,7 @@ MAX_LINE_BYTES: Final = 16 << 20
 
 
 class Line(NamedTuple):
-    """What the journal says in one line."""
+    """One line of the journal."""
 
     end: int
     """Offset of the first byte after it: where reading goes on."""
@@ -37,7 +37,7 @@ class Line(NamedTuple):
 
 
 class Journal:
-    """The writer's side. Life: New; create once; append from any thread; sync from one; close once.
+    """Writes the journal of a mission. Life: New; create once; append from any thread; sync from one; close once.
 
     ``_lock`` guards the descriptor and makes a line one write.
     """

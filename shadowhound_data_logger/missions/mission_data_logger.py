@@ -38,7 +38,7 @@ CLOSE_S: Final = 5.0
 
 
 class MissionDataLogger:
-    """One agent's logger. Life: New; any number of missions, one at a time; close once, or never.
+    """Logs the missions of one agent. Life: New; any number of missions, one at a time; close once, or never.
 
     The constructor starts the process that sends (it takes seconds to load MLflow, and a mission's start should not wait for
     that) and the thread ``missions``, which syncs journals. All methods may be called from any thread. ``_lock`` guards the

@@ -40,7 +40,10 @@ LONGEST_PAUSE_S: Final = 60.0
 
 
 class Gate:
-    """Open while the receiver is to be tried; each failure closes it for longer (exponential, full jitter, up to a minute)."""
+    """Decides when a receiver is tried again.
+
+    Open while it is to be tried; each failure closes it for longer (exponential, full jitter, up to a minute).
+    """
 
     def __init__(self, monotonic: Callable[[], float], rng: random.Random) -> None:
         self._monotonic = monotonic
@@ -80,7 +83,7 @@ TRACKING, ARTIFACTS, OBJECTS, STORE = 'tracking', 'artifacts', 'objects', 'store
 
 
 class Replay:
-    """All missions of one home. Life: New; step any number; close once. Not thread-safe."""
+    """Sends all missions of one home. Life: New; step any number; close once. Not thread-safe."""
 
     def __init__(self, home: Path, tracking: Tracking, spooler: Spooler, drawing: Drawing, *,
                  settle: Callable[[MissionFolder], bool] = lambda _: True, monotonic: Callable[[], float] = time.monotonic,

@@ -37,7 +37,7 @@ class Point(NamedTuple):
 
 @dataclass(slots=True)
 class Story:
-    """A fold over the records, in their order; the same journal always gives the same story."""
+    """The state of a mission, folded from its journal's records in their order; the same journal always gives the same story."""
 
     start: Mapping[str, Any] = field(default_factory=dict)
     end: Mapping[str, Any] = field(default_factory=dict)

@@ -28,7 +28,10 @@ LOOK_EVERY_S: Final = 1.0
 
 
 class Ahead:
-    """The backlog in two orders, what is live, and when to ask for more. Guarded by the lock of the Schedule it belongs to."""
+    """Looks up objects before they are needed: the backlog in two orders, what is live, and when to ask for more.
+
+    Guarded by the lock of the Schedule it belongs to.
+    """
 
     def __init__(self) -> None:
         self._important: dict[int, SpooledObject] = {}

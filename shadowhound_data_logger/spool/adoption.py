@@ -34,7 +34,7 @@ _LARGEST: Final = (1 << 63) - 1
 
 @dataclass(slots=True)
 class Recovery:
-    """What recovery did, by word; all zero after a clean stop."""
+    """Counts what recovery did, by word; all zero after a clean stop."""
 
     counts: Counter[str] = field(default_factory=Counter)
 
@@ -57,7 +57,7 @@ class _Found(NamedTuple):
 
 
 class Adoption:
-    """One run over the tree: New; run once. The caller holds the recovery lock."""
+    """Makes index and files agree after a crash, in one run over the tree: New; run once. The caller holds the recovery lock."""
 
     def __init__(self, tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
         self._tree = tree

@@ -21,7 +21,10 @@ _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 class Ballast:
-    """A file of nothing, given up when the disk is full and taken back when there is space. Guarded by the spool's lock."""
+    """Keeps space for a full disk: a file of zeros, deleted when the disk is full and made again when there is space.
+
+    Guarded by the spool's lock.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -69,7 +69,7 @@ UNDECLARED: Final = Expectation()
 
 
 class Hearing(NamedTuple):
-    """How some messages were heard."""
+    """The conditions under which some messages arrived."""
 
     now_s: float = 0.0
     """When they were taken, monotonic."""
@@ -102,7 +102,7 @@ class Estimate(NamedTuple):
 
 @dataclass(slots=True)
 class LossEstimator:
-    """One publisher of one topic. ``observe`` what was received, in the order in which it came."""
+    """Estimates what one publisher of one topic lost. ``observe`` what was received, in the order in which it came."""
 
     expected: Expectation = UNDECLARED
     period: float = 0.0
@@ -341,7 +341,10 @@ def _agree(intervals: Sequence[int], period: float) -> bool:
 
 @dataclass(slots=True)
 class TopicEstimate:
-    """All publishers of one topic that do not number their messages. Guarded by its owner's lock."""
+    """Estimates what was lost of one topic whose messages have no numbers, over all its publishers.
+
+    Guarded by its owner's lock.
+    """
 
     expected: Expectation = UNDECLARED
     before: RhythmRow | None = None

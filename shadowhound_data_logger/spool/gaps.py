@@ -95,7 +95,7 @@ class Watermark(NamedTuple):
 
 
 class GapKey(NamedTuple):
-    """What names a row beside its session and topic."""
+    """Identifies a row within its session and topic."""
 
     kind: str
     cause: str
@@ -118,7 +118,7 @@ class GapRow(NamedTuple):
 
 
 class TakenBack(NamedTuple):
-    """Losses that were none, of whatever rows are the newest."""
+    """Losses to take back, because they were none; taken from the newest rows."""
 
     topic: str
     kind: str

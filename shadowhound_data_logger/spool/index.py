@@ -327,7 +327,7 @@ class Index:
             (state and state.value, sensor, prefix, prefix),
         )
 
-    def heaps(self) -> list[tuple[Any, ...]]:
+    def usage_by_sensor(self) -> list[tuple[Any, ...]]:
         """(sensor, state, reason, objects, bytes, oldest created_ns) of the same, the most important first."""
         return self._db.execute(
             f'SELECT sensor, state, reason, count(*), sum(bytes), min(created_ns) FROM objects WHERE {_IN_SPOOL}'  # noqa: S608

@@ -20,7 +20,7 @@ HERE: Final = (State.PENDING, State.HELD, State.QUARANTINED, State.KEPT)
 
 
 @dataclass(frozen=True, slots=True)
-class Heap:
+class SensorUsage:
     """The objects of a sensor that are in the same state for the same reason."""
 
     sensor: str
@@ -57,9 +57,9 @@ class Retried:
     """Asked for, but their files are not there."""
 
 
-def heaps(index: Index) -> list[Heap]:
+def usage_by_sensor(index: Index) -> list[SensorUsage]:
     """Of an open index, the most important first. Raises sqlite3.Error."""
-    return [Heap(*row) for row in index.heaps()]
+    return [SensorUsage(*row) for row in index.usage_by_sensor()]
 
 
 def objects(index: Index, root: Path, *, state: State | None = None, sensor: str | None = None,

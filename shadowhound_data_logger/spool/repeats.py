@@ -33,7 +33,7 @@ class _Last:
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """What a repeat stands for."""
+    """The object that holds the content of a repeat."""
 
     body: FileBody
     """Size and checksum of the object that holds the content; its path is of no use."""

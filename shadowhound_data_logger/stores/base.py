@@ -37,7 +37,7 @@ class Content:
 
 
 class ObjectStore(Protocol):
-    """A bucketed object store. Thread-safe after ``open``; life: New; open once; use from any thread; close once.
+    """Puts, gets and lists objects in buckets. Thread-safe after ``open``; life: New; open once; use from any thread; close once.
 
     Each request is one try (``retry.steadily`` makes it more). Errors are those of ``shadowhound_data_logger.errors``:
     StoreUnavailable (transient), CredentialsRejected, BucketMissing, AccessDenied, ObjectRefused, ForeignObject. No other

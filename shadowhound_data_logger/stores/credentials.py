@@ -34,7 +34,10 @@ _log = logging.getLogger(__name__)
 
 
 class Keys(Credentials):
-    """What everything of one store signs with. Thread-safe; ``_lock`` guards what was found, and is held while a file is read."""
+    """Finds the keys that one store signs with, and reads them again when they are refused.
+
+    Thread-safe; ``_lock`` guards what was found, and is held while a file is read.
+    """
 
     def __init__(self, settings: StoreSettings, monotonic: Callable[[], float] = time.monotonic) -> None:
         """Raises SettingError for one half of a pair. Nothing is read yet."""

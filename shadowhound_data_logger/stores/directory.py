@@ -44,7 +44,7 @@ _FULL: Final = {errno.ENOSPC, errno.EDQUOT}
 
 
 class DirectoryStore:
-    """Objects as files. Several processes may use one folder: ``link(2)`` decides who was first."""
+    """Stores objects as files. Several processes may use one folder: ``link(2)`` decides who was first."""
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory

@@ -73,7 +73,7 @@ def _background() -> tuple[tuple[int, int, int], ...]:
 
 
 class ContentRequests:
-    """Requests with content, signed and sent without botocore's client.
+    """Sends signed requests with content, without botocore's client.
 
     Thread-safe. New; ask any number of times; close once. Raises what botocore's client would raise.
 

@@ -206,7 +206,7 @@ def test_it_is_proved(house: House, exported: Exported) -> None:
     store.open()
     found = verify(exported.folder, store, frames=None, is_read=True)
     assert found.wrong == []
-    assert (found.episodes, found.least_likeness > 0.9) == (2, True)
+    assert (found.episodes, found.least_ssim > 0.9) == (2, True)
     assert found.frames == sum(row['length'] for row in Lerobot(exported.folder).rows)
 
 
