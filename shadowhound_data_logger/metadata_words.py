@@ -54,6 +54,8 @@ GAP_VERSION: Final = 'gap_version'
 SHIP: Final = 'ship'
 ON_REQUEST: Final = 'on_request'
 """The one value of ``ship``."""
+PREVIEW_OF: Final = 'preview_of'
+"""Of a preview: the key of the object that it is a small picture of, in the same bucket."""
 
 # A file of a bag.
 BAG: Final = 'bag'

@@ -117,6 +117,9 @@ class KeepSettings:
     max_bytes: int = _setting(500 * GIBI, 'Most bytes to keep on the robot; beyond it the oldest objects are evicted.', low=MEBI)
     days: float = _setting(14.0, 'Days to keep them.', low=0.01, high=3650.0)
     missions: tuple[str, ...] = _setting(('',), 'Types of missions of which everything is uploaded always.')
+    preview_s: float = _setting(
+        1.0, 'Seconds between two small pictures of a camera that are uploaded at once; 0 makes none.', low=0.0, high=3600.0
+    )
     poll_s: float = _setting(10.0, 'Seconds between two looks at what is asked for.', low=0.5, high=3600.0)
 
 

@@ -15,6 +15,7 @@ from shadowhound_data_logger.bags.naming import BAGS, BUCKET, prefix_of
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.mcap.writer import OPEN
 from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 
 RECORDS: Final = 'records'
@@ -71,9 +72,9 @@ def _recording(folder: Path) -> Iterator[UnsentFile]:
 
 
 def _spooled(spool: Path, robot: str) -> Iterator[UnsentFile]:
-    for bag, name, row in _rows(spool, robot, State.PENDING, State.HELD, State.QUARANTINED):
+    for bag, name, row in _rows(spool, robot, State.PENDING, State.HELD, State.QUARANTINED, State.KEPT):
         is_refused = row['state'] == 'quarantined'
-        path = None if is_refused else spool / 'ready' / BUCKET / row['key']
+        path = None if is_refused else Tree(spool).path(State(row['state']), row['reason'], BUCKET, row['key'])
         where = QUARANTINE if is_refused else SPOOL
         yield UnsentFile(bag, name, where, row['bytes'], json.loads(row['metadata']), path)
 

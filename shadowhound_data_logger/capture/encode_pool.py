@@ -35,6 +35,7 @@ PATIENCE_S: Final = 60.0
 """A batch that takes longer is stuck: the largest images and clouds take a second on a Jetson."""
 Marking = Callable[[DataObject], DataObject]
 """Gives an object more metadata, or another name; from any thread."""
+Preview = Callable[[DataObject], 'DataObject | None']
 Observe = Callable[[Batch, 'DataObject | None'], None]
 
 
@@ -156,10 +157,12 @@ class EncodePool:
     """
 
     def __init__(self, robot: str, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,  # noqa: PLR0913 - each is a neighbour
-                 writer: SpoolWriter, marks: Sequence[Marking], observe: Observe, *, threads: int = THREADS) -> None:  # fmt: skip
+                 writer: SpoolWriter, marks: Sequence[Marking], observe: Observe, *,
+                 preview: Preview = lambda _: None, threads: int = THREADS) -> None:  # fmt: skip
         """``sensors`` are the settings in force. An object goes through the ``marks`` one after the other, then to ``writer``.
 
         ``observe`` is shown each batch and its object, if there is one, once that is on its way; what it raises loses nothing.
+        ``preview`` may make a small one of an object, which goes the same way before it.
         """
         self._queue = queue
         self._sensors = sensors
@@ -169,6 +172,7 @@ class EncodePool:
         self._accounts = writer.spool.accounts
         self._marks = marks
         self._observe = observe
+        self._preview = preview
         self._told: set[tuple[str, str]] = set()
         self.workers = [Worker(f'encode-{number}', self._step, patience_s=PATIENCE_S) for number in range(threads)]
 
@@ -217,7 +221,8 @@ class EncodePool:
     def _spool(self, item: DataObject) -> None:
         for mark in self._marks:
             item = mark(item)
-        self._writer.put(item)
+        preview = self._preview(item)
+        self._writer.put(*([preview] if preview is not None else []), item)
 
     def _tell(self, topic: str, details: Mapping[str, str]) -> None:
         """Say once for each topic and reason what is wrong; the ledger counts the rest."""

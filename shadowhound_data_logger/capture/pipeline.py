@@ -147,8 +147,10 @@ class Pipeline:
         self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
         self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)
-        marks = self.mission.mark, track.mark, Keeping(settings.keep, sensors).mark, self._redating.date
-        self.pool = EncodePool(settings.robot, queue, sensors, types, self.writer, marks, self.mission.observe)
+        keeping = Keeping(settings.keep, sensors, settings.robot)
+        marks = self.mission.mark, track.mark, keeping.mark, self._redating.date
+        self.pool = EncodePool(settings.robot, queue, sensors, types, self.writer, marks, self.mission.observe,
+                               preview=keeping.preview)  # fmt: skip
         self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
                                        self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,

@@ -1,0 +1,61 @@
+"""A process of its own that asks a robot for what it keeps, and writes down what it saw and asked for: it may be killed."""
+
+from __future__ import annotations
+
+import json
+import random
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Lock
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.lake import pull
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.query import default_source
+from shadowhound_data_logger.mailbox import BAG_SENSOR, KeptFilter
+from shadowhound_data_logger.options import UploadSettings
+from shadowhound_data_logger.stores import open_store
+
+SHORT_S = 3
+
+
+def main(robot: str, output: str, name: str, count: int, threads: int, seed: int) -> None:
+    """Ask so often, each time for a few seconds of a sensor, or of all bags."""
+    source, lock = default_source(), Lock()
+    store = open_store(source.settings, UploadSettings(read_timeout_s=5.0))
+    rng = random.Random(seed)
+
+    def write(line: dict[str, object]) -> None:
+        with lock, Path(output).open('a', encoding='utf-8') as file:
+            file.write(json.dumps(line) + '\n')
+
+    def ask(number: int) -> None:
+        now_ns = time.time_ns()
+        with lock:
+            sensor = rng.choice(['camera', 'camera', 'lidar', 'imu', BAG_SENSOR])
+            since_ns = now_ns - rng.randrange(2 * SECOND, 25 * SECOND)
+            until_ns = since_ns + rng.randrange(SECOND, 15 * SECOND)
+            is_short, is_cancelled = rng.random() < 0.15, rng.random() < 0.1
+            priority = rng.randrange(10)
+        want = KeptFilter(sensor=sensor, since_ns=since_ns, until_ns=until_ns)
+        try:
+            seen = pull.kept(source, robot, want, Findings(lambda _: None))['key'].to_pylist()
+            expiry_ns = SHORT_S * SECOND if is_short else 3600 * SECOND
+            asked = pull.ask(store, source, robot, want, by=f'{name}-{number % 3}', priority=priority, expiry_ns=expiry_ns)
+            write({'id': asked.id, 'made_ns': asked.made_ns, 'keys': seen, 'short': is_short, 'cancelled': is_cancelled})
+            if is_cancelled:
+                pull.cancel(store, source, robot, asked.id, by=name)
+        except (DataLoggerError, OSError) as error:  # the store is away, or the mailbox full: nothing was asked for
+            write({'failed': str(error)[:200]})
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(ask, range(count)))
+    store.close()
+
+
+if __name__ == '__main__':
+    robot_, output_, name_, *numbers = sys.argv[1:]
+    main(robot_, output_, name_, *map(int, numbers))
