@@ -19,6 +19,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 FOLDER = Path(__file__).resolve().parent
+SPOOL = Path(os.environ.get('SHADOWHOUND_HOME') or '~/.shadowhound').expanduser() / 'spool'
+"""Named, since before the first start of the node there is none yet, and the page would be that of the store."""
 RESTART_AFTER_S = 2.0
 FINAL = (0, 2)
 """Exit codes that mean what they say: asked to stop, and settings that were refused. Starting again would change neither."""
@@ -60,7 +62,7 @@ def live_page() -> Action:
     return Node(
         package='shadowhound_data_logger',
         executable='shadowhound-data',
-        arguments=['live', '--bind', LaunchConfiguration('live_bind')],
+        arguments=['live', '--spool', str(SPOOL), '--bind', LaunchConfiguration('live_bind')],
         condition=IfCondition(LaunchConfiguration('live')),
         output='screen',
         respawn=True,

@@ -19,6 +19,7 @@ from shadowhound_data_logger.cli.common import (
     spool_folder,
     the_home,
     the_spool,
+    the_store_settings,
 )
 from shadowhound_data_logger.cli.output import print_json
 from shadowhound_data_logger.spool.status import robots
@@ -51,7 +52,8 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
          robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Serve a page that shows robot and data.
 
-    It shows in a browser what the robot sees now, its data, and what is missing.
+    It shows in a browser what the robot sees now, its data, what is missing, and what was recorded at any moment before. On a
+    machine without a spool it is the page of the store: the past of every robot that has a folder there.
 
     Ctrl-C ends it. On 127.0.0.1 everybody on this machine may watch; other addresses need a token. Actions (bags, events, flush,
     pause) always need the operator's token. The tokens are files in SHADOWHOUND_HOME/live.
@@ -64,9 +66,11 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
     folder = the_spool(spool)
     tokens = the_home() / 'live'
     paths = make_tokens(tokens, anew=new_tokens)
+    store = the_store_settings()
+    is_of_store = spool is None and not folder.is_dir() and (bool(store.endpoint_url) or store.directory.is_dir())
     settings = LiveSettings(
         spool=folder, robot=robot or next(iter(robots(folder)), 'thor'), tokens=tokens, bind=bind, port=port, names=names,
-        certificate=tls or None, uploads_mbps=uploads_mbps,
+        certificate=tls or None, uploads_mbps=uploads_mbps, is_of_store=is_of_store,
     )  # fmt: skip
     logging.basicConfig(level=logging.INFO, format='%(message)s')
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final
@@ -72,27 +72,36 @@ class SpoolFigures:
         midnight = utc(now_ns).replace(hour=0, minute=0, second=0, microsecond=0)
         since_ns = since_ns if since_ns is not None else int(midnight.timestamp()) * SECOND
         until_ns = until_ns if until_ns is not None else int((midnight + timedelta(days=1)).timestamp()) * SECOND
-        rows = [gap for gap in ledger.journal(self._spool, self._robot) if _is_within(gap, since_ns, until_ns)]
-        grain_ns = (until_ns - since_ns) // MOST_GAPS if len(rows) > MOST_GAPS else 0
-        merged: dict[tuple[str, str, str, str], list[Any]] = {}
-        shown: list[list[Any]] = []
-        for gap in rows:
-            key = gap.sink, gap.topic, gap.kind, gap.cause
-            last = merged.get(key)
-            from_ns, to_ns = gap.from_ns or 0, gap.to_ns or 0
-            if last is not None and grain_ns and from_ns - last[5] < grain_ns:
-                last[5], last[6] = max(last[5], to_ns), last[6] + (gap.count or 0)
-                continue
-            merged[key] = [*key, from_ns, to_ns, gap.count or 0, gap.grade]
-            shown.append(merged[key])
-        for row in shown:
-            row[4:6] = row[4] / 1e6, row[5] / 1e6
+        gaps = [
+            (gap.sink, gap.topic, gap.kind, gap.cause, gap.from_ns, gap.to_ns, gap.count or 0, gap.grade)
+            for gap in ledger.journal(self._spool, self._robot) if _is_within(gap, since_ns, until_ns)
+        ]  # fmt: skip
         marks = [mark for mark in ledger.watermarks(self._spool) if mark.complete_ns >= since_ns and mark.since_ns <= until_ns]
-        return {
-            'from': since_ns / 1e6, 'to': until_ns / 1e6, 'now': now_ns / 1e6,
-            'columns': ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade'], 'gaps': shown,
-            'known': [[mark.topic, mark.since_ns / 1e6, mark.complete_ns / 1e6] for mark in marks if mark.sink == OBJECTS],
-        }  # fmt: skip
+        known = [(mark.topic, mark.since_ns, mark.complete_ns) for mark in marks if mark.sink == OBJECTS]
+        return told_gaps(gaps, known, since_ns, until_ns, now_ns)
+
+
+def told_gaps(gaps: Sequence[tuple[Any, ...]], known: Sequence[tuple[str, int, int]], since_ns: int, until_ns: int,
+              now_ns: int) -> dict[str, Any]:  # fmt: skip
+    """As ``SpoolFigures.gaps``, of gaps by time with the columns that it names, their times in ns."""
+    grain_ns = (until_ns - since_ns) // MOST_GAPS if len(gaps) > MOST_GAPS else 0
+    merged: dict[tuple[str, str, str, str], list[Any]] = {}
+    shown: list[list[Any]] = []
+    for sink, topic, kind, cause, from_ns, to_ns, count, grade in gaps:
+        key = sink, topic, kind, cause
+        last = merged.get(key)
+        if last is not None and grain_ns and from_ns - last[5] < grain_ns:
+            last[5], last[6] = max(last[5], to_ns), last[6] + count
+            continue
+        merged[key] = [*key, from_ns, to_ns, count, grade]
+        shown.append(merged[key])
+    for row in shown:
+        row[4:6] = row[4] / 1e6, row[5] / 1e6
+    return {
+        'from': since_ns / 1e6, 'to': until_ns / 1e6, 'now': now_ns / 1e6,
+        'columns': ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade'], 'gaps': shown,
+        'known': [[topic, from_ns / 1e6, to_ns / 1e6] for topic, from_ns, to_ns in known],
+    }  # fmt: skip
 
 
 def _is_within(gap: Gap, since_ns: int, until_ns: int) -> bool:

@@ -142,12 +142,16 @@ KINDS: Final[Mapping[str, Kind]] = {
 """By type of message; topics of other types are counted on the page and not drawn."""
 
 
-def series(
-    topic: str, kind: Kind, type_name: str, types: MessageTypes, messages: Sequence[tuple[float, bytes]]
-) -> LiveItem | None:
+def series(topic: str, kind: Kind, type_name: str, types: MessageTypes, messages: Sequence[tuple[float, bytes]]) -> LiveItem:
     """Rows of figures from messages and when each came (ms): all times as float64, then a row of float32 for each."""
     assert kind.values is not None
-    rows = [(at_ms, kind.values(types.deserialize(type_name, memoryview(cdr)))) for at_ms, cdr in messages]
+    return table_item(
+        topic, kind, [(at_ms, kind.values(types.deserialize(type_name, memoryview(cdr)))) for at_ms, cdr in messages]
+    )
+
+
+def table_item(topic: str, kind: Kind, rows: Sequence[tuple[float, Mapping[str, float]]]) -> LiveItem:
+    """Times and figures as an item: all times as float64, then a row of float32 for each that names what the last one names."""
     names = list(rows[-1][1])
     rows = [row for row in rows if list(row[1]) == names]
     times = np.array([at_ms for at_ms, _ in rows], '<f8')
@@ -209,14 +213,19 @@ def clouds(topic: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Seq
     every = max(1, -(-count // MOST_POINTS))
     points = np.frombuffer(cloud.data, layout, count)[::every]
     table = np.stack([points[axis] for axis in _AXES], axis=1).astype('<f4', copy=False)
+    yield from points_items(topic, at_ms, table, cloud.header.frame_id, sizes)
+
+
+def points_items(topic: str, at_ms: float, table: NDArray[Any], frame: str, sizes: Sequence[int]) -> Iterator[LiveItem]:
+    """The finite of these points (n, 3; float32, metres) in each size that is asked for."""
     table = table[np.isfinite(table).all(axis=1)]
     low = table.min(axis=0) if len(table) else np.zeros(3, '<f4')
-    span = (table.max(axis=0) - low if len(table) else low).astype('f8')
+    span = (table.max(axis=0).astype('f8') - low if len(table) else low).astype('f8')
     scale = np.where(span > 0, span, 1.0) / 65_535
     for size in sizes:
         chosen = ((table[:: _EVERY[size]] - low) * (1 / scale).astype('f4') + np.float32(0.5)).astype('<u2')
         head = {
             'at': round(at_ms, 1), 'low': [round(float(value), 4) for value in low], 'step': [float(value) for value in scale],
-            'points': len(chosen), 'frame': cloud.header.frame_id[:80],
+            'points': len(chosen), 'frame': frame[:80],
         }  # fmt: skip
         yield LiveItem(topic, 'cloud', size, head, chosen.tobytes())

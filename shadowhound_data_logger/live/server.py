@@ -26,6 +26,7 @@ from aiohttp import WSMsgType, web
 
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.errors import DataLoggerError, NodeUnavailable
+from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.live.access import (
     COOKIE,
     LASTS_S,
@@ -37,6 +38,7 @@ from shadowhound_data_logger.live.access import (
     make_tokens,
 )
 from shadowhound_data_logger.live.figures import SpoolFigures
+from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
 from shadowhound_data_logger.live.kinds import KINDS, LiveItem
 from shadowhound_data_logger.live.viewer import Viewer
 from shadowhound_data_logger.spool.control import connect
@@ -93,6 +95,8 @@ class LiveSettings:
     """Further names under which the page may be asked for."""
     certificate: tuple[Path, Path] | None = None
     """Certificate and key, for https."""
+    is_of_store: bool = False
+    """Whether the page is that of a store, with the past of all its robots, and not a robot's own."""
     uploads_mbps: float = 4.0
     """What uploads are left while somebody watches over the network; 0: all they want."""
 
@@ -125,6 +129,7 @@ class LiveServer:
         self._asking = asyncio.Lock()
         self._doctor: tuple[float, dict[str, Any]] | None = None
         self._examining = asyncio.Lock()
+        self._history = HistoryProcess([] if settings.is_of_store else [str(settings.spool), settings.robot])
         self._runner: web.AppRunner | None = None
         self._ticker: asyncio.Task[None] | None = None
         self.port = settings.port
@@ -138,7 +143,8 @@ class LiveServer:
         app.add_routes([
             web.get('/ws', self._watch), web.get('/api/session', self._session), web.post('/api/session', self._sign_in),
             web.post('/api/sign-out', self._sign_out), web.post('/api/act', self._act), web.get('/api/gaps', self._tell_gaps),
-            web.get('/api/doctor', self._tell_doctor), web.get('/{name:.*}', self._file),
+            web.get('/api/doctor', self._tell_doctor),
+            web.get('/api/past/{do:robots|days|timeline|moment}', self._tell_past), web.get('/{name:.*}', self._file),
         ])  # fmt: skip
         self._runner = web.AppRunner(app, access_log=None, handle_signals=False)
         await self._runner.setup()
@@ -162,6 +168,7 @@ class LiveServer:
                 task.cancel()
         if self._runner is not None:
             await self._runner.cleanup()
+        await self._history.close()
         if self._topics is not None:
             await asyncio.to_thread(self._topics.close)
         self._pool.shutdown()
@@ -178,6 +185,8 @@ class LiveServer:
 
     def _open_topics(self) -> None:
         """Where ROS is, read topics; else the data alone is shown."""
+        if self._settings.is_of_store:
+            return
         if find_spec('rclpy') is None:
             self.ros_problem = 'ROS is not sourced here: the page shows the data, and no camera, cloud or plots'
             return
@@ -229,7 +238,7 @@ class LiveServer:
             began_s = time.monotonic()
             if self._topics is not None:
                 self._topics.worker.look()
-            if self._viewers:
+            if self._viewers and not self._settings.is_of_store:
                 try:
                     await self._tell_figures(with_ledger=rounds % LEDGER_EVERY == 0)
                 except Exception:  # the one supervised catch-all: the page shows the age of what it has
@@ -308,7 +317,11 @@ class LiveServer:
 
     async def _session(self, request: web.Request) -> web.StreamResponse:
         who = self._who(request)
-        return _json({'role': who.role, 'csrf': who.csrf, 'signed_in': bool(who.nonce), 'robot': self._settings.robot})
+        return _json({'role': who.role, 'csrf': who.csrf, 'signed_in': bool(who.nonce), **self._about})
+
+    @property
+    def _about(self) -> dict[str, Any]:
+        return {'robot': self._settings.robot, 'has_live': not self._settings.is_of_store}
 
     async def _sign_in(self, request: web.Request) -> web.StreamResponse:
         address = request.remote or ''
@@ -321,7 +334,7 @@ class LiveServer:
             return _problem(401, 'this is not the token of a viewer or operator')
         who, cookie = found
         log.info('%s signed in from %s', who.role, address)
-        response = _json({'role': who.role, 'csrf': who.csrf, 'signed_in': True, 'robot': self._settings.robot})
+        response = _json({'role': who.role, 'csrf': who.csrf, 'signed_in': True, **self._about})
         response.set_cookie(COOKIE, cookie, max_age=LASTS_S, httponly=True, samesite='Strict', secure=self._scheme == 'https')
         return response
 
@@ -364,18 +377,40 @@ class LiveServer:
             return {'ok': False, 'robot': self._settings.robot, 'error': str(error)}
 
     async def _tell_gaps(self, request: web.Request) -> web.StreamResponse:
-        times = []
-        for name in ('from', 'to'):
-            text = request.query.get(name, '')
-            if text and not (text.isdecimal() and len(text) < 15):
-                return _problem(400, 'from and to are UTC in ms')
-            times.append(int(text) * SECOND // 1000 if text else None)
+        try:
+            times = [None if given is None else given * SECOND // 1000 for given in (_ms(request, 'from'), _ms(request, 'to'))]
+        except ValueError as error:
+            return _problem(400, str(error))
         try:
             async with self._reading:
                 found = await self._loop.run_in_executor(self._pool, partial(self._figures.gaps, *times))
         except DataLoggerError as error:
             return _problem(503, str(error))
         response = _json(found)
+        response.enable_compression()
+        return response
+
+    async def _tell_past(self, request: web.Request) -> web.StreamResponse:
+        """Of a timeline JSON; of a moment its head as JSON and its items, each after a uint32 with its length."""
+        do, robot = request.match_info['do'], request.query.get('robot', self._settings.robot)
+        takes = {'timeline': ('from', 'to'), 'moment': ('at',)}.get(do, ())
+        try:
+            times = {name: _ms(request, name) for name in takes}
+        except ValueError as error:
+            return _problem(400, str(error))
+        if not is_name(robot) or None in times.values():
+            return _problem(400, f'{do} takes {" and ".join(("robot", *takes))}')
+        try:
+            head, body = await self._history.ask({'do': do, 'robot': robot, **times})
+        except PastUnavailable as error:
+            return _problem(503, str(error), {'Retry-After': '2'})
+        if 'error' in head:
+            return _problem(400 if head.get('is_wrong') else 503, str(head['error']))
+        if do == 'moment':
+            told = json.dumps(head).encode()
+            return web.Response(body=len(told).to_bytes(4, 'little') + told + body, headers={'Cache-Control': 'no-store'},
+                                content_type='application/octet-stream')  # fmt: skip
+        response = _json(head)
         response.enable_compression()
         return response
 
@@ -453,6 +488,14 @@ async def _body(request: web.Request) -> dict[str, Any]:
         return _parsed((await request.read()).decode())
     except UnicodeDecodeError:
         return {}
+
+
+def _ms(request: web.Request, name: str) -> int | None:
+    """A time of a request. Raises ValueError."""
+    text = request.query.get(name, '')
+    if text and not (text.isascii() and text.isdecimal() and len(text) < 15):
+        raise ValueError(f'{name} is a time in UTC, in ms')
+    return int(text) if text else None
 
 
 def _json(content: Mapping[str, Any]) -> web.Response:

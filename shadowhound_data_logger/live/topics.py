@@ -166,8 +166,7 @@ class Topics:
         offset_ns = time.monotonic_ns() - time.time_ns()
         messages = [((message.received_ns + offset_ns) / 1e6, message.cdr) for message in taken]
         if not one.kind.is_bulk:
-            item = series(topic, one.kind, one.type, self._types, messages)
-            return [item] if item is not None else []
+            return [series(topic, one.kind, one.type, self._types, messages)]
         at_ms, cdr = messages[-1]
         if one.kind.name == 'cloud':
             return list(clouds(topic, self._types, at_ms, cdr, sizes))

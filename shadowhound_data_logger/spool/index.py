@@ -84,6 +84,7 @@ _OF_SENSOR: Final = 'bucket = ? AND sensor = ? AND key >= ? AND key < ?'
 _OBJECT: Final = 'id, bucket, key, bytes, sha256, content_type, metadata, priority, created_ns, state, reason'
 
 
+_SAID: Final = (words.MISSION_ID, words.MISSION_TYPE, words.POSE, words.BATTERY, words.CONTENT_KEY)
 _NOTHING_SWEPT: Final = (0, '')
 
 
@@ -326,6 +327,45 @@ class Index:
             " AND substr(bucket || '/' || key, 1, length(?)) = ? ORDER BY id",
             (state and state.value, sensor, prefix, prefix),
         )
+
+    def recorded(self, robot: str, begin_ns: int, end_ns: int) -> Iterator[tuple[Any, ...]]:
+        """Objects of a robot that are not lost and begin in this time, with what the catalogue has of them, by time.
+
+        (bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns, mission_id, mission_type, pose, battery,
+        content_key); what has a short row is not among them.
+        """
+        said = ', '.join(f"json_extract(metadata, '$.{word}')" for word in _SAID)
+        return self._db.execute(
+            f'SELECT bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns, {said} FROM objects'  # noqa: S608
+            f" WHERE t_start_ns >= ? AND t_start_ns < ? AND key >= ? AND key < ? AND state <> 'evicted'"
+            f" AND sensor <> '{CATALOGUE}' AND json_valid(metadata) ORDER BY t_start_ns",
+            (begin_ns, end_ns, f'{robot}/', _after(f'{robot}/')),
+        )
+
+    def recorded_compact(self, robot: str, date: str) -> Iterator[tuple[str, str, str, int, int]]:
+        """(bucket, key, sensor, bytes, settled_s) of short rows of delivered objects in whose folder's name is a ``YYYYMMDD``."""
+        return self._db.execute(
+            'SELECT bucket, path || name, sensor, bytes, settled_s FROM folders JOIN compact_objects ON folder = folders.id'  # noqa: S608
+            f" WHERE path >= ? AND path < ? AND instr(path, ?) AND state <> 2 AND sensor <> '{CATALOGUE}'",
+            (f'{robot}/', _after(f'{robot}/'), date),
+        )
+
+    def recorded_days(self, robot: str) -> list[int]:
+        """Days since 1970 on which objects begin that have full rows."""
+        rows = self._db.execute(
+            'SELECT DISTINCT t_start_ns / 86400000000000 FROM objects WHERE key >= ? AND key < ? AND t_start_ns >= ?'  # noqa: S608
+            f" AND sensor <> '{CATALOGUE}'",
+            (f'{robot}/', _after(f'{robot}/'), EARLIEST_SANE_NS),
+        )
+        return [day for (day,) in rows]
+
+    def folders(self, robot: str) -> list[str]:
+        """Folders of keys that have short rows."""
+        rows = self._db.execute(
+            f"SELECT DISTINCT path FROM folders WHERE path >= ? AND path < ? AND sensor <> '{CATALOGUE}'",  # noqa: S608
+            (f'{robot}/', _after(f'{robot}/')),
+        )
+        return [path for (path,) in rows]
 
     def usage_by_sensor(self) -> list[tuple[Any, ...]]:
         """(sensor, state, reason, objects, bytes, oldest created_ns) of the same, the most important first."""

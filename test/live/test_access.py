@@ -105,6 +105,13 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('GET', '/api/session', {'headers': REBOUND}, (403, 403, 403)),
     ('GET', '/api/gaps', {}, (401, 503, 503)),  # there is no spool
     ('GET', '/api/gaps?from=-1', {}, (401, 400, 400)),
+    ('GET', '/api/past/days', {}, (401, 503, 503)),  # there is no spool
+    ('GET', '/api/past/days?robot=../x', {}, (401, 400, 400)),
+    ('GET', '/api/past/moment?at=1e9', {}, (401, 400, 400)),
+    ('GET', '/api/past/moment', {}, (401, 400, 400)),
+    ('GET', '/api/past/timeline?from=0&to=99999999999999', {}, (401, 400, 400)),
+    ('GET', '/api/past/..%2f..%2fx', {}, (401, 404, 404)),
+    ('GET', '/api/past/days', {'headers': REBOUND}, (403, 403, 403)),
     ('GET', '/api/doctor', {'headers': REBOUND}, (403, 403, 403)),
     ('GET', '/ws', {}, (401, 101, 101)),
     ('GET', '/ws', {'headers': FOREIGN}, (403, 403, 403)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
+import shlex
 import shutil
 import signal
 import subprocess
@@ -150,8 +151,7 @@ def test_after_a_kill_the_page_goes_on_by_itself(page: Page, watching: Watching)
     holds(page, "document.querySelector('.pill').textContent.includes('no connection')")
     holds(page, "[...document.querySelectorAll('[data-age=camera]')].every(each => each.classList.contains('old'))")
     first = int(page.locator('[data-age=camera]').get_attribute('data-ms') or 0)
-    page.wait_for_timeout(1000)
-    assert int(page.locator('[data-age=camera]').get_attribute('data-ms') or 0) >= first + 700
+    holds(page, f"document.querySelector('[data-age=camera]').dataset.ms >= {first + 700}")
     before = counted(page, 'camera')
     watching.serve(port)
     holds(page, f'shadowhound.count.camera > {before}')
@@ -220,6 +220,42 @@ def test_a_gap_stands_on_the_timeline_at_its_time(page: Page, watching: Watching
 
     until(lambda: not lacks(), lambda: f'the page lacks {lacks()}')
     assert page.wrong == []
+
+
+def test_back_in_time(page: Page, watching: Watching) -> None:
+    """A click on the timeline shows that moment: frame, cloud, path and plots of then; it plays on from there.
+
+    The gap of the restart stands there too, and the commands that the page tells do what they say.
+    """
+    page.get_by_role('button', name='Back in time').click()
+    holds(page, '(shadowhound.past?.count ?? 0) > 0')
+    holds(page, "document.querySelectorAll('rect.recorded').length > 5")
+    assert {'/imu', '/camera/compressed'} <= set(
+        page.locator('rect.recorded').evaluate_all('all => all.map(one => one.dataset.topic)')
+    )
+    assert 'restart' in page.locator('rect.gap[data-topic="/imu"]').evaluate_all('all => all.map(one => one.dataset.cause)')
+    page.get_by_role('button', name='15 min').click()
+    slider = "document.querySelector('svg[role=slider]')"
+    holds(page, f'{slider}.ariaValueMax - {slider}.ariaValueMin < 1000000')
+    spot = page.locator('rect.recorded[data-topic="/imu"]').first.bounding_box()
+    assert spot is not None
+    page.mouse.click(spot['x'] + spot['width'] / 2, spot['y'])
+    kinds = "['camera', 'cloud', 'odom', 'imu', 'joints', 'battery']"
+    holds(page, f'{kinds}.every(each => shadowhound.past.shown.some(([, kind]) => kind === each))')
+    live = counted(page, 'imu')
+    before = int(page.locator('[data-moment]').get_attribute('data-moment') or 0)
+    page.locator('[data-play]').click()
+    holds(page, f'shadowhound.past.at > {before + 1000}')
+    page.locator('[data-play]').click()
+    assert counted(page, 'imu') <= live + 3  # nobody watches the live topics meanwhile
+    home = {**watching.processes.environ, 'SHADOWHOUND_HOME': str(watching.home)}
+    query = shlex.split(page.locator('[data-command=query]').inner_text())
+    assert query[0] == 'shadowhound-data'
+    command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', *query[1:], '--json']
+    ran = subprocess.run(command, env=home, capture_output=True, text=True, check=True, timeout=120)
+    assert {'camera', 'imu'} <= {row['sensor'] for row in json.loads(ran.stdout)}
+    page.get_by_role('button', name='Back to now').click()
+    page.locator('#data').wait_for()
 
 
 @pytest.mark.parametrize(('width', 'scheme'), [(1440, 'light'), (1440, 'dark'), (390, 'light')])

@@ -3,6 +3,7 @@ import { batch, html, render, signal, useEffect, useRef, useState } from './vend
 import { Cards, Controls, Findings, TopicTable } from './data.js';
 import { Link } from './link.js';
 import { Plot, Ring } from './plots.js';
+import { openRobot, past, show } from './past.js';
 import { Timeline } from './timeline.js';
 import { span } from './words.js';
 
@@ -16,29 +17,34 @@ const problem = signal('');
 const picked = signal({});
 const seen = new Map(); // kind -> { at } of what is shown, by the robot's clock
 const rings = { imu: new Ring(30), joints: new Ring(30), battery: new Ring(900), odom: new Ring(30), state: new Ring(30) };
+const pastRings = Object.fromEntries(Object.keys(rings).map((kind) => [kind, new Ring(10)]));
 const views = {};
+const ringOf = (kind) => (past.value ? pastRings : rings)[kind];
 // For whoever measures: how late items were when they came and when they were drawn, ms.
 const stats = (window.shadowhound = { came: {}, drawn: {}, count: {}, link: null, ages: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, link.now() - at])) });
 let link;
 
 function note(where, kind, at) {
-  const now = link.now();
-  if (now !== null) (where[kind] ??= []).push(now - at);
+  const now = link?.now() ?? null;
+  if (now !== null && !past.value) (where[kind] ??= []).push(now - at);
   if (where[kind]?.length > 4000) where[kind].splice(0, 2000);
 }
 
+// [topic, kind, type] of what can be shown.
+const having = (kind) => (past.value ? past.value.shown : topics.value).filter(([, each]) => each === kind);
+
 function chosen(kind) {
-  const having = topics.value.filter(([, each]) => each === kind);
-  const wanted = having.find(([topic]) => topic === picked.value[kind]);
+  const found = having(kind);
+  const wanted = found.find(([topic]) => topic === picked.value[kind]);
   if (wanted) return wanted[0];
   const logged = new Set((figures.value?.topics ?? []).filter((row) => row.sensor && row.publishers).map((row) => row.topic));
-  const rank = ([topic, , type]) => (logged.has(topic) ? 0 : 2) + (type.endsWith('/Image') ? 1 : 0);
-  return having.sort((a, b) => rank(a) - rank(b) || (a[0] < b[0] ? -1 : 1))[0]?.[0];
+  const rank = ([topic, , type]) => (logged.has(topic) ? 0 : 2) + (String(type).endsWith('/Image') ? 1 : 0);
+  return found.sort((a, b) => rank(a) - rank(b) || (a[0] < b[0] ? -1 : 1))[0]?.[0];
 }
 
 const KINDS = ['camera', 'cloud', 'odom', 'imu', 'joints', 'battery', 'state'];
 function rewatch() {
-  link?.watch(KINDS.map(chosen).filter(Boolean));
+  link?.watch(past.value ? [] : KINDS.map(chosen).filter(Boolean));
 }
 
 let decoding = false;
@@ -65,6 +71,7 @@ async function showFrame(head, body) {
 
 function onItem(head, body) {
   const { kind } = head;
+  if (past.value && kind !== 'topics' && kind !== 'figures') return; // on its way when somebody looked back
   stats.count[kind] = (stats.count[kind] ?? 0) + 1;
   if (head.at !== undefined) {
     seen.set(kind, { at: head.at });
@@ -95,12 +102,53 @@ function onItem(head, body) {
   }
 }
 
+// Of a moment that is past, all there is of it, at once.
+show((head, items) => {
+  rewatch();
+  for (const ring of Object.values(pastRings)) ring.clear();
+  for (const [item, body] of items) {
+    const { kind, topic } = item;
+    if (kind === 'path') {
+      const view = new DataView(body.buffer);
+      const poses = Array.from({ length: item.points }, (_, row) => [0, 1, 2].map((place) => view.getFloat32((row * 3 + place) * 4, true)));
+      views.plan?.trail(poses);
+      views.cloud?.trail(poses);
+    } else if (topic !== chosen(kind)) {
+      // another topic of the kind is shown
+    } else if (kind === 'camera') {
+      showFrame(item, body);
+    } else if (kind === 'cloud') {
+      views.cloud?.cloud(item, body);
+      views.plan?.cloud(item, body, true);
+    } else if (pastRings[kind]) {
+      pastRings[kind].add(item, body);
+      if (kind === 'odom') {
+        views.cloud?.pose(pastRings.odom.last());
+        views.plan?.pose(pastRings.odom.last());
+      }
+    }
+  }
+  stats.past = { at: head.at, shown: head.shown, count: (stats.past?.count ?? 0) + 1 };
+});
+let wasPast = false;
+past.subscribe((now) => {
+  if (Boolean(now) === wasPast) return;
+  wasPast = Boolean(now);
+  views.plan?.clear();
+  views.cloud?.trail([]);
+  rewatch();
+});
+
 function Age({ kind, children }) {
   const [, again] = useState(0);
   useEffect(() => {
     const timer = setInterval(() => again((count) => count + 1), 200);
     return () => clearInterval(timer);
   }, []);
+  if (past.value && kind !== 'figures') {
+    const before = past.value.shown.find(([topic]) => topic === chosen(kind))?.[2];
+    return html`<span class=${`age ${before === undefined ? 'old' : ''}`} data-age=${kind} data-before=${before ?? ''}>${before === undefined ? 'nothing then' : `${span(Math.max(0, before) / 1000)} before`}</span>${children}`;
+  }
   const at = seen.get(kind)?.at;
   const now = link?.now();
   const age = at === undefined || now === null || now === undefined ? null : Math.max(0, now - at);
@@ -109,10 +157,10 @@ function Age({ kind, children }) {
 }
 
 function Panel({ title, kind, className = '', tools, children }) {
-  const having = topics.value.filter(([, each]) => each === kind);
+  const found = having(kind);
   return html`<section class=${`panel view ${className}`} aria-label=${title}><div class="panel-head"><h3>${title}</h3>
-    ${having.length > 1 && html`<select aria-label=${`Topic of ${title}`} value=${chosen(kind)} onChange=${(event) => { picked.value = { ...picked.value, [kind]: event.target.value }; rewatch(); }}>
-      ${having.map(([topic]) => html`<option>${topic}</option>`)}</select>`}
+    ${found.length > 1 && html`<select aria-label=${`Topic of ${title}`} value=${chosen(kind)} onChange=${(event) => { picked.value = { ...picked.value, [kind]: event.target.value }; rewatch(); }}>
+      ${found.map(([topic]) => html`<option>${topic}</option>`)}</select>`}
     ${tools}<${Age} kind=${kind} /></div>${children}</section>`;
 }
 
@@ -155,15 +203,17 @@ function Chart({ title, kind, lines, options, className = '', figure }) {
     let rounds = 0;
     const timer = setInterval(() => {
       if (document.hidden) return;
+      plot.ring = ringOf(kind);
+      plot.seconds = past.value ? 10 : options.seconds ?? 30;
       plot.draw();
       if ((rounds += 1) % 4 === 0) again(rounds);
     }, calm.matches ? 1000 : 200);
     return () => clearInterval(timer);
   }, []);
-  const last = rings[kind].last();
+  const last = ringOf(kind).last();
   return html`<${Panel} title=${title} kind=${kind} className=${`chart ${className}`}><div class="legend small">
     ${(lines ?? []).map(([name, label, factor], place) => html`<span><i class=${`stroke line-${place + 1}`}></i>${label} <b>${last[name] === undefined ? '–' : (last[name] * factor).toFixed(options.digits ?? 1)}</b>${options.unit ? ` ${options.units?.[place] ?? options.unit}` : ''}</span>`)}
-    ${!lines && html`<span>${rings[kind].names.length} ${figure}</span>`}</div><div class="plot" ref=${box}></div></${Panel}>`;
+    ${!lines && html`<span>${ringOf(kind).names.length} ${figure}</span>`}</div><div class="plot" ref=${box}></div></${Panel}>`;
 }
 
 const DEGREES = 180 / Math.PI;
@@ -194,7 +244,7 @@ function Head({ onSignIn }) {
   const told = figures.value;
   const isLost = connection.value !== 'connected';
   const running = told?.state === 'running';
-  const [text, kind] = isLost ? ['no connection: trying again', 'bad'] : !told ? ['connecting', 'none'] : running ? [told.paused ? 'paused' : 'recording', told.paused ? 'watch' : 'good']
+  const [text, kind] = past.value ? ['back in time', 'watch'] : !session.value.has_live ? ['the store', 'none'] : isLost ? ['no connection: trying again', 'bad'] : !told ? ['connecting', 'none'] : running ? [told.paused ? 'paused' : 'recording', told.paused ? 'watch' : 'good']
     : [told.state === 'not_answering' ? 'the node does not answer' : 'the node is not running', 'bad'];
   const signOut = async () => {
     await fetch('/api/sign-out', { method: 'POST', headers: { 'X-CSRF-Token': session.value.csrf } });
@@ -202,7 +252,7 @@ function Head({ onSignIn }) {
   };
   return html`<header><a class="skip" href="#data">Skip to the data</a><img src="icon.svg" alt="" width="30" height="30" /><h1>${session.value?.robot ?? 'Live'}</h1>
     <span class=${`pill ${kind}`} role="status">${text}</span>
-    <nav aria-label="Parts of this page"><a href="#now">Now</a><a href="#data">The data</a><a href="#gaps">Gaps</a></nav>
+    ${!past.value && session.value.has_live && html`<nav aria-label="Parts of this page"><a href="#now">Now</a><a href="#data">The data</a><a href="#gaps">Gaps</a></nav>`}
     <span class="spacer"></span>${told && html`<${Age} kind="figures" />`}
     ${session.value?.signed_in ? html`<button type="button" onClick=${signOut}>Sign out (${session.value.role})</button>` : html`<button type="button" onClick=${onSignIn}>Sign in</button>`}</header>`;
 }
@@ -220,22 +270,26 @@ function App() {
   if (who === false) return html`<main class="alone"><div class="panel"><${SignIn} onDone=${done} /></div></main>`;
   const told = figures.value;
   return html`<${Head} onSignIn=${open} />
-    <main class=${connection.value === 'connected' ? '' : 'stale'}>
-      <section id="now" aria-label="Now">${problem.value && html`<p class="banner">${problem.value}</p>`}
+    <main class=${past.value ? 'past' : connection.value === 'connected' || !who.has_live ? '' : 'stale'}>
+      <section id="now" aria-label="Now">${problem.value && !past.value && html`<p class="banner">${problem.value}</p>`}
         <div class="views"><${Camera} /><${Cloud} /><${Plan} />
         <${Chart} title="Attitude" kind="imu" lines=${ATTITUDE} options=${{ unit: '°' }} />
         <${Chart} title="Acceleration" kind="imu" lines=${FORCE} options=${{ unit: 'm/s²' }} />
         <${Chart} title="Joints" kind="joints" lines=${null} options=${{ unit: 'rad' }} figure="joints, rad" />
         <${Chart} title="Battery" kind="battery" lines=${POWER} options=${{ unit: '%', units: ['%', 'V'], seconds: 600 }} />
         <${Chart} title="Temperature" kind="battery" lines=${HEAT} options=${{ unit: '°C', seconds: 600, digits: 0 }} /></div></section>
-      <section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} />
-        <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div>` : html`<p class="empty">…</p>`}</section>
-      <section id="gaps" aria-label="Gaps"><h2>What is missing</h2><${Timeline} /></section>
+      ${!past.value && who.has_live && html`<section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} />
+        <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div>` : html`<p class="empty">…</p>`}</section>`}
+      <section id="gaps" aria-label="Gaps"><h2>What is missing</h2><${Timeline} session=${who} /></section>
     </main>
     <dialog ref=${box}><${SignIn} box=${box} onDone=${done} /></dialog>`;
 }
 
 function start() {
+  if (!session.value.has_live) {
+    if (!past.value) openRobot(session.value.robot);
+    return;
+  }
   if (link) return;
   link = stats.link = new Link({ onItem, onState: (state) => { connection.value = state; if (state === 'lost') check(); } });
 }

@@ -30,6 +30,11 @@ export class Ring {
     }
   }
 
+  clear() {
+    this.names = [];
+    this.columns = [];
+  }
+
   last() {
     return Object.fromEntries(this.names.map((name, place) => [name, this.columns[place + 1].at(-1)]));
   }

@@ -183,9 +183,24 @@ export class FloorPlan {
     new ResizeObserver(() => this.draw()).observe(canvas.parentElement);
   }
 
-  cloud({ low, step, points, frame }, body) {
+  clear() {
+    this.plan.clearRect(0, 0, SIDE, SIDE);
+    this.hits.fill(0);
+    this.path = [];
+    this.bounds = this.robot = null;
+  }
+
+  // Where it went, all of it at once: x, y and yaw.
+  trail(poses) {
+    this.path = poses.map(([x, y]) => [x, y]);
+    for (const [x, y] of this.path) this.reach(x / CELL + SIDE / 2, SIDE / 2 - y / CELL);
+    const [x, y, yaw] = poses.at(-1) ?? [];
+    this.robot = poses.length ? { x, y, yaw } : null;
+  }
+
+  cloud({ low, step, points, frame }, body, always = false) {
     const now = performance.now();
-    if (now - this.cloudAt < 500 || (ON_ROBOT.test(frame) && !this.robot)) return;
+    if ((now - this.cloudAt < 500 && !always) || (ON_ROBOT.test(frame) && !this.robot)) return;
     this.cloudAt = now;
     const values = new Uint16Array(body.slice(0, points * 6).buffer);
     const { x: rx = 0, y: ry = 0, yaw = 0 } = ON_ROBOT.test(frame) ? this.robot : {};
@@ -201,8 +216,8 @@ export class FloorPlan {
       if (x < 0 || y < 0 || x >= SIDE || y >= SIDE) continue;
       const cell = y * SIDE + x;
       const hits = (this.hits[cell] = Math.min(255, this.hits[cell] + 1));
-      if (hits === 2) this.reach(x, y);
-      picture.data[cell * 4 + 3] = hits < 2 ? 0 : Math.min(255, 90 + hits * 14);
+      if (hits === 2 || always) this.reach(x, y);
+      picture.data[cell * 4 + 3] = hits < 2 && !always ? 0 : Math.min(255, 90 + hits * 14);
     }
     this.plan.putImageData(picture, 0, 0);
   }

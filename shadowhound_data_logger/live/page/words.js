@@ -30,6 +30,8 @@ export function digits(number) {
 
 export const clock = (ms, seconds = true) => new Date(ms).toISOString().slice(11, seconds ? 19 : 16);
 
+export const moment = (ms) => `${new Date(ms).toISOString().slice(0, 10)} ${new Date(ms).toISOString().slice(11, 21)}`;
+
 export const CAUSES = {
   restart: 'The node was not running', transport: 'Lost on the way to the node', no_room: 'The disk was full', queue_full: 'The queue was full',
   paused: 'The node was paused', unknown: 'Of unknown cause',

@@ -1,0 +1,397 @@
+"""The process that reads the past for the live page: a timeline of a time, and what the robot saw at a moment of it.
+
+It reads a request a line on its standard input and answers each on its standard output: two uint32 (little-endian) with the
+lengths of head and body, the head as JSON, the body. The live page starts it when somebody looks back, and ends it a minute
+after the last request. Whatever a hostile store does to it, the page goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final
+
+import numpy as np
+import simplejpeg
+
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.errors import BagDamaged, DataLoggerError, LakeError, Rejected
+from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.lake import decode
+from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem, clouds, frames, points_items, series, table_item
+from shadowhound_data_logger.live.past import PastContents, PastDay, PastObject, PastSource, SpoolPast, StorePast, dates_between
+from shadowhound_data_logger.mcap.index import McapIndex, read_index
+from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.mcap.ranges import Ranged
+from shadowhound_data_logger.untrusted import check_pixels, visible
+
+MOST_SPAN_NS: Final = 50 * 3600 * SECOND
+"""Of a timeline."""
+RUNS: Final = 800
+"""A timeline is told this fine; and what follows within ``RHYTHM_NS`` is one run however fine it is."""
+RHYTHM_NS: Final = 5 * SECOND // 2
+LONGEST_BATCH_NS: Final = 15 * SECOND
+STALE_NS: Final = 10 * SECOND
+"""What is older at a moment is not shown for it."""
+SERIES_NS: Final = 10 * SECOND
+"""So much before a moment the plots show."""
+PATH_NS: Final = 600 * SECOND
+AROUND_NS: Final = 5 * SECOND
+"""Of a moment, on either side: what its commands ask for."""
+IN_BAG_NS: Final = 3 * SECOND // 2
+"""So much before a moment is read of a bag."""
+MOST_TEXT: Final = 160
+MOST_MARKS: Final = 500
+MOST_CUTS: Final = 3
+"""Commands that cut a bag."""
+MOST_COLUMNS: Final = 64
+MOST_MESSAGES: Final = 2000
+"""Of a series at a moment; and of one object."""
+MOST_TOPICS: Final = 64
+MOST_MEMORY: Final = 6 << 30
+"""Address space of this process: a file that makes it ask for more ends it, and not the machine."""
+_CLOUD, _CAMERA = 'cloud', 'camera'
+
+
+class PastReader:
+    """Answers questions about the past, one at a time. Close once."""
+
+    def __init__(self, source: PastSource, prefixes: Sequence[str] = ()) -> None:
+        self._source = source
+        self._contents = PastContents()
+        self._types = MessageTypes(prefixes)
+        self._pool = ThreadPoolExecutor(8, 'past')
+        self._index = lru_cache(maxsize=16)(self._read_index)
+
+    def close(self) -> None:
+        self._pool.shutdown()
+        self._contents.close()
+
+    def answer(self, asked: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
+        """Head and body. Raises DataLoggerError, ValueError for what is no question."""
+        do, robot = asked.get('do'), asked.get('robot', '')
+        if do == 'robots':
+            return {'robots': self._source.robots()}, b''
+        if not isinstance(robot, str) or not is_name(robot):
+            raise ValueError('robot is the name of a robot')
+        if do == 'days':
+            return {'days': self._source.days(robot)}, b''
+        if do == 'timeline':
+            return self.timeline(robot, int(asked['from']) * 1_000_000, int(asked['to']) * 1_000_000), b''
+        if do == 'moment':
+            return self.moment(robot, int(asked['at']) * 1_000_000)
+        raise ValueError('do is robots, days, timeline or moment')
+
+    # -- a time ----------------------------------------------------------------------------------------------------
+
+    def timeline(self, robot: str, begin_ns: int, end_ns: int) -> dict[str, Any]:
+        """What was recorded between two times, the gaps, and what happened.
+
+        ``recorded``: [topic, from, to]; ``marks``: [kind, name, from, to, text]; times are UTC in ms, the rest is as in
+        ``SpoolFigures.gaps``. Raises ValueError, DataLoggerError.
+        """
+        if not 0 < end_ns - begin_ns <= MOST_SPAN_NS:
+            raise ValueError(f'a timeline has at most {MOST_SPAN_NS // SECOND // 3600} hours')
+        days = [self._source.day(robot, date) for date in dates_between(begin_ns - LONGEST_BATCH_NS, end_ns)]
+        found = self._source.gaps(robot, begin_ns, end_ns)
+        found['recorded'] = [
+            [_text(topic), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1)]
+            for topic, from_ns, to_ns in _runs(days, begin_ns, end_ns)
+        ]  # fmt: skip
+        marks = sorted([*self._marks_of_missions(days), *self._marks_of_bags(days)], key=lambda mark: mark[2])
+        inside = [mark for mark in marks if mark[3] >= begin_ns and mark[2] <= end_ns][:MOST_MARKS]
+        found['marks'] = [
+            [kind, _text(name), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1), _text(text)]
+            for kind, name, from_ns, to_ns, text in inside
+        ]  # fmt: skip
+        found['problem'] = _text(next((day.problem for day in days if day.problem), ''), 400)
+        found['commands'] = commands(robot, begin_ns, end_ns, [mark[1] for mark in inside if mark[0] == 'bag'])
+        return found
+
+    @staticmethod
+    def _marks_of_missions(days: Sequence[PastDay]) -> Iterator[tuple[str, str, int, int, str]]:
+        spans: dict[str, tuple[str, int, int]] = {}
+        for day in days:
+            for name, kind, begin_ns, end_ns in day.missions:
+                known = spans.get(name, (kind, begin_ns, end_ns))
+                spans[name] = known[0] or kind, min(known[1], begin_ns), max(known[2], end_ns)
+        for name, (kind, begin_ns, end_ns) in spans.items():
+            yield 'mission', name, begin_ns, end_ns, kind
+
+    def _marks_of_bags(self, days: Sequence[PastDay]) -> Iterator[tuple[str, str, int, int, str]]:
+        for day in days:
+            told = self._pool.map(self._contents.manifest, day.bag_files.values())
+            for (bag, files), manifest in zip(day.bag_files.items(), told, strict=True):
+                slices = manifest.slices if manifest is not None else ()
+                begin_ns = min((one.t_start_ns for one in slices), default=min(one.begin_ns for one in files))
+                end_ns = max((one.t_end_ns for one in slices), default=max(one.end_ns for one in files))
+                yield 'bag', bag, begin_ns, end_ns, '' if manifest is None else manifest.state
+                for trigger in manifest.event.triggers if manifest is not None and manifest.event is not None else ():
+                    text = f'{trigger.by}: {trigger.detail}' if trigger.detail else trigger.by
+                    yield 'event', trigger.name, trigger.at_ns, trigger.at_ns, text
+
+    # -- a moment --------------------------------------------------------------------------------------------------
+
+    def moment(self, robot: str, at_ns: int) -> tuple[dict[str, Any], bytes]:
+        """What there is of a moment: the newest of each topic at or before it, as items, each after a uint32 with its length.
+
+        The head has ``shown``: [topic, kind, ms before the moment, where it was read]. Raises DataLoggerError.
+        """
+        days = [self._source.day(robot, date) for date in dates_between(at_ns - PATH_NS, at_ns + 1)]
+        near = [one for day in days for one in day.between(at_ns - LONGEST_BATCH_NS, at_ns + 1)]
+        shown: dict[str, tuple[LiveItem, str]] = {}
+        for item, where in (*self._of_objects(near, at_ns), *self._of_bags(days, at_ns)):
+            known = shown.get(item.topic)
+            if known is None or (item.head or {})['at'] > (known[0].head or {})['at'] + 1:
+                shown[item.topic] = item, where
+        walked = [one for day in days for one in day.between(at_ns - PATH_NS, at_ns + 1)]
+        poses = [((one.begin_ns + one.end_ns) // 2, one.pose) for one in walked if one.pose]
+        items = [*(item for item, _ in shown.values()), *_track(poses)]
+        bags = [pair for day in days for pair in day.bag_files.items()]
+        covering = [bag for bag, files in bags if _slices(files, self._contents.manifest(files), at_ns)]
+        last = max((one for one in near if one.mission_id), key=lambda one: one.begin_ns, default=None)
+        head = {
+            'at': at_ns / 1e6, 'mission': _text(last.mission_id) if last is not None else '',
+            'commands': commands(robot, at_ns - AROUND_NS, at_ns + AROUND_NS, covering),
+            'shown': [[_text(item.topic), item.kind, round(at_ns / 1e6 - (item.head or {})['at'], 1), _text(where, 300)]
+                      for item, where in shown.values()],
+        }  # fmt: skip
+        return head, b''.join(len(item.packed).to_bytes(4, 'little') + item.packed for item in items)
+
+    def _of_objects(self, near: Sequence[PastObject], at_ns: int) -> list[tuple[LiveItem, str]]:
+        chosen: dict[str, list[PastObject]] = {}
+        for one in near:
+            if '/rosbags/' not in one.key and '/missions/' not in one.key:
+                topic = one.topic or one.sensor
+                if topic in chosen or len(chosen) < MOST_TOPICS:
+                    chosen.setdefault(topic, []).append(one)
+        found = self._pool.map(lambda pair: self._of_topic(pair[0], pair[1], at_ns), chosen.items())
+        return [item for item in found if item is not None]
+
+    def _of_topic(self, topic: str, objects: Sequence[PastObject], at_ns: int) -> tuple[LiveItem, str] | None:
+        """The newest of a topic that can be read."""
+        last = objects[-1]
+        extension = decode.extension_of(last.key)
+        with suppress(DataLoggerError, *_BROKEN):
+            if extension == 'json':
+                return self._series(topic, [one for one in objects if one.end_ns >= at_ns - SERIES_NS], at_ns)
+            is_known = extension in decode.CLOUDS | decode.IMAGES | decode.ARCHIVES
+            if not is_known or at_ns - last.begin_ns > STALE_NS:
+                return None
+            body, stamp_ns = self._contents.get(last), last.begin_ns
+            if extension in decode.ARCHIVES:
+                members = [one for one in decode.members(body, extension) if one.stamp_ns <= at_ns]
+                if not members:
+                    return None
+                newest = max(members, key=lambda one: one.stamp_ns)
+                body, stamp_ns, extension = newest.body, newest.stamp_ns, newest.extension
+            if item := _picture(topic, extension, body, stamp_ns / 1e6):
+                return item, _where(last)
+        return None
+
+    def _series(self, topic: str, objects: Sequence[PastObject], at_ns: int) -> tuple[LiveItem, str] | None:
+        if not objects or (objects[-1].type and objects[-1].type not in KINDS):
+            return None
+        rows: list[tuple[float, Mapping[str, float]]] = []
+        name = ''
+        for one in objects[-MOST_TOPICS:]:
+            told, samples = _samples(self._contents.get(one))
+            name = one.type or told
+            kind = KINDS.get(name)
+            if kind is None or kind.values is None:
+                return None
+            rows += [
+                (sample['stamp_ns'] / 1e6, _checked(kind.values(_message(name, sample)))) for sample in samples[-MOST_MESSAGES:]
+                if at_ns - SERIES_NS <= sample['stamp_ns'] <= at_ns
+            ]  # fmt: skip
+        if not rows:
+            return None
+        rows.sort(key=lambda row: row[0])
+        return table_item(topic, KINDS[name], rows[-MOST_MESSAGES:]), _where(objects[-1])
+
+    # -- bags ------------------------------------------------------------------------------------------------------
+
+    def _of_bags(self, days: Sequence[PastDay], at_ns: int) -> list[tuple[LiveItem, str]]:
+        found: list[tuple[LiveItem, str]] = []
+        for day in days:
+            for files in day.bag_files.values():
+                for one in _slices(files, self._contents.manifest(files), at_ns):
+                    with suppress(DataLoggerError, *_BROKEN):
+                        found += self._of_slice(one, at_ns)
+        return found
+
+    def _of_slice(self, one: PastObject, at_ns: int) -> list[tuple[LiveItem, str]]:
+        source, index = self._index(one)
+        if not index.is_indexed:
+            return []
+        wanted = MessageFilter(at_ns - IN_BAG_NS, at_ns + 1, lambda channel: channel.type in KINDS)
+        came: dict[tuple[str, str], list[tuple[float, bytes]]] = {}
+        for message in read_messages(source, index, wanted):
+            name = message.channel.topic, message.channel.type
+            if name in came or len(came) < MOST_TOPICS:
+                of = came.setdefault(name, [])
+                of.append((message.log_ns / 1e6, message.cdr))
+                if KINDS[name[1]].is_bulk or len(of) > MOST_MESSAGES:
+                    del of[:-1]
+        found: list[tuple[LiveItem, str]] = []
+        for (topic, type_name), messages in came.items():
+            with suppress(Rejected, *_BROKEN):
+                found.append((self._of_messages(topic, type_name, messages), _where(one)))
+        return found
+
+    def _of_messages(self, topic: str, type_name: str, messages: Sequence[tuple[float, bytes]]) -> LiveItem:
+        kind, (at_ms, cdr) = KINDS[type_name], messages[-1]
+        if kind.name == _CLOUD:
+            return next(clouds(topic, self._types, at_ms, cdr, (FULL,)))
+        if kind.name == _CAMERA:
+            return next(frames(topic, type_name, self._types, at_ms, cdr, (FULL,)))
+        return series(topic, kind, type_name, self._types, messages)
+
+    def _read_index(self, one: PastObject) -> tuple[Ranged, McapIndex]:
+        source = self._contents.ranged(one)
+        return source, read_index(source)
+
+
+_BROKEN: Final = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, MemoryError, OSError)
+"""What comes of content that is not what its name says."""
+
+
+def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str]) -> list[list[str]]:
+    """[what, command line] for this time, to be pasted into a shell: names of a store are quoted."""
+    since, until = (f'{utc(at_ns):%Y-%m-%dT%H:%M:%S.%f}'[:-3] + 'Z' for at_ns in (begin_ns, end_ns))
+    of = f'--robot {shlex.quote(robot)}'
+    span = f'{of} --since {since} --until {until}'
+    cuts = [
+        ['bag cut', f'shadowhound-data bag cut {shlex.quote(bag)} {of} --start {since} --end {until} --output cut']
+        for bag in [bag for bag in dict.fromkeys(bags) if is_name(bag)][:MOST_CUTS]
+    ]
+    return [['query', f'shadowhound-data query {span}'], ['fetch', f'shadowhound-data fetch {span} --to data'], *cuts]
+
+
+def _slices(files: Sequence[PastObject], manifest: Manifest | None, at_ns: int) -> list[PastObject]:
+    """The files of a bag that may have messages of a moment."""
+    spans = {} if manifest is None else {one.file: (one.t_start_ns, one.t_end_ns) for one in manifest.slices}
+    found = []
+    for one in files:
+        begin_ns, end_ns = spans.get(one.key.rpartition('/')[2], (one.begin_ns, one.end_ns))
+        if one.key.endswith('.mcap') and begin_ns <= at_ns and end_ns >= at_ns - IN_BAG_NS:
+            found.append(one)
+    return found[:4]
+
+
+def _runs(days: Sequence[PastDay], begin_ns: int, end_ns: int) -> Iterator[tuple[str, int, int]]:
+    """(topic, from, to) of the times in which objects follow one another."""
+    grain_ns = max(RHYTHM_NS, (end_ns - begin_ns) // RUNS)
+    for day in days:
+        inside = (day.begins < end_ns) & (day.ends >= begin_ns)
+        codes, begins, ends = day.codes[inside], day.begins[inside], day.ends[inside]
+        for code, name in list(enumerate(day.names))[:MOST_TOPICS]:
+            chosen = codes == code
+            if not name or name == 'bag' or not chosen.any():
+                continue
+            starts, reached = begins[chosen], np.maximum.accumulate(ends[chosen])
+            breaks = np.flatnonzero(starts[1:] - reached[:-1] > grain_ns) + 1
+            for low, high in zip((0, *breaks.tolist()), (*breaks.tolist(), len(starts)), strict=True):
+                yield name, max(begin_ns, int(starts[low])), min(end_ns, int(reached[high - 1]))
+
+
+def _track(poses: Sequence[tuple[int, tuple[float, float, float]]]) -> Iterator[LiveItem]:
+    """Where the robot went, by poses and the times that they are of (of a batch its middle)."""
+    ordered = sorted(poses, key=lambda each: each[0])
+    if not ordered:
+        return
+    places = np.array([pose for _, pose in ordered[:: len(ordered) // MOST_MESSAGES + 1]], '<f4')
+    yield LiveItem('', 'path', head={'points': len(places)}, body=places.tobytes())
+
+
+def _picture(topic: str, extension: str, body: bytes, at_ms: float) -> LiveItem | None:
+    if extension in decode.CLOUDS:
+        table = decode.cloud(body)[:, :3]
+        return next(points_items(topic, at_ms, table[:: len(table) // 200_000 + 1], 'odom', (FULL,)))
+    if extension in {'jpg', 'jpeg'}:
+        height, width, *_ = simplejpeg.decode_jpeg_header(body)
+        check_pixels(width, height)
+        return LiveItem(topic, _CAMERA, head={'at': round(at_ms, 1)}, body=body)
+    if extension in decode.IMAGES:
+        pixels = decode.image(body)
+        if pixels.dtype != np.uint8 or pixels.ndim != 3:
+            return None
+        body = bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(pixels), 75, 'RGB'))
+        return LiveItem(topic, _CAMERA, head={'at': round(at_ms, 1)}, body=body)
+    return None
+
+
+def _samples(body: bytes) -> tuple[str, list[dict[str, Any]]]:
+    """The type that a document names, and its messages."""
+    found = decode.records(body)
+    told = json.loads(body).get('type')
+    return told if isinstance(told, str) else '', found
+
+
+def _message(type_name: str, sample: Mapping[str, Any]) -> Any:
+    """A sample as the message that it was made of; the short document of odometry too (docs/formats.md)."""
+    if type_name == 'nav_msgs/msg/Odometry' and 'pose' not in sample:
+        sample = {'pose': {'pose': {'position': sample['position'], 'orientation': sample['orientation']}}}
+    return _space(sample)
+
+
+def _space(value: Any) -> Any:
+    if isinstance(value, dict):
+        return SimpleNamespace(**{name: _space(inner) for name, inner in value.items()})
+    return [_space(inner) for inner in value] if isinstance(value, list) else value
+
+
+def _checked(values: Mapping[Any, Any]) -> Mapping[str, float]:
+    """Raises ValueError for names that are none: those of joints are in the message."""
+    if len(values) > MOST_COLUMNS or not all(isinstance(name, str) and len(name) <= MOST_TEXT for name in values):
+        raise ValueError('too many figures, or their names are none')
+    return {name: float(value) for name, value in values.items()}
+
+
+def _where(one: PastObject) -> str:
+    is_here = one.path != '' and os.path.isfile(one.path)  # noqa: PTH113 - never raises
+    return f'{"the spool" if is_here else "the store"}: {one.bucket}/{one.key}'
+
+
+def _text(text: str, most: int = MOST_TEXT) -> str:
+    return visible(text[:most].encode(errors='replace').decode())
+
+
+def main() -> None:
+    """Serve until the input ends. The arguments: the spool's folder and the robot; without them it is the store's past."""
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
+    with suppress(OSError):
+        os.nice(10)  # whoever records goes first
+    out = os.fdopen(os.dup(1), 'wb')
+    os.dup2(2, 1)  # whatever prints does not answer
+    history: PastReader | None = None
+    for line in sys.stdin.buffer:
+        head: dict[str, Any]
+        body = b''
+        try:
+            if history is None:
+                source: PastSource = SpoolPast(Path(sys.argv[1]), sys.argv[2]) if len(sys.argv) > 2 else StorePast()
+                history = PastReader(source, os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
+            head, body = history.answer(json.loads(line))
+        except DataLoggerError as error:
+            head = {'error': visible(str(error))[:1000]}
+        except (*_BROKEN, LakeError, BagDamaged) as error:
+            head = {'error': f'this cannot be read: {type(error).__name__}: {visible(str(error))[:300]}', 'is_wrong': True}
+        told = json.dumps(head, separators=(',', ':')).encode()
+        out.write(len(told).to_bytes(4, 'little') + len(body).to_bytes(4, 'little') + told + body)
+        out.flush()
+
+
+if __name__ == '__main__':
+    main()

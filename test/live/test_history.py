@@ -1,0 +1,299 @@
+"""Looking back: the timeline of a time and what there is of a moment, from the spool, from the store, from bags."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shlex
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import simplejpeg
+from lake.gap_parts import lost, mark, tell
+from lake.making import NOON_NS, add, add_part, folder_store
+from live.test_kinds import cdr, header, new
+from spool.making import FakeClock, index_of, make, new_spool, put, settle
+
+from shadowhound_data_logger.bags.manifest import COMPLETE, EventOf, Manifest, MissionOf, SliceEntry, TriggerOf
+from shadowhound_data_logger.catalogue.schema import BUCKET, Row, row_of
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.live.history import PastReader, commands
+from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
+from shadowhound_data_logger.live.past import PastSource, SpoolPast, StorePast
+from shadowhound_data_logger.mcap.slice_info import Channel
+from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.model import State
+from shadowhound_data_logger.options import COMPRESSED_IMAGE, UploadSettings
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
+
+IMU = 'sensor_msgs/msg/Imu'
+ODOMETRY = 'nav_msgs/msg/Odometry'
+HOSTILE = '<img src=x onerror=alert(1)>$(reboot)\x1b[31m'
+
+
+def jpeg(shade: int) -> bytes:
+    return bytes(simplejpeg.encode_jpeg(np.full((48, 64, 3), shade, np.uint8), 75, 'RGB'))
+
+
+def items(body: bytes) -> dict[str, tuple[dict[str, Any], bytes]]:
+    """By topic; as the page takes them apart."""
+    found = {}
+    while body:
+        size, head_size = int.from_bytes(body[:4], 'little'), int.from_bytes(body[4:8], 'little')
+        head = json.loads(body[8 : 8 + head_size])
+        found[head['topic']], body = (head, body[8 + head_size : 4 + size]), body[4 + size :]
+    return found
+
+
+def told(at_s: float, sensor: str, topic: str, kind: str, extension: str, **more: str) -> Row:
+    """The row of an object so many seconds after noon."""
+    at_ns = NOON_NS + round(at_s * SECOND)
+    metadata = {'robot': 'thor', 'sensor': sensor, 'topic': topic, 'type': kind, 'count': '1', 't_start_ns': str(at_ns),
+                't_end_ns': str(at_ns), 'pose': f'{at_s:.3f} 1.000 0.5000 odom', 'battery_pct': '80', **more}  # fmt: skip
+    return row_of(BUCKET, f'thor/{sensor}/{utc(at_ns):%Y%m%d/%H%M%S}_x.{extension}', 10, 'image/jpeg', metadata)
+
+
+def odometry(at_s: float) -> bytes:
+    point = {'x': at_s, 'y': 1.0, 'z': 0.3}
+    document = {'stamp_ns': NOON_NS + round(at_s * SECOND), 'position': point, 'orientation': {'x': 0, 'y': 0, 'z': 0, 'w': 1},
+                'linear_velocity': point, 'angular_velocity': point}  # fmt: skip
+    return json.dumps(document).encode()
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectStore]:
+    """The folder that is the store where no server is named."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
+    with closing(open_store(folder_store(tmp_path), UploadSettings())) as opened:
+        yield opened
+
+
+Opened = Callable[[PastSource], PastReader]
+
+
+@pytest.fixture
+def opened(store: ObjectStore) -> Iterator[Opened]:
+    """Histories that are closed in the end."""
+    with ExitStack() as stack:
+        yield lambda source: stack.enter_context(closing(PastReader(source)))
+
+
+def patrol(store: ObjectStore, folder: Path) -> None:
+    """Ten seconds of camera and odometry of one mission, and the parts that tell of them."""
+    rows = []
+    for second in range(10):
+        for sensor, topic, kind, extension, body in (
+            ('camera', '/camera', COMPRESSED_IMAGE, 'jpg', jpeg(20 * second)),
+            ('odom', '/odom', ODOMETRY, 'json', odometry(second)),
+        ):
+            rows.append(told(second, sensor, topic, kind, extension, mission_id='m1', mission_type='patrol'))
+            add(store, folder / 'tmp', rows[-1]['key'], body)
+    add_part(store, rows, 'a', folder / 'tmp')
+
+
+def asked(history: PastReader, at_s: float) -> tuple[dict[str, Any], dict[str, tuple[dict[str, Any], bytes]]]:
+    head, body = history.moment('thor', NOON_NS + round(at_s * SECOND))
+    return head, items(body)
+
+
+def test_the_past_of_a_store(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """What was recorded, the gaps in their causes, how far that is known, the mission; and a moment as it was."""
+    patrol(store, tmp_path)
+    settings = folder_store(tmp_path)
+    tell(settings, tmp_path, lost('1', 3, 4, cause='transport', topic='/imu'), mark(8, topic='/imu'))
+    history = opened(StorePast())
+    assert history.answer({'do': 'robots'})[0] == {'robots': ['thor']}
+    assert history.answer({'do': 'days', 'robot': 'thor'})[0] == {'days': [f'{utc(NOON_NS):%Y-%m-%d}']}
+    noon = NOON_NS // 1_000_000
+    found, _ = history.answer({'do': 'timeline', 'robot': 'thor', 'from': noon - 60_000, 'to': noon + 60_000})
+    assert found['recorded'] == [['/camera', noon, noon + 9000], ['/odom', noon, noon + 9000]]
+    assert found['marks'] == [['mission', 'm1', noon, noon + 9000, 'patrol']]
+    named = [dict(zip(found['columns'], row, strict=True)) for row in found['gaps']]
+    assert [(gap['topic'], gap['cause'], gap['from'], gap['to']) for gap in named] == [
+        ('/imu', 'transport', noon + 3000, noon + 4000)
+    ]
+    assert found['known'] == [['/imu', noon, noon + 8000]]
+    head, shown = asked(history, 5.5)
+    assert shown['/camera'][1] == jpeg(100)
+    assert (head['mission'], shown['/camera'][0]['at']) == ('m1', noon + 5000)
+    rows = np.frombuffer(shown['/odom'][1], '<f8', 6)
+    assert rows.tolist() == [noon + 1000 * second for second in range(6)]
+    places = np.frombuffer(shown[''][1], '<f4').reshape(-1, 3)
+    assert places[-1].tolist() == [5.0, 1.0, 0.5]
+
+
+def test_the_past_of_a_spool(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """What waits is read from the spool, what was delivered from the store, also when its row is a short one."""
+    clock = FakeClock()
+    spool = new_spool(tmp_path / 'spool', clock)
+    spool.open()
+    try:
+        made = []
+        for second in range(3):
+            at_ns = NOON_NS_OF_SPOOL + second * SECOND
+            key = f'thor/camera/20251018/12000{second}_front.jpg'
+            made += put(spool, make(key, jpeg(60 * second), t_start_ns=at_ns, t_end_ns=at_ns, topic='/camera'))
+        for item in made[:2]:
+            add(store, tmp_path / 'tmp', item.key, item.path.read_bytes())
+            settle(spool, item, State.DELIVERED)
+    finally:
+        spool.close()
+    with index_of(tmp_path / 'spool') as index:
+        index.clear_uncatalogued()
+        with index.transaction():
+            index.compact(clock.wall_ns() + 1)
+    history = opened(SpoolPast(tmp_path / 'spool', 'thor'))
+    assert history.answer({'do': 'days', 'robot': 'thor'})[0] == {'days': ['2025-10-18']}
+    for second, where in enumerate(('the store', 'the store', 'the spool')):
+        head, body = history.moment('thor', NOON_NS_OF_SPOOL + second * SECOND + 1)
+        (topic, kind, before, told_where), *_ = head['shown']
+        assert (kind, before, told_where.partition(':')[0]) == ('camera', 0.0, where)
+        assert items(body)[topic][1] == jpeg(60 * second)
+
+
+NOON_NS_OF_SPOOL = 1_760_788_800 * SECOND
+
+
+def recorded(path: Path, begin_s: float) -> Any:
+    """A slice with ten frames and a hundred samples of an IMU in a second."""
+    camera, imu = (Channel(topic, kind, 'ros2msg', '', '', '') for topic, kind in (('/bagged', COMPRESSED_IMAGE), ('/imu', IMU)))
+    vector, turn = (
+        new('geometry_msgs/msg/Vector3', x=1.0, y=2.0, z=3.0),
+        new('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    unknown = {f'{name}_covariance': np.zeros(9) for name in ('orientation', 'angular_velocity', 'linear_acceleration')}
+    sample = new(IMU, header=header(), orientation=turn, angular_velocity=vector, linear_acceleration=vector, **unknown)
+    writer = SliceWriter(path)
+    for number in range(100):
+        at_ns = NOON_NS + round((begin_s + number / 100) * SECOND)
+        writer.write(imu, at_ns, at_ns, number, cdr(sample, IMU))
+        if number % 10 == 0:
+            frame = new(COMPRESSED_IMAGE, header=header(), format='jpeg', data=np.frombuffer(jpeg(2 * number), np.uint8))
+            writer.write(camera, at_ns, at_ns, number, cdr(frame, COMPRESSED_IMAGE))
+    return writer.close()
+
+
+def bag(store: ObjectStore, folder: Path, name: str, event: str) -> list[Row]:
+    """A whole bag of one slice in the store; the rows of its files."""
+    (folder / 'tmp').mkdir(exist_ok=True)
+    info = recorded(folder / 'tmp' / f'{name}_0.mcap', 20.0)
+    key = f'thor/rosbags/{name}/{name}_0.mcap'
+    trigger = TriggerOf(event, 'service', NOON_NS + 20 * SECOND, HOSTILE)
+    manifest = Manifest(name, 'thor', MissionOf('patrol', 'm1', None), COMPLETE, (), (), (SliceEntry.of(info, key),),
+                        EventOf(event, 5.0, 5.0, 5.0, (trigger,)))  # fmt: skip
+    bodies = {key: info.path.read_bytes(), f'thor/rosbags/{name}/manifest.json': manifest.to_json()}
+    rows = []
+    for each, body in bodies.items():
+        add(store, folder / 'tmp', each, body)
+        times = {'t_start_ns': str(info.t_start_ns), 't_end_ns': str(info.t_end_ns)}
+        rows.append(row_of(BUCKET, each, len(body), '', {'robot': 'thor', 'sensor': 'bag', 'bag': name, **times}))
+    return rows
+
+
+def test_a_bag_is_read_by_ranges(store: ObjectStore, opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frame of the moment and the series before it come from the bag; its event is a mark, its cut a command."""
+    name = f'bump_{utc(NOON_NS + 20 * SECOND):%Y%m%d_%H%M%S}'
+    add_part(store, bag(store, tmp_path, name, 'bump'), 'a', tmp_path / 'tmp')
+    history = opened(StorePast())
+    got: list[str] = []
+    whole = type(store).get
+    monkeypatch.setattr(
+        type(store), 'get', lambda self, bucket, key, most=None: got.append(key) or whole(self, bucket, key, most)
+    )
+    head, shown = asked(history, 20.55)
+    assert shown['/bagged'][1] == jpeg(100)
+    assert shown['/imu'][0]['rows'] == 56
+    assert [key for key in got if key.endswith('.mcap')] == []
+    cut = dict(head['commands'])['bag cut']
+    assert shlex.split(cut)[:4] == ['shadowhound-data', 'bag', 'cut', name]
+    noon = NOON_NS // 1_000_000
+    found, _ = history.answer({'do': 'timeline', 'robot': 'thor', 'from': noon, 'to': noon + 60_000})
+    assert [(kind, name) for kind, name, *_ in found['marks']] == [('bag', name), ('event', 'bump')]
+    assert [begin for kind, _, begin, *_ in found['marks'] if kind == 'event'] == [noon + 20_000]
+    assert '\x1b' not in json.dumps(found)
+
+
+def test_a_hostile_store_is_answered_without_what_is_wrong(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """Keys that climb, pictures and documents that are none, names that are code: what is sound is shown."""
+    patrol(store, tmp_path)
+    (tmp_path / 'secret.jpg').write_bytes(jpeg(7))
+    joints, points = 'sensor_msgs/msg/JointState', 'sensor_msgs/msg/PointCloud2'
+    rows = [
+        told(5.2, 'camera', '/climbs', COMPRESSED_IMAGE, 'jpg'), told(5.2, 'odom', '/no-json', ODOMETRY, 'json'),
+        told(5.2, 'camera', '/bomb', COMPRESSED_IMAGE, 'jpg'), told(5.2, 'odom', '/deep', ODOMETRY, 'json'),
+        told(5.2, 'x', HOSTILE, HOSTILE, 'jpg', mission_id=HOSTILE), told(5.2, 'joints', '/names', joints, 'json'),
+        told(5.2, 'lidar', '/cloud', points, 'pcd'),
+    ]  # fmt: skip
+    for place, row in enumerate(rows):
+        row['key'] = f'thor/hostile/{place}.{row["key"].rpartition(".")[2]}'
+    rows[0]['key'] = 'thor/../../../secret.jpg'
+    bomb = bytearray(jpeg(1))
+    frame = bomb.index(b'\xff\xc0')
+    bomb[frame + 5 : frame + 9] = b'\xff\xdc\xff\xdc'
+    names = {'stamp_ns': NOON_NS, 'name': [[HOSTILE]], 'position': [1e400]}
+    bodies = [
+        b'{"samples": [{"stamp_ns": "now"}]}', bytes(bomb), b'{"samples":' + b'[' * 900, jpeg(1),
+        json.dumps({'samples': [names]}).encode(), b'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nPOINTS 4000000\nDATA binary\n',
+    ]  # fmt: skip
+    for row, body in zip(rows[1:], bodies, strict=True):
+        add(store, tmp_path / 'tmp', row['key'], body)
+    add_part(store, rows, 'hostile', tmp_path / 'tmp')
+    history = opened(StorePast())
+    head, shown = asked(history, 5.5)
+    assert {topic for topic, *_ in head['shown']} == {'/camera', '/odom', HOSTILE.replace('\x1b', '\\x1b')}
+    assert shown['/camera'][1] == jpeg(100)
+    noon = NOON_NS // 1_000_000
+    found, _ = history.answer({'do': 'timeline', 'robot': 'thor', 'from': noon, 'to': noon + 60_000})
+    assert '\x1b' not in json.dumps([found, head], ensure_ascii=False)
+    assert commands('thor', 0, SECOND, ['a; reboot', '$(reboot)', '../x']) == commands('thor', 0, SECOND, [])
+
+
+@pytest.mark.parametrize('question', [
+    {'do': 'days', 'robot': '../x'}, {'do': 'timeline', 'robot': 'thor', 'from': 0, 'to': 10**14},
+    {'do': 'read', 'robot': 'thor'}, {'do': 'moment', 'robot': 'thor', 'at': 10**14 * 9}, {},
+])  # fmt: skip
+def test_what_is_no_question_is_refused(opened: Opened, question: dict[str, Any]) -> None:
+    """By an error that the process goes on after."""
+    with pytest.raises((ValueError, OverflowError)):
+        opened(StorePast()).answer(question)
+
+
+@pytest.mark.long('processes that read the past')
+def test_the_process_ends_when_nobody_asks_and_comes_again(store: ObjectStore, tmp_path: Path) -> None:
+    """After an idle while, after a kill, and after a question that took too long."""
+    patrol(store, tmp_path)
+
+    async def gone(pid: int) -> None:
+        while Path(f'/proc/{pid}').exists():
+            await asyncio.sleep(0.02)
+
+    async def run() -> None:
+        past = HistoryProcess([], idle_s=0.3)
+        assert past.pid is None
+        assert (await past.ask({'do': 'robots'}))[0] == {'robots': ['thor']}
+        pid = past.pid or 0
+        await asyncio.wait_for(gone(pid), 60)
+        assert past.pid is None
+        past = HistoryProcess([])
+        both = await asyncio.gather(past.ask({'do': 'robots'}), past.ask({'do': 'days', 'robot': '..'}))
+        assert both[1][0]['is_wrong']
+        os.kill(past.pid or 0, signal.SIGKILL)
+        with pytest.raises(PastUnavailable):
+            await past.ask({'do': 'robots'})
+        assert (await past.ask({'do': 'robots'}))[0] == {'robots': ['thor']}
+        await past.close()
+        slow = HistoryProcess([], answer_s=0.01)
+        with pytest.raises(PastUnavailable, match='TimeoutError'):
+            await slow.ask({'do': 'robots'})
+        assert slow.pid is None
+        await slow.close()
+
+    asyncio.run(run())
