@@ -21,13 +21,14 @@ ALLOWED: Final = (
     "a text such as 'low_battery: lowstate:bms_state.soc < 20 for 5': "
     "a name, topic:field, one of < <= > >= == !=, a number and, where it has to hold, 'for' seconds"
 )
-_COMPARISONS: Final[dict[str, Callable[[float, float], bool]]] = {
+COMPARISONS: Final[dict[str, Callable[[float, float], bool]]] = {
     '<': operator.lt, '<=': operator.le, '>': operator.gt, '>=': operator.ge, '==': operator.eq, '!=': operator.ne,
 }  # fmt: skip
-_NUMBER: Final = r'[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?'
+"""Signs and what they compare."""
+NUMBER: Final = r'[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?'
 _CONDITION: Final = re.compile(
     rf'\s*(?P<name>[^:\s]+)\s*:\s*(?P<topic>[^:\s]+):(?P<field>[A-Za-z]\w*(?:\.\w+)*)\s*(?P<comparison><=|>=|==|!=|<|>)'
-    rf'\s*(?P<threshold>{_NUMBER})(?:\s+for\s+(?P<hold>{_NUMBER})(?:\s*s)?)?\s*', re.ASCII,
+    rf'\s*(?P<threshold>{NUMBER})(?:\s+for\s+(?P<hold>{NUMBER})(?:\s*s)?)?\s*', re.ASCII,
 )  # fmt: skip
 
 
@@ -46,7 +47,7 @@ class Condition:
 
     def holds(self, value: float) -> bool:
         """Whether the number is beyond the threshold."""
-        return _COMPARISONS[self.comparison](value, self.threshold)
+        return COMPARISONS[self.comparison](value, self.threshold)
 
 
 def conditions(texts: Iterable[str], setting: str = 'events.conditions') -> tuple[Condition, ...]:

@@ -89,6 +89,8 @@ class DataObject:
     """Not stored where its content is that of the object which its sensor stored before it (``spool.repeats``)."""
     key_pattern: str | None = None
     """The wanted key with its time left open (``keys.dated``), should that not be known yet."""
+    statistics: bytes = b''
+    """Of the numbers in it, as ``encode.statistics.packed``; for the catalogue."""
     catalogues: tuple[int, ...] = ()
     """A part of the catalogue: the ids of the objects that it has rows of. It is left out where another part has one of them."""
     tells: tuple[tuple[int, str], ...] = ()

@@ -67,6 +67,10 @@ class SensorSettings:
         '', 'Field that counts messages or milliseconds, such as tick, to estimate losses from it instead of from stamps.'
     )
 
+    statistics: tuple[str, ...] = _setting(
+        ('',), 'Fields whose statistics go to the catalogue, such as bms_state.soc; none named: the first 64; "none": none.'
+    )
+
     @property
     def period_ns(self) -> int:
         """The time between two objects as far as their names go, ns; 0 where they can follow each other at any distance."""
@@ -278,7 +282,10 @@ DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
     'joints': {
         'topics': ('joint_states',), 'types': ('sensor_msgs/msg/JointState',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4,
     },
-    'lowstate': {'topics': ('lowstate',), 'types': ('go2_interfaces/msg/LowState',), 'batch_s': 10.0, 'priority': 3},
+    'lowstate': {
+        'topics': ('lowstate',), 'types': ('go2_interfaces/msg/LowState',), 'batch_s': 10.0, 'priority': 3,
+        'statistics': ('imu_state', 'bms_state.soc', 'bms_state.current', 'foot_force', 'power_v', 'power_a', 'temperature_ntc1'),
+    },
     'cmd_vel': {
         'enabled': False, 'topics': ('cmd_vel',), 'types': ('geometry_msgs/msg/Twist',), 'rate_hz': 0.0, 'batch_s': 1.0,
         'priority': 3,

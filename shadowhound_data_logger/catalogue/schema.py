@@ -3,7 +3,8 @@
 A row holds nothing that is not in the object's S3 metadata and in a listing: a catalogue that is lost is made again from those.
 Every object of a robot is a row but the files of the catalogue itself. Parts lie at
 ``<robot>/_catalog/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.parquet``; the date is that of ``t_start``, UTC.
-Beside them lie the parts of the gap journal (catalogue/gaps.py), in ``<robot>/_gaps/``.
+Beside them lie the parts of the gap journal (catalogue/gaps.py), in ``<robot>/_gaps/``, and of the statistics of what is in the
+objects (catalogue/statistics.py), in ``<robot>/_stats/``.
 """
 
 from __future__ import annotations
@@ -95,14 +96,17 @@ know nothing of this table see only what the store has.
 """
 GAPS_FOLDER: Final = '_gaps'
 """Of the gap journal's parts."""
+STATISTICS_FOLDER: Final = '_stats'
+LABELS_FOLDER: Final = '_labels'
 
 Row = dict[str, Any]
 """Column -> value; a time as an int of microseconds."""
 
 
 def is_row(bucket: str, key: str) -> bool:
-    """Whether an object belongs into the catalogue: all do but its own files, those of the gap journal and of what is kept."""
-    return bucket != BUCKET or key.split('/')[1:2] not in ([SENSOR], [GAPS_FOLDER], [KEPT.folder])
+    """Whether an object belongs into the catalogue: all do but its own files, and those of the tables beside it."""
+    folders = {SENSOR, GAPS_FOLDER, KEPT.folder, STATISTICS_FOLDER, LABELS_FOLDER}
+    return bucket != BUCKET or ''.join(key.split('/')[1:2]) not in folders
 
 
 def date_of(row: Row) -> str:

@@ -18,8 +18,10 @@ from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue import parts
 from shadowhound_data_logger.catalogue.gaps import GAP, GAPS, WITHDRAWN, Statement, complete, date_of, name_of, statement
 from shadowhound_data_logger.catalogue.schema import BUCKET, KEPT, LOST, OBJECTS, ON_ROBOT, SENSOR, Row, TableSchema, row_of
+from shadowhound_data_logger.catalogue.statistics import STATISTICS, statistic_rows
 from shadowhound_data_logger.clock import Clock, utc
 from shadowhound_data_logger.config import CatalogueSettings
+from shadowhound_data_logger.encode.statistics import unpacked_statistics
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.model import DataObject
@@ -28,7 +30,8 @@ from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
 
 MOST_ROWS: Final = 2000
-"""At a time: 60 ms of CPU, and 10 MB of memory meanwhile. While there are more, the next ones come with the next look."""
+"""At a time: 60 ms of CPU without their statistics, and 10 MB of memory meanwhile. While there are more, the next ones come with
+the next look."""
 SOON_S: Final = 5.0
 """After a mission: until then its last objects are usually delivered."""
 KEPT_S: Final = 5.0
@@ -102,7 +105,11 @@ class CatalogueWriter:
         rows = [(item.id, row_of(item.bucket, item.key, item.size, item.content_type, item.metadata)) for item in new]
         made = [self._part(robot, date, found) for robot, date, found in parts.by_folder(rows)]
         self._handed += [frozenset(part.catalogues) for part in made]
-        return [*made, *self._gaps.parts(), *self._kept_parts()]
+        said = {item.id: unpacked_statistics(item.statistics) for item in new if item.statistics}
+        told = [(number, one) for number, row in rows for one in statistic_rows(row, said.get(number, {}))]
+        # Before the rows: what is told goes with those from the index, and statistics that are told twice do no harm.
+        return [*(self._part(*each, STATISTICS) for each in parts.by_folder(told)), *made, *self._gaps.parts(),
+                *self._kept_parts()]  # fmt: skip
 
     def _kept_parts(self) -> list[DataObject]:
         """Parts of the table of what is kept, of what is in none yet nor handed out. Raises SpoolError or sqlite3.Error."""
@@ -136,7 +143,7 @@ class CatalogueWriter:
             bucket=BUCKET, key=of.part_key(robot, date, name), body=parts.encode(rows, of), content_type=parts.CONTENT_TYPE,
             sensor=SENSOR, topic=None, type='', samples=0, t_start_ns=min(times), t_end_ns=max(times), priority=PRIORITY,
             protected=True, metadata={words.ROBOT: robot, words.COUNT: str(len(rows))},
-            catalogues=tuple(number for number, _ in found),
+            catalogues=tuple(number for number, _ in found) if of is OBJECTS else (),
         )  # fmt: skip
 
     def _named(self, robot: str | None) -> str:

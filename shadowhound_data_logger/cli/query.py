@@ -6,23 +6,40 @@ import csv
 import functools
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 from rich.console import RenderableType
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, store_hint, the_store_settings
-from shadowhound_data_logger.cli.output import number, plain, plain_table, print_json, print_page, volume
+from shadowhound_data_logger.cli.output import (
+    counted,
+    duration,
+    number,
+    plain,
+    plain_table,
+    print_json,
+    print_page,
+    shown_time,
+    volume,
+    with_dates,
+)
 from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, tell_left_out
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.untrusted import csv_cell, visible
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.lake.values import ValueAnswer
 
 SHOWN: Final = 30
 """Rows of a table unless --limit says more."""
 COLUMNS: Final = ('t_start', 'sensor', 'key', 'bytes', 'x', 'y', 'battery_pct', 'mission_type')
 """Of a table of objects; the other formats have all."""
 MOST_POSES: Final = 20_000
+MOST_TIMES: Final = 100
 _OBJECTS: Final = {'bucket', 'key'}
 
 
@@ -30,6 +47,8 @@ _OBJECTS: Final = {'bucket', 'key'}
     epilog=examples(
         'query --sensor camera --since yesterday --near 2.0,6.5,3 --sheet kitchen.jpg',
         'query --topic /odom --limit 5 --format csv',
+        "query --where 'imu.accelerometer.2 > 15' --since 7d --json > bumps.json",
+        'query --sensor camera --ranges bumps.json',
         'query "SELECT sensor, count(*) AS n FROM objects GROUP BY sensor" --since 7d',
     )
 )
@@ -38,24 +57,42 @@ _OBJECTS: Final = {'bucket', 'key'}
 @click.option('--order', metavar='COLUMN', help="What to sort by, such as 't_start desc'  [default: t_start]")
 @click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N rows.')
 @click.option('--format', 'kind', type=click.Choice(['table', 'csv', 'json', 'keys']), default='table', show_default=True)
+@click.option('--scan', is_flag=True, help='Of a condition on values: open objects without statistics as well.')
+@click.option('--join', 'join_s', type=click.FloatRange(0.0), default=1.0, show_default=True, metavar='S',
+              help='Times at most so far apart are one.')  # fmt: skip
+@click.option('--pad', 'pad_s', type=click.FloatRange(0.0), default=0.0, metavar='S', help='So much before and after each time.')
 @as_json
 @click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')
 @click.option(
     '--map', 'ground', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw where the objects were recorded.'
 )
 def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str, as_json: bool,  # noqa: PLR0913 - one an option
-          sheet: Path | None, ground: Path | None) -> ExitCode:  # fmt: skip
+          scan: bool, join_s: float, pad_s: float, sheet: Path | None, ground: Path | None) -> ExitCode:  # fmt: skip
     """Search what is stored, by flags or SQL.
 
     An object must match all flags; times are UTC.
 
     SQL knows the views objects, missions, topics, gaps and watermarks, restricted by the flags.
 
+    A --where with SENSOR.FIELD, such as 'imu.accelerometer.2 > 15 and max(imu.temperature) < 60', asks for values: the answer is
+    times, which --ranges takes. A plain name is about each message, first last min max mean count nan_count about each object.
+
     Exit code 1 when files of the catalogue are damaged: they are left out, and named on standard error.
     """
     with asking():
         from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
+        from shadowhound_data_logger.lake import values  # noqa: PLC0415
 
+        if values.is_about_values(flags.get('where', '')):
+            if sql or sheet or ground or order or limit or kind not in {'table', 'json'}:
+                raise BadUsage('a condition on values answers with times, as a table or JSON',
+                               'write them to a file with --json, and ask again with --ranges FILE')  # fmt: skip
+            left_out = quietly()
+            others = {name: value for name, value in flags.items() if name != 'where'}
+            found = values.ranges(flags['where'], lake.default_source(the_store_settings()), scan=scan, join_s=join_s,
+                                  pad_s=pad_s, findings=left_out, **others)  # fmt: skip
+            _print_times(flags['where'], found, is_json=as_json or kind == 'json')
+            return tell_left_out(left_out)
         source, left_out = lake.default_source(the_store_settings()), quietly()
         ask = functools.partial(lake.sql, sql) if sql else lake.objects
         frame = ask(source, findings=left_out, **flags)
@@ -69,6 +106,39 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
             _pictures(source, found.to_pylist(), flags, left_out, sheet, ground)
     _print(found, 'json' if as_json else kind, source.describe(), is_objects=not sql, is_limited=limit is not None)
     return tell_left_out(left_out)
+
+
+def _print_times(condition: str, found: ValueAnswer, *, is_json: bool) -> None:
+    if is_json:
+        fresh = [with_dates({**asdict(each), 'fresh_ns': each.fresh_ns}) for each in found.fresh]
+        print_json({'where': condition, **asdict(found), 'ranges': [with_dates(asdict(each)) for each in found.ranges],
+                    'fresh': fresh})  # fmt: skip
+        return
+    table = plain_table('', ('robot', 'from (UTC)', 'to (UTC)', 'lasts', 'messages'), ('robot', 'from (UTC)', 'to (UTC)'))
+    table.title = None
+    for each in found.ranges[:MOST_TIMES]:
+        lasts = duration((each.until_ns - each.since_ns) / SECOND)
+        table.add_row(plain(each.robot), shown_time(each.since_ns), shown_time(each.until_ns), lasts, number(each.messages))
+    parts: list[RenderableType] = [table, ''] if found.ranges else []
+    print_page(*parts, *_about_times(found))
+
+
+def _about_times(found: ValueAnswer) -> Iterator[RenderableType]:
+    """How many, what was opened for it, what may be missing, and up to when it is all that there is."""
+    if not found.objects:
+        yield plain(f'There are no such objects.{store_hint()}')
+        return
+    more = f'; the first {MOST_TIMES} are shown (--json has all)' if len(found.ranges) > MOST_TIMES else ''
+    share = f'{100 * found.opened / found.objects:.2g} %' if found.opened else 'none'
+    opened = f'{number(found.opened)} of {counted(found.objects, "object")} opened ({share})'
+    yield plain(f'{counted(len(found.ranges), "time")}{more}. {opened}.')
+    if found.fields:
+        yield plain(f'There is no such field. There are {", ".join(found.fields)}.', 'yellow')
+    if found.unknown:
+        yield plain(f'{counted(found.unknown, "object")} without statistics may hold more: --scan opens them.', 'yellow')
+    for each in found.fresh:
+        until = f'up to {shown_time(each.fresh_ns)}' if each.fresh_ns is not None else 'up to a time that is not known'
+        yield plain(f'{each.robot} {each.topic}: fresh {until}.')
 
 
 def _ordered(frame: Any, order: str | None) -> Any:

@@ -12,6 +12,7 @@ import click
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, exit_code
 from shadowhound_data_logger.cli.output import number
 from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, from_json
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.findings import Findings
@@ -35,8 +36,16 @@ FLAGS: Final = {
         '--succeeded', 'success', flag_value=True, type=bool, default=None, help='Only of missions that succeeded.'
     ),
     'where': click.option('--where', metavar='SQL', help="A condition, such as 'battery_pct < 30'."),
+    'ranges': click.option(
+        '--ranges',
+        type=click.File('rb'),
+        metavar='FILE.json',
+        callback=lambda _, __, file: _ranges(file),
+        help='In one of these times: the answer of `query --where SENSOR.FIELD... --json`; - is stdin.',
+    ),
 }
-NAMES: Final = ('robot', 'sensor', 'topic', 'since', 'until', 'near', 'mission', 'mission_type', 'success', 'where')
+_RANGES: Final = 'it is what `query --where SENSOR.FIELD... --json` prints'
+NAMES: Final = ('robot', 'sensor', 'topic', 'since', 'until', 'near', 'mission', 'mission_type', 'success', 'where', 'ranges')
 _Command = TypeVar('_Command', bound=Callable[..., Any])
 
 
@@ -53,11 +62,27 @@ def question(command: _Command) -> _Command:
     return asked  # type: ignore[return-value]
 
 
+def _ranges(file: Any) -> list[Any] | None:
+    """Those of an answer: its list, or all of it."""
+    if file is None:
+        return None
+    try:
+        told = from_json(file.read(MOST_DOCUMENT_BYTES + 1))
+    except ValueError as error:
+        raise BadUsage(f'--ranges {file.name}: {error}', _RANGES) from error
+    found = told.get('ranges') if isinstance(told, dict) else told
+    if not isinstance(found, list):
+        raise BadUsage(f'--ranges {file.name} is not a list of times', _RANGES)
+    return found
+
+
 def question_text(flags: Mapping[str, Any]) -> str:
     """The query, as the title of a picture."""
     told = {**flags, 'success': {True: 'succeeded', False: 'failed'}.get(flags.get('success'), '')}  # type: ignore[arg-type]
     return ', '.join(
-        str(told[name]) if name in {'sensor', 'success'} else f'{name} {told[name]}' for name in NAMES if told.get(name)
+        str(told[name]) if name in {'sensor', 'success'} else f'{name} {told[name]}'
+        for name in NAMES
+        if name != 'ranges' and told.get(name)
     )
 
 

@@ -15,9 +15,11 @@ import numpy as np
 import simplejpeg
 
 from shadowhound_data_logger.encode.payload import Fact, Job, Payload
+from shadowhound_data_logger.encode.statistics import ALL, NONE, Statistic, of_number, of_whole
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
-from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE
+from shadowhound_data_logger.options import ARCHIVES, COMPRESSED_IMAGE, IMAGE
+from shadowhound_data_logger.untrusted import check_pixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -88,17 +90,18 @@ def _encode(job: Job, sample: Sample, *, lossless: bool) -> Payload:
         raise Rejected('wrong_type', f'{job.batch.type} is not an image')
     message = job.types.deserialize(job.batch.type, memoryview(sample.cdr))
     if job.batch.type == COMPRESSED_IMAGE:
-        return _published(sample, message)
+        return _published(job, sample, message)
     pixel = _layout(message)
     facts = {'width': message.width, 'height': message.height, 'encoding': message.encoding}
     if pixel.colorspace and not lossless:
-        return Payload(_jpeg(message, pixel, job.sensor.quality), (sample,), 'jpg', 'image/jpeg', facts)
+        body = _jpeg(message, pixel, job.sensor.quality)
+        return Payload(body, (sample,), 'jpg', 'image/jpeg', facts, _statistics(job, body))
     if pixel.mode == 'F':
         return Payload(_pillow(message, pixel, 'TIFF'), (sample,), 'tiff', 'image/tiff', facts)
     return Payload(_pillow(message, pixel, 'PNG', compress_level=_PNG_LEVEL), (sample,), 'png', 'image/png', facts)
 
 
-def _published(sample: Sample, message: Any) -> Payload:
+def _published(job: Job, sample: Sample, message: Any) -> Payload:
     """A CompressedImage's own bytes, if they are a JPEG or a PNG."""
     data: Any = message.data
     facts: dict[str, Fact] = {}
@@ -114,7 +117,13 @@ def _published(sample: Sample, message: Any) -> Payload:
     else:
         text = f'neither JPEG nor PNG: format {message.format[:40]!r}, data begins with {body[:4].hex()}'
         raise Rejected('unsupported_encoding', text)
-    return Payload(body, (sample,), ext, content_type, {'width': width, 'height': height, **facts})
+    found = _statistics(job, body) if ext == 'jpg' else {}
+    return Payload(body, (sample,), ext, content_type, {'width': width, 'height': height, **facts}, found)
+
+
+def _statistics(job: Job, body: bytes) -> dict[str, Statistic]:
+    """Of a picture that is an object of its own."""
+    return of_jpeg(body) if job.sensor.statistics != (NONE,) and job.sensor.format not in ARCHIVES else {}
 
 
 def _depth(message: Any) -> tuple[Any, dict[str, Fact]]:
@@ -171,6 +180,25 @@ def _pillow(message: Any, pixel: _Pixel, kind: str, **options: int) -> bytes:
     file = BytesIO()
     image.save(file, kind, **options)
     return file.getvalue()
+
+
+def of_jpeg(body: bytes) -> dict[str, Statistic]:
+    """Brightness, 0 to 255, and sharpness, the variance of the Laplacian, both of its grey at an eighth of the size.
+
+    Empty where it cannot be decoded.
+    """
+    try:
+        height, width, _, _ = simplejpeg.decode_jpeg_header(body)
+        check_pixels(width, height)
+        grey = simplejpeg.decode_jpeg(body, 'GRAY', fastdct=True, fastupsample=True, min_height=1, min_width=1)
+        grey = grey[:, :, 0].astype(np.float32)
+    except (ValueError, MemoryError):
+        return {}
+    found = {'brightness': float(grey.mean(dtype=np.float64))}
+    if min(grey.shape) > 2:
+        edges = 4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
+        found['sharpness'] = float(edges.var(dtype=np.float64))
+    return {ALL: of_whole(1), **{name: of_number(value) for name, value in found.items()}}
 
 
 def jpeg_size(data: bytes) -> tuple[int, int]:

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from shadowhound_data_logger.encode.payload import Fact, Job, Payload
+from shadowhound_data_logger.encode.statistics import ALL, MOST_FIELDS, NONE, Statistic, of_number, of_whole
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
-from shadowhound_data_logger.options import POINT_CLOUD
+from shadowhound_data_logger.options import ARCHIVES, POINT_CLOUD
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,7 +66,26 @@ def encode_cloud(job: Job, sample: Sample) -> Payload:
     points = _points(cloud, fields, row_step)
     body = b''.join((_header(cloud, fields, sample.stamp_ns), points.data))
     facts: dict[str, Fact] = {'points': cloud.width * cloud.height, 'is_dense': bool(cloud.is_dense)}
-    return Payload(body, (sample,), 'pcd', 'application/octet-stream', facts)
+    is_asked = job.sensor.statistics != (NONE,) and job.sensor.format not in ARCHIVES
+    found = of_points(points.reshape(-1).view([(field.name, field.format('<')) for field in fields])) if is_asked else {}
+    return Payload(body, (sample,), 'pcd', 'application/octet-stream', facts, found)
+
+
+def of_points(points: Any) -> dict[str, Statistic]:
+    """Of a structured array of points: their number, and each field of one value a point. There is no mean."""
+    found = {ALL: of_whole(1), 'points': of_number(len(points))}
+    for name in (points.dtype.names or ())[: MOST_FIELDS - 1]:
+        values = points[name]
+        if values.ndim != 1:
+            continue
+        with np.errstate(invalid='ignore'):  # a NaN may be of a kind that signals
+            whole = np.asarray(values, np.float64)
+        present = whole[np.isfinite(whole)]
+        missing = len(whole) - len(present)
+        ends = (present[0], present[-1], present.min(), present.max()) if len(present) else (None,) * 4
+        first, last, least, greatest = (None if one is None else float(one) for one in ends)
+        found[name] = Statistic(first, last, least, greatest, None, len(present), missing)
+    return found
 
 
 def _row_step(cloud: Any) -> int:

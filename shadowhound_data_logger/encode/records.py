@@ -24,6 +24,7 @@ from rosbags.typesys.base import normalize_fieldname
 
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.encode.payload import Job, Payload, Rejections
+from shadowhound_data_logger.encode.statistics import NONE, FieldStatistics
 from shadowhound_data_logger.encode.types import PLACEHOLDER, MessageTypes, nested_type
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 ODOMETRY: Final = 'nav_msgs/msg/Odometry'
 NON_FINITE: Final = 'non_finite'
 _TAKEN: Final = frozenset({'stamp_ns', NON_FINITE})
-_AT_ONCE: Final = 100
+AT_ONCE: Final = 100
 """Records that are Python objects at a time: they take twenty times the bytes of the message, and ``orjson`` holds the GIL
 while it writes them."""
 _AWKWARD: Final = b'7.038531e-26'
@@ -53,10 +54,14 @@ def encode_records(job: Job, rejections: Rejections) -> Payload | None:
     records = _records(job, _of_batch if batched else _alone, kept, rejections)
     parts: list[bytes] = []
     non_finite = 0
-    while some := list(islice(records, _AT_ONCE)):
+    has_statistics = job.sensor.statistics != (NONE,)
+    found = FieldStatistics(job.sensor.statistics)
+    while some := list(islice(records, AT_ONCE)):
         part, missing = _dump(some)
         parts.append(part[1:-1])
         non_finite += missing
+        if has_statistics:
+            found.add(orjson.loads(part))
     if not kept:
         return None
     body = b','.join(parts)
@@ -64,7 +69,7 @@ def encode_records(job: Job, rejections: Rejections) -> Payload | None:
         body = b'%b,"samples":[%b]}' % (_head(job, kept)[:-1], body)
     if non_finite:
         body = b'%b,"non_finite":%d}' % (body[:-1], non_finite)
-    return Payload(body, tuple(kept), 'json', 'application/json')
+    return Payload(body, tuple(kept), 'json', 'application/json', statistics=found.told() if has_statistics else {})
 
 
 def _records(job: Job, record: ToRecord, kept: list[Sample], rejections: Rejections) -> Iterator[dict[str, Any]]:

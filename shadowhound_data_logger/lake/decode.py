@@ -133,7 +133,16 @@ def cloud(body: bytes) -> NDArray[np.float32]:
         raise LakeError(f'this is not a PCD that can be read: {error}') from error
 
 
-def _cloud(body: bytes) -> NDArray[np.float32]:
+def cloud_points(body: bytes) -> NDArray[Any]:
+    """(n,) structured: all fields of a cloud's points, under their names. Raises LakeError."""
+    try:
+        found = _points(body)
+        return found.view(np.dtype([(name.partition(':')[2], found.dtype[name]) for name in found.dtype.names or ()]))
+    except _BROKEN as error:
+        raise LakeError(f'this is not a PCD that can be read: {error}') from error
+
+
+def _points(body: bytes) -> NDArray[Any]:
     at = body.index(_DATA, 0, _MOST_HEADER) + len(_DATA)
     end = body.index(b'\n', at, at + 64)
     if body[at:end].strip() != b'binary':
@@ -148,9 +157,13 @@ def _cloud(body: bytes) -> NDArray[np.float32]:
     )
     layout = np.dtype([(f'{number}:{name}', f'<{kind.lower()}{int(size)}', (int(count),) if int(count) > 1 else ())
                        for number, (name, kind, size, count) in enumerate(fields)])  # fmt: skip
-    data = np.frombuffer(body, layout, points, end + 1)
-    found = np.full((points, len(POINT)), np.nan, np.float32)
-    for name in layout.names or ():
+    return np.frombuffer(body, layout, points, end + 1)
+
+
+def _cloud(body: bytes) -> NDArray[np.float32]:
+    data = _points(body)
+    found = np.full((len(data), len(POINT)), np.nan, np.float32)
+    for name in data.dtype.names or ():
         if (plain := name.partition(':')[2]) in POINT and data[name].ndim == 1:
             found[:, POINT.index(plain)] = data[name]
     return found

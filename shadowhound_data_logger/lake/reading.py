@@ -24,6 +24,7 @@ import pyarrow.parquet as pq
 from shadowhound_data_logger.catalogue.gaps import GAPS, STATEMENT_KINDS
 from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
 from shadowhound_data_logger.catalogue.schema import KEPT, OBJECTS, TableSchema
+from shadowhound_data_logger.catalogue.statistics import STATISTICS
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
@@ -59,9 +60,9 @@ _PAGE: Final = re.compile(
     rb'\x2c\x15[\x80-\xff]{0,4}[\x00-\x7f]\x15\x00\x15\x06\x15\x06\x00\x00'
 )  # fmt: skip
 """The header of a plain data page as ``parquet.py`` writes it, its sizes in groups."""
-_OWNER: Final = {OBJECTS.folder: 'key', KEPT.folder: 'key', GAPS.folder: 'robot'}
+_OWNER: Final = {OBJECTS.folder: 'key', KEPT.folder: 'key', STATISTICS.folder: 'key', GAPS.folder: 'robot'}
 """The column that says whose a row is, by the table's folder."""
-_COUNTS: Final = ('bytes', 'revision', 'merged', 'received', 'skipped')
+_COUNTS: Final = ('bytes', 'revision', 'merged', 'received', 'skipped', 'nan_count')
 _TIMES: Final = ('t_start', 't_end', 't_from', 't_to')
 _YEARS_US: Final = (-62_135_596_800_000_000, 253_402_300_799_999_999)
 """1 to 9999, those of a date."""
@@ -105,7 +106,7 @@ def whole(source: Bucket, entries: Sequence[ObjectInfo], findings: Findings,
             findings.add(one.key, one.why, one.rows)
 
 
-@lru_cache(maxsize=3)
+@lru_cache(maxsize=8)
 def arrow_schema(of: TableSchema = OBJECTS) -> pa.Schema:
     """The columns of a table as pyarrow has them."""
     kinds = {STRING: pa.string(), INT32: pa.int32(), INT64: pa.int64(), DOUBLE: pa.float64(), TIME: pa.timestamp('us', tz='UTC')}
@@ -452,7 +453,7 @@ def _bounds(wanted: Wanted) -> list[_Bound]:
     if wanted.near is not None:
         x, y, radius = wanted.near
         found += [('x', x - radius, x + radius), ('y', y - radius, y + radius)]
-    return found
+    return [*found, *wanted.bounds]
 
 
 def _may_hold(group: Any, places: Mapping[str, int], bounds: Sequence[_Bound]) -> bool:

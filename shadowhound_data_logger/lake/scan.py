@@ -14,14 +14,16 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from typing import Final, TypeVar
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import Day, days, robots
 from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, arrow_schema
-from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.lake.select import TimeSpan, Wanted
 from shadowhound_data_logger.model import ObjectInfo
 
 os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # else it tells its makers of each run, over the network
@@ -34,7 +36,8 @@ from daft.recordbatch import RecordBatch
 
 _Answer = TypeVar('_Answer')
 KEY: Final = ('bucket', 'key')
-_ROW: Final = (*KEY, 't_start_ns')
+_TIMES: Final = ('robot', 't_start_ns', 't_end_ns')
+ROW: Final = (*KEY, 't_start_ns')
 """Of a repeat the key is that of another row (spool/repeats.py)."""
 
 
@@ -104,12 +107,31 @@ class _Parts(DataSourceTask):
             tables.close()
 
     def _tables(self) -> Generator[pa.Table, None, None]:
-        wide = (*self._columns, *(name for name in _ROW if name not in self._columns)) if self._once else self._columns
-        found = reading.tables(self._source, self._entries, wide, self._findings, self._wanted)
+        wide = (*self._columns, *(name for name in ROW if name not in self._columns)) if self._once else self._columns
+        if self._wanted.spans:
+            wide = (*wide, *(name for name in _TIMES if name not in wide))
+        found = (_within(table, self._wanted.spans)
+                 for table in reading.tables(self._source, self._entries, wide, self._findings, self._wanted))  # fmt: skip
         if self._once:
             yield unrepeated(pa.concat_tables([reading.narrow(wide).empty_table(), *found])).select(self._columns)
         else:
-            yield from found
+            yield from (table.select(self._columns) for table in found)
+
+
+def _within(table: pa.Table, spans: Sequence[TimeSpan]) -> pa.Table:
+    """The rows that reach into one of these times, where there are any; each robot's are sorted, and none meets the next."""
+    if not spans:
+        return table
+    first = pc.fill_null(table['t_start_ns'], -1).to_numpy()
+    last = np.maximum(first, pc.fill_null(table['t_end_ns'], -1).to_numpy())
+    found = np.zeros(len(table), bool)
+    for robot, each in groupby(spans, lambda span: span.robot):
+        since, until = np.array([span[1:] for span in each], np.int64).T
+        place = np.searchsorted(until, first)
+        inside = (place < len(until)) & (since[np.minimum(place, len(until) - 1)] <= last)
+        is_its = pc.fill_null(pc.equal(table['robot'], robot), fill_value=False).to_numpy() if robot else True
+        found |= inside & is_its
+    return table.filter(pa.array(found))
 
 
 async def _apart(work: Callable[[], _Answer]) -> _Answer:
@@ -125,10 +147,10 @@ def folders(source: Bucket, wanted: Wanted, findings: Findings) -> list[Day]:
         return days(source, named, wanted.dates(time.time_ns()), pool, findings, wanted.has_date)
 
 
-def unrepeated(table: pa.Table) -> pa.Table:
-    """The first row of each key and time, in order."""
+def unrepeated(table: pa.Table, of: Sequence[str] = ROW) -> pa.Table:
+    """The first row of each key and time, or of what else tells rows apart, in order."""
     numbered = table.append_column('_row', pa.array(range(len(table)), pa.int64()))
-    first = numbered.group_by(list(_ROW)).aggregate([('_row', 'min')])['_row_min']
+    first = numbered.group_by(list(of)).aggregate([('_row', 'min')])['_row_min']
     return table if len(first) == len(table) else table.take(first.combine_chunks().sort())
 
 

@@ -6,18 +6,30 @@ An object belongs to the moment at which it begins (``t_start``, UTC), as its ro
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.catalogue.schema import UNDATED
-from shadowhound_data_logger.clock import FUTURE_SLACK_NS, utc
+from shadowhound_data_logger.clock import FUTURE_SLACK_NS, SECOND, utc
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.times import moment
 
 DAY: Final = timedelta(days=1)
+LONGEST_BATCH_NS: Final = 3600 * SECOND
+"""A batch that began so long before a time can reach into it (``sensor.batch_s``)."""
+RANGES: Final = 'the ranges of `shadowhound-data query --where ... --json`: since_ns and until_ns in ns since 1970, and robot'
 MOST_FOLDERS: Final = 400
 """Dates that are asked for by name; for a longer time the folders that there are are listed first."""
+
+
+class TimeSpan(NamedTuple):
+    """A time of one robot, or of all (None); both ends are in it."""
+
+    robot: str | None
+    since_ns: int
+    until_ns: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +51,10 @@ class Wanted:
     """How the mission ended by its ``summary.json``; of one that goes on, neither is true."""
     where: str | None = None
     """SQL, such as ``battery_pct < 30``."""
+    spans: tuple[TimeSpan, ...] = ()
+    """Objects that reach into one of these; in the order of their times, each robot's apart. None: of all times."""
+    bounds: tuple[tuple[str, Any, Any], ...] = ()
+    """Further columns with the least and the greatest value of what is wanted: row groups without are left out."""
 
     def has_date(self, date: str) -> bool:
         """Whether a row under this date can be wanted."""
@@ -65,14 +81,49 @@ def wanted(  # noqa: PLR0913 - the flags of a question
     now_ns: int, *, since: str | datetime | None = None, until: str | datetime | None = None,
     near: tuple[float, float, float] | str | None = None, robot: str | None = None, sensor: str | None = None,
     topic: str | None = None, mission: str | None = None, mission_type: str | None = None, success: bool | None = None,
-    where: str | None = None,
+    where: str | None = None, ranges: Sequence[Mapping[str, Any]] | None = None,
 ) -> Wanted:  # fmt: skip
-    """The query with these flags. Raises SettingError for an invalid one."""
-    return Wanted(
+    """The query with these flags. Raises SettingError for an invalid one.
+
+    ``ranges`` are those of an answer about values or labels: mappings with ``since_ns``, ``until_ns`` and maybe ``robot``.
+    """
+    asked = Wanted(
         robot=robot, sensor=sensor, topic=topic, mission=mission, mission_type=mission_type, success=success, where=where,
         since_ns=None if since is None else moment('since', since, now_ns),
         until_ns=None if until is None else moment('until', until, now_ns),
         near=None if near is None else _circle(near),
+    )  # fmt: skip
+    return asked if ranges is None else within(asked, spans_of(ranges))
+
+
+def spans_of(ranges: Sequence[Mapping[str, Any]]) -> list[TimeSpan]:
+    """Raises SettingError for what are no ranges."""
+    found = []
+    for each in ranges:
+        try:
+            robot, since_ns, until_ns = each.get('robot'), each['since_ns'], each['until_ns']
+        except (AttributeError, LookupError, TypeError):
+            raise SettingError('ranges', str(each)[:200], RANGES) from None
+        are_times = all(type(one) is int and 0 <= one < 1 << 63 for one in (since_ns, until_ns))
+        if not are_times or not (robot is None or isinstance(robot, str)):
+            raise SettingError('ranges', str(each)[:200], RANGES)
+        found.append(TimeSpan(robot, since_ns, until_ns))
+    return found
+
+
+def within(asked: Wanted, spans: Iterable[TimeSpan]) -> Wanted:
+    """Of what is asked what reaches into these times; where there are none, nothing."""
+    joined: list[TimeSpan] = []
+    for each in sorted((each for each in spans if each.since_ns <= each.until_ns), key=lambda each: (each.robot or '', each[1:])):
+        if joined and joined[-1].robot == each.robot and each.since_ns <= joined[-1].until_ns:
+            joined[-1] = joined[-1]._replace(until_ns=max(joined[-1].until_ns, each.until_ns))
+        else:
+            joined.append(each)
+    since_ns = max(0, min((each.since_ns for each in joined), default=0) - LONGEST_BATCH_NS)
+    until_ns = max((each.until_ns + 1 for each in joined), default=0)
+    return replace(
+        asked, spans=tuple(joined) or (TimeSpan(None, 0, 0),), since_ns=max(since_ns, asked.since_ns or 0),
+        until_ns=until_ns if asked.until_ns is None else min(until_ns, asked.until_ns),
     )  # fmt: skip
 
 

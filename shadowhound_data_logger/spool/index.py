@@ -97,6 +97,8 @@ class UncataloguedObject(NamedTuple):
     size: int
     content_type: str
     metadata: Mapping[str, str]
+    statistics: bytes = b''
+    """As its encoder packed them; empty where there are none."""
 
 
 class Index:
@@ -393,6 +395,8 @@ class Index:
         if item.counts:
             rows = ((number, account, count) for account, count in item.counts.items())
             self._db.executemany('INSERT INTO contents VALUES (?,?,?)', rows)
+        if item.statistics and state is not State.EVICTED:
+            self._db.execute('INSERT INTO statistics VALUES (?,?)', (number, item.statistics))
         return number
 
     def move(self, ids: Iterable[int], state: State, reason: str | None, now_ns: int) -> None:
@@ -560,12 +564,12 @@ class Index:
     def uncatalogued(self, limit: int) -> list[UncataloguedObject]:
         """Delivered objects that no part of the catalogue has a row of yet, the oldest first: triggers keep the list."""
         rows = self._db.execute(
-            'SELECT id, bucket, key, bytes, content_type, metadata FROM uncatalogued JOIN objects USING (id)'
-            ' ORDER BY id LIMIT ?', (limit,),
+            'SELECT id, bucket, key, bytes, content_type, said, metadata FROM uncatalogued JOIN objects USING (id)'
+            ' LEFT JOIN statistics USING (id) ORDER BY id LIMIT ?', (limit,),
         )  # fmt: skip
         said = [(*row, json.loads(metadata)) for *row, metadata in rows]
-        return [UncataloguedObject(number, bucket, metadata.get(words.CONTENT_KEY, key), size, content_type, metadata)
-                for number, bucket, key, size, content_type, metadata in said]  # fmt: skip
+        return [UncataloguedObject(number, bucket, metadata.get(words.CONTENT_KEY, key), size, kind, metadata, told or b'')
+                for number, bucket, key, size, kind, told, metadata in said]  # fmt: skip
 
     def take_uncatalogued(self, ids: Collection[int]) -> bool:
         """Take these off the list, in the transaction that spools their part, so that a death leaves both or neither.

@@ -51,6 +51,19 @@ CREATE TRIGGER forgotten AFTER DELETE ON objects BEGIN
 END;
 """  # noqa: S608 - own constants only
 """What the store holds and no part of the catalogue has a row of (``Index.uncatalogued``)."""
+_STATISTICS: Final = """
+CREATE TABLE statistics (id INTEGER PRIMARY KEY, said BLOB NOT NULL);
+CREATE TRIGGER statistics_told AFTER DELETE ON uncatalogued BEGIN
+  DELETE FROM statistics WHERE id = OLD.id;
+END;
+CREATE TRIGGER statistics_lost AFTER UPDATE OF state ON objects WHEN NEW.state = 'evicted' BEGIN
+  DELETE FROM statistics WHERE id = NEW.id;
+END;
+CREATE TRIGGER statistics_forgotten AFTER DELETE ON objects BEGIN
+  DELETE FROM statistics WHERE id = OLD.id;
+END;
+"""
+"""Of the numbers in an object, until a part of the catalogue tells them. An index that is made again has none of them."""
 _CONTENTS: Final = """
 CREATE TABLE contents (
   id INTEGER NOT NULL, topic TEXT NOT NULL, samples INTEGER NOT NULL, PRIMARY KEY (id, topic)) WITHOUT ROWID;
@@ -338,6 +351,7 @@ CREATE TABLE sessions (
 {_GAPS_TOLD}
 {_RECORDINGS}
 {_KEEP}
+{_STATISTICS}
 PRAGMA user_version = {SCHEMA_VERSION};
 """  # noqa: S608 - own constants only
 MIGRATIONS: Final = {
@@ -346,7 +360,7 @@ MIGRATIONS: Final = {
     3: _OTHER_TYPES,
     4: f'{_ESTIMATES} {_REGRADED}',
     5: _JOURNALED,
-    6: f'{_COMPACTED} {_RECORDINGS} {_KEPT_IS_A_STATE}',
+    6: f'{_COMPACTED} {_RECORDINGS} {_KEPT_IS_A_STATE} {_STATISTICS}',
 }
 """Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
 _AS_NOW: Final = """
@@ -421,6 +435,7 @@ _NUMBERS: Final = {
     'folders': ('id',),
     'compact_objects': ('folder', 'id', 'state', 'bytes', 'settled_s'),
     'gaps_told': ('version', 'again'),
+    'statistics': ('id',),
     'recordings': (),
     'untold': ('id',),
     'requests': ('priority', 'made_ns', 'expires_ns', 'received_ns', 'objects', 'bytes', 'answers', 'told_ns'),
@@ -448,6 +463,7 @@ _TEXTS: Final = {
     'folders': ('bucket', 'path', 'sensor'),
     'compact_objects': ('name',),
     'gaps_told': ('robot',),
+    'statistics': (),
     'recordings': ('owner', 'folder', 'said', 'channels'),
     'untold': ('state',),
     'requests': ('id', 'requester', 'wanted', 'state', 'why', 'told'),
@@ -479,7 +495,10 @@ def _implausible(table: str) -> str:
     conditions += [f"{column} NOT GLOB '{{*}}'" for column in _JSON.get(table, ())]
     if table == 'compact_objects':
         conditions.append("typeof(sha256) <> 'blob' OR state > 2")
-    name = 'rowid' if table in {'objects', 'sessions', 'sqlite_sequence', 'folders'} else _TEXTS[table][0]  # without a rowid
+    if table == 'statistics':
+        conditions.append("typeof(said) <> 'blob'")
+    has_rowid = table in {'objects', 'sessions', 'sqlite_sequence', 'folders', 'statistics'}
+    name = 'rowid' if has_rowid else _TEXTS[table][0]
     where = ' OR '.join((*conditions, *([_UNSAFE] if table == 'objects' else [])))
     return f'SELECT {name} FROM {table} WHERE {where} LIMIT 1'  # noqa: S608 - own constants only
 

@@ -23,6 +23,7 @@ BUCKET = 'sensor-data'
 READY = f'ready/{BUCKET}'
 KEY = 'thor/camera/20251018/120000_front.jpg'
 WITHOUT_SHORT_ROWS = """
+DROP TABLE statistics; DROP TRIGGER statistics_told; DROP TRIGGER statistics_lost; DROP TRIGGER statistics_forgotten;
 DROP TRIGGER kept_here; DROP TRIGGER kept_again; DROP TRIGGER kept_lost; DROP TRIGGER kept_forgotten; DROP TRIGGER answered;
 DROP INDEX kept; DROP TABLE untold; DROP TABLE requests; DROP TABLE requested;
 DROP TABLE recordings; DROP TABLE slices; DROP TABLE missing;

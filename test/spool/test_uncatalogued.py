@@ -54,7 +54,7 @@ def test_what_the_store_holds_is_listed(spool: Spool, root: Path) -> None:
     settle(spool, items[0], State.DELIVERED)
     assert listed(root) == ['a', 'd']
     (first, _) = uncatalogued(root, ALL)
-    assert first == (items[0].id, 'sensor-data', 'a', 1, 'image/jpeg', items[0].metadata)
+    assert first == (items[0].id, 'sensor-data', 'a', 1, 'image/jpeg', items[0].metadata, b'')
     settle(spool, items[2], State.DELIVERED)  # it was on its way when it was evicted
     assert listed(root) == ['a', 'c', 'd']
     assert [item.key for item in uncatalogued(root, 2)] == ['a', 'c']

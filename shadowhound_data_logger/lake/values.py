@@ -1,0 +1,471 @@
+"""When the numbers in the objects were so: from a condition such as ``imu.accelerometer.2 > 15`` to ranges of time.
+
+A name is that of a sensor and of a field (encode/statistics.py), or what several fields begin with: then any of them will do.
+A plain name is about each message; ``max(...)`` and the other statistics are about each object, a batch of messages, as a whole.
+``and``, ``or`` and parentheses join comparisons. What is missing, NaN or infinite compares as false.
+
+The statistics in the catalogue say of most objects that all or none of their messages meet the condition. Only the others are
+opened, and what they say counts: the answer is that of a loop over all messages.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from shadowhound_data_logger.catalogue.statistics import STATISTICS
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.conditions import COMPARISONS, NUMBER
+from shadowhound_data_logger.encode.image import of_jpeg
+from shadowhound_data_logger.encode.pointcloud import of_points
+from shadowhound_data_logger.encode.records import AT_ONCE
+from shadowhound_data_logger.encode.statistics import (
+    ALL,
+    NUMBERS,
+    FieldStatistics,
+    Statistic,
+    covers,
+    values_of,
+)
+from shadowhound_data_logger.errors import DataLoggerError, LakeError, ObjectRefused, SettingError, StoreError
+from shadowhound_data_logger.lake import query
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket
+from shadowhound_data_logger.lake.decode import cloud_points, extension_of, records
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.gaps import OBJECTS, newest, watermarks
+from shadowhound_data_logger.lake.live_files import days, robots
+from shadowhound_data_logger.lake.reading import arrow_schema, narrow, tables
+from shadowhound_data_logger.lake.select import TimeSpan, Wanted, wanted
+from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
+
+ALLOWED: Final = (
+    "comparisons such as 'imu.accelerometer.2 > 15' or 'max(states.foot_force) > 200': sensor.field, or one of first last min "
+    'max mean count nan_count of it, then < <= > >= = != and a number; joined by and, or and parentheses'
+)
+JOIN_S: Final = 1.0
+"""What is no further apart is one range."""
+OPENED_AT_A_TIME: Final = 64
+MOST_LEAVES: Final = 32
+_PATH: Final = r'[A-Za-z_][\w-]*(?:\.(?:\w+|\*))+'
+_COMPARISON: Final = re.compile(
+    rf'\s*(?:(?P<function>{"|".join(NUMBERS)})\s*\(\s*(?P<inner>{_PATH})\s*\)|(?P<plain>{_PATH}))'
+    rf'\s*(?P<sign><=|>=|==|!=|<>|<|>|=)\s*(?P<number>{NUMBER})(?![\w.])', re.ASCII,
+)  # fmt: skip
+_WORD: Final = re.compile(r'\s*(and\b|or\b|\(|\)|$)', re.ASCII | re.IGNORECASE)
+_IS_VALUE: Final = re.compile(rf'(?<![\w.]){_PATH}', re.ASCII)
+_TEXT: Final = re.compile(r"'[^']*'")
+_SIGNS: Final = {'=': '==', '<>': '!='}
+_JSON, _JPEG, _PCD = 'json', 'jpg', 'pcd'
+_KEY: Final = ('bucket', 'key', 't_start_ns')
+_OBJECT: Final = ('robot', 'topic', *_KEY, 't_end_ns', 'count', 'sha256')
+_STATISTIC: Final = (*_KEY, 'field', *NUMBERS)
+Mask = NDArray[np.bool_]
+
+
+class Comparison(NamedTuple):
+    """A field of a sensor against a number; ``function`` is empty where it is about each message."""
+
+    function: str
+    sensor: str
+    field: str
+    sign: str
+    number: float
+
+    def holds(self, values: Any) -> Any:
+        """Of a number or an array; NaN never does."""
+        return COMPARISONS[self.sign](values, self.number) & (values == values)  # noqa: PLR0124 - false for NaN alone
+
+
+class Joined(NamedTuple):
+    """Expressions, of which all must hold (``and``) or any (``or``)."""
+
+    word: str
+    parts: tuple[Comparison | Joined, ...]
+
+
+Expression = Comparison | Joined
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """A time in which messages met the condition: from the first to the last of them."""
+
+    robot: str
+    sensor: str
+    since_ns: int
+    until_ns: int
+    """Inclusive."""
+    messages: int
+
+
+@dataclass(frozen=True, slots=True)
+class Freshness:
+    """Up to when a stream is in the answer. None: not known."""
+
+    robot: str
+    topic: str
+    newest_ns: int | None
+    """End of the newest object that the catalogue has."""
+    complete_ns: int | None
+    """The watermark: what was lost before is in the gap journal."""
+
+    @property
+    def fresh_ns(self) -> int | None:
+        """What was stored or lost until then is known here; an object that is still on the robot comes later."""
+        known = [each for each in (self.newest_ns, self.complete_ns) if each is not None]
+        return min(known) if len(known) == 2 else None
+
+
+@dataclass(frozen=True, slots=True)
+class ValueAnswer:
+    """When a condition held, and what was looked at to find out."""
+
+    ranges: tuple[Range, ...]
+    objects: int
+    """Of the sensor, in the time that was asked for."""
+    opened: int
+    unknown: int
+    """Without statistics of these fields, and not opened: the condition may hold in them as well."""
+    fresh: tuple[Freshness, ...]
+    fields: tuple[str, ...] = ()
+    """Where a field is in no object: those that are there."""
+
+
+def is_about_values(text: str) -> bool:
+    """Whether a ``--where`` is a condition on values, and not SQL over the columns of the catalogue, which have no dots."""
+    return _IS_VALUE.search(_TEXT.sub('', text)) is not None
+
+
+def parse(text: str) -> Expression:
+    """Raises SettingError."""
+    found, at = _any(text, 0, 0)
+    if text[at:].strip():
+        raise SettingError('where', text, ALLOWED)
+    sensors = {each.sensor for each in leaves(found)}
+    if len(sensors) > 1:
+        raise SettingError('where', text, f'one sensor at a time, not {" and ".join(sorted(sensors))}: write the ranges of one '
+                                          'with --json to a file, and ask for the other with --ranges')  # fmt: skip
+    return found
+
+
+def leaves(expression: Expression) -> list[Comparison]:
+    """All comparisons, from left to right."""
+    if isinstance(expression, Comparison):
+        return [expression]
+    return [leaf for part in expression.parts for leaf in leaves(part)]
+
+
+def _any(text: str, at: int, depth: int) -> tuple[Expression, int]:
+    return _joined('or', text, at, depth)
+
+
+def _joined(word: str, text: str, at: int, depth: int) -> tuple[Expression, int]:
+    parts: list[Expression] = []
+    while True:
+        part, at = _joined('and', text, at, depth) if word == 'or' else _one(text, at, depth)
+        parts.append(part)
+        after = _WORD.match(text, at)
+        if after is None or after[1].lower() != word or len(parts) >= MOST_LEAVES:
+            return parts[0] if len(parts) == 1 else Joined(word, tuple(parts)), at
+        at = after.end()
+
+
+def _one(text: str, at: int, depth: int) -> tuple[Expression, int]:
+    if found := _COMPARISON.match(text, at):
+        sensor, _, name = (found['inner'] or found['plain']).partition('.')
+        sign = _SIGNS.get(found['sign'], found['sign'])
+        return Comparison(found['function'] or '', sensor, name, sign, float(found['number'])), found.end()
+    bracket = _WORD.match(text, at)
+    if bracket is None or bracket[1] != '(' or depth >= MOST_LEAVES:
+        raise SettingError('where', text, ALLOWED)
+    inner, at = _any(text, bracket.end(), depth + 1)
+    close = _WORD.match(text, at)
+    if close is None or close[1] != ')':
+        raise SettingError('where', text, ALLOWED)
+    return inner, close.end()
+
+
+# -- the question --------------------------------------------------------------------------------------------------------------
+
+
+def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, join_s: float = JOIN_S, pad_s: float = 0.0,
+           findings: Findings | None = None, **flags: Any) -> ValueAnswer:  # fmt: skip
+    """When a condition held; ``flags`` are those of ``lake.objects`` and choose objects of its sensor.
+
+    ``scan`` opens objects without statistics as well. Ranges at most ``join_s`` apart are one, and each gets ``pad_s`` before and
+    after it. Raises SettingError, LakeError for what is not a question, StoreError.
+    """
+    expression = parse(condition)
+    sensor = leaves(expression)[0].sensor
+    if flags.get('sensor', sensor) != sensor:
+        raise SettingError('sensor', flags['sensor'], f'{sensor}, of which the condition is; leave it out')
+    findings = Findings() if findings is None else findings
+    source = source or query.default_source()
+    flags = {**flags, 'sensor': sensor}
+    asked = wanted(time.time_ns(), **flags)
+    with query.answering():
+        frame = query.objects(source, findings=findings, **flags).select(*_OBJECT, 't_start')
+        rows = frame.to_arrow().cast(narrow([*_OBJECT, 't_start'])).combine_chunks()
+    rows = rows.filter(pc.is_valid(rows['t_start'])).sort_by([('robot', 'ascending'), ('t_start_ns', 'ascending')])
+    told = _Told(rows, _statistics(source, asked, expression, findings))
+    may, must, is_known = told.judged(expression)
+    to_open = np.flatnonzero(may & ~must & (is_known | scan))
+    found = [*_whole(rows, np.flatnonzero(must), sensor)]
+    unread = int(np.count_nonzero(may & ~must & ~is_known)) if not scan else 0
+    for number, some in _opened(source, rows, to_open, expression, findings):
+        if some is None:
+            unread += 1
+        else:
+            found += [Range(rows['robot'][number].as_py(), sensor, *each) for each in some]
+    within = asked.spans
+    joined = _joined_ranges(found, round(join_s * SECOND))
+    padded = _joined_ranges((replace(each, since_ns=each.since_ns - round(pad_s * SECOND), until_ns=each.until_ns + round(
+        pad_s * SECOND)) for each in _clipped(joined, within)), 0) if pad_s else _clipped(joined, within)  # fmt: skip
+    return ValueAnswer(tuple(padded), len(rows), len(to_open), unread, tuple(_freshness(source, asked, rows, findings)),
+                  () if found or not told.is_lacking(expression) else tuple(_fields_of(source, asked, findings)))  # fmt: skip
+
+
+def _statistics(source: Bucket, asked: Wanted, expression: Expression, findings: Findings) -> pa.Table:
+    """The rows of the fields that are asked for, and of the objects as a whole, once each."""
+    names = sorted({each.field for each in leaves(expression)})
+    found = [arrow_schema(STATISTICS).empty_table().select(_STATISTIC)]
+    for table in _read(source, asked, findings, (ALL, f'{names[-1]}.\U0010ffff')):
+        kept = pc.equal(table['field'], ALL)
+        for name in names:
+            kept = pc.or_(kept, pc.or_(pc.equal(table['field'], name), pc.starts_with(table['field'], f'{name}.')))
+        found.append(table.filter(kept).select(_STATISTIC))
+    return pa.concat_tables(found).combine_chunks()
+
+
+def _read(source: Bucket, asked: Wanted, findings: Findings, names: tuple[str, str]) -> Iterator[pa.Table]:
+    """The statistics of a sensor in the time that is asked for, of fields whose names lie between two."""
+    named = [asked.robot] if asked.robot else robots(source)
+    with ThreadPoolExecutor(THREADS) as pool:
+        found = days(source, named, asked.dates(time.time_ns()), pool, findings, asked.has_date, STATISTICS)
+    entries = [entry for day in sorted(found, key=lambda day: day.robot) for entry in day.entries]
+    narrow = Wanted(robot=asked.robot, sensor=asked.sensor, since_ns=asked.since_ns, until_ns=asked.until_ns,
+                    bounds=(('field', *names),))  # fmt: skip
+    for table in tables(source, entries, ('sensor', *_STATISTIC), findings, narrow, STATISTICS):
+        yield table.filter(pc.equal(table['sensor'], asked.sensor))
+
+
+def _fields_of(source: Bucket, asked: Wanted, findings: Findings) -> list[str]:
+    found: set[str] = set()
+    for table in _read(source, asked, findings, (ALL, '\U0010ffff')):
+        found.update(pc.unique(table['field']).to_pylist())
+    return sorted(found - {ALL})
+
+
+class _Told:
+    """What the statistics say of each object, by its row."""
+
+    def __init__(self, rows: pa.Table, statistics: pa.Table) -> None:
+        self._objects = len(rows)
+        numbered = rows.select(_KEY).append_column('_row', pa.array(np.arange(len(rows)), pa.int64()))
+        found = statistics.join(numbered, keys=list(_KEY), join_type='inner').combine_chunks()
+        self._rows = _numbers(found, '_row').astype(np.int64)
+        encoded = found['field'].combine_chunks().dictionary_encode()
+        if isinstance(encoded, pa.ChunkedArray):
+            encoded = encoded.combine_chunks()
+        self._names: list[str] = encoded.dictionary.to_pylist()
+        self._fields = np.asarray(encoded.indices)
+        self._values = {name: _numbers(found, name) for name in NUMBERS}
+        whole = self._of(lambda name: name == ALL)
+        self._messages = np.zeros(self._objects)
+        self._messages[self._rows[whole]] = self._values['count'][whole]
+        self._has = np.zeros(self._objects, bool)
+        self._has[self._rows[whole]] = True
+        self._left_out = np.zeros(self._objects, bool)
+        self._left_out[self._rows[whole]] = self._values['nan_count'][whole] > 0
+
+    def is_lacking(self, expression: Expression) -> bool:
+        """Whether an object has statistics, and none has those of a field that is asked for."""
+        names = [each.field for each in leaves(expression)]
+        return bool(self._has.any()) and not all(any(covers(name, each) for each in self._names) for name in names)
+
+    def judged(self, expression: Expression) -> tuple[Mask, Mask, Mask]:
+        """Whether the condition may hold in an object; must hold in all of it; may hold by what is known alone."""
+        if isinstance(expression, Comparison):
+            may, must, unknown = self._leaf(expression)
+            return may | unknown, must, may
+        join = np.logical_and if expression.word == 'and' else np.logical_or
+        parts = [self.judged(part) for part in expression.parts]
+        may, must, known = (reduce(join, each) for each in zip(*parts, strict=True))
+        return may, must, known
+
+    def _of(self, wanted_name: Any) -> Mask:
+        codes = [code for code, name in enumerate(self._names) if wanted_name(name)]
+        return np.isin(self._fields, codes)
+
+    def _leaf(self, leaf: Comparison) -> tuple[Mask, Mask, Mask]:
+        chosen = self._of(lambda name: name != ALL and covers(leaf.field, name))
+        is_exact = self._of(lambda name: name == leaf.field)
+        is_scalar = ~self._of(lambda name: '*' in name.split('.'))
+        rows = self._rows[chosen]
+        some, every = _by_statistics(leaf, {name: values[chosen] for name, values in self._values.items()})
+        if not leaf.function:
+            messages, count = self._messages[rows], self._values['count'][chosen]
+            is_one_each = (count == messages) & (self._values['nan_count'][chosen] == 0) & is_scalar[chosen]
+            # Of a single message any of its values will do, and where they are told by their ends one of the two is it.
+            every = (every & is_one_each) | (some & (messages == 1) & (leaf.sign != '=='))
+        may, must, exact = (np.zeros(self._objects, bool) for _ in range(3))
+        may[rows[some]] = True
+        must[rows[every]] = True
+        exact[self._rows[is_exact]] = True
+        return may, must, ~self._has | (self._left_out & ~exact)
+
+
+def _by_statistics(leaf: Comparison, values: Mapping[str, NDArray[np.float64]]) -> tuple[Mask, Mask]:
+    """Whether it holds for some of the numbers, and for all: of a statistic itself both are one."""
+    if leaf.function:
+        found: Mask = leaf.holds(values[leaf.function])
+        return found, found
+    low, high, number = values['min'], values['max'], leaf.number
+    if leaf.sign == '==':
+        return (low <= number) & (number <= high), (low == number) & (number == high)
+    if leaf.sign == '!=':
+        return leaf.holds(low) | leaf.holds(high), (number < low) | (high < number)
+    some, every = (high, low) if leaf.sign in {'>', '>='} else (low, high)
+    return leaf.holds(some), leaf.holds(every)
+
+
+def _numbers(table: pa.Table, name: str) -> NDArray[np.float64]:
+    """Null is NaN."""
+    return np.asarray(table[name].cast(pa.float64(), safe=False).to_numpy())
+
+
+# -- opened --------------------------------------------------------------------------------------------------------------------
+
+
+_Run = tuple[int, int, int]
+"""First and last stamp of messages that follow each other, and how many they are."""
+
+
+def _opened(source: Bucket, rows: pa.Table, numbers: NDArray[np.intp], expression: Expression,
+            findings: Findings) -> Iterator[tuple[int, list[_Run] | None]]:  # fmt: skip
+    """The runs in each of these objects; None where it cannot be read."""
+
+    def body(row: dict[str, Any]) -> bytes | DataLoggerError:
+        try:
+            found = Bucket(source.settings, row['bucket']).get(row['key'], MOST_OBJECT_BYTES)
+        except ObjectRefused as error:
+            return error
+        if row['sha256'] is not None and hashlib.sha256(found).hexdigest() != row['sha256']:
+            return StoreError('its content is not what its row says')
+        return found
+
+    with ThreadPoolExecutor(THREADS, 'lake-values') as pool:
+        for start in range(0, len(numbers), OPENED_AT_A_TIME):
+            some = [int(number) for number in numbers[start : start + OPENED_AT_A_TIME]]
+            asked = rows.take(some).to_pylist()
+            for number, row, content in zip(some, asked, pool.map(body, asked), strict=True):
+                try:
+                    if isinstance(content, DataLoggerError):
+                        raise content
+                    yield number, list(_runs(row, content, expression))
+                except DataLoggerError as error:
+                    findings.add(row['key'], str(error))
+                    yield number, None
+
+
+def _runs(row: Mapping[str, Any], body: bytes, expression: Expression) -> Iterator[_Run]:
+    """Raises LakeError."""
+    extension = extension_of(row['key'])
+    if extension == _JSON:
+        messages = records(body)
+        stamps = np.array([each['stamp_ns'] for each in messages], np.int64)
+        met = _met(expression, messages)
+    elif extension in {_JPEG, _PCD}:
+        points = cloud_points(body) if extension == _PCD else None
+        found = of_jpeg(body) if points is None else of_points(points)
+        stamps, met = np.zeros(1, np.int64), np.array([_met_by(expression, found, points)])
+    else:
+        raise LakeError(f'values cannot be looked for in a .{extension}', remedy='store the sensor as json, jpeg or pcd')
+    if not len(stamps):
+        return
+    order = np.argsort(stamps, kind='stable')
+    # Of a repeat, and of what was stored before the clock was set, the row has the time.
+    stamps, met = stamps[order] + (row['t_start_ns'] - stamps.min()), met[order]
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], met, [False])).astype(np.int8)))
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        yield int(stamps[first]), int(stamps[end - 1]), int(end - first)
+
+
+def _met(expression: Expression, messages: Sequence[Mapping[str, Any]]) -> Mask:
+    """Of each message."""
+    if isinstance(expression, Joined):
+        join = np.logical_and if expression.word == 'and' else np.logical_or
+        found: Mask = reduce(join, [_met(part, messages) for part in expression.parts])
+        return found
+    if expression.function:
+        collected = FieldStatistics([expression.field])
+        for start in range(0, len(messages), AT_ONCE):
+            collected.add(messages[start : start + AT_ONCE])
+        return np.full(len(messages), _met_by(expression, collected.told(), None))
+    return np.array([any(map(expression.holds, values_of(each, expression.field))) for each in messages], bool)
+
+
+def _met_by(expression: Expression, found: Mapping[str, Statistic], points: NDArray[Any] | None) -> bool:
+    """Of an object of one message, or of a statistic."""
+    if isinstance(expression, Joined):
+        return (all if expression.word == 'and' else any)(_met_by(part, found, points) for part in expression.parts)
+    named = [(name, each) for name, each in found.items() if name != ALL and covers(expression.field, name)]
+    if expression.function:
+        values = [getattr(each, expression.function) for _, each in named]
+        return any(value is not None and bool(expression.holds(float(value))) for value in values)
+    if points is not None and expression.sign == '==' and expression.field in (points.dtype.names or ()):
+        return bool(expression.holds(points[expression.field].astype(np.float64)).any())
+    ends = [value for _, each in named for value in (each.min, each.max) if value is not None]
+    return any(bool(expression.holds(value)) for value in ends)
+
+
+# -- ranges --------------------------------------------------------------------------------------------------------------------
+
+
+def _whole(rows: pa.Table, numbers: NDArray[np.intp], sensor: str) -> Iterator[Range]:
+    some = rows.select(['robot', 't_start_ns', 't_end_ns', 'count']).take(numbers)
+    for robot, first, last, count in zip(*(each.to_pylist() for each in some.columns), strict=True):
+        yield Range(robot, sensor, first, max(first, first if last is None else last), count or 1)
+
+
+def _joined_ranges(found: Iterable[Range], apart_ns: int) -> list[Range]:
+    joined: list[Range] = []
+    for each in sorted(found, key=lambda each: (each.robot, each.since_ns, each.until_ns)):
+        last = joined[-1] if joined else None
+        if last is not None and last.robot == each.robot and each.since_ns - last.until_ns <= apart_ns:
+            joined[-1] = replace(last, until_ns=max(last.until_ns, each.until_ns), messages=last.messages + each.messages)
+        else:
+            joined.append(each)
+    return joined
+
+
+def _clipped(found: Iterable[Range], within: Sequence[TimeSpan]) -> list[Range]:
+    """What of them lies in the ranges that were given, if any were; messages are then those of all of a range."""
+    if not within:
+        return list(found)
+    clipped = []
+    for each in found:
+        for span in within:
+            low, high = max(each.since_ns, span.since_ns), min(each.until_ns, span.until_ns)
+            if low <= high and span.robot in {None, each.robot}:
+                clipped.append(replace(each, since_ns=low, until_ns=high))
+    return clipped
+
+
+def _freshness(source: Bucket, asked: Wanted, rows: pa.Table, findings: Findings) -> Iterator[Freshness]:
+    ends = rows.select(['robot', 'topic', 't_end_ns']).group_by(['robot', 'topic']).aggregate([('t_end_ns', 'max')])
+    for robot, topic, newest_ns in zip(*(ends[name].to_pylist() for name in ('robot', 'topic', 't_end_ns_max')), strict=True):
+        told = newest(source, robot=robot, topic=topic, sink=OBJECTS, since_ns=asked.since_ns, findings=findings)
+        marks = [row['to_ns'] for row in watermarks(told.to_pylist())]
+        yield Freshness(robot, topic, newest_ns, max(marks, default=None))

@@ -1,0 +1,262 @@
+"""Conditions on the numbers in the objects: held against a loop over all messages, whatever the numbers are."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import operator
+from contextlib import closing, suppress
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import orjson
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from lake.making import NOON_NS, add, folder_store
+
+from shadowhound_data_logger.catalogue import parts, schema
+from shadowhound_data_logger.catalogue.statistics import STATISTICS, statistic_rows
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.encode.statistics import MOST_FIELDS, FieldStatistics
+from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.lake import query, values
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.compact import compact
+from shadowhound_data_logger.stores import open_store
+
+SIGNS = {'<': operator.lt, '<=': operator.le, '>': operator.gt, '>=': operator.ge, '=': operator.eq, '!=': operator.ne}
+NUMBERS = st.sampled_from([0.0, -1.0, 2.5, 7.038531e-26, 1e308, -1e308, math.inf, -math.inf, math.nan, 15.0, 0.1])
+"""Few, so that they meet the thresholds often."""
+MESSAGES = st.lists(
+    st.fixed_dictionaries({}, optional={'a': NUMBERS, 'n': st.fixed_dictionaries({'b': NUMBERS}),
+                                        'l': st.lists(NUMBERS, max_size=3), 'w': st.lists(NUMBERS, min_size=21, max_size=22)}),
+    min_size=1, max_size=5,
+)  # fmt: skip
+"""A batch: fields that are missing in some, nested ones, lists of changing length, and long ones."""
+FIELDS = st.sampled_from(['a', 'n.b', 'n', 'l', 'l.1', 'w', 'z'])
+LEAVES = st.builds(
+    '{0}s.{1}{2} {3} {4}'.format,
+    st.sampled_from(['', '', '', 'min(', 'max(', 'mean(', 'first(', 'last(', 'count(', 'nan_count(']), FIELDS, st.just(''),
+    st.sampled_from(sorted(SIGNS)), st.sampled_from([0, -1.0, 2.5, 15, 0.1, 3]),
+).map(lambda text: text.replace(' ', ') ', 1) if '(' in text else text)  # fmt: skip
+CONDITIONS = st.recursive(LEAVES, lambda inner: st.builds('({}) {} ({})'.format, inner, st.sampled_from(['and', 'or']), inner),
+                          max_leaves=3)  # fmt: skip
+
+
+def body(begin_ns: int, messages: list[dict[str, Any]]) -> bytes:
+    samples = [{'stamp_ns': begin_ns + place * SECOND // 10, **message} for place, message in enumerate(messages)]
+    return orjson.dumps({'robot': 'thor', 'sensor': 's', 'count': len(samples), 'samples': samples})
+
+
+def filled(root: Path, batches: list[list[dict[str, Any]]], told: list[bool], chosen: tuple[str, ...] = ()) -> Bucket:
+    """A lake with a batch every minute; ``told`` says of which there are statistics."""
+    store_settings = folder_store(root)
+    with closing(open_store(store_settings, UploadSettings())) as store:
+        rows, statistics = [], []
+        for number, (messages, is_told) in enumerate(zip(batches, told, strict=True)):
+            begin_ns = NOON_NS + number * 60 * SECOND
+            content = body(begin_ns, messages)
+            key = f'thor/s/20261028/{number:06d}_s.json'
+            add(store, root, key, content)
+            metadata = {'robot': 'thor', 'sensor': 's', 'topic': '/s', 'type': 'x/msg/S', 'count': str(len(messages)),
+                        'sha256': hashlib.sha256(content).hexdigest(), 't_start_ns': str(begin_ns),
+                        't_end_ns': str(begin_ns + (len(messages) - 1) * SECOND // 10)}  # fmt: skip
+            row = schema.row_of(schema.BUCKET, key, len(content), 'application/json', metadata)
+            rows.append(row)
+            if is_told:
+                found = FieldStatistics(chosen)
+                found.add(orjson.loads(content)['samples'])
+                statistics += statistic_rows(row, found.told())
+        add(store, root, schema.OBJECTS.part_key('thor', '2026-10-28', '20261028T120000_a'), parts.encode(rows))
+        for name in 'ab' if statistics else '':  # told twice, as after a power cut
+            key = STATISTICS.part_key('thor', '2026-10-28', f'20261028T12000{"ab".index(name)}_{name}')
+            add(store, root, key, parts.encode(statistics, STATISTICS))
+    return Bucket(store_settings, schema.BUCKET)
+
+
+# -- the oracle: a loop that knows nothing of statistics -----------------------------------------------------------------------
+
+
+def numbers(value: Any, path: list[str]) -> list[float]:
+    """What a path means in a message: all finite numbers below it; of long lists the elements have no numbers of their own."""
+    if isinstance(value, dict):
+        below = [value[path[0]]] if path and path[0] in value else [] if path else list(value.values())
+        return [number for each in below for number in numbers(each, path[1:])]
+    if isinstance(value, list):
+        if not path:
+            return [number for each in value for number in numbers(each, [])]
+        place = int(path[0])
+        return numbers(value[place], path[1:]) if place < len(value) <= 20 else []
+    return [value] if not path and value is not None and math.isfinite(value) else []
+
+
+def fields(messages: list[dict[str, Any]], path: str) -> dict[str, list[float | None]]:
+    """By the name of each field that a path means, its numbers in the order of the messages; None for those not finite."""
+    found: dict[str, list[float | None]] = {}
+
+    def walk(name: str, value: Any) -> None:
+        if isinstance(value, dict):
+            for key, each in value.items():
+                walk(f'{name}.{key}'.lstrip('.'), each)
+        elif isinstance(value, list):
+            for place, each in enumerate(value):
+                walk(f'{name}.{place}' if len(value) <= 20 else f'{name}.*', each)
+        elif name == path or name.startswith(f'{path}.'):
+            found.setdefault(name, []).append(value if value is not None and math.isfinite(value) else None)
+
+    for message in messages:
+        walk('', message)
+    return found
+
+
+def met(text: str, messages: list[dict[str, Any]]) -> list[bool]:
+    """Of each message, by taking the condition apart at its outermost word."""
+    if text.startswith('('):
+        depth = next(at for at in range(1, len(text)) if text[: at + 1].count('(') == text[: at + 1].count(')'))
+        word, right = text[depth + 1 :].strip().split(' ', 1)
+        pairs = zip(met(text[1:depth], messages), met(right.strip()[1:-1], messages), strict=True)
+        return [all(pair) if word == 'and' else any(pair) for pair in pairs]
+    left, sign, number = text.split()
+    function, _, name = left.rstrip(')').rpartition('(')
+    path = name.partition('.')[2]
+    if not function:
+        return [any(SIGNS[sign](each, float(number)) for each in numbers(message, path.split('.'))) for message in messages]
+    holds = False
+    for each in fields(messages, path).values():
+        finite = [value for value in each if value is not None]
+        told: dict[str, Any] = {'count': len(finite), 'nan_count': len(each) - len(finite)}
+        if finite:
+            told |= {'min': min(finite), 'max': max(finite), 'first': finite[0], 'last': finite[-1]}
+            with suppress(OverflowError):
+                told['mean'] = math.fsum(finite) / len(finite)
+        holds |= function in told and SIGNS[sign](told[function], float(number))
+    return [holds] * len(messages)
+
+
+def expected(text: str, batches: list[list[dict[str, Any]]]) -> list[tuple[int, int, int]]:
+    """Runs of messages that meet the condition: first and last stamp, and how many they are."""
+    runs = []
+    for number, messages in enumerate(batches):
+        begin_ns = NOON_NS + number * 60 * SECOND
+        run: list[int] = []
+        for place, holds in enumerate([*met(text, messages), False]):
+            if holds:
+                run.append(begin_ns + place * SECOND // 10)
+            elif run:
+                runs.append((run[0], run[-1], len(run)))
+                run = []
+    return runs
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp('values')
+
+
+LATER = datetime.fromtimestamp(NOON_NS // SECOND, timezone.utc) + timedelta(days=9)
+examples = [0]
+
+
+@given(st.lists(MESSAGES, min_size=1, max_size=4), st.lists(CONDITIONS, min_size=4, max_size=4), st.data())
+@settings(max_examples=5, deadline=None, suppress_health_check=list(HealthCheck))
+def test_it_is_what_a_loop_over_all_messages_finds(
+    folder: Path, batches: list[list[dict[str, Any]]], conditions: list[str], data: st.DataObject
+) -> None:
+    """With statistics of all objects, of some, or of fields that were chosen; before compaction and after it."""
+    told = data.draw(st.lists(st.booleans(), min_size=len(batches), max_size=len(batches)))
+    examples[0] += 1
+    root = folder / str(examples[0])
+    source = filled(root, batches, told, data.draw(st.sampled_from([(), ('a', 'n')])))
+    if data.draw(st.booleans()):
+        with closing(open_store(source.settings, UploadSettings())) as store:
+            assert len([*compact(source, store, now=lambda: LATER)]) == any(told)
+    seen = [[json.loads(orjson.dumps(message)) for message in messages] for messages in batches]
+    for text in conditions:
+        found = values.ranges(text, source, scan=True, join_s=0.0)
+        assert [(each.since_ns, each.until_ns, each.messages) for each in found.ranges] == expected(text, seen), text
+        assert found.unknown == 0
+
+
+BATCHES = [[{'a': 1.0 * number + place} for place in range(5)] for number in range(10)]
+"""Ten batches: 0 to 4, 1 to 5, ... 9 to 13."""
+
+
+def test_only_what_may_hold_it_is_opened(tmp_path: Path) -> None:
+    """A batch of which all or no message meets the condition is not opened, nor is any for a statistic."""
+    source = filled(tmp_path, BATCHES, [True] * 10)
+    found = values.ranges('s.a > 11', source)
+    assert (found.objects, found.opened, found.unknown) == (10, 2, 0)
+    assert [(each.since_ns - NOON_NS) / SECOND for each in found.ranges] == [480.4, 540.3]
+    assert values.ranges('s.a >= 0', source).opened == 0
+    assert [values.ranges('max(s.a) > 12', source).opened, len(values.ranges('max(s.a) > 12', source).ranges)] == [0, 1]
+
+
+def test_what_has_no_statistics_is_unknown_until_it_is_scanned(tmp_path: Path) -> None:
+    """An answer says how many objects it does not know; with ``scan`` they are opened."""
+    source = filled(tmp_path, BATCHES, [True] * 5 + [False] * 5)
+    found = values.ranges('s.a > 11', source)
+    assert (len(found.ranges), found.opened, found.unknown) == (0, 0, 5)
+    found = values.ranges('s.a > 11', source, scan=True)
+    assert (len(found.ranges), found.opened, found.unknown) == (2, 5, 0)
+
+
+def test_the_ranges_of_an_answer_choose_objects(tmp_path: Path) -> None:
+    """An object counts where it reaches into one of them, and an answer within them is cut to them."""
+    source = filled(tmp_path, BATCHES, [True] * 10)
+    found = values.ranges('s.a > 11', source)
+    chosen = [{'robot': each.robot, 'since_ns': each.since_ns, 'until_ns': each.until_ns} for each in found.ranges]
+    keys = query.objects(source, ranges=chosen).to_pydict()['key']
+    assert sorted(keys) == ['thor/s/20261028/000008_s.json', 'thor/s/20261028/000009_s.json']
+    assert query.objects(source, ranges=[]).to_pydict()['key'] == []
+    assert query.objects(source, ranges=[{**chosen[0], 'robot': 'tachi'}]).to_pydict()['key'] == []
+    within = values.ranges('s.a > 0', source, ranges=chosen)
+    assert [(each.since_ns, each.until_ns) for each in within.ranges] == [(each['since_ns'], each['until_ns']) for each in chosen]
+
+
+def test_other_readers_read_the_statistics(tmp_path: Path) -> None:
+    """PyArrow and DuckDB, as they are: before compaction and after it."""
+    duckdb = pytest.importorskip('duckdb')
+    source = filled(tmp_path, BATCHES, [True] * 10)
+    files = f'{tmp_path}/store/sensor-data/thor/_stats/*/*.parquet'
+    asked = f"SELECT DISTINCT key FROM '{files}' WHERE field = 'a' AND max > 11 ORDER BY key"  # noqa: S608 - a test's own path
+    before = duckdb.sql(asked).fetchall()
+    assert before == [('thor/s/20261028/000008_s.json',), ('thor/s/20261028/000009_s.json',)]
+    with closing(open_store(source.settings, UploadSettings())) as store:
+        assert [day.merged for day in compact(source, store, now=lambda: LATER)] == [2]
+        assert [day.deleted for day in compact(source, store, now=lambda: LATER + timedelta(days=9999))] == [2]
+    assert duckdb.sql(asked).fetchall() == before
+    (file,) = tmp_path.glob('store/sensor-data/thor/_stats/*/*.parquet')
+    table = pq.read_table(file)
+    assert table.column_names[: len(STATISTICS.columns)] == list(STATISTICS.columns)
+    assert len(table) == 2 * len(BATCHES)
+    assert table.to_pylist()[-1]['mean'] == 11.0
+
+
+def test_fields_beyond_the_bound_are_unknown(tmp_path: Path) -> None:
+    """The first fields have statistics; of the others nobody says that they never were so."""
+    wide = [[{f'f{place:03d}': 1.0 for place in range(MOST_FIELDS + 1)}]]
+    source = filled(tmp_path, wide, [True])
+    last = f's.f{MOST_FIELDS:03d} = 1'
+    assert (values.ranges('s.f063 = 1', source).unknown, len(values.ranges('s.f063 = 1', source).ranges)) == (0, 1)
+    assert (values.ranges(last, source).unknown, len(values.ranges(last, source).ranges)) == (1, 0)
+    assert len(values.ranges(last, source, scan=True).ranges) == 1
+
+
+@pytest.mark.parametrize('text', [
+    's.a >', 's.a > x', 'max(s.a > 1', 's.a > 1 and', '(s.a > 1', 's.a > 1 t.b > 2', 's.a > 1 and t.b > 2', 's.a', '(' * 99,
+])  # fmt: skip
+def test_what_is_no_condition_is_told(text: str) -> None:
+    """With what is allowed instead."""
+    with pytest.raises(SettingError, match='where'):
+        values.parse(text)
+
+
+@pytest.mark.parametrize('text', ['battery_pct < 30', "key LIKE 'thor/imu.x%'", 'x > 1.5', 'x IS NULL', 'x > 1e3 AND y < .5'])
+def test_sql_over_columns_stays_sql(text: str) -> None:
+    """What has no SENSOR.FIELD outside its texts is a condition on the catalogue's own columns."""
+    assert not values.is_about_values(text)
