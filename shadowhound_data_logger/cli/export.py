@@ -39,6 +39,7 @@ SCHEME: Final = 's3://'
 SHOWN: Final = 30
 COPIES: Final = 'exports'
 """In SHADOWHOUND_HOME: the folders of what is exported to a store."""
+TASK_SET: Final = 'synchronized/lerobot'
 NOT_ASKED: Final = {'sensor', 'topic', 'near'}
 _Command = TypeVar('_Command', bound=Callable[..., Any])
 _place = click.argument('place', metavar='DIR|s3://...')
@@ -71,11 +72,14 @@ def _missions(command: _Command) -> _Command:
         'export lerobot go2_patrol --mission-type patrol --since 30d',
         'export lerobot go2_patrol --mission-type patrol --to s3://lerobot/datasets/go2/go2_patrol --wait',
         'export lerobot go2_patrol --since yesterday --state pose,joints --dry-run',
+        'export lerobot fetch_task --mission-type fetch --arm soarm --state velocity --task',
     ),
 )
 @click.argument('name')
 @_missions
 @click.option('--to', metavar='DIR|s3://...', help='Target  [default: the folder NAME]')
+@click.option('--task', is_flag=True,
+              help='Make NAME/synchronized/lerobot, and beside it what robot and arm recorded: go2, soarm.')  # fmt: skip
 @click.option(
     '--fps', default='auto', show_default=True, metavar='N', help='Frames a second; auto: the rate of the slowest camera.'
 )
@@ -104,8 +108,8 @@ def _missions(command: _Command) -> _Command:
 @click.option('--dry-run', is_flag=True, help='Only say what would be exported.')
 @click.option('--workers', type=click.IntRange(1, 64), default=1, show_default=True, metavar='N', help='Episodes at a time.')
 @as_json
-def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, wait: bool, dry_run: bool, workers: int,
-                   as_json: bool, **how: Any) -> ExitCode:  # fmt: skip
+def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task: bool, wait: bool, dry_run: bool,  # noqa: PLR0913
+                   workers: int, as_json: bool, **how: Any) -> ExitCode:  # fmt: skip
     """Add missions to the LeRobot data set NAME (v3.0).
 
     Missions that are already in it stay as they are. Exit code 1 when a mission was refused or waits: the report says why.
@@ -118,7 +122,10 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, wait:
         check_name(name, 'the name of the data set')
         options = _options(how)
         place = DatasetPlace.of(to) if to and to.startswith(SCHEME) else None
+        if task and place is not None:
+            raise BadUsage(f'--task with --to {to} is refused', 'the folder of a task is made on this machine: --to DIR')
     folder = _copy_of(to) if place and to else Path(to or name)
+    folder = folder / TASK_SET if task else folder
     left_out, moved = quietly(), None
     with progress('looking at what there is') as bar:
         if place is not None and not dry_run:
@@ -209,6 +216,7 @@ def _report(result: Exported, where: str, *, is_dry: bool) -> Iterator[Text]:
     if not (result.added or result.present):
         yield plain(f'No mission was exported.{store_hint()}')
         return
+    yield from (plain(line) for line in result.absent)
     yield plain(f'{counted(len(result.added), "episode")} added to {where}, {number(len(result.present))} were in it already; '
                 f'digest {result.digest[:16]}.')  # fmt: skip
 

@@ -23,6 +23,7 @@ from shadowhound_data_logger.datasets import plan as planning
 from shadowhound_data_logger.datasets.episodes import TOLD, build
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.lerobot import REPORT, Lerobot
+from shadowhound_data_logger.datasets.mobile import forget, synchronize, task_of, write_recordings
 from shadowhound_data_logger.datasets.plan import ChosenMission, EpisodePlan
 from shadowhound_data_logger.datasets.report import draw
 from shadowhound_data_logger.datasets.ticks import whole_fps
@@ -63,6 +64,8 @@ class Exported:
     fps: int = 0
     action: str = ''
     digest: str = ''
+    absent: list[str] = field(default_factory=list)
+    """Of the folder of a task, what there is nothing of."""
     streams: dict[str, Mapping[str, str]] = field(default_factory=dict)
     """Mission -> stream -> where it comes from, of a dry run."""
 
@@ -109,7 +112,15 @@ def export(  # noqa: PLR0913 - the flags of the command
             return result
         settings = {**options.told(), 'fps': fps, 'action': action}
         built = _build(ready, options, fps, source.settings, folder / WORK, settings=settings, workers=workers, say=say)
-        _put_together(made, built, options, settings, result, folder)
+        task = task_of(folder)
+
+        def added(plan: EpisodePlan) -> None:
+            if task is not None:
+                write_recordings(task, plan, source.settings, folder / WORK / 'look')
+
+        _put_together(made, built, options, settings, result, added)
+        if task is not None and made.rows:
+            result.absent = synchronize(task)
         return result
 
 
@@ -170,6 +181,9 @@ def _drop(made: Lerobot, mission_id: str) -> str:
     if made.rows:
         draw(made, picture)
     digest = made.commit(report, {})
+    if (task := task_of(made.folder)) is not None:
+        forget(task, mission_id)
+        synchronize(task)
     (made.folder / DROPPING).unlink(missing_ok=True)
     return digest
 
@@ -259,7 +273,8 @@ def _tracks_of(plan: EpisodePlan) -> dict[str, Track]:
 
 
 def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings: Mapping[str, Any], result: Exported,
-                  folder: Path) -> None:  # fmt: skip
+                  added: Callable[[EpisodePlan], None]) -> None:  # fmt: skip
+    folder = made.folder
     report: dict[str, Any] = {'settings': settings, 'episodes': _told_before(folder), 'dropped': made.dropped}
     new: dict[str, Path] = {}
     for plan, told, work in built:
@@ -273,6 +288,7 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
         except LakeError as error:
             result.refused[mission] = error.what
             continue
+        added(plan)
         result.added.append(told)
         new[mission] = work
         kept = {name: value for name, value in told.items() if name not in {'histograms', 'sizes'}}

@@ -50,6 +50,9 @@ BEFORE_NS: Final = 10 * SECOND
 """So long before its start what a mission's first tick may still hold was published."""
 LONGEST_BATCH_NS: Final = 3600 * SECOND
 """An object that began so long before may reach into a mission (sensor.batch_s)."""
+RECORDED: Final = ('odom', 'joints')
+"""Sensors whose messages are handed on as they are, beside what frames are made of (mobile.py)."""
+DETECTIONS: Final = frozenset({'vision_msgs/msg/Detection2DArray', 'vision_msgs/msg/Detection3DArray'})
 END_SLACK_NS: Final = 2 * SECOND
 """A topic's last message comes so much before the end of a mission that the robot is switched off with; a slow topic's two
 periods."""
@@ -127,6 +130,8 @@ class EpisodePlan:
     missing: tuple[str, ...] = ()
     """Sensors that are wanted and of which there is nothing."""
     arm: ArmPlan | None = None
+    detections: tuple[Track, ...] = ()
+    """Of topics with detections of objects."""
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -209,11 +214,11 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
     rows = query.objects(
         source, findings=findings, robot=mission.robot, since=utc(since - LONGEST_BATCH_NS), until=utc(until + 1000)
     )
+    used = col('sensor').is_in(sorted({*sensors, *RECORDED})) | col('type').is_in(sorted(DETECTIONS))
     with query.answering():
-        found = (
-            rows.where(col('sensor').is_in(sorted(set(sensors))) & col('t_start').not_null()).select(*NEEDED, 'topic').to_pylist()
-        )
-    tracks, topics = _tracks(found)
+        found = rows.where(used & col('t_start').not_null()).select(*NEEDED, 'topic').to_pylist()
+    seen = _tracks([row for row in found if row['type'] in DETECTIONS])[0]
+    tracks, topics = _tracks([row for row in found if row['type'] not in DETECTIONS])
     bags = tuple(bags_of(store, mission.robot, since, until))
     with Recordings(Place(source.settings), store, tracks, topics, (since, until), bags, work) as recordings:
         best = {sensor: recordings.best(sensor) for sensor in set(sensors)}
@@ -242,7 +247,7 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
         missing += [] if more or arm.why else [f'/{options.arm}/{ARM_TOPICS[ARM_JOINTS]}']
     topics_used = pa.array(sorted({stream.recording.topic for stream in streams}), pa.string())
     return EpisodePlan(mission, tuple(streams), tracks, topics, bags, _about(stated, topics_used, since, until),
-                       tuple(missing), arm)  # fmt: skip
+                       tuple(missing), arm, tuple(seen.values()))  # fmt: skip
 
 
 def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, options: ExportOptions, *, bags: Sequence[Manifest],  # noqa: PLR0913
