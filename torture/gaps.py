@@ -166,16 +166,31 @@ Came = dict[str, dict[int, int]]
 """Number -> stamp of what is in the store, by topic."""
 
 
-def stored(roots: Iterable[Path]) -> Came:
-    """What the objects below these folders hold."""
+def stored(roots: Iterable[Path]) -> tuple[Came, set[int]]:
+    """What the objects below these folders hold; the stamps of what came after one with a greater number."""
     came: dict[str, dict[int, int]] = {stream.topic: {} for stream in STREAMS}
+    late: set[int] = set()
     for root in roots:
         for path in root.rglob('*.json'):
             if '_ledger' not in path.parts:
                 document = json.loads(path.read_bytes())
+                greatest = 0
                 for sample in document['samples']:
-                    came[document['topic']][told(sample['data'])[1]] = sample['stamp_ns']
-    return came
+                    number = told(sample['data'])[1]
+                    came[document['topic']][number] = sample['stamp_ns']
+                    if number < greatest:
+                        late.add(sample['stamp_ns'])
+                    greatest = max(greatest, number)
+    return came, late
+
+
+def in_time(came: Mapping[int, int], late: set[int], stamp_ns: int, step: int) -> int:
+    """The stamp from there on, later (1) or earlier (-1), of a message in time: a late one leaves its row's times alone."""
+    number = next((number for number, stamp in came.items() if stamp == stamp_ns), None)
+    while number is not None and stamp_ns in late and number + step in came:
+        number += step
+        stamp_ns = came[number]
+    return stamp_ns
 
 
 def absent(came: Came, first: Mapping[str, tuple[int, int]]) -> dict[str, list[Loss]]:
@@ -238,7 +253,7 @@ def audit(found: Found, node: Node, roots: Iterable[Path], who: str, still: Sequ
     found.say('every loss has a time', f'{who}: {[row for row in rows if row.from_ns is None]}',
               holds=all(row.from_ns is not None for row in rows))  # fmt: skip
     said = journaled([row for row in rows if row.from_ns is not None])
-    came = stored(roots)
+    came, late = stored(roots)
     real = absent(came, {topic: (first, said[topic][0].from_ns) for topic, first in began(node).items() if said.get(topic)})
     for stream in STREAMS:
         near_ns = round(stream.period_s * SECOND) + LATE_NS
@@ -248,7 +263,9 @@ def audit(found: Found, node: Node, roots: Iterable[Path], who: str, still: Sequ
             found.say('every loss is in the journal, and nothing else', text, holds=bool(lost) and bool(journal))
             if not (lost and journal):
                 continue
-            begin_ns, end_ns = min(loss.from_ns for loss in lost), max(loss.to_ns for loss in lost)
+            numbers = came[stream.topic]
+            begin_ns = in_time(numbers, late, min(loss.from_ns for loss in lost), -1)
+            end_ns = in_time(numbers, late, max(loss.to_ns for loss in lost), 1)
             counts = [sum(loss.count for loss in each) for each in (lost, journal)]
             found.say('with its count', text, holds=counts[0] == counts[1])
             causes = {loss.cause for loss in journal}
