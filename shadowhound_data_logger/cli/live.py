@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import click
 
@@ -27,7 +28,12 @@ from shadowhound_data_logger.spool.status import robots
 PORT = 8765
 
 
-@click.command(epilog=examples('live', 'live --bind 0.0.0.0', 'live --bind 0.0.0.0 --tls tower.crt tower.key'))
+@click.command(
+    epilog=examples(
+        'live', 'live --bind 0.0.0.0', 'live --bind 0.0.0.0 --tls tower.crt tower.key',
+        'live --robot thor --robot-url http://thor:8765/ --robot-token thor.token',
+    )
+)  # fmt: skip
 @click.option('--bind', default='127.0.0.1', show_default=True, metavar='ADDRESS', help='Address to listen on.')
 @click.option(
     '--port', type=click.IntRange(0, 65535), default=PORT, show_default=True, help='Port to listen on; 0 takes a free one.'
@@ -45,11 +51,15 @@ PORT = 8765
 @click.option('--uploads-mbps', type=click.FloatRange(0.0, 10_000.0), default=4.0, show_default=True,
               help='Limit of uploads in Mbit/s while somebody watches over the network; 0: no limit.')  # fmt: skip
 @click.option('--new-tokens', is_flag=True, help='Make new tokens first: everybody has to sign in again.')
+@click.option('--robot-url', metavar='URL', help="Of a store's page: relay the live view of this robot's own page.")
+@click.option('--robot-token', type=click.Path(path_type=Path, dir_okay=False), metavar='FILE',
+              help="The file with a viewer's token there.")  # fmt: skip
 @click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Robot to show  [default: the one that ran here]')
 @spool_folder
 @as_json
-def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[str, ...], uploads_mbps: float, new_tokens: bool,  # noqa: PLR0913 - one an option
-         robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
+def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[str, ...],  # noqa: PLR0913 - one an option
+         uploads_mbps: float, new_tokens: bool, robot_url: str | None, robot_token: Path | None, robot: str | None,
+         spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Serve a page that shows robot and data.
 
     It shows in a browser what the robot sees now, its data, what is missing, and what was recorded at any moment before. On a
@@ -67,10 +77,18 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
     tokens = the_home() / 'live'
     paths = make_tokens(tokens, anew=new_tokens)
     store = the_store_settings()
-    is_of_store = spool is None and not folder.is_dir() and (bool(store.endpoint_url) or store.directory.is_dir())
+    has_store = bool(store.endpoint_url) or store.directory.is_dir()
+    is_of_store = spool is None and not folder.is_dir() and (has_store or robot_url is not None)
+    if robot_url is not None:
+        if not is_of_store:
+            raise BadUsage(f'{folder} is a spool: this is the robot itself', 'leave out --robot-url')
+        parts = urlsplit(robot_url)
+        if parts.scheme not in ('http', 'https') or not parts.hostname or '@' in parts.netloc:
+            raise BadUsage(f'--robot-url {robot_url[:100]!r} is not a URL such as http://thor.local:8765/')
     settings = LiveSettings(
         spool=folder, robot=robot or next(iter(robots(folder)), 'thor'), tokens=tokens, bind=bind, port=port, names=names,
         certificate=tls or None, uploads_mbps=uploads_mbps, is_of_store=is_of_store,
+        robot_url=robot_url or '', robot_token=robot_token,
     )  # fmt: skip
     logging.basicConfig(level=logging.INFO, format='%(message)s')
 

@@ -69,11 +69,11 @@ def make_tokens(folder: Path, *, anew: bool = False) -> dict[str, Path]:
             ) as file:
                 file.write(f'{secrets.token_urlsafe(24)}\n')
         except FileExistsError:
-            _read(path)
+            token_of(path)
     return paths
 
 
-def _read(path: Path) -> str:
+def token_of(path: Path) -> str:
     """Raises TokenRefused for a file that others may read, or that holds no token."""
     try:
         with path.open(encoding='utf-8') as file:
@@ -152,7 +152,7 @@ class Access:
 
     def _token(self, role: str) -> str:
         """Read anew each time: whoever replaces the file ends all sign-ins."""
-        return _read(self._paths[role])
+        return token_of(self._paths[role])
 
     def _fail(self, address: str) -> None:
         if len(self._failures) > MOST_ADDRESSES:

@@ -31,12 +31,13 @@ from shadowhound_data_logger.catalogue.gaps import GAP
 from shadowhound_data_logger.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import BagDamaged, LakeError, SpoolError, StoreError
-from shadowhound_data_logger.live.figures import SpoolFigures, told_gaps
+from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures, told_gaps
 from shadowhound_data_logger.mcap.ranges import LocalFile, Ranged, StoredFile
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.options import UploadSettings
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.listing import HERE
 from shadowhound_data_logger.spool.status import read as read_status
 from shadowhound_data_logger.stores import open_reader, open_store
 from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, MOST_OBJECT_BYTES, is_path
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
 
     from shadowhound_data_logger.stores.base import ObjectStore
 
-DAY_NS: Final = 24 * 3600 * SECOND
 MOST_ROWS: Final = 1_500_000
 """Of a day: a robot that stores every message of everything makes some 600,000."""
 MOST_DAYS_KEPT: Final = 3
@@ -266,7 +266,7 @@ class SpoolPast:
         bucket, key, state, reason, sensor, topic, kind, size, begin_ns, end_ns, mission, mission_type, pose, battery, content = (
             row
         )
-        is_here = state in ('pending', 'held', 'quarantined')
+        is_here = State(state) in HERE
         path = str(self._tree.path(State(state), reason, bucket, key)) if is_here else ''
         return PastObject(
             bucket, content or key, sensor, topic or '', kind or '', size, begin_ns, max(begin_ns, end_ns), mission or '',

@@ -37,9 +37,10 @@ from shadowhound_data_logger.live.access import (
     is_same_origin,
     make_tokens,
 )
-from shadowhound_data_logger.live.figures import SpoolFigures
+from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures
 from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
 from shadowhound_data_logger.live.kinds import KINDS, LiveItem
+from shadowhound_data_logger.live.relay import Relay
 from shadowhound_data_logger.live.viewer import Viewer
 from shadowhound_data_logger.spool.control import connect
 
@@ -97,6 +98,10 @@ class LiveSettings:
     """Certificate and key, for https."""
     is_of_store: bool = False
     """Whether the page is that of a store, with the past of all its robots, and not a robot's own."""
+    robot_url: str = ''
+    """Of a store's page: where the robot's own page is, from which the live view is relayed; empty: there is none."""
+    robot_token: Path | None = None
+    """The file with the token of a viewer there."""
     uploads_mbps: float = 4.0
     """What uploads are left while somebody watches over the network; 0: all they want."""
 
@@ -124,6 +129,8 @@ class LiveServer:
         self._wanted: dict[str, frozenset[int]] | None = None
         self._graph: Mapping[str, str] = {}
         self._topics: Topics | None = None
+        self._relay: Relay | None = None
+        self._told_topics: LiveItem | None = None
         self._pool = ThreadPoolExecutor(2, 'spool')
         self._reading = asyncio.Lock()
         self._asking = asyncio.Lock()
@@ -169,6 +176,8 @@ class LiveServer:
         if self._runner is not None:
             await self._runner.cleanup()
         await self._history.close()
+        if self._relay is not None:
+            await self._relay.close()
         if self._topics is not None:
             await asyncio.to_thread(self._topics.close)
         self._pool.shutdown()
@@ -186,6 +195,9 @@ class LiveServer:
     def _open_topics(self) -> None:
         """Where ROS is, read topics; else the data alone is shown."""
         if self._settings.is_of_store:
+            if self._settings.robot_url:
+                self._relay = Relay(self._settings.robot_url, self._settings.robot_token, lambda: self._wanted, self._on_relayed)
+                self._relay.open()
             return
         if find_spec('rclpy') is None:
             self.ros_problem = 'ROS is not sourced here: the page shows the data, and no camera, cloud or plots'
@@ -215,7 +227,17 @@ class LiveServer:
                 if item.topic in one.viewer.watched and one.viewer.size(item.topic) == item.size:
                     one.viewer.offer(item)
 
+    def _on_relayed(self, item: LiveItem) -> None:
+        if item.kind == 'topics':
+            self._told_topics = item
+        for one in self._viewers:
+            if not item.topic or item.topic in one.viewer.watched:
+                one.viewer.offer(item)
+
     def _offer_catalogue(self, one: _Connected) -> None:
+        if self._told_topics is not None:
+            one.viewer.offer(self._told_topics)
+            return
         topics = [[topic, KINDS[name].name, name] for topic, name in self._graph.items() if name in KINDS]
         one.viewer.offer(LiveItem('', 'topics', head={'topics': topics, 'problem': self.ros_problem}))
 
@@ -227,8 +249,10 @@ class LiveServer:
                 wanted.setdefault(topic, set()).add(one.viewer.size(topic))
         before = self._wanted
         self._wanted = {topic: frozenset(sizes) for topic, sizes in wanted.items()} if self._viewers else None
-        if self._topics is not None and self._wanted != before:
-            self._topics.wake()
+        if self._wanted != before:
+            for source in (self._topics, self._relay):
+                if source is not None:
+                    source.wake()
 
     async def _tick(self) -> None:
         """Once a second: the figures, the sizes, the lease, and threads that died."""
@@ -321,7 +345,7 @@ class LiveServer:
 
     @property
     def _about(self) -> dict[str, Any]:
-        return {'robot': self._settings.robot, 'has_live': not self._settings.is_of_store}
+        return {'robot': self._settings.robot, 'has_live': not self._settings.is_of_store or self._relay is not None}
 
     async def _sign_in(self, request: web.Request) -> web.StreamResponse:
         address = request.remote or ''
@@ -358,6 +382,8 @@ class LiveServer:
             return _problem(403, 'only an operator may do that: sign in with the token of the operator')
         if not self._access.is_csrf(who, request.headers.get('X-CSRF-Token', '')):
             return _problem(403, 'the request does not come from this page')
+        if self._settings.is_of_store:
+            return _problem(404, "there is no node here: the buttons are on the robot's own page")
         asked = await _body(request)
         do = asked.get('do')
         takes = ACTS.get(do) if isinstance(do, str) else None
@@ -381,6 +407,8 @@ class LiveServer:
             times = [None if given is None else given * SECOND // 1000 for given in (_ms(request, 'from'), _ms(request, 'to'))]
         except ValueError as error:
             return _problem(400, str(error))
+        if self._settings.is_of_store:
+            return await self._tell_today(times)
         try:
             async with self._reading:
                 found = await self._loop.run_in_executor(self._pool, partial(self._figures.gaps, *times))
@@ -389,6 +417,12 @@ class LiveServer:
         response = _json(found)
         response.enable_compression()
         return response
+
+    async def _tell_today(self, times: list[int | None]) -> web.StreamResponse:
+        """The gaps of a robot whose spool is elsewhere."""
+        now_ns = time.time_ns()
+        since_ns, until_ns = times[0] or now_ns - now_ns % DAY_NS, times[1] or now_ns
+        return await self._of_past('timeline', self._settings.robot, {'from': since_ns // 1_000_000, 'to': until_ns // 1_000_000})
 
     async def _tell_past(self, request: web.Request) -> web.StreamResponse:
         """Of a timeline JSON; of a moment its head as JSON and its items, each after a uint32 with its length."""
@@ -400,6 +434,9 @@ class LiveServer:
             return _problem(400, str(error))
         if not is_name(robot) or None in times.values():
             return _problem(400, f'{do} takes {" and ".join(("robot", *takes))}')
+        return await self._of_past(do, robot, times)
+
+    async def _of_past(self, do: str, robot: str, times: Mapping[str, int | None]) -> web.StreamResponse:
         try:
             head, body = await self._history.ask({'do': do, 'robot': robot, **times})
         except PastUnavailable as error:

@@ -1,0 +1,184 @@
+"""One connection to a robot's own live page, whose items are shown to all viewers of this one.
+
+The link carries each topic once, however many watch. What the robot says is not trusted: sizes are bounded, and what is not an
+item ends the connection, which begins again. Times are made those of this machine's clock, as the page's script does it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+import aiohttp
+import numpy as np
+
+from shadowhound_data_logger.live.access import token_of
+from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem
+
+log = logging.getLogger(__name__)
+
+PING_S: Final = 1.0
+SILENT_S: Final = 5.0
+"""The robot says something each second."""
+AGAIN_S: Final = 2.0
+"""After a connection ended."""
+PINGS: Final = 12
+MOST_MESSAGE: Final = 1 << 20
+MOST_ITEM: Final = 32 << 20
+MOST_LANES: Final = 64
+_SHOWN: Final = {'topics', 'figures', 'pong', *(kind.name for kind in KINDS.values())}
+_BROKEN: Final = (asyncio.TimeoutError, OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
+_BULK: Final = {kind.name for kind in KINDS.values() if kind.is_bulk}
+
+
+class Relay:
+    """Watches at a robot while somebody watches here. Used by one event loop. New; open once; close once.
+
+    ``wanted`` says which topics are watched, None while there is no viewer; ``came`` is given each item.
+    """
+
+    def __init__(self, url: str, token: Path | None, wanted: Callable[[], Iterable[str] | None],
+                 came: Callable[[LiveItem], None]) -> None:  # fmt: skip
+        self._url, self._token, self._wanted, self._came = url.rstrip('/'), token, wanted, came
+        parts = urlsplit(self._url)
+        self._origin = f'{parts.scheme}://{parts.netloc}'
+        self._wake = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+        self.problem = ''
+        """Why nothing comes; empty while connected, or while nobody watches."""
+
+    def open(self) -> None:
+        self._task = asyncio.create_task(self._run())
+
+    def wake(self) -> None:
+        """What is wanted has changed."""
+        self._wake.set()
+
+    async def close(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._task
+
+    async def _run(self) -> None:
+        while True:
+            while self._wanted() is None:
+                self._wake.clear()
+                await self._wake.wait()
+            try:
+                await self._watch()
+            except (aiohttp.ClientError, *_BROKEN) as error:
+                why = str(error)[:200] or type(error).__name__
+                if not self.problem:
+                    log.warning('the page of the robot cannot be read: %s', why)
+                self.problem = f'the page of the robot cannot be read: {why}'
+                self._came(_catalogue([], self.problem))
+                await asyncio.sleep(AGAIN_S)
+
+    async def _watch(self) -> None:
+        """Until nobody watches any more. Raises for a connection that failed, or an answer that is none."""
+        timeout = aiohttp.ClientTimeout(total=None, connect=10.0, sock_read=30.0)
+        jar = aiohttp.CookieJar(unsafe=True)  # an address is as good as a name
+        async with aiohttp.ClientSession(headers={'Origin': self._origin}, timeout=timeout, cookie_jar=jar) as session:
+            if self._token is not None:
+                given = {'token': token_of(self._token)}
+                async with session.post(f'{self._url}/api/session', json=given, allow_redirects=False) as answer:
+                    if answer.status != 200:
+                        raise ValueError(f'it does not let us in ({answer.status})')
+            async with session.ws_connect(f'{self._url}/ws', max_msg_size=MOST_MESSAGE) as ws:
+                self.problem = ''
+                log.info('watching at %s', self._origin)
+                connection = _Connection(ws, self._came)
+                teller = asyncio.create_task(self._tell(connection))
+                try:
+                    await connection.read()
+                finally:
+                    teller.cancel()
+                    with suppress(asyncio.CancelledError, OSError, RuntimeError):
+                        await teller
+
+    async def _tell(self, connection: _Connection) -> None:
+        """What is watched, when it changes, and a ping each second."""
+        told: list[str] | None = None
+        while True:
+            wanted = self._wanted()
+            if wanted is None:
+                await connection.ws.close()
+                return
+            if (topics := sorted(wanted)) != told:
+                told = topics
+                await connection.ws.send_json({'watch': topics})
+            await connection.ws.send_json({'ping': time.monotonic() * 1e3})
+            self._wake.clear()
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), PING_S)
+
+
+class _Connection:
+    """A WebSocket to the robot's page: frames to items, by this machine's clock."""
+
+    def __init__(self, ws: Any, came: Callable[[LiveItem], None]) -> None:
+        self.ws, self._came = ws, came
+        self._parts: dict[int, bytearray] = {}
+        self._received = 0
+        self._pings: deque[tuple[float, float]] = deque(maxlen=PINGS)
+
+    async def read(self) -> None:
+        while True:
+            message = await self.ws.receive(SILENT_S)
+            if message.type is not aiohttp.WSMsgType.BINARY:
+                if message.type in (aiohttp.WSMsgType.TEXT, aiohttp.WSMsgType.ERROR):
+                    raise ValueError(f'it said {message.type.name}')
+                return
+            frame = message.data
+            self._received = (self._received + len(frame)) & 0xFFFF_FFFF
+            await self.ws.send_bytes(self._received.to_bytes(4, 'little'))
+            lane, flags = frame[0], frame[1]
+            if flags & 1:
+                self._parts[lane] = bytearray()
+            part = self._parts[lane]
+            part += frame[4:]
+            if len(part) > MOST_ITEM or len(self._parts) > MOST_LANES:
+                raise ValueError('it sends more than any robot does')
+            if flags & 2:
+                self._take(bytes(self._parts.pop(lane)))
+
+    def _take(self, whole: bytes) -> None:
+        size = int.from_bytes(whole[:4], 'little')
+        head, body = json.loads(whole[4 : 4 + size]), whole[4 + size :]
+        kind = head.pop('kind')
+        topic = head.pop('topic')
+        if kind not in _SHOWN or not isinstance(topic, str):
+            raise ValueError('it sends what no page does')
+        if kind == 'pong':
+            here = time.monotonic() * 1e3
+            self._pings.append((here - float(head['ping']), float(head['now']) - (here + float(head['ping'])) / 2))
+            return
+        if kind == 'topics':
+            told = [[str(text)[:256] for text in row[:3]] for row in head['topics'][:500] if len(row) == 3]
+            self._came(_catalogue(told, str(head.get('problem', ''))[:300]))
+            return
+        if not self._pings:
+            return  # nobody could say how old it is
+        ahead = min(self._pings)[1]  # the round with the least delay tells best
+        at = float(head['at']) - ahead
+        if not math.isfinite(at):
+            raise ValueError('it sends no time')
+        head['at'] = round(at, 1)
+        if kind != 'figures' and kind not in _BULK:
+            rows = int(head['rows'])
+            body = (np.frombuffer(body, '<f8', rows) - ahead).astype('<f8').tobytes() + body[8 * rows :]
+        self._came(LiveItem(topic, kind, FULL, head, body))
+
+
+def _catalogue(topics: list[list[str]], problem: str) -> LiveItem:
+    return LiveItem('', 'topics', head={'topics': topics, 'problem': problem})

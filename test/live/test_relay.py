@@ -1,0 +1,153 @@
+"""The page of a store, with the live view of one robot: one connection to the robot, however many watch."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import numpy as np
+import pytest
+from aiohttp import web
+from live.test_access import Page, serving
+
+from shadowhound_data_logger.live.kinds import KINDS, LiveItem, table_item
+from shadowhound_data_logger.live.server import LiveServer, LiveSettings
+from shadowhound_data_logger.options import COMPRESSED_IMAGE
+
+CAMERA, IMU = '/camera', '/imu'
+GRAPH = {CAMERA: COMPRESSED_IMAGE, IMU: 'sensor_msgs/msg/Imu'}
+VIEWERS = 10
+
+
+@asynccontextmanager
+async def tower(folder: Path, url: str, token: Path | None) -> AsyncIterator[LiveServer]:
+    """The page of a store on this machine."""
+    settings = LiveSettings(
+        spool=folder / 'none', robot='thor', tokens=folder / 'tower', port=0, is_of_store=True, robot_url=url, robot_token=token
+    )
+    server = LiveServer(settings)
+    await server.open()
+    try:
+        yield server
+    finally:
+        await server.close()
+
+
+class Browser:
+    """A viewer that puts items together, and the newest of each topic."""
+
+    def __init__(self) -> None:
+        self.newest: dict[str, tuple[dict[str, Any], bytes]] = {}
+
+    async def run(self, server: LiveServer) -> None:
+        origin = f'http://127.0.0.1:{server.port}'
+        async with aiohttp.ClientSession(headers={'Origin': origin}) as session, session.ws_connect(f'{origin}/ws') as ws:
+            await ws.send_json({'watch': [CAMERA, IMU]})
+            parts: dict[int, bytes] = {}
+            size = 0
+            async for message in ws:
+                size += len(message.data)
+                await ws.send_bytes(size.to_bytes(4, 'little'))
+                lane, flags = message.data[:2]
+                parts[lane] = (b'' if flags & 1 else parts[lane]) + message.data[4:]
+                if flags & 2:
+                    whole = parts.pop(lane)
+                    end = 4 + int.from_bytes(whole[:4], 'little')
+                    head = json.loads(whole[4:end])
+                    self.newest[head['topic'] or head['kind']] = head, whole[end:]
+
+
+async def until(condition: Callable[[], Any]) -> None:
+    async def looking() -> None:
+        while not condition():
+            await asyncio.sleep(0.01)
+
+    await asyncio.wait_for(looking(), 60.0)
+
+
+def publish(robot: LiveServer, number: int) -> None:
+    """A frame of 40 KB and a row of figures."""
+    at = asyncio.get_running_loop().time() * 1e3
+    frame = LiveItem(CAMERA, 'camera', head={'at': at}, body=bytes([number % 256]) * 40_000)
+    robot._on_items([frame, table_item(IMU, KINDS['sensor_msgs/msg/Imu'], [(at, {'x': float(number)})])])
+
+
+def test_ten_viewers_cost_the_robot_one_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It signs in with the token of a viewer; frames arrive as they were, with their times; without viewers it is gone."""
+
+    async def run(robot: Page, page: LiveServer) -> None:
+        robot.server._on_graph(GRAPH)
+        browsers = [Browser() for _ in range(VIEWERS)]
+        tasks = [asyncio.create_task(browser.run(page)) for browser in browsers]
+        await until(lambda: [one.viewer.watched for one in robot.server._viewers] == [{CAMERA, IMU}])
+        await until(lambda: all('topics' in browser.newest for browser in browsers))
+        number = 0
+        while not all({CAMERA, IMU} <= browser.newest.keys() for browser in browsers):
+            publish(robot.server, number := number + 1)
+            await asyncio.sleep(0.02)
+        for browser in browsers:
+            head, body = browser.newest[CAMERA]
+            assert (len(body), len(set(body))) == (40_000, 1)
+            assert -100 < asyncio.get_running_loop().time() * 1e3 - head['at'] < 20_000
+            figures, rows = browser.newest[IMU]
+            assert figures['names'] == ['x']
+            assert abs(np.frombuffer(rows, '<f8', 1)[0] - figures['at']) < 1
+        assert len(robot.server._viewers) == 1
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await until(lambda: not robot.server._viewers)
+
+    async def both() -> None:
+        async with AsyncExitStack() as stack:
+            robot = await stack.enter_async_context(serving(tmp_path / 'robot', monkeypatch))
+            token = robot.folder / 'viewer.token'
+            await run(robot, await stack.enter_async_context(tower(tmp_path, robot.origin, token)))
+
+    asyncio.run(both())
+
+
+WHOLE = b'\x00\x03\x00\x00'
+
+
+@pytest.mark.parametrize('said', [
+    b'', b'\x00\x03', b'\x00\x02\x00\x00ab', WHOLE + b'\xff' * 99, WHOLE + b'\x02\x00\x00\x00[]',
+    WHOLE + LiveItem('', 'pong', head={'ping': 'x', 'now': {}}).packed, WHOLE + LiveItem('', 'topics', head={'topics': 7}).packed,
+    WHOLE + LiveItem('/a', 'script', head={'at': 1}).packed,
+])  # fmt: skip
+def test_a_robot_that_says_nonsense_is_said_to_be_unreadable(
+    tmp_path: Path, said: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page of the store goes on, and says why there is no live view."""
+    monkeypatch.setattr('shadowhound_data_logger.live.relay.AGAIN_S', 0.01)
+
+    async def nonsense(request: web.Request) -> web.StreamResponse:
+        ws = web.WebSocketResponse()
+        await ws.prepare(request)
+        await ws.send_bytes(said)
+        async for _ in ws:
+            pass
+        return ws
+
+    async def run() -> None:
+        app = web.Application()
+        app.add_routes([web.get('/ws', nonsense)])
+        runner = web.AppRunner(app)
+        await runner.setup()
+        await web.TCPSite(runner, '127.0.0.1', 0).start()
+        try:
+            async with tower(tmp_path, f'http://127.0.0.1:{runner.addresses[0][1]}', None) as page:
+                browser = Browser()
+                task = asyncio.create_task(browser.run(page))
+                await until(lambda: 'cannot be read' in browser.newest.get('topics', ({'problem': ''},))[0]['problem'])
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+        finally:
+            await runner.cleanup()
+
+    asyncio.run(run())
