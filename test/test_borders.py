@@ -40,13 +40,23 @@ MODULES = sorted(ROOT.rglob('*.py'))
 
 
 @cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding='utf-8'))
+
+
+@cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(tree(path)))
+
+
+@cache
 def imports(path: Path) -> tuple[str, ...]:
     """The full names of all modules that a file imports, anywhere in it."""
     return tuple(_imports(path))
 
 
 def _imports(path: Path) -> Iterator[str]:
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             yield from (name.name for name in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -100,7 +110,7 @@ def test_who_imports_what(package: str) -> None:
 
 def _defined(path: Path) -> Iterator[str]:
     """The public names that a module defines: classes, type aliases, functions and constants."""
-    for node in ast.parse(path.read_text(encoding='utf-8')).body:
+    for node in tree(path).body:
         if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
             yield node.name
         elif isinstance(node, (ast.Assign, ast.AnnAssign)):
@@ -128,7 +138,7 @@ def test_a_name_that_crosses_folders_stands_for_one_thing() -> None:
     defined = {_module(path): set(_defined(path)) for path in MODULES}
     origins: dict[str, set[str]] = {}
     for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        for node in nodes(path):
             if isinstance(node, ast.ImportFrom) and node.module in defined:
                 home = ROOT.joinpath(*node.module.split('.')[1:])
                 if (home if home.is_dir() else home.parent) == path.parent:
@@ -157,7 +167,7 @@ def test_one_module_owns_the_sql_of_the_spools_index() -> None:
     index = {'spool/index.py', 'spool/gap_table.py', 'spool/request_table.py', 'spool/schema.py'}
     own = {'spool/deliveries.py', 'lake/fetched.py', 'bags/contents.py', 'bags/verify.py'}
     senders = {
-        path.relative_to(ROOT).as_posix() for path in MODULES for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        path.relative_to(ROOT).as_posix() for path in MODULES for node in nodes(path)
         if isinstance(node, ast.Attribute) and node.attr in {'execute', 'executemany', 'executescript'}
     }  # fmt: skip
     assert senders == index | own
