@@ -17,6 +17,7 @@ from shadowhound_data_logger.cli.common import MEANINGS, PROGRAM, BadUsage, Exit
 from shadowhound_data_logger.cli.doctor import doctor
 from shadowhound_data_logger.cli.export import export
 from shadowhound_data_logger.cli.fetch import fetch
+from shadowhound_data_logger.cli.label import label
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.cli.ledger import ledger
 from shadowhound_data_logger.cli.live import live
@@ -32,7 +33,7 @@ from shadowhound_data_logger.errors import DataLoggerError, SettingError
 SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
     'On every machine': (doctor,),
     'On the robot': (status, ledger, spool, node, live),
-    'On Tower and Spark': (query, fetch, pull, bag, lake, export),
+    'On Tower and Spark': (query, fetch, pull, bag, lake, label, export),
     'Missions': (missions,),
 }
 """The verbs by who needs them, in the order of the help."""

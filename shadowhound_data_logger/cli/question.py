@@ -18,6 +18,13 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.lake.findings import Findings
 
 EXTRA: Final = {'daft', 'matplotlib', 'obstore', 'pyarrow'}
+ranges_option = click.option(
+    '--ranges',
+    type=click.File('rb'),
+    metavar='FILE.json',
+    callback=lambda _, __, file: _ranges(file),
+    help='In one of these times: the answer of `query --where SENSOR.FIELD... --json`; - is stdin.',
+)
 FLAGS: Final = {
     'robot': click.option('--robot', metavar='NAME', help='Only of this robot.'),
     'sensor': click.option('--sensor', metavar='NAME', help='Only of this sensor: camera, lidar, odom, ...'),
@@ -36,16 +43,24 @@ FLAGS: Final = {
         '--succeeded', 'success', flag_value=True, type=bool, default=None, help='Only of missions that succeeded.'
     ),
     'where': click.option('--where', metavar='SQL', help="A condition, such as 'battery_pct < 30'."),
-    'ranges': click.option(
-        '--ranges',
-        type=click.File('rb'),
-        metavar='FILE.json',
-        callback=lambda _, __, file: _ranges(file),
-        help='In one of these times: the answer of `query --where SENSOR.FIELD... --json`; - is stdin.',
-    ),
+    'label': click.option('--label', metavar='NAME', help='With this label, or of a time that has it.'),
+    'ranges': ranges_option,
 }
 _RANGES: Final = 'it is what `query --where SENSOR.FIELD... --json` prints'
-NAMES: Final = ('robot', 'sensor', 'topic', 'since', 'until', 'near', 'mission', 'mission_type', 'success', 'where', 'ranges')
+NAMES: Final = (
+    'robot',
+    'sensor',
+    'topic',
+    'since',
+    'until',
+    'near',
+    'mission',
+    'mission_type',
+    'success',
+    'where',
+    'label',
+    'ranges',
+)
 _Command = TypeVar('_Command', bound=Callable[..., Any])
 
 

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from operator import and_
 from typing import Any, Final
@@ -22,14 +22,17 @@ import pyarrow.compute as pc
 
 from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.catalogue.gaps import GAP, GAPS
+from shadowhound_data_logger.catalogue.labels import LABELS
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import newest, watermarks
+from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.scan import Catalogue
-from shadowhound_data_logger.lake.select import Wanted, wanted
+from shadowhound_data_logger.lake.select import Wanted, wanted, within
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.untrusted import MOST_SUMMARY_BYTES, from_json
 
@@ -37,8 +40,9 @@ import daft  # isort: skip - after scan, which turns its telemetry off
 from daft import DataFrame, Expression, col, lit  # isort: skip
 
 _MISSIONS: Final = re.compile(r'\bmissions\b', re.IGNORECASE)
+_LABELS: Final = re.compile(r'\blabels\b', re.IGNORECASE)
 _GAPS: Final = re.compile(r'\b(gaps|watermarks)\b', re.IGNORECASE)
-_OF_OBJECTS: Final = ('near', 'mission_type', 'success', 'where')
+_OF_OBJECTS: Final = ('near', 'mission_type', 'success', 'where', 'label')
 """Flags that gaps know nothing of."""
 _UNSEEN: Final = {'what', 'id', 'revision', 'received', 'skipped', 'format_version'}
 _GAP_COLUMNS: Final = [name for name in GAPS.columns if name not in _UNSEEN]
@@ -55,6 +59,7 @@ _OF_WATERMARKS: Final = {
     'received',
     'skipped',
 }
+_UNSEEN_OF_LABELS: Final = {'what', 'made', 'format_version'}
 _WATERMARK_COLUMNS: Final = [name for name in GAPS.columns if name in _OF_WATERMARKS]
 LONGEST_NS: Final = 24 * 3600 * SECOND
 """For so long after a time that is asked for a mission may go on before one of its objects knows its run."""
@@ -110,6 +115,8 @@ def sql(query: str, source: Bucket | None = None, *, findings: Findings | None =
     views = {'objects': rows, 'topics': _topics(rows)}
     if _MISSIONS.search(query):  # it has to look first
         views['missions'] = _missions(chosen, asked)
+    if _LABELS.search(query):
+        views['labels'] = _labels(chosen, asked)
     if _GAPS.search(query):
         views.update(_gaps(chosen, asked))
     with answering():
@@ -138,7 +145,18 @@ def answering() -> Iterator[None]:
         raise LakeError(f'the query cannot be answered: {" ".join(str(error).split())}') from error
 
 
+def labelled(source: Bucket, asked: Wanted, findings: Findings) -> Wanted:
+    """What is asked, with the times and objects that bear its label instead of that. Raises StoreError."""
+    if asked.label is None:
+        return asked
+    found = labels.read(source, asked.robot, label=asked.label, findings=findings)
+    times, keys = labels.spans(found)
+    ends = [end_ns for each in found for end_ns in (each.since_ns, each.until_ns)]
+    return within(replace(asked, label=None), times, keys, ends)
+
+
 def _objects(lake: _Asked, asked: Wanted) -> DataFrame:
+    asked = labelled(lake.source, asked, lake.findings)
     rows = Catalogue(lake.source, asked, lake.findings).read()
     with answering():
         conditions = list(_conditions(asked))
@@ -202,6 +220,15 @@ def _missions(lake: _Asked, asked: Wanted) -> DataFrame:
     for column, (name, kind) in _SUMMARY.items():
         found = found.append_column(column, pa.array([_value(one.get(name), kind) for one in told], kind))
     return daft.from_arrow(found)
+
+
+def _labels(lake: _Asked, asked: Wanted) -> DataFrame:
+    """Those that reach into the time."""
+    found = labels.read(lake.source, asked.robot, label=asked.label, findings=lake.findings)
+    since_ns, until_ns = asked.since_ns or 0, (1 << 63) - 1 if asked.until_ns is None else asked.until_ns
+    rows = [asdict(each) for each in found if each.until_ns >= since_ns and each.since_ns < until_ns]
+    names = [name for name in LABELS.columns if name not in _UNSEEN_OF_LABELS]
+    return daft.from_arrow(pa.Table.from_pylist(rows, schema=narrow(names, LABELS)))
 
 
 def _gaps(lake: _Asked, asked: Wanted) -> dict[str, DataFrame]:

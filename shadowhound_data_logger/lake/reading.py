@@ -22,6 +22,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from shadowhound_data_logger.catalogue.gaps import GAPS, STATEMENT_KINDS
+from shadowhound_data_logger.catalogue.labels import LABEL_KINDS, LABELS
 from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
 from shadowhound_data_logger.catalogue.schema import KEPT, OBJECTS, TableSchema
 from shadowhound_data_logger.catalogue.statistics import STATISTICS
@@ -60,10 +61,17 @@ _PAGE: Final = re.compile(
     rb'\x2c\x15[\x80-\xff]{0,4}[\x00-\x7f]\x15\x00\x15\x06\x15\x06\x00\x00'
 )  # fmt: skip
 """The header of a plain data page as ``parquet.py`` writes it, its sizes in groups."""
-_OWNER: Final = {OBJECTS.folder: 'key', KEPT.folder: 'key', STATISTICS.folder: 'key', GAPS.folder: 'robot'}
+_OWNER: Final = {
+    OBJECTS.folder: 'key',
+    KEPT.folder: 'key',
+    STATISTICS.folder: 'key',
+    GAPS.folder: 'robot',
+    LABELS.folder: 'robot',
+}
 """The column that says whose a row is, by the table's folder."""
 _COUNTS: Final = ('bytes', 'revision', 'merged', 'received', 'skipped', 'nan_count')
-_TIMES: Final = ('t_start', 't_end', 't_from', 't_to')
+_SPANS: Final = (('from_ns', 'to_ns'), ('since_ns', 'until_ns'))
+_TIMES: Final = ('t_start', 't_end', 't_from', 't_to', 'made')
 _YEARS_US: Final = (-62_135_596_800_000_000, 253_402_300_799_999_999)
 """1 to 9999, those of a date."""
 UNREADABLE: Final = (pa.ArrowException, OSError, MemoryError, ValueError, LookupError, TypeError, OverflowError)
@@ -241,7 +249,7 @@ def _fit(table: pa.Table, schema: pa.Schema) -> pa.Table:
 
 def _is_own(table: pa.Table, robot: str, of: TableSchema) -> pa.ChunkedArray:
     """Whether a row is one of the robot whose folder it lies in."""
-    if of is GAPS:
+    if _OWNER[of.folder] == 'robot':
         return pc.fill_null(pc.equal(table['robot'], robot), fill_value=False)
     own = pc.fill_null(pc.starts_with(table['key'], f'{robot}/'), fill_value=False)
     if 'robot' in table.column_names:
@@ -255,14 +263,15 @@ def _is_sane(table: pa.Table, of: TableSchema) -> pa.ChunkedArray:
     for name in (name for name in of.required if name in table.column_names):
         sane = pc.and_(sane, pc.is_valid(table[name]))
     if 'bucket' in table.column_names:
-        named = [each for each in pc.unique(table['bucket']).to_pylist() if each is not None and is_name(each)]
+        named = [each for each in pc.unique(table['bucket']).to_pylist() if each is None or is_name(each)]
         sane = pc.and_(sane, pc.is_in(table['bucket'], value_set=pa.array(named, pa.string())))
     if 'what' in table.column_names:
-        sane = pc.and_(sane, pc.is_in(table['what'], value_set=pa.array(STATEMENT_KINDS)))
+        sane = pc.and_(sane, pc.is_in(table['what'], value_set=pa.array(LABEL_KINDS if of is LABELS else STATEMENT_KINDS)))
     for name in (name for name in _COUNTS if name in table.column_names):
         sane = pc.and_(sane, pc.fill_null(pc.greater_equal(table[name], 0), fill_value=name not in of.required))
-    if {'from_ns', 'to_ns'}.issubset(table.column_names):
-        sane = pc.and_(sane, pc.fill_null(pc.less_equal(table['from_ns'], table['to_ns']), fill_value=True))
+    for first, last in _SPANS:
+        if {first, last}.issubset(table.column_names):
+            sane = pc.and_(sane, pc.fill_null(pc.less_equal(table[first], table[last]), fill_value=True))
     for name in (name for name in _TIMES if name in table.column_names):
         micros = table[name].cast(pa.int64())
         inside = pc.and_(pc.greater_equal(micros, _YEARS_US[0]), pc.less_equal(micros, _YEARS_US[1]))

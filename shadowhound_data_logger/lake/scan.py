@@ -23,7 +23,7 @@ from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import Day, days, robots
 from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, arrow_schema
-from shadowhound_data_logger.lake.select import TimeSpan, Wanted
+from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.model import ObjectInfo
 
 os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # else it tells its makers of each run, over the network
@@ -36,7 +36,7 @@ from daft.recordbatch import RecordBatch
 
 _Answer = TypeVar('_Answer')
 KEY: Final = ('bucket', 'key')
-_TIMES: Final = ('robot', 't_start_ns', 't_end_ns')
+_TIMES: Final = ('robot', *KEY, 't_start_ns', 't_end_ns')
 ROW: Final = (*KEY, 't_start_ns')
 """Of a repeat the key is that of another row (spool/repeats.py)."""
 
@@ -108,9 +108,9 @@ class _Parts(DataSourceTask):
 
     def _tables(self) -> Generator[pa.Table, None, None]:
         wide = (*self._columns, *(name for name in ROW if name not in self._columns)) if self._once else self._columns
-        if self._wanted.spans:
+        if self._wanted.chosen:
             wide = (*wide, *(name for name in _TIMES if name not in wide))
-        found = (_within(table, self._wanted.spans)
+        found = (_within(table, self._wanted)
                  for table in reading.tables(self._source, self._entries, wide, self._findings, self._wanted))  # fmt: skip
         if self._once:
             yield unrepeated(pa.concat_tables([reading.narrow(wide).empty_table(), *found])).select(self._columns)
@@ -118,20 +118,26 @@ class _Parts(DataSourceTask):
             yield from (table.select(self._columns) for table in found)
 
 
-def _within(table: pa.Table, spans: Sequence[TimeSpan]) -> pa.Table:
-    """The rows that reach into one of these times, where there are any; each robot's are sorted, and none meets the next."""
-    if not spans:
+def _within(table: pa.Table, wanted: Wanted) -> pa.Table:
+    """The rows that are in all that was chosen."""
+    if not wanted.chosen:
         return table
     first = pc.fill_null(table['t_start_ns'], -1).to_numpy()
     last = np.maximum(first, pc.fill_null(table['t_end_ns'], -1).to_numpy())
-    found = np.zeros(len(table), bool)
-    for robot, each in groupby(spans, lambda span: span.robot):
-        since, until = np.array([span[1:] for span in each], np.int64).T
-        place = np.searchsorted(until, first)
-        inside = (place < len(until)) & (since[np.minimum(place, len(until) - 1)] <= last)
-        is_its = pc.fill_null(pc.equal(table['robot'], robot), fill_value=False).to_numpy() if robot else True
-        found |= inside & is_its
-    return table.filter(pa.array(found))
+    kept = np.ones(len(table), bool)
+    for chosen in wanted.chosen:
+        found = np.zeros(len(table), bool)
+        for robot, each in groupby(chosen.spans, lambda span: span.robot):
+            since, until = np.array([span[1:] for span in each], np.int64).T
+            place = np.searchsorted(until, first)
+            inside = (place < len(until)) & (since[np.minimum(place, len(until) - 1)] <= last)
+            is_its = pc.fill_null(pc.equal(table['robot'], robot), fill_value=False).to_numpy() if robot else True
+            found |= inside & is_its
+        if chosen.keys:
+            pairs = zip(table['bucket'].to_pylist(), table['key'].to_pylist(), strict=True)
+            found |= np.fromiter((pair in chosen.keys for pair in pairs), bool, len(table))
+        kept &= found
+    return table.filter(pa.array(kept))
 
 
 async def _apart(work: Callable[[], _Answer]) -> _Answer:

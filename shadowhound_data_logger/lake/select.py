@@ -32,6 +32,15 @@ class TimeSpan(NamedTuple):
     until_ns: int
 
 
+class Chosen(NamedTuple):
+    """Objects that reach into one of some times, or are named."""
+
+    spans: tuple[TimeSpan, ...]
+    """By robot, in the order of their times; none meets the next."""
+    keys: frozenset[tuple[str, str]] = frozenset()
+    """(bucket, key)."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
     """What a query selects: everything that is given must hold; None means any."""
@@ -51,8 +60,10 @@ class Wanted:
     """How the mission ended by its ``summary.json``; of one that goes on, neither is true."""
     where: str | None = None
     """SQL, such as ``battery_pct < 30``."""
-    spans: tuple[TimeSpan, ...] = ()
-    """Objects that reach into one of these; in the order of their times, each robot's apart. None: of all times."""
+    label: str | None = None
+    """Objects that bear this label, or reach into a time that bears it."""
+    chosen: tuple[Chosen, ...] = ()
+    """An object must be in each of these."""
     bounds: tuple[tuple[str, Any, Any], ...] = ()
     """Further columns with the least and the greatest value of what is wanted: row groups without are left out."""
 
@@ -82,6 +93,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
     near: tuple[float, float, float] | str | None = None, robot: str | None = None, sensor: str | None = None,
     topic: str | None = None, mission: str | None = None, mission_type: str | None = None, success: bool | None = None,
     where: str | None = None, ranges: Sequence[Mapping[str, Any]] | None = None,
+    label: str | None = None,
 ) -> Wanted:  # fmt: skip
     """The query with these flags. Raises SettingError for an invalid one.
 
@@ -89,7 +101,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
     """
     asked = Wanted(
         robot=robot, sensor=sensor, topic=topic, mission=mission, mission_type=mission_type, success=success, where=where,
-        since_ns=None if since is None else moment('since', since, now_ns),
+        label=label, since_ns=None if since is None else moment('since', since, now_ns),
         until_ns=None if until is None else moment('until', until, now_ns),
         near=None if near is None else _circle(near),
     )  # fmt: skip
@@ -111,18 +123,22 @@ def spans_of(ranges: Sequence[Mapping[str, Any]]) -> list[TimeSpan]:
     return found
 
 
-def within(asked: Wanted, spans: Iterable[TimeSpan]) -> Wanted:
-    """Of what is asked what reaches into these times; where there are none, nothing."""
+def within(asked: Wanted, spans: Iterable[TimeSpan], keys: Iterable[tuple[str, str]] = (), all_ns: Iterable[int] = ()) -> Wanted:
+    """Of what is asked what reaches into these times, or is one of these objects; where there are none, nothing.
+
+    ``all_ns`` are the times of the objects.
+    """
     joined: list[TimeSpan] = []
     for each in sorted((each for each in spans if each.since_ns <= each.until_ns), key=lambda each: (each.robot or '', each[1:])):
         if joined and joined[-1].robot == each.robot and each.since_ns <= joined[-1].until_ns:
             joined[-1] = joined[-1]._replace(until_ns=max(joined[-1].until_ns, each.until_ns))
         else:
             joined.append(each)
-    since_ns = max(0, min((each.since_ns for each in joined), default=0) - LONGEST_BATCH_NS)
-    until_ns = max((each.until_ns + 1 for each in joined), default=0)
+    ends = [*all_ns, *(each.since_ns for each in joined), *(each.until_ns for each in joined)]
+    since_ns = max(0, min(ends, default=0) - LONGEST_BATCH_NS)
+    until_ns = max(ends, default=-1) + 1
     return replace(
-        asked, spans=tuple(joined) or (TimeSpan(None, 0, 0),), since_ns=max(since_ns, asked.since_ns or 0),
+        asked, chosen=(*asked.chosen, Chosen(tuple(joined), frozenset(keys))), since_ns=max(since_ns, asked.since_ns or 0),
         until_ns=until_ns if asked.until_ns is None else min(until_ns, asked.until_ns),
     )  # fmt: skip
 

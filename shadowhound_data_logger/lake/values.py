@@ -213,7 +213,7 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
     findings = Findings() if findings is None else findings
     source = source or query.default_source()
     flags = {**flags, 'sensor': sensor}
-    asked = wanted(time.time_ns(), **flags)
+    asked = query.labelled(source, wanted(time.time_ns(), **flags), findings)
     with query.answering():
         frame = query.objects(source, findings=findings, **flags).select(*_OBJECT, 't_start')
         rows = frame.to_arrow().cast(narrow([*_OBJECT, 't_start'])).combine_chunks()
@@ -228,10 +228,11 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
             unread += 1
         else:
             found += [Range(rows['robot'][number].as_py(), sensor, *each) for each in some]
-    within = asked.spans
     joined = _joined_ranges(found, round(join_s * SECOND))
+    for chosen in asked.chosen:
+        joined = joined if chosen.keys else _clipped(joined, chosen.spans)
     padded = _joined_ranges((replace(each, since_ns=each.since_ns - round(pad_s * SECOND), until_ns=each.until_ns + round(
-        pad_s * SECOND)) for each in _clipped(joined, within)), 0) if pad_s else _clipped(joined, within)  # fmt: skip
+        pad_s * SECOND)) for each in joined), 0) if pad_s else joined  # fmt: skip
     return ValueAnswer(tuple(padded), len(rows), len(to_open), unread, tuple(_freshness(source, asked, rows, findings)),
                   () if found or not told.is_lacking(expression) else tuple(_fields_of(source, asked, findings)))  # fmt: skip
 
@@ -451,9 +452,7 @@ def _joined_ranges(found: Iterable[Range], apart_ns: int) -> list[Range]:
 
 
 def _clipped(found: Iterable[Range], within: Sequence[TimeSpan]) -> list[Range]:
-    """What of them lies in the ranges that were given, if any were; messages are then those of all of a range."""
-    if not within:
-        return list(found)
+    """What of them lies in the ranges that were given; messages are then those of all of a range."""
     clipped = []
     for each in found:
         for span in within:

@@ -1,0 +1,239 @@
+"""``shadowhound-data label``: what people say of the data, kept beside them in layers that are never changed."""
+
+from __future__ import annotations
+
+import getpass
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from shadowhound_data_logger.cli.common import (
+    BadUsage,
+    ExitCode,
+    as_json,
+    examples,
+    exit_code,
+    robot_name,
+    store_hint,
+    the_store,
+    the_store_settings,
+)
+from shadowhound_data_logger.cli.output import (
+    counted,
+    number,
+    plain,
+    plain_table,
+    print_json,
+    print_lines,
+    print_page,
+    shown_time,
+)
+from shadowhound_data_logger.cli.question import asking, quietly, ranges_option, tell_left_out
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.times import moment
+from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, visible
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.lake.labels import Label
+
+SHOWN: Final = 100
+_robot = click.option('--robot', metavar='NAME', callback=robot_name, help='Whose data  [default: SHADOWHOUND_ROBOT]')
+_by = click.option('--by', metavar='NAME', help='Who says so  [default: the user of this machine]')
+
+
+@click.group(epilog=examples('label add stairs --robot thor --since 2026-11-20T12:30 --until 2026-11-20T12:31', 'label list'))
+def label() -> None:
+    """Label times, objects and boxes in pictures.
+
+    Labels lie in the store, beside what they are about. Nothing is overwritten: a removal is added, too. `query`, `fetch`,
+    `search` and `export` take --label NAME.
+    """
+
+
+@label.command(
+    'add',
+    epilog=examples(
+        'label add stairs --robot thor --since 2026-11-20T12:30 --until 2026-11-20T12:31 --note "the cellar"',
+        'label add person --robot thor --key thor/camera/20261120/123005_front.jpg --box 40,60,120,300',
+        'label add bump --robot thor --ranges bumps.json',
+    ),
+)
+@click.argument('name')
+@_robot
+@click.option('--since', metavar='TIME', help='From then on: 2h, 2026-11-20T12:30 (UTC).')
+@click.option('--until', metavar='TIME', help='Until then, which is included.')
+@click.option('--key', metavar='KEY', help='Of this object instead, as `query --format keys` prints it.')
+@click.option('--box', metavar='X,Y,W,H', help='Of this box in it, in pixels from the left upper corner.')
+@ranges_option
+@click.option('--note', default='', metavar='TEXT', help='Why, or what else there is to say.')
+@_by
+@as_json
+def label_add(*, name: str, robot: str | None, since: str | None, until: str | None, key: str | None, box: str | None,  # noqa: PLR0913 - one an option
+              ranges: list[Any] | None, note: str, by: str | None, as_json: bool) -> ExitCode:  # fmt: skip
+    """Label a time, an object, or the times of an answer."""
+    ways = (bool(since and until), key is not None, ranges is not None)
+    if sum(ways) != 1 or bool(since) != bool(until) or (box and not key):
+        raise BadUsage('give either --since and --until, or --key, or --ranges; --box goes with --key', 'label add --help')
+    with asking():
+        from shadowhound_data_logger.lake.labels import Label  # noqa: PLC0415
+        from shadowhound_data_logger.lake.select import spans_of  # noqa: PLC0415
+
+        of: dict[str, Any] = {'label': name, 'note': note}
+        if ranges is not None:
+            found = [Label(robot=span.robot or _named(robot), since_ns=span.since_ns, until_ns=span.until_ns, **of)
+                     for span in spans_of(ranges)]  # fmt: skip
+        elif key is not None:
+            bucket, key = _place(key, _named(robot))
+            found = [Label(robot=_named(robot), since_ns=0, until_ns=0, bucket=bucket, key=key, **{**of, **_box(box)})]
+        else:
+            now_ns = SystemClock.of_this_machine().wall_ns()
+            found = [Label(robot=_named(robot), since_ns=moment('--since', since or '', now_ns),
+                           until_ns=moment('--until', until or '', now_ns), **of)]  # fmt: skip
+    return _add(found, by, is_json=as_json)
+
+
+@label.command('import', epilog=examples('label import labels.csv --robot thor', 'label import coco.json'))
+@click.argument('file', type=click.File('rb'))
+@_robot
+@_by
+@as_json
+def label_import(*, file: Any, robot: str | None, by: str | None, as_json: bool) -> ExitCode:
+    """Import labels from a CSV, or boxes from a COCO file.
+
+    A CSV names its columns: label, since and until, or key; and any of robot bucket x y width height note. The file names of a
+    COCO file are keys, as `fetch` lays pictures out. Exit code 1 when the catalogue lacks one of them: the others are imported.
+    """
+    body = file.read(MOST_DOCUMENT_BYTES + 1)
+    now_ns = SystemClock.of_this_machine().wall_ns()
+    robot = robot or os.environ.get('SHADOWHOUND_ROBOT') or ''
+    with asking():
+        from shadowhound_data_logger.lake import labels  # noqa: PLC0415
+
+        is_json = body.lstrip()[:1] == b'{'
+        found = labels.from_coco(body, robot) if is_json else labels.from_csv(body, robot or _only_robot(), now_ns)
+    return _add(found, by, is_json=as_json)
+
+
+@label.command('list', epilog=examples('label list', 'label list --label stairs --json'))
+@_robot
+@click.option('--label', 'name', metavar='NAME', help='Of this name.')
+@as_json
+def label_list(*, robot: str | None, name: str | None, as_json: bool) -> ExitCode:
+    """Show the labels that stand."""
+    with asking():
+        from shadowhound_data_logger.lake import labels  # noqa: PLC0415
+        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+        left_out, source = quietly(), default_source(the_store_settings())
+        found = labels.read(source, robot, label=name, findings=left_out)
+    if as_json:
+        print_json([asdict(each) for each in found])
+        return tell_left_out(left_out)
+    table = plain_table('', _COLUMNS, _COLUMNS)
+    table.title = None
+    for each in found[:SHOWN]:
+        of = each.key or ''
+        if each.box is not None:
+            of += ' ' + ','.join(f'{side:g}' for side in each.box)
+        table.add_row(*map(plain, (each.id, each.robot, each.label, shown_time(each.since_ns), shown_time(each.until_ns), of,
+                                   each.by, each.note)))  # fmt: skip
+    print_page(*([table] if found else [plain(f'There are no labels in {source.describe()}.{store_hint()}')]))
+    if len(found) > SHOWN:
+        click.echo(f'{number(len(found))} labels; the first {SHOWN} are shown (--json has all)')
+    return tell_left_out(left_out)
+
+
+_COLUMNS: Final = ('id', 'robot', 'label', 'from (UTC)', 'to (UTC)', 'object', 'by', 'note')
+
+
+@label.command('remove', epilog=examples('label remove 3f2a9c0d11e45b67', 'label remove --label stairs --robot thor'))
+@click.argument('ids', nargs=-1)
+@_robot
+@click.option('--label', 'name', metavar='NAME', help='All of this name.')
+@_by
+@as_json
+def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, by: str | None, as_json: bool) -> ExitCode:
+    """Remove labels, by their ids or all of a name.
+
+    A layer says so; what was said before stays in the store. Exit code 1 when an id is not there.
+    """
+    if bool(ids) == bool(name):
+        raise BadUsage('give either ids or --label', 'shadowhound-data label list')
+    with asking():
+        from shadowhound_data_logger.lake import labels  # noqa: PLC0415
+        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+        left_out = quietly()
+        standing = labels.read(default_source(the_store_settings()), robot, label=name, findings=left_out)
+    found = [each for each in standing if name or each.id in ids]
+    unknown = sorted(set(ids) - {each.id for each in found})
+    with the_store() as store:
+        keys = [labels.write(store, of, some, by=by or _me(), is_removal=True) for of, some in labels.by_robot(found)]
+    if as_json:
+        print_json({'removed': len(found), 'unknown': unknown, 'layers': keys})
+    else:
+        print_lines(
+            f'{counted(len(found), "label")} removed.', *(f'{visible(each)} is not the id of a label.' for each in unknown)
+        )
+    return exit_code(finding=unknown or tell_left_out(left_out))
+
+
+def _add(found: Sequence[Label], by: str | None, *, is_json: bool) -> ExitCode:
+    from shadowhound_data_logger.lake import labels  # noqa: PLC0415
+    from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+    left_out = quietly()
+    with asking():
+        kept, absent = labels.timed(default_source(the_store_settings()), found, left_out)
+        checked = [each.checked() for each in kept]
+        with the_store() as store:
+            keys = [labels.write(store, robot, some, by=by or _me()) for robot, some in labels.by_robot(checked)]
+    if is_json:
+        print_json({'added': len(checked), 'ids': [each.id for each in checked], 'absent': absent, 'layers': keys})
+    else:
+        print_lines(f'{counted(len(checked), "label")} added, in {counted(len(keys), "layer")}.',
+                    *(f'{visible(key)} is not in the catalogue.' for key in absent[:SHOWN]))  # fmt: skip
+    return exit_code(finding=absent or tell_left_out(left_out))
+
+
+def _me() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError, ImportError):  # a container without an entry for its user
+        return 'unknown'
+
+
+def _named(robot: str | None) -> str:
+    return robot or os.environ.get('SHADOWHOUND_ROBOT') or _only_robot()
+
+
+def _only_robot() -> str:
+    """The one that the store has. Raises BadUsage where there are several."""
+    from shadowhound_data_logger.lake.live_files import robots  # noqa: PLC0415
+    from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+    found = robots(default_source(the_store_settings()))
+    if len(found) != 1:
+        raise BadUsage(f'which robot? The store has {", ".join(found) or "none"}', '--robot NAME')
+    return found[0]
+
+
+def _place(key: str, robot: str) -> tuple[str, str]:
+    """Bucket and key of an object, which may be told as BUCKET/KEY."""
+    from shadowhound_data_logger.catalogue.schema import BUCKET  # noqa: PLC0415
+
+    bucket, _, rest = key.partition('/')
+    return (BUCKET, key) if bucket == robot else (bucket, rest)
+
+
+def _box(text: str | None) -> Mapping[str, float]:
+    if text is None:
+        return {}
+    try:
+        x, y, width, height = map(float, text.split(','))
+    except ValueError:
+        raise BadUsage(f'--box {text} is not a box', 'x,y,width,height in pixels, such as 40,60,120,300') from None
+    return {'x': x, 'y': y, 'width': width, 'height': height}

@@ -1,0 +1,255 @@
+"""Labels: what people say of a time, of an object, or of a box in a picture, in layers that are never changed.
+
+A layer is a Parquet part at ``<robot>/_labels/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<digest>.parquet``; the date is the one
+on which it was made, UTC. Each of its rows adds a label or removes one. What a label says gives its ``id``, so the same label is
+there once however often it is imported, and of several rows about it the newest counts: a removal is a row, too.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import math
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from shadowhound_data_logger.catalogue import parts
+from shadowhound_data_logger.catalogue.labels import LABEL, LABELS, MOST_TEXT, REMOVED
+from shadowhound_data_logger.catalogue.schema import BUCKET, Row
+from shadowhound_data_logger.clock import utc
+from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.keys import check_name, is_name
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.live_files import days, robots
+from shadowhound_data_logger.lake.reading import tables
+from shadowhound_data_logger.lake.select import TimeSpan
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.times import moment
+from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json, is_path
+
+MOST_IN_LAYER: Final = 50_000
+_BOX: Final = ('x', 'y', 'width', 'height')
+_CSV: Final = frozenset({'label', 'since', 'until', 'robot', 'bucket', 'key', 'note', *_BOX})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Label:
+    """What somebody says of a time of a robot, both ends included; of an object where it has a key, of a box in it in pixels."""
+
+    robot: str
+    label: str
+    since_ns: int
+    until_ns: int
+    bucket: str | None = None
+    key: str | None = None
+    x: float | None = None
+    y: float | None = None
+    """Of the left upper corner, from that of the picture."""
+    width: float | None = None
+    height: float | None = None
+    note: str = ''
+    by: str = ''
+    made_ns: int = 0
+    id: str = ''
+    """Follows from what it says; who says so, when and why are not in it."""
+
+    @property
+    def box(self) -> tuple[float, float, float, float] | None:
+        """x, y, width and height; None where it is about all of the object."""
+        if self.x is None or self.y is None or self.width is None or self.height is None:
+            return None
+        return self.x, self.y, self.width, self.height
+
+    def checked(self) -> Label:
+        """With its id. Raises SettingError, NameRefused for what is no label."""
+        check_name(self.robot, 'the robot name')
+        if not self.label.strip() or len(self.label) > MOST_TEXT or not self.label.isprintable():
+            raise SettingError('label', self.label[:80], f'a text on one line, of at most {MOST_TEXT} letters')
+        if len(self.note) > 10 * MOST_TEXT:
+            raise SettingError('note', self.note[:80], f'a text of at most {10 * MOST_TEXT:,} letters')
+        if not 0 <= self.since_ns <= self.until_ns < 1 << 63:
+            raise SettingError('until', self.until_ns, f'a time after since, which is {self.since_ns}')
+        box = [getattr(self, name) for name in _BOX]
+        are_sides = all(one is not None and math.isfinite(one) for one in box) and self.key is not None and min(box[2:]) > 0
+        if not are_sides and any(one is not None for one in box):
+            raise SettingError('box', box, 'x, y, width and height in pixels, of an object')
+        if self.key is not None and not (
+            is_path(self.key) and self.key.startswith(f'{self.robot}/') and is_name(self.bucket or '')
+        ):
+            raise SettingError('key', self.key[:200], f'the key of an object of {self.robot}, which begins with {self.robot}/')
+        said = [self.robot, self.label, self.since_ns, self.until_ns, self.bucket, self.key, *box]
+        return replace(self, id=hashlib.blake2b('\0'.join(map(str, said)).encode(), digest_size=8).hexdigest())
+
+
+_FIELDS: Final = tuple(each.name for each in fields(Label))
+
+
+def write(store: ObjectStore, robot: str, found: Sequence[Label], *, by: str, is_removal: bool = False) -> str:
+    """Put a layer that adds these labels of one robot, or removes them; returns its key. Raises SettingError, StoreError."""
+    if not 0 < len(found) <= MOST_IN_LAYER:
+        raise SettingError('labels', len(found), f'1 to {MOST_IN_LAYER:,} at a time')
+    made_ns = time.time_ns()
+    rows: list[Row] = []
+    for each in found:
+        one = each.checked()
+        said = {name: getattr(one, name) for name in _FIELDS}
+        rows.append({**said, 'what': REMOVED if is_removal else LABEL, 'by': by, 'made_ns': made_ns, 'made': made_ns // 1000,
+                     'format_version': 1})  # fmt: skip
+    body = parts.encode(rows, LABELS)
+    digest = hashlib.blake2b(body, digest_size=8).hexdigest()
+    made = utc(made_ns)
+    key = LABELS.part_key(robot, f'{made:%Y-%m-%d}', f'{made:%Y%m%dT%H%M%S}_{digest}')
+    put_part(store, key, robot, body, len(rows))
+    return key
+
+
+def read(source: Bucket, robot: str | None = None, *, label: str | None = None, findings: Findings | None = None) -> list[Label]:
+    """The labels that stand, of one robot or of all, in the order of their times. Raises StoreError."""
+    findings = Findings() if findings is None else findings
+    named = [robot] if robot else robots(source)
+    with ThreadPoolExecutor(THREADS) as pool:
+        found = days(source, named, None, pool, findings, of=LABELS)
+    entries = [entry for day in sorted(found, key=lambda day: day.robot) for entry in day.entries]
+    newest: dict[tuple[str, str], Row] = {}
+    for table in tables(source, entries, tuple(LABELS.columns), findings, of=LABELS):
+        for row in table.to_pylist():
+            name = row['robot'], row['id']
+            if name not in newest or (row['made_ns'], row['what']) > (newest[name]['made_ns'], newest[name]['what']):
+                newest[name] = row
+    standing = (row for row in newest.values() if row['what'] == LABEL and label in {None, row['label']})
+    labels = (Label(**{name: row[name] for name in _FIELDS if row[name] is not None}) for row in standing)
+    return sorted(labels, key=lambda each: (each.robot, each.since_ns, each.label, each.id))
+
+
+def spans(found: Iterable[Label]) -> tuple[list[TimeSpan], list[tuple[str, str]]]:
+    """What is labelled: times, and (bucket, key) of objects."""
+    times, keys = [], []
+    for each in found:
+        if each.key is None:
+            times.append(TimeSpan(each.robot, each.since_ns, each.until_ns))
+        else:
+            keys.append((each.bucket or BUCKET, each.key))
+    return times, keys
+
+
+def column(rows: pa.Table, found: Sequence[Label]) -> list[list[str]]:
+    """For each row of the catalogue the labels of its object: those of its key, and of times into which it reaches."""
+    of_keys: dict[tuple[str, str], set[str]] = {}
+    said: list[set[str]] = [set() for _ in range(len(rows))]
+    first = pc.fill_null(rows['t_start_ns'], -1).to_numpy()
+    last = np.maximum(first, pc.fill_null(rows['t_end_ns'], -1).to_numpy())
+    robots_of = np.array(rows['robot'].to_pylist(), object)
+    for each in found:
+        if each.key is not None:
+            of_keys.setdefault((each.bucket or BUCKET, each.key), set()).add(each.label)
+            continue
+        for place in np.flatnonzero(
+            (robots_of == each.robot) & (first <= each.until_ns) & (last >= each.since_ns) & (first >= 0)
+        ):
+            said[int(place)].add(each.label)
+    if of_keys:
+        for number, name in enumerate(zip(rows['bucket'].to_pylist(), rows['key'].to_pylist(), strict=True)):
+            said[number] |= of_keys.get(name, set())
+    return [sorted(each) for each in said]
+
+
+# -- files of labels -----------------------------------------------------------------------------------------------------------
+
+
+def from_csv(body: bytes, robot: str, now_ns: int) -> list[Label]:
+    """Rows with the columns ``label since until`` and maybe ``robot bucket key x y width height note``; times as of ``query``.
+
+    Of a row with a key the times may be empty: ``timed`` fills them in. Raises LakeError.
+    """
+    try:
+        check_size(len(body), MOST_DOCUMENT_BYTES)
+        reader = csv.DictReader(io.StringIO(body.decode('utf-8-sig')), strict=True)
+        _check_columns(reader.fieldnames or ())
+        return [_of_csv({name: value or '' for name, value in row.items() if name}, robot, now_ns) for row in reader]
+    except (ValueError, csv.Error, TypeError) as error:
+        raise LakeError(f'it is not a CSV of labels: {error}') from error
+
+
+def _check_columns(names: Iterable[str]) -> None:
+    if 'label' not in names or set(names) - _CSV:
+        raise ValueError(f'its first line has to name the columns: label, and any of {" ".join(sorted(_CSV - {"label"}))}')
+
+
+def _of_csv(row: Mapping[str, str], robot: str, now_ns: int) -> Label:
+    key = row.get('key') or None
+    if key is None and not (row.get('since') and row.get('until')):
+        raise ValueError(f'the label {row["label"]!r} has neither since and until nor a key')
+    since_ns, until_ns = (moment(name, row[name], now_ns) if row.get(name) else 0 for name in ('since', 'until'))
+    x, y, width, height = (float(row[name]) if row.get(name) else None for name in _BOX)
+    return Label(robot=row.get('robot') or robot, label=row['label'], since_ns=since_ns, until_ns=until_ns,
+                 bucket=(row.get('bucket') or BUCKET) if key else None, key=key, x=x, y=y, width=width, height=height,
+                 note=row.get('note', ''))  # fmt: skip
+
+
+def from_coco(body: bytes, robot: str) -> list[Label]:
+    """The boxes of a COCO file whose ``file_name`` are keys, as ``fetch`` lays pictures out; without times. Raises LakeError.
+
+    https://cocodataset.org/#format-data: ``bbox`` is x, y, width, height from the left upper corner, in pixels.
+    """
+    try:
+        told = from_json(body)
+        names = {one['id']: str(one['name']) for one in told['categories']}
+        keys = {one['id']: str(one['file_name']) for one in told['images']}
+        found = []
+        for one in told['annotations']:
+            x, y, width, height = (float(side) for side in one['bbox'])
+            key = keys[one['image_id']]
+            found.append(Label(robot=robot or key.partition('/')[0], label=names[one['category_id']], since_ns=0, until_ns=0,
+                               bucket=BUCKET, key=key, x=x, y=y, width=width, height=height))  # fmt: skip
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise LakeError(
+            f'it is not a COCO file of boxes: {" ".join(str(error).split())[:200] or type(error).__name__}'
+        ) from error
+    return found
+
+
+def timed(source: Bucket, found: Sequence[Label], findings: Findings) -> tuple[list[Label], list[str]]:
+    """Labels of objects with the times of those, and the keys that the catalogue does not have. Raises StoreError."""
+    from shadowhound_data_logger.lake import query  # noqa: PLC0415 - which asks for labels, too
+
+    wanted_keys = {(each.bucket, each.key) for each in found if each.key is not None}
+    if not wanted_keys:
+        return list(found), []
+    times: dict[tuple[str, str], tuple[int, int]] = {}
+    for robot in sorted({each.robot for each in found}):
+        rows = query.objects(source, findings=findings, robot=robot).select('bucket', 'key', 't_start_ns', 't_end_ns').to_arrow()
+        rows = rows.filter(
+            pc.is_in(rows['key'].cast(pa.string()), value_set=pa.array([key for _, key in wanted_keys], pa.string()))
+        )
+        for bucket, key, first, last in zip(*(each.to_pylist() for each in rows.columns), strict=True):
+            if first is not None:
+                times[bucket, key] = first, first if last is None else max(first, last)
+    kept, absent = [], []
+    for each in found:
+        if each.key is None:
+            kept.append(each)
+        elif (each.bucket or BUCKET, each.key) in times:
+            since_ns, until_ns = times[each.bucket or BUCKET, each.key]
+            kept.append(replace(each, since_ns=since_ns, until_ns=until_ns))
+        else:
+            absent.append(each.key)
+    return kept, absent
+
+
+def by_robot(found: Iterable[Label]) -> Iterator[tuple[str, list[Label]]]:
+    """The labels of each robot, at most ``MOST_IN_LAYER`` at a time."""
+    grouped: dict[str, list[Label]] = {}
+    for each in found:
+        grouped.setdefault(each.robot, []).append(each)
+    for robot, some in grouped.items():
+        for start in range(0, len(some), MOST_IN_LAYER):
+            yield robot, some[start : start + MOST_IN_LAYER]
