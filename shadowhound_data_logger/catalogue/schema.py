@@ -87,12 +87,14 @@ class TableSchema:
 OBJECTS: Final = TableSchema(SENSOR, COLUMNS, REQUIRED, {'shadowhound.catalog': str(FORMAT_VERSION)})
 ON_ROBOT, LOST = 'robot', 'lost'
 """The values of ``where``."""
-KEPT: Final = TableSchema('_kept', {**COLUMNS, 'where': STRING}, (*REQUIRED, 'where'), {'shadowhound.kept': str(FORMAT_VERSION)})
+KEPT: Final = TableSchema(
+    '_kept', {**COLUMNS, 'where': STRING, 'reason': STRING}, (*REQUIRED, 'where'), {'shadowhound.kept': str(FORMAT_VERSION)}
+)
 """What robots keep until somebody asks for it: rows as of the catalogue, and ``where`` each object is.
 
-``robot``: on the robot's disk. ``lost``: it was evicted there, or refused. A row of the same object in the catalogue, which says
-that the store has it, supersedes both, and ``lost`` supersedes ``robot``, whatever comes first. Readers of the catalogue that
-know nothing of this table see only what the store has.
+``robot``: on the robot's disk. ``lost``: it was evicted there, or refused; ``reason`` says why. A row of the same object in the
+catalogue, which says that the store has it, supersedes both, and ``lost`` supersedes ``robot``, whatever comes first. Readers of
+the catalogue that know nothing of this table see only what the store has.
 """
 GAPS_FOLDER: Final = '_gaps'
 """Of the gap journal's parts."""

@@ -118,17 +118,18 @@ class CatalogueWriter:
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
             index.open()
             listed = index.untold(MOST_ROWS)
-        there = {(item.id, state) for state, item in listed}
+        there = {(item.id, state) for state, _, item in listed}
         self._told = [told for told in self._told if told <= there]
         handed = frozenset[tuple[int, str]]().union(*self._told)
-        new = [(state, item) for state, item in listed if (item.id, state) not in handed]
+        new = [each for each in listed if (each[2].id, each[0]) not in handed]
         rows = [
-            (place, {**row_of(item.bucket, item.key, item.size, item.content_type, item.metadata), 'where': _WHERE[state]})
-            for place, (state, item) in enumerate(new)
-        ]
+            (place, {**row_of(item.bucket, item.key, item.size, item.content_type, item.metadata), 'where': _WHERE[state],
+                     'reason': reason if _WHERE[state] == LOST else None})
+            for place, (state, reason, item) in enumerate(new)
+        ]  # fmt: skip
         made = []
         for robot, date, found in parts.by_folder(rows):
-            told = tuple((new[place][1].id, new[place][0]) for place, _ in found)
+            told = tuple((new[place][2].id, new[place][0]) for place, _ in found)
             part = self._part(robot, date, found, KEPT)
             made.append(replace(part, catalogues=(), tells=told))
             self._told.append(frozenset(told))

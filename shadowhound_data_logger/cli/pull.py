@@ -5,12 +5,14 @@ from __future__ import annotations
 import getpass
 import re
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any, Final
 
 import click
 
+from shadowhound_data_logger.catalogue.schema import LOST, ON_ROBOT
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
 from shadowhound_data_logger.cli.output import number, plain, plain_table, print_json, print_page, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
@@ -64,13 +66,16 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
                 click.echo(f'Asked {robot} to leave request {cancel}.', err=True)
                 return ExitCode.FINE
             want = _want(source, robot, flags, bag, left_out)
-            found = lake.kept(source, robot, want, left_out)
-            said = {'robot': robot, 'objects': len(found), 'bytes': sum(found['bytes'].to_pylist()), 'want': want.to_json()}
+            rows = lake.known(source, robot, want, left_out).select(('bytes', 'where', 'reason')).to_pylist()
+            found = [row for row in rows if row['where'] == ON_ROBOT]
+            lost = Counter(row['reason'] or 'unknown' for row in rows if row['where'] == LOST)
+            said = {'robot': robot, 'objects': len(found), 'bytes': sum(row['bytes'] for row in found), 'lost': dict(lost),
+                    'want': want.to_json()}  # fmt: skip
             if not as_json:
-                click.echo(f'{robot} keeps {number(said["objects"])} such objects, {volume(said["bytes"])}.')
+                click.echo(_found_sentence(said))
             answer: dict[str, Any] | None = None
             said['id'] = None
-            if not dry_run and len(found):
+            if not dry_run and found:
                 request = lake.ask(store, source, robot, want, by=name, priority=priority, expiry_ns=_expiry_ns(expires))
                 said['id'] = request.id
                 if not as_json:
@@ -81,6 +86,15 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
         print_json({**said, 'answer': answer})
     code = tell_left_out(left_out)
     return exit_code(finding=code is not ExitCode.FINE or (answer is not None and _is_finding(answer)))
+
+
+def _found_sentence(said: Mapping[str, Any]) -> str:
+    """What the robot keeps, and what it has lost."""
+    text = f'{said["robot"]} keeps {number(said["objects"])} such objects, {volume(said["bytes"])}'
+    if said['lost']:
+        reasons = ', '.join(f'{reason} {count:,}' for reason, count in said['lost'].items())
+        text += f'; {sum(said["lost"].values()):,} are lost ({visible(reasons)})'
+    return f'{text}.'
 
 
 class _Told:

@@ -76,6 +76,12 @@ class PullState:
 
 def kept(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa.Table:
     """Rows of what a robot keeps and the filter takes, with the columns of ``catalogue.schema.KEPT``. Raises StoreError."""
+    rows = known(source, robot, want, findings)
+    return rows.filter(pc.equal(rows['where'], ON_ROBOT))
+
+
+def known(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa.Table:
+    """The same, and rows of what it has lost. Raises StoreError."""
     early = Wanted(robot=robot, since_ns=None if want.since_ns is None else want.since_ns - _DAY_NS, until_ns=want.until_ns)
     with ThreadPoolExecutor(THREADS) as pool:
         found = days(source, [robot], early.dates(time.time_ns()), pool, findings, early.has_date, KEPT)
@@ -84,7 +90,6 @@ def kept(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa
     stored = [entry for day in folders(source, early, findings) for entry in day.entries]
     keys = pa.concat_tables([arrow_schema().empty_table().select(KEY), *tables(source, stored, KEY, findings)])
     rows = superseding(rows, keys)
-    rows = rows.filter(pc.equal(rows['where'], ON_ROBOT))
     return rows.filter(pa.array([_takes(want, row) for row in rows.to_pylist()], pa.bool_()))
 
 

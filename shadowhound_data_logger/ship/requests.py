@@ -31,7 +31,7 @@ from shadowhound_data_logger.mailbox import (
     read_entry,
 )
 from shadowhound_data_logger.model import DataObject, SpooledObject
-from shadowhound_data_logger.spool.request_table import ACTIVE, CANCELLED, DONE, EXPIRED, REFUSED, RequestRow
+from shadowhound_data_logger.spool.request_table import ACTIVE, CANCELLED, DONE, EXPIRED, REFUSED, KeptObject, RequestRow
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.worker import Worker
@@ -180,10 +180,14 @@ class RequestServer:
         answers = {request.id: known[request.id].answers if request.id in known else self._answers_before(request.id)
                    for request in new}  # fmt: skip
         chosen: dict[str, list[int]] = {request.id: [] for request in new}
+        gone: dict[str, list[KeptObject]] = {request.id: [] for request in new}
         for item in self._spool.kept():
             for request in new:
                 if request.want.takes(item.key, item.sensor, item.topic, item.t_start_ns, item.t_end_ns, item.metadata):
-                    chosen[request.id].append(item.id)
+                    if item.is_here:
+                        chosen[request.id].append(item.id)
+                    else:
+                        gone[request.id].append(item)
         now_ns = self._clock.wall_ns()
         for request in new:
             is_late = request.expires_ns <= now_ns
@@ -191,7 +195,7 @@ class RequestServer:
                 id=request.id, requester=request.by, priority=request.priority, made_ns=request.made_ns,
                 expires_ns=request.expires_ns, received_ns=now_ns, wanted=json.dumps(request.want.to_json()),
                 state=REFUSED if is_late else ACTIVE, why='it has expired already' if is_late else '',
-                answers=answers[request.id],
+                answers=answers[request.id], gone=json.dumps(_gone(gone[request.id])),
             ), [] if is_late else chosen[request.id])  # fmt: skip
             log.info('%s asks for %d objects that are kept (request %s)', row.requester, row.objects, row.id)
             yield row
@@ -263,7 +267,7 @@ class RequestServer:
             'state': 'accepted' if row.is_open and not row.told else 'sending' if row.is_open else row.state,
             'time': iso(now_ns), 'made_ns': row.made_ns, 'expires': iso(row.expires_ns), 'why': row.why,
             'want': json.loads(row.wanted),
-            'objects': row.objects, 'bytes': row.bytes,
+            'objects': row.objects, 'bytes': row.bytes, 'gone': json.loads(row.gone),
             'outcomes': {state: {'objects': count, 'bytes': size} for state, (count, size) in progress.outcomes.items()},
             'lost': [{'key': key, 'state': state, 'reason': reason, 'when': iso(settled_ns) if settled_ns else None}
                      for key, state, reason, settled_ns in progress.lost],
@@ -273,3 +277,15 @@ class RequestServer:
             content_type='application/json', sensor=ANSWERS, topic=None, type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns,
             priority=0, protected=True, metadata={words.ROBOT: self._robot}, answers=(row.id, number, row.state),
         ))  # fmt: skip
+
+
+def _gone(items: Sequence[KeptObject]) -> dict[str, Any]:
+    """What of a request left the robot for good before it was asked for: how much, why, of when, and when it went."""
+    if not items:
+        return {}
+    return {
+        'objects': len(items), 'bytes': sum(item.bytes for item in items),
+        'reasons': dict(Counter(f'{item.state}: {item.reason}' for item in items).most_common(8)),
+        'from': iso(min(item.t_start_ns for item in items)), 'to': iso(max(item.t_end_ns for item in items)),
+        'went': iso(max(item.settled_ns for item in items)),
+    }  # fmt: skip

@@ -584,14 +584,14 @@ class Index:
         self._db.executemany('DELETE FROM uncatalogued WHERE id = ?', ((number,) for number in ids))
         return True
 
-    def untold(self, limit: int) -> list[tuple[str, UncataloguedObject]]:
-        """What the table of what is kept lacks: ``kept`` or ``lost``, and the object; the oldest first."""
+    def untold(self, limit: int) -> list[tuple[str, str | None, UncataloguedObject]]:
+        """What the table of what is kept lacks: ``kept`` or ``lost``, why, and the object; the oldest first."""
         rows = self._db.execute(
-            'SELECT untold.state, id, bucket, key, bytes, content_type, metadata FROM untold JOIN objects USING (id)'
+            'SELECT untold.state, reason, id, bucket, key, bytes, content_type, metadata FROM untold JOIN objects USING (id)'
             ' ORDER BY id LIMIT ?', (limit,),
         )  # fmt: skip
-        return [(state, UncataloguedObject(number, bucket, key, size, content_type, json.loads(metadata)))
-                for state, number, bucket, key, size, content_type, metadata in rows]  # fmt: skip
+        return [(state, reason, UncataloguedObject(number, bucket, key, size, content_type, json.loads(metadata)))
+                for state, reason, number, bucket, key, size, content_type, metadata in rows]  # fmt: skip
 
     def take_untold(self, told: Collection[tuple[int, str]]) -> bool:
         """As ``take_uncatalogued``, of rows of the table of what is kept."""

@@ -12,10 +12,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
+from shadowhound_data_logger import metadata_words as words
+
 ACTIVE, DONE, EXPIRED, CANCELLED, REFUSED = 'active', 'done', 'expired', 'cancelled', 'refused'
 """States of a request; all but the first are final."""
 _COLUMNS: Final = (
-    'id, requester, priority, made_ns, expires_ns, received_ns, wanted, state, why, objects, bytes, answers, told, told_ns'
+    'id, requester, priority, made_ns, expires_ns, received_ns, wanted, state, why, objects, bytes, gone, answers, told, told_ns'
 )
 _HERE: Final = "('kept', 'pending')"
 
@@ -38,6 +40,8 @@ class RequestRow:
     objects: int = 0
     """That it found."""
     bytes: int = 0
+    gone: str = '{}'
+    """JSON: what it would have found, had that not left before (``ship/requests.py``)."""
     answers: int = 0
     """The number of the newest answer that is durable."""
     told: str = ''
@@ -62,6 +66,14 @@ class KeptObject(NamedTuple):
     t_start_ns: int
     t_end_ns: int
     metadata: Mapping[str, str]
+    state: str
+    reason: str
+    settled_ns: int
+    """When it was evicted, say; 0 of what is here."""
+
+    @property
+    def is_here(self) -> bool:
+        return self.state in {'kept', 'pending'}
 
 
 class Progress(NamedTuple):
@@ -105,23 +117,30 @@ class RequestTable:
         objects, size = self._db.execute(count, (row.id,)).fetchone()
         row = replace(row, objects=objects, bytes=size)
         self._db.execute(
-            f'INSERT OR REPLACE INTO requests ({_COLUMNS}) VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?)',  # noqa: S608 - own constants only
+            f'INSERT OR REPLACE INTO requests ({_COLUMNS}) VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',  # noqa: S608 - own constants only
             tuple(getattr(row, name) for name in _COLUMNS.split(', ')),
         )
         return row
 
-    def here(self, robot: str) -> Iterator[KeptObject]:
-        """What is kept of a robot, and what others have asked for and is not delivered yet, as it was spooled."""
-        columns = 'id, bucket, key, bytes, sensor, topic, t_start_ns, t_end_ns, metadata'
+    def known(self, robot: str) -> Iterator[KeptObject]:
+        """What is kept of a robot, what was asked for and is on its way, and what left for good within the last hour."""
+        columns = (
+            'id, bucket, key, bytes, sensor, topic, t_start_ns, t_end_ns, metadata, state, ifnull(reason, state),'
+            ' ifnull(settled_ns, 0)'
+        )
+        is_on_request = f"CASE WHEN json_valid(metadata) THEN json_extract(metadata, '$.{words.SHIP}') = '{words.ON_REQUEST}' END"
         query = (
             f"SELECT {columns} FROM objects WHERE state = 'kept' AND key >= ?1 AND key < ?2 UNION SELECT {columns} FROM objects"  # noqa: S608
             " WHERE state = 'pending' AND id IN (SELECT id FROM requested WHERE outcome = 'pending') AND key >= ?1 AND key < ?2"
-            ' ORDER BY id'
+            f" UNION SELECT {columns} FROM objects WHERE state IN ('evicted', 'quarantined') AND {is_on_request}"
+            ' AND key >= ?1 AND key < ?2 ORDER BY id'
         )
-        for number, bucket, key, size, sensor, topic, start_ns, end_ns, metadata in self._db.execute(
-            query, (f'{robot}/', f'{robot}0')
-        ):
-            yield KeptObject(number, bucket, key, size, sensor, topic, start_ns, end_ns, json.loads(metadata))
+        for (number, bucket, key, size, sensor, topic, start_ns, end_ns, said, state, reason,
+             settled_ns) in self._db.execute(query, (f'{robot}/', f'{robot}0')):  # fmt: skip
+            metadata = json.loads(said)
+            yield KeptObject(
+                number, bucket, key, size, sensor, topic, start_ns, end_ns, metadata, state, reason, settled_ns
+            )  # fmt: skip
 
     def close(self, request: str, state: str, why: str) -> None:
         """What it has not released is nobody's any more, as far as this request goes."""

@@ -144,13 +144,17 @@ CREATE TRIGGER kept_lost AFTER UPDATE OF state ON objects
     WHEN NEW.state IN {_LOST} AND OLD.state <> NEW.state AND {_IS_ON_REQUEST} BEGIN
   INSERT OR IGNORE INTO untold VALUES (NEW.id, 'lost');
 END;
+CREATE TRIGGER never_kept AFTER INSERT ON objects WHEN NEW.state IN {_LOST} AND {_IS_ON_REQUEST} BEGIN
+  INSERT OR IGNORE INTO untold VALUES (NEW.id, 'lost');
+END;
 CREATE TRIGGER kept_forgotten AFTER DELETE ON objects BEGIN
   DELETE FROM untold WHERE id = OLD.id;
 END;
 CREATE TABLE requests (
   id TEXT NOT NULL PRIMARY KEY, requester TEXT NOT NULL, priority INTEGER NOT NULL, made_ns INTEGER NOT NULL,
   expires_ns INTEGER NOT NULL, received_ns INTEGER NOT NULL, wanted TEXT NOT NULL, state TEXT NOT NULL, why TEXT NOT NULL,
-  objects INTEGER NOT NULL, bytes INTEGER NOT NULL, answers INTEGER NOT NULL, told TEXT NOT NULL, told_ns INTEGER NOT NULL)
+  objects INTEGER NOT NULL, bytes INTEGER NOT NULL, gone TEXT NOT NULL,
+  answers INTEGER NOT NULL, told TEXT NOT NULL, told_ns INTEGER NOT NULL)
   WITHOUT ROWID;
 CREATE TABLE requested (
   request TEXT NOT NULL, id INTEGER NOT NULL, bytes INTEGER NOT NULL, outcome TEXT NOT NULL,
@@ -466,7 +470,7 @@ _TEXTS: Final = {
     'statistics': (),
     'recordings': ('owner', 'folder', 'said', 'channels'),
     'untold': ('state',),
-    'requests': ('id', 'requester', 'wanted', 'state', 'why', 'told'),
+    'requests': ('id', 'requester', 'wanted', 'state', 'why', 'gone', 'told'),
     'requested': ('request', 'outcome'),
     'slices': ('owner', 'folder', 'sha256', 'counts'),
     'missing': ('owner', 'folder', 'file', 'what', 'topic', 'reason'),
@@ -474,7 +478,7 @@ _TEXTS: Final = {
 }
 _JSON: Final = {
     'accounts': ('rejected', 'dropped'), 'publishers': ('missed',), 'estimates': ('missed',), 'objects': ('metadata',),
-    'requests': ('wanted',),
+    'requests': ('wanted', 'gone'),
 }  # fmt: skip
 _UNSAFE: Final = (
     "length(key) > 1024 OR length(bucket) > 64 OR bucket GLOB '*[^A-Za-z0-9_.-]*' OR bucket IN ('', '.', '..')"

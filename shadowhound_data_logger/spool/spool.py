@@ -267,10 +267,13 @@ class Spool:
         return self._view.requests.released()
 
     def kept(self) -> Iterator[KeptObject]:
-        """What is kept of this robot, and what was released and is on its way. Waits for no commit; raises sqlite3.Error."""
+        """What is kept of this robot, was released and is on its way, or is lost since an hour. Waits for no commit.
+
+        Raises sqlite3.Error.
+        """
         with closing(Index(self.root / 'index.db', read_only=True)) as index:
             index.open()
-            yield from index.requests.here(self._robot)
+            yield from index.requests.known(self._robot)
 
     def accept(self, row: RequestRow, chosen: Iterable[int]) -> RequestRow:
         """Make a request a row, with what it chose of what is kept; returns the row as it is then. Raises as ``commit``."""

@@ -127,8 +127,12 @@ def test_what_is_lost_on_the_robot_is_told(field: Field) -> None:
     """A row of a loss supersedes that of what was kept, before and after compaction, and so does that of an arrival."""
     field.records(*range(8), size=200 << 10)
     assert field.kept() == [3, 4, 5, 6, 7]
-    run('pull', '--sensor', 'camera', '--until', '2025-10-18T12:00:04Z')
+    said = run('pull', '--sensor', 'camera', '--until', '2025-10-18T12:00:04Z')
+    assert (said['objects'], said['lost']) == (1, {'no_room': 3})
     field.passes()
+    answer = lake.newest_answer(field.source, 'thor', said['id'])
+    assert answer
+    assert (answer['gone']['objects'], answer['gone']['reasons']) == (3, {'evicted: no_room': 3})
     assert field.kept() == [4, 5, 6, 7]
     for _ in range(2):
         list(compact(field.source, field.store, before='2025-10-19', grace=None))

@@ -25,6 +25,7 @@ KEY = 'thor/camera/20251018/120000_front.jpg'
 WITHOUT_SHORT_ROWS = """
 DROP TABLE statistics; DROP TRIGGER statistics_told; DROP TRIGGER statistics_lost; DROP TRIGGER statistics_forgotten;
 DROP TRIGGER kept_here; DROP TRIGGER kept_again; DROP TRIGGER kept_lost; DROP TRIGGER kept_forgotten; DROP TRIGGER answered;
+DROP TRIGGER never_kept;
 DROP INDEX kept; DROP TABLE untold; DROP TABLE requests; DROP TABLE requested;
 DROP TABLE recordings; DROP TABLE slices; DROP TABLE missing;
 DROP TABLE folders; DROP TABLE compact_objects; DROP TABLE gaps_told;
