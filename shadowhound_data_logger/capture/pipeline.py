@@ -30,6 +30,7 @@ from shadowhound_data_logger.capture.front import Front
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.interface import Interface
 from shadowhound_data_logger.capture.keeping import Keeping, keeps_bag
+from shadowhound_data_logger.capture.link_track import LinkTrack
 from shadowhound_data_logger.capture.middleware import Middleware
 from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_observer import MissionObserver
@@ -126,10 +127,6 @@ class Pipeline:
         settings = self._settings
         self.writer = SpoolWriter(self.spool)
         self.uploader = Uploader(self.spool, self._store, settings.upload, self.writer.settle)
-        self._requests = self._make_request_server()
-        keeps = self._requests is not None
-        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, self._clock, keeps=keeps)
-        self.writer.on_commit(spooled=self.uploader.wake, settled=self._settled if keeps else self.uploader.settled)
         accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         place = BagPlace(settings.home / BAGS / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
                          self._record.offsets, keeps=partial(keeps_bag, settings.bag, settings.keep))  # fmt: skip
@@ -139,6 +136,10 @@ class Pipeline:
         queue, bag_queue = BatchQueue(settings.queue), BagQueue()
         sensors = {sensor.name: sensor for sensor in settings.sensors}
         track = RobotTrack(settings.mission, types, self._clock, node.resolve_topic_name)
+        self._make_request_server(track)
+        keeps = self._requests is not None
+        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, self._clock, keeps=keeps)
+        self.writer.on_commit(spooled=self.uploader.wake, settled=self._settled if keeps else self.uploader.settled)
         sampler = Sampler(sensors, accounts, types, self._clock, queue)
         accounts.oldest_open = sampler.oldest_open
         bags = BagConsumer(node, settings.bag, accounts, bag_queue)
@@ -217,6 +218,7 @@ class Pipeline:
         if not all(finished.values()):
             return
         self._ship_ledger()
+        self._look_at_link(is_last=True)
         self.writer.prompt = True
         self.writer.flush(1.0)
         end_s = time.monotonic() + self._settings.shutdown.drain_s
@@ -246,6 +248,7 @@ class Pipeline:
         self._name_held()
         self.recorder.look()
         self._spool_parts(self._catalogue.due)
+        self._look_at_link()
         self._tell()
         day = self._today()
         if day != self._day:
@@ -273,14 +276,18 @@ class Pipeline:
         self.uploader.set_max_mbps(settings.upload.max_mbps)
         self.event_buffer.update(settings.events)
 
-    def _make_request_server(self) -> RequestServer | None:
-        """None where nothing is kept until somebody asks for it."""
+    def _make_request_server(self, track: RobotTrack) -> None:
+        """Only where something is kept until somebody asks for it."""
+        self._requests: RequestServer | None = None
+        self._link: LinkTrack | None = None
         settings = self._settings
         ships = {settings.bag.ship, *(sensor.ship for sensor in settings.sensors)}
         if ON_REQUEST not in ships and not self.spool.has_kept():
-            return None
-        return RequestServer(self.spool, self._store, settings.keep, settings.robot, self._clock,
-                             put=partial(self.writer.put, wait=False), released=self.uploader.wake)  # fmt: skip
+            return
+        self._link = link = LinkTrack(self.uploader.status, track.marks, settings.robot, self._clock)
+        self._requests = RequestServer(self.spool, self._store, settings.keep, settings.robot, self._clock,
+                                       put=partial(self.writer.put, wait=False), released=self.uploader.wake,
+                                       mbps=lambda: link.mbps)  # fmt: skip
 
     def _settled(self, ids: Collection[int]) -> None:
         self.uploader.settled(ids)
@@ -328,6 +335,12 @@ class Pipeline:
                 self.writer.put(part, wait=False)
         except (DataLoggerError, sqlite3.Error) as error:
             log.warning('the catalogue is not written yet: %s', error)
+
+    def _look_at_link(self, *, is_last: bool = False) -> None:
+        """How fast uploads go where the robot is, where somebody may ask for more of them."""
+        found = self._link.look(is_last=is_last) if self._link is not None else None
+        if found is not None:
+            self.writer.put(found, wait=False)
 
     def _name_held(self) -> None:
         """What waited for the clock to be set may go now, or as soon as the disk lets it."""

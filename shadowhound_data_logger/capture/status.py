@@ -127,8 +127,9 @@ class Status:
             'mission': self._stages.mission.status(), 'bag': self._bag(), 'events': self._events(), 'topics': self._topics(now_s),
             'queue': asdict(self._stages.queue.status()) | asdict(self._settings.queue),
             'spool': {'path': str(self._stages.spool.root), **asdict(usage), 'evicted': self._stages.spool.evicted,
+                      'unkept': self._stages.spool.unkept,
                       **asdict(self._settings.spool)},
-            'store': self._store(upload, now_s), 'clock': asdict(self._clock.state()),
+            'store': self._store(upload, now_s, usage.bytes), 'clock': asdict(self._clock.state()),
             'consumers': {name: {'failures': count, 'last_error': text}
                           for name, (count, text) in self._stages.intake.consumer_failures().items()},
             'workers': {worker.name: asdict(worker.status()) for worker in self._stages.workers},
@@ -191,12 +192,13 @@ class Status:
         left_out = sum(self._stages.intake.left_out(each) for each in self._stages.event_buffer.consumers)
         return {**asdict(self._stages.event_buffer.events.status()), 'topics': topics, 'left_out': left_out}
 
-    def _store(self, upload: UploadStatus, now_s: float) -> dict[str, Any]:
+    def _store(self, upload: UploadStatus, now_s: float, waiting: int) -> dict[str, Any]:
         then_s, sent_bytes, _ = self._past[0] if self._past else (now_s, upload.sent_bytes, {})
         mbps = 8e-6 * _slope(upload.sent_bytes - sent_bytes, now_s - then_s)
         figures = asdict(upload)
         del figures['sent_bytes'], figures['worker_failures']
-        return {'target': self._target, **figures, 'mbps': round(mbps, 3)}
+        left_s = round(8e-6 * waiting / mbps) if upload.state == 'shipping' and mbps > 0 else None
+        return {'target': self._target, **figures, 'mbps': round(mbps, 3), 'left_s': left_s}
 
 
 def _slope(rise: float, run: float) -> float:

@@ -198,7 +198,9 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
 
 @lake.command(
     'coverage',
-    epilog=examples('lake coverage --since yesterday', 'lake coverage --topic /imu --map imu.png'),
+    epilog=examples(
+        'lake coverage --since yesterday', 'lake coverage --topic /imu --map imu.png', 'lake coverage --since 7d --wifi wifi.png'
+    ),
 )
 @_robot
 @click.option('--topic', metavar='NAME', help='Only of this topic.')
@@ -209,9 +211,11 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
 )
 @click.option('--until', metavar='TIME', default='now', show_default=True, help='Before TIME.')
 @click.option('--map', 'chart', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw it, one line for each topic.')
+@click.option('--wifi', type=click.Path(path_type=Path), metavar='FILE.png',
+              help='Draw instead how fast uploads went where the robot was: where to dock.')  # fmt: skip
 @as_json
-def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str, until: str, chart: Path | None,
-                  as_json: bool) -> ExitCode:  # fmt: skip
+def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str, until: str, chart: Path | None,  # noqa: PLR0913 - one an option
+                  wifi: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Show which hours of a topic are stored or lost.
 
     By topic and hour, with the causes, and what is not known yet.
@@ -231,6 +235,8 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
                 f'--since before --until, up to {MOST_COVERED_NS // DAY_NS} days',
             )
         left_out = quietly()
+        if wifi is not None:
+            return _wifi(wifi, robot, since_ns, until_ns, left_out, as_json=as_json)
         found = library.coverage(since_ns, until_ns, robot=robot, topic=topic, sink=sink, findings=left_out,
                                  source=default_source(the_store_settings()))  # fmt: skip
         if chart and found:
@@ -242,6 +248,20 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
         print_json([_told(each) for each in found])
     else:
         print_page(*_covered(found))
+    return tell_left_out(left_out)
+
+
+def _wifi(target: Path, robot: str | None, since_ns: int, until_ns: int, left_out: Any, *, as_json: bool) -> ExitCode:
+    from shadowhound_data_logger.lake import link, live_files, pictures  # noqa: PLC0415
+    from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+    source = default_source(the_store_settings())
+    names = [robot] if robot else live_files.robots(source)
+    found = [one for name in names for one in link.samples(source, name, since_ns, until_ns, left_out)]
+    pictures.wifi(found, f'{" ".join(names)}, {utc(since_ns):%Y-%m-%d %H:%M} to {utc(until_ns):%Y-%m-%d %H:%M} UTC', target)
+    click.echo(f'Wrote {target}', err=True)
+    if as_json:
+        print_json([one._asdict() for one in found])
     return tell_left_out(left_out)
 
 

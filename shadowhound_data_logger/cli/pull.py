@@ -14,7 +14,7 @@ import click
 
 from shadowhound_data_logger.catalogue.schema import LOST, ON_ROBOT
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
-from shadowhound_data_logger.cli.output import number, plain, plain_table, print_json, print_page, volume
+from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.mailbox import BAG_SENSOR, DEFAULT_PRIORITY, LONGEST_NS, MOST_KEYS, KeptFilter
@@ -50,7 +50,8 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
     Exit code 1 where something of it is lost, or the robot refused.
     """
     with asking():
-        from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415 - pyarrow takes a while
+        from shadowhound_data_logger.lake import link  # noqa: PLC0415 - pyarrow takes a while
+        from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415
         from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
 
         source, left_out = default_source(the_store_settings()), quietly()
@@ -70,7 +71,8 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
             found = [row for row in rows if row['where'] == ON_ROBOT]
             lost = Counter(row['reason'] or 'unknown' for row in rows if row['where'] == LOST)
             said = {'robot': robot, 'objects': len(found), 'bytes': sum(row['bytes'] for row in found), 'lost': dict(lost),
-                    'want': want.to_json()}  # fmt: skip
+                    'want': want.to_json(), 'mbps': link.pace_mbps(source, robot, left_out)}  # fmt: skip
+            said['seconds'] = 8e-6 * said['bytes'] / said['mbps'] if said['mbps'] else None
             if not as_json:
                 click.echo(_found_sentence(said))
             answer: dict[str, Any] | None = None
@@ -94,6 +96,8 @@ def _found_sentence(said: Mapping[str, Any]) -> str:
     if said['lost']:
         reasons = ', '.join(f'{reason} {count:,}' for reason, count in said['lost'].items())
         text += f'; {sum(said["lost"].values()):,} are lost ({visible(reasons)})'
+    if said['seconds'] is not None and said['objects']:
+        text += f'. At its pace, {said["mbps"]:.1f} Mbit/s, that takes {duration(said["seconds"])}'
     return f'{text}.'
 
 

@@ -216,7 +216,7 @@ def _disk(spool: Mapping[str, Any]) -> str:
 def _usage(spool: Mapping[str, Any]) -> str:
     """``3 objects wait (oldest 0.4 s), 1 quarantined``."""
     oldest = '' if spool['oldest_age_s'] is None else f' (oldest {duration(spool["oldest_age_s"])})'
-    usage = ''.join(f', {spool[name]:,} {name}' for name in ('held', 'quarantined', 'evicted') if spool.get(name))
+    usage = ''.join(f', {spool[name]:,} {name}' for name in ('held', 'kept', 'quarantined', 'evicted') if spool.get(name))
     return f'{spool["pending"]:,} objects wait{oldest}{usage}'
 
 
@@ -225,7 +225,8 @@ def _add_store(grid: Table, found: Mapping[str, Any]) -> None:
     fine = store['state'] in FINE_STORE
     cap = f' of {store["max_mbps"]:g}' if store['max_mbps'] else ''
     grid.add_row('store', plain(str(store['state']).replace('_', ' '), 'green' if fine else 'red'), plain(store['target']))
-    grid.add_row('', '', f'{store["delivered"]:,} delivered, {store["mbps"]:.1f}{cap} Mbit/s')
+    left = '' if store.get('left_s') is None else f', all that waits arrives in {duration(store["left_s"])}'
+    grid.add_row('', '', f'{store["delivered"]:,} delivered, {store["mbps"]:.1f}{cap} Mbit/s{left}')
     if store['last_error'] and (not fine or store['blocked_buckets']):
         grid.add_row('', '', plain(store['last_error'], 'yellow'))
 

@@ -5,11 +5,13 @@ Importing this loads Pillow; ``ground`` loads matplotlib.
 
 from __future__ import annotations
 
+import math
 import tempfile
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from statistics import median
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import SECOND, utc
@@ -17,6 +19,7 @@ from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetched import UNWRITABLE
 from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED, Coverage, named
+from shadowhound_data_logger.lake.link import LinkSample
 from shadowhound_data_logger.missions.contact_sheet import MOST, LoggedFrame, contact_sheet
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, visible
 
@@ -33,6 +36,8 @@ DAY_NS: Final = 24 * 3600 * SECOND
 FARTHEST_M: Final = 1e6
 LETTERS: Final = 56
 """Of a line of the title."""
+SQUARE_M: Final = 1.0
+"""Side of a square of ground whose link is one colour."""
 DOTS: Final = 60
 """Area of an object on the ground, in square points, where there are few."""
 
@@ -157,6 +162,35 @@ def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
         figure.legend(
             handles=[Patch(fc=colours[word], label=visible(word)) for word in shown], loc='outside lower center', ncols=4
         )
+        try:
+            figure.savefig(target, format='png')
+        except OSError as error:
+            raise LakeError(f'{target} cannot be written: {error.strerror or error}', remedy=UNWRITABLE) from error
+
+
+def wifi(found: Sequence[LinkSample], title: str, target: Path) -> None:
+    """A PNG: squares of ground in the colour of how fast uploads went there. Raises LakeError where no sample has a place."""
+    from matplotlib import rc_context  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    from shadowhound_data_logger.missions import plots  # noqa: PLC0415
+
+    squares: dict[tuple[int, int], list[float]] = {}
+    for one in found:
+        if one.x is not None and one.y is not None and _is_place(one.x, one.y):
+            squares.setdefault((math.floor(one.x / SQUARE_M), math.floor(one.y / SQUARE_M)), []).append(one.mbps)
+    if not squares:
+        raise LakeError('no sample of the link has a place', remedy='was there odometry, and something to upload?')
+    with rc_context(plots.STYLE):
+        figure = Figure(figsize=(plots.WIDTH_IN, plots.WIDTH_IN), dpi=plots.DPI, layout='constrained')
+        axes = figure.add_subplot()
+        xs, ys = zip(*(((x + 0.5) * SQUARE_M, (y + 0.5) * SQUARE_M) for x, y in squares), strict=True)
+        speeds = [median(each) for each in squares.values()]
+        dots = axes.scatter(xs, ys, c=speeds, s=DOTS, marker='s', cmap='viridis', vmin=0.0, lw=0)
+        axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal')
+        axes.set_title('\n'.join(textwrap.wrap(title, LETTERS)))
+        axes.margins(0.08)
+        figure.colorbar(dots, label=f'uploads, median of {SQUARE_M:g} m squares [Mbit/s]').outline.set_visible(False)
         try:
             figure.savefig(target, format='png')
         except OSError as error:

@@ -66,8 +66,9 @@ class RequestServer:
 
     def __init__(self, spool: Spool, store: ObjectStore, settings: KeepSettings, robot: str, clock: Clock, *,  # noqa: PLR0913 - each is a neighbour
                  put: Callable[[DataObject], None], released: Callable[[Sequence[SpooledObject]], None],
+                 mbps: Callable[[], float | None] = lambda: None,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
-        """``put`` takes answers to be spooled, ``released`` hears of objects that may be shipped."""
+        """``put`` takes answers to be spooled, ``released`` hears of objects that may be shipped; ``mbps`` is the pace."""
         self._spool = spool
         self._store = store
         self._settings = settings
@@ -75,6 +76,7 @@ class RequestServer:
         self._clock = clock
         self._put = put
         self._released = released
+        self._mbps = mbps
         self._monotonic = monotonic
         self._version = ''
         self._poll_at_s = self._tidy_at_s = 0.0
@@ -267,7 +269,7 @@ class RequestServer:
             'state': 'accepted' if row.is_open and not row.told else 'sending' if row.is_open else row.state,
             'time': iso(now_ns), 'made_ns': row.made_ns, 'expires': iso(row.expires_ns), 'why': row.why,
             'want': json.loads(row.wanted),
-            'objects': row.objects, 'bytes': row.bytes, 'gone': json.loads(row.gone),
+            'objects': row.objects, 'bytes': row.bytes, 'gone': json.loads(row.gone), 'mbps': self._mbps(),
             'outcomes': {state: {'objects': count, 'bytes': size} for state, (count, size) in progress.outcomes.items()},
             'lost': [{'key': key, 'state': state, 'reason': reason, 'when': iso(settled_ns) if settled_ns else None}
                      for key, state, reason, settled_ns in progress.lost],

@@ -38,10 +38,10 @@ _TOPIC: Final[dict[str, Any]] = {
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
     'spool': {'path': '', 'pending': 0, 'held': 0, 'quarantined': 0, 'evicted': 0, 'bytes': 0, 'max_bytes': None,
-              'kept': 0, 'kept_bytes': 0,
+              'kept': 0, 'kept_bytes': 0, 'unkept': 0,
               'free_bytes': None, 'oldest_age_s': None, 'min_free_bytes': None, 'remember_days': None},
     'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
-              'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
+              'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0, 'left_s': None},
     'middleware': {'rmw': '', 'robot': '', 'why': '', 'asked': '', 'network': '', 'receive_bytes': None, 'dropped_datagrams': 0,
                    'unheard': None},
     'clock': {'is_set': True, 'gave_up': False, 'unset_s': 0.0, 'steps': 0, 'last_step_s': None, 'last_step_age_s': None},
@@ -197,10 +197,16 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
     yield from _missed(found['topics'], 'missed_estimated', 'missed in this session, as estimated', '~')
     yield from _other_types(found)
     yield from _left_out(found)
-    if evicted := (found['spool'] or {}).get('evicted', 0):
-        yield f'evicted in this session: {evicted:,} objects; disk or spool is full (spool.min_free_bytes, spool.max_bytes)'
+    yield from _given_up(found['spool'] or {})
     if store['quarantined']:
         yield f'quarantined in this session: {store["quarantined"]:,} objects'
+
+
+def _given_up(spool: Mapping[str, Any]) -> Iterator[str]:
+    if evicted := spool.get('evicted', 0):
+        yield f'evicted in this session: {evicted:,} objects; disk or spool is full (spool.min_free_bytes, spool.max_bytes)'
+    if unkept := spool.get('unkept', 0):
+        yield f'not kept in this session: {unkept:,} objects, for what is kept is asked for or protected (keep.max_bytes)'
 
 
 def _left_out(found: Mapping[str, Any]) -> Iterator[str]:

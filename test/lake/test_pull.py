@@ -16,6 +16,7 @@ from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
+from shadowhound_data_logger.lake import link
 from shadowhound_data_logger.lake import pull as lake
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
@@ -167,3 +168,23 @@ def test_what_cannot_be_asked_for_is_said(field: Field, arguments: tuple[str, ..
     done = CliRunner().invoke(cli, ['pull', *arguments], standalone_mode=False)
     assert done.exception is not None
     assert run('pull', '--list') == []
+
+
+def test_the_pace_of_the_link_says_how_long_a_pull_takes(field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The median of what the robot measured lately; the same by place is a picture."""
+    field.records(1, 2)
+    samples = [
+        {'stamp_ns': NOON_NS, 'x': float(number), 'y': 0.0, 'mbps': mbps} for number, mbps in enumerate((0.0, 1.0, 2.0, 9.0))
+    ]
+    body = json.dumps({'samples': [*samples, {'mbps': 'fast'}, 7]}).encode()
+    field.commit(make('thor/_wifi/20251018/120000_wifi.json', body, sensor='_wifi', topic=None, samples=0))
+    field.passes()
+    field.now_s += 60
+    field.passes()
+    monkeypatch.setattr(link.time, 'time_ns', lambda: NOON_NS + 3600 * SECOND)
+    said = run('pull', '--sensor', 'camera', '--dry-run')
+    assert (said['mbps'], said['seconds']) == (2.0, pytest.approx(0.008))
+    target = tmp_path / 'wifi.png'
+    told = run('lake', 'coverage', '--since', '2025-10-18', '--until', '2025-10-19', '--wifi', str(target))
+    assert [one['mbps'] for one in told] == [0.0, 1.0, 2.0, 9.0]
+    assert target.read_bytes().startswith(b'\x89PNG')

@@ -1,0 +1,74 @@
+"""How fast a robot's uploads went, and where it was then: the samples that it writes while it keeps something (``_wifi``)."""
+
+from __future__ import annotations
+
+import math
+import time
+from statistics import median
+from typing import Any, Final, NamedTuple
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.errors import ObjectRefused
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.reading import tables
+from shadowhound_data_logger.lake.scan import folders
+from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.untrusted import from_json
+
+LINK: Final = '_wifi'
+MOST_LINK_BYTES: Final = 1 << 20
+RECENT_NS: Final = 7 * 24 * 3600 * SECOND
+RECENT_OBJECTS: Final = 3
+FASTEST_MBPS: Final = 1e6
+
+
+class LinkSample(NamedTuple):
+    """Five seconds of uploading."""
+
+    stamp_ns: int
+    x: float | None
+    y: float | None
+    """Metres, in the odometry's frame."""
+    mbps: float
+    """Megabits a second; 0 where the store could not be reached."""
+
+
+def samples(source: Bucket, robot: str, since_ns: int, until_ns: int, findings: Findings,
+            newest: int | None = None) -> list[LinkSample]:  # fmt: skip
+    """Of a robot, from ``since_ns`` until before ``until_ns``, or of the ``newest`` objects of that time. Raises StoreError."""
+    wanted = Wanted(robot=robot, sensor=LINK, since_ns=since_ns, until_ns=until_ns)
+    entries = [entry for day in folders(source, wanted, findings) for entry in day.entries]
+    columns = 'key', 'sensor', 't_start_ns'
+    rows = [row for table in tables(source, entries, columns, findings, wanted) for row in table.to_pylist()]
+    rows = sorted((row for row in rows if row['sensor'] == LINK and since_ns <= (row['t_start_ns'] or 0) < until_ns),
+                  key=lambda row: row['t_start_ns'])  # fmt: skip
+    found: list[LinkSample] = []
+    for row in rows if newest is None else rows[-newest:]:
+        try:
+            told = from_json(source.get(row['key'], MOST_LINK_BYTES), MOST_LINK_BYTES)
+            found += [sample for one in told['samples'] if (sample := _sample(one)) is not None]
+        except (ObjectRefused, ValueError, TypeError, LookupError) as error:
+            findings.add(row['key'], f'it has no samples of the link ({error})')
+    return found
+
+
+def pace_mbps(source: Bucket, robot: str, findings: Findings) -> float | None:
+    """Megabits a second at which a robot uploaded lately; None where it has told nothing for a week. Raises StoreError."""
+    now_ns = time.time_ns()
+    found = [one.mbps for one in samples(source, robot, now_ns - RECENT_NS, now_ns, findings, RECENT_OBJECTS) if one.mbps > 0]
+    return median(found) if found else None
+
+
+def _sample(one: Any) -> LinkSample | None:
+    """None for what makes no sense."""
+    if not isinstance(one, dict) or type(one.get('stamp_ns')) is not int:
+        return None
+    x, y, mbps = (_number(one.get(name)) for name in ('x', 'y', 'mbps'))
+    if mbps is None or not 0 <= mbps < FASTEST_MBPS:
+        return None
+    return LinkSample(one['stamp_ns'], x, y, mbps)
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if type(value) in {int, float} and abs(value) < 1e12 and math.isfinite(value) else None
