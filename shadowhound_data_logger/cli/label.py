@@ -212,10 +212,10 @@ def _named(robot: str | None) -> str:
 
 def _only_robot() -> str:
     """The one that the store has. Raises BadUsage where there are several."""
-    from shadowhound_data_logger.lake.live_files import robots  # noqa: PLC0415
+    from shadowhound_data_logger.lake import live_files  # noqa: PLC0415
     from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
 
-    found = robots(default_source(the_store_settings()))
+    found = live_files.robots(default_source(the_store_settings()))
     if len(found) != 1:
         raise BadUsage(f'which robot? The store has {", ".join(found) or "none"}', '--robot NAME')
     return found[0]

@@ -26,6 +26,7 @@ from shadowhound_data_logger.cli.node import node
 from shadowhound_data_logger.cli.output import tell_error
 from shadowhound_data_logger.cli.pull import pull
 from shadowhound_data_logger.cli.query import query
+from shadowhound_data_logger.cli.search import lake_index, search
 from shadowhound_data_logger.cli.spool import spool
 from shadowhound_data_logger.cli.status import status
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
@@ -33,7 +34,7 @@ from shadowhound_data_logger.errors import DataLoggerError, SettingError
 SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
     'On every machine': (doctor,),
     'On the robot': (status, ledger, spool, node, live),
-    'On Tower and Spark': (query, fetch, pull, bag, lake, label, export),
+    'On Tower and Spark': (query, search, fetch, pull, bag, lake, label, export),
     'Missions': (missions,),
 }
 """The verbs by who needs them, in the order of the help."""
@@ -78,6 +79,7 @@ def cli() -> None:
 
 for _verb in (verb for section in SECTIONS.values() for verb in section):
     cli.add_command(_verb)
+lake.add_command(lake_index)
 
 
 def main() -> None:

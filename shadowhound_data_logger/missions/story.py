@@ -22,6 +22,9 @@ MS: Final = 1_000_000
 BATTERY, TEMPERATURE, DISTANCE, FRAMES = 'battery_pct', 'temperature_c', 'distance_traveled_m', 'camera_frames'
 KILLED, FAILED, FINISHED = 'KILLED', 'FAILED', 'FINISHED'
 MOST_ERRORS: Final = 20
+MOST_EVENTS: Final = 200
+MOST_EVENT: Final = 2000
+"""Letters of an event that stands in the summary; ``events.jsonl`` in the run has all."""
 BUCKET: Final = 'sensor-data'
 TRAJECTORIES: Final = 'trajectories'
 
@@ -44,6 +47,7 @@ class Story:
     counts: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
     errors: list[dict[str, Any]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
     first: dict[str, float] = field(default_factory=dict)
     last: dict[str, float] = field(default_factory=dict)
     steps: dict[str, int] = field(default_factory=dict)
@@ -73,6 +77,8 @@ class Story:
             number = int(record['id'])
             return [Point(f'camera_frame_{number}', 1.0, time_ns // MS, max(number, 0)),
                     Point(FRAMES, float(self.counts['frame']), time_ns // MS, self.counts['frame'])]  # fmt: skip
+        if kind == 'event':
+            self._note_event(record, time_ns)
         if kind == 'refused':
             self.refused[str(record['reason'])] += 1
         elif kind == 'event' and record.get('name') in {'error', 'exception'}:
@@ -135,6 +141,12 @@ class Story:
     def final_params(self) -> dict[str, str]:
         return {'duration_s': f'{self.duration_s:.3f}'}
 
+    def _note_event(self, record: Mapping[str, Any], time_ns: int) -> None:
+        """The first ones, as far as they are short."""
+        said = {'time': iso(time_ns), 'name': record.get('name'), **record.get('data', {})}
+        if len(self.events) < MOST_EVENTS and len(str(said)) <= MOST_EVENT:
+            self.events.append(said)
+
     def _note(self, key: str, value: float, step: int) -> None:
         self.first.setdefault(key, value)
         self.last[key] = value
@@ -167,6 +179,7 @@ def summary_of(story: Story, mission_id: str, run: Run, sent: MissionSent, pictu
         'start': iso(int(start['t'])), 'end': iso(int(end['t'])), 'start_ns': int(start['t']), 'end_ns': int(end['t']),
         'result': end['status'], 'success': story.success, 'ended_by': end.get('by', 'agent'),
         'errors': [*story.errors, *([end['error']] if end.get('error') else [])],
+        'events': story.events,
         'distance_m': story.distance_m, 'duration_s': story.duration_s, 'battery_consumed_pct': story.battery_consumed_pct,
         'stated': {name: end.get(name) for name in ('success', 'distance_m', 'duration_s')},
         'measured': {'distance_m': story.newest.get(DISTANCE), 'duration_s': story.measured_s},

@@ -1,0 +1,343 @@
+"""Words: a full-text index of what missions were told, what happened in them, what went wrong, and what people labelled.
+
+The index is one SQLite file (FTS5), made of the store alone: of the ``summary.json`` of each mission, which is never changed, and
+of the labels. An update reads only missions that are new. It can be thrown away, and made again from nothing.
+
+A query is words that all must be there, in any order and any form of letters: ``door handle``, ``"door handle"`` for a phrase,
+``door*`` for what begins so, ``-door`` for without, ``door OR gate`` for either. The best match comes first (BM25; what a mission
+was told and the name of an event or label count four times).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sqlite3
+import tempfile
+import time
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.catalogue.schema import BUCKET
+from shadowhound_data_logger.errors import ForeignObject, LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.lake import labels
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.live_files import robots
+from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.times import moment
+from shadowhound_data_logger.untrusted import MOST_SUMMARY_BYTES, from_json
+
+MISSION, EVENT, ERROR, LABEL_KIND = 'mission', 'event', 'error', 'label'
+KINDS: Final = (MISSION, EVENT, ERROR, LABEL_KIND)
+REMEDY: Final = 'shadowhound-data lake index makes it of the store'
+MOST_WORDS: Final = 32
+MOST_TEXT: Final = 20_000
+"""Letters of a document."""
+MOST_DOCUMENTS: Final = 1000
+"""Events and errors of one mission."""
+AT_A_TIME: Final = 500
+MOST_BYTES: Final = 2 << 30
+_TRIES: Final = 5
+_VERSION: Final = 1
+_SCHEMA: Final = f"""
+CREATE TABLE documents (
+  id INTEGER PRIMARY KEY, kind TEXT NOT NULL, robot TEXT NOT NULL, run_id TEXT, mission_id TEXT, mission_type TEXT,
+  success INTEGER, since_ns INTEGER, until_ns INTEGER, bucket TEXT, key TEXT, label_id TEXT
+);
+CREATE INDEX by_run ON documents (robot, run_id) WHERE kind = 'mission';
+CREATE INDEX by_label ON documents (robot, kind, since_ns) WHERE kind = 'label';
+CREATE VIRTUAL TABLE words USING fts5(title, text, tokenize = "unicode61 remove_diacritics 2", prefix = '2 3');
+PRAGMA application_id = 1397246276;
+PRAGMA user_version = {_VERSION};
+"""
+_FOUND: Final = (
+    'SELECT kind, robot, mission_id, run_id, mission_type, success, since_ns, until_ns, bucket, key, title,'
+    " snippet(words, -1, '', '', ' ... ', 16) AS excerpt, -bm25(words, 4.0, 1.0) AS score"
+    ' FROM words JOIN documents ON documents.id = words.rowid WHERE words MATCH ?'
+)
+_TERM: Final = re.compile(r'\s*(?P<not>-)?(?:"(?P<phrase>[^"]*)"|(?P<word>[^\s"]+))(?P<prefix>\*)?')
+
+
+@dataclass(frozen=True, slots=True)
+class Indexed:
+    """What an update did."""
+
+    missions: int
+    """Added."""
+    documents: int
+    """In the index now."""
+    waiting: int
+    """Missions without a summary yet."""
+
+
+def update(path: Path, source: Bucket, findings: Findings | None = None) -> Indexed:
+    """Bring the index up to date with the store, or make it. Raises StoreError, LakeError for a file that is something else."""
+    findings = Findings() if findings is None else findings
+    path.parent.mkdir(parents=True, exist_ok=True)
+    is_new = not path.exists() or path.stat().st_size == 0
+    with _opened(path, is_new=is_new) as db:
+        added, waiting = 0, 0
+        for robot in robots(source):
+            known = {run for (run,) in db.execute("SELECT run_id FROM documents WHERE kind = 'mission' AND robot = ?", (robot,))}
+            new = [run for run in source.folders(f'{robot}/missions/') if run not in known]
+            for start in range(0, len(new), AT_A_TIME):
+                some = new[start : start + AT_A_TIME]
+                with ThreadPoolExecutor(THREADS, 'lake-index') as pool:
+                    told = list(pool.map(lambda run, of=robot: _summary(source, of, run, findings), some))
+                with db:
+                    for run, summary in zip(some, told, strict=True):
+                        if summary is not None:
+                            add(db, of_mission(robot, run, summary))
+                            added += 1
+                waiting += told.count(None)
+        with db:
+            db.execute("DELETE FROM words WHERE rowid IN (SELECT id FROM documents WHERE kind = 'label')")
+            db.execute("DELETE FROM documents WHERE kind = 'label'")
+            add(db, (_of_label(each) for each in labels.read(source, findings=findings)))
+        (count,) = db.execute('SELECT count(*) FROM documents').fetchone()
+    return Indexed(added, count, waiting)
+
+
+def search(path: Path, text: str, asked: Wanted, *, kind: str | None = None, limit: int = 20) -> list[dict[str, Any]]:
+    """The best documents, the best first.
+
+    Each has ``kind robot mission_id run_id mission_type success since_ns until_ns bucket key title excerpt score``.
+    Raises SettingError for what is no query, LakeError for a file that is no index.
+    """
+    match = match_of(text)
+    conditions, values = _conditions(asked, kind)
+    query = ' AND '.join((_FOUND, *conditions)) + ' ORDER BY score DESC, since_ns LIMIT ?'
+    with _opened(path) as db:
+        db.row_factory = sqlite3.Row
+        found = [dict(row) for row in db.execute(query, (match, *values, limit))]
+    return [{**row, 'success': None if row['success'] is None else bool(row['success'])} for row in found]
+
+
+def match_of(text: str) -> str:
+    """The query as FTS5 takes it, every word quoted: nothing in it is obeyed. Raises SettingError."""
+    allowed = 'words, "a phrase", begin*, -without, this OR that'
+    if any(unicodedata.category(letter)[0] == 'C' and letter not in '\t\n' for letter in text):
+        raise SettingError('query', text, f'{allowed}; it has a control character')
+    if text.count('"') % 2:
+        raise SettingError('query', text, f'{allowed}; a quotation mark is not closed')
+    groups: list[list[str]] = [[]]
+    without: list[str] = []
+    for term in _TERM.finditer(text.strip()):
+        word = term['phrase'] if term['phrase'] is not None else term['word']
+        if word == 'OR' and term['phrase'] is None and not term['not']:
+            groups.append([])
+            continue
+        is_prefix = bool(term['prefix']) or (term['phrase'] is None and word.endswith('*'))
+        word = word.rstrip('*') if term['phrase'] is None else word
+        if not any(letter.isalnum() for letter in word):
+            continue
+        quoted = '"{}"{}'.format(word.replace('"', '""'), '*' if is_prefix else '')
+        (without if term['not'] else groups[-1]).append(quoted)
+    if not all(groups) or sum(map(len, groups)) + len(without) > MOST_WORDS:
+        raise SettingError('query', text, f'{allowed}: at least one word on each side of OR, at most {MOST_WORDS} in all')
+    match = ' OR '.join(f'({" AND ".join(group)})' for group in groups)
+    return f'({match}) NOT ({" OR ".join(without)})' if without else match
+
+
+def _conditions(asked: Wanted, kind: str | None) -> tuple[list[str], list[Any]]:
+    conditions: list[str] = []
+    values: list[Any] = []
+
+    def must(condition: str, *given: Any) -> None:
+        conditions.append(condition)
+        values.extend(given)
+
+    for name, value in (('kind', kind), ('robot', asked.robot), ('mission_type', asked.mission_type), ('success', asked.success)):
+        if value is not None:
+            must(f'{name} = ?', value)
+    if asked.mission is not None:
+        must('(substr(mission_id, 1, ?) = ? OR substr(run_id, 1, ?) = ?)', *(len(asked.mission), asked.mission) * 2)
+    if asked.since_ns is not None:
+        must('until_ns >= ?', asked.since_ns)
+    if asked.until_ns is not None:
+        must('since_ns < ?', asked.until_ns)
+    for chosen in asked.chosen:
+        spans = chosen.spans[:MOST_DOCUMENTS]
+        must('(' + ' OR '.join(['0', *('(robot = ifnull(?, robot) AND since_ns <= ? AND until_ns >= ?)' for _ in spans)]) + ')',
+             *(each for span in spans for each in (span.robot, span.until_ns, span.since_ns)))  # fmt: skip
+    if asked.label is not None:
+        must("EXISTS (SELECT 1 FROM documents AS said JOIN words AS named ON named.rowid = said.id WHERE said.kind = 'label'"
+             ' AND said.robot = documents.robot AND said.since_ns <= documents.until_ns AND said.until_ns >= documents.since_ns'
+             ' AND named.title = ?)', asked.label)  # fmt: skip
+    return conditions, values
+
+
+# -- documents -----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Document:
+    """What the index has of a mission, an event, an error or a label."""
+
+    kind: str
+    robot: str
+    title: str
+    text: str
+    run_id: str | None = None
+    mission_id: str | None = None
+    mission_type: str | None = None
+    success: bool | None = None
+    since_ns: int | None = None
+    until_ns: int | None = None
+    bucket: str | None = None
+    key: str | None = None
+    label_id: str | None = None
+
+
+def add(db: sqlite3.Connection, found: Iterable[Document]) -> None:
+    """Into an index that is open, within a transaction."""
+    for each in found:
+        number = db.execute(
+            'INSERT INTO documents (kind, robot, run_id, mission_id, mission_type, success, since_ns, until_ns, bucket, key,'
+            ' label_id) VALUES (?,?,?,?,?,?,?,?,?,?,?)',
+            (each.kind, each.robot, each.run_id, each.mission_id, each.mission_type, each.success, each.since_ns, each.until_ns,
+             each.bucket, each.key, each.label_id),
+        ).lastrowid  # fmt: skip
+        db.execute('INSERT INTO words (rowid, title, text) VALUES (?,?,?)', (number, each.title, each.text))
+
+
+def of_mission(robot: str, run_id: str, told: Mapping[str, Any]) -> Iterator[Document]:
+    """Of a ``summary.json``, which may say anything."""
+    common: dict[str, Any] = {
+        'robot': robot, 'run_id': run_id, 'mission_id': _text(told.get('mission_id')) or None,
+        'mission_type': _text(told.get('mission_type')) or None,
+        'success': told.get('success') if isinstance(told.get('success'), bool) else None,
+    }  # fmt: skip
+    since_ns, until_ns = _stamp(told.get('start_ns')), _stamp(told.get('end_ns'))
+    errors, events = _listed(told.get('errors')), _listed(told.get('events'))
+    text = _text([*(told.get(name) for name in ('mission_type', 'result', 'run_name', 'ended_by', 'last')), robot])
+    yield Document(kind=MISSION, title=_text(told.get('mission_command')), text=text, since_ns=since_ns, until_ns=until_ns,
+                   bucket=BUCKET, key=f'{robot}/missions/{run_id}/summary.json', **common)  # fmt: skip
+    for kind, some in ((ERROR, errors), (EVENT, events)):
+        for each in some[:MOST_DOCUMENTS]:
+            said = dict(each) if isinstance(each, dict) else {'text': each}
+            at_ns = _moment(said.pop('time', None), since_ns)
+            name = _text(said.pop('name', '')) if kind == EVENT else ''
+            yield Document(kind=kind, title=name, text=_text(said), since_ns=at_ns, until_ns=at_ns, **common)
+
+
+def _of_label(each: labels.Label) -> Document:
+    return Document(kind=LABEL_KIND, robot=each.robot, title=each.label, text=_text([each.note, each.by]), since_ns=each.since_ns,
+                    until_ns=each.until_ns, bucket=each.bucket, key=each.key, label_id=each.id)  # fmt: skip
+
+
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _text(value: Any) -> str:
+    """All words of a value of JSON, names of fields among them."""
+    return ' '.join(_words(value, 0))[:MOST_TEXT].encode(errors='replace').decode()
+
+
+def _words(value: Any, depth: int) -> Iterator[str]:
+    if depth > 8:
+        return
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield str(name)
+            yield from _words(inner, depth + 1)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from _words(inner, depth + 1)
+    elif value is not None:
+        yield str(value)
+
+
+def _stamp(value: Any) -> int | None:
+    return value if type(value) is int and 0 <= value < 1 << 63 else None
+
+
+def _moment(value: Any, otherwise: int | None) -> int | None:
+    try:
+        return moment('time', value, 0) if isinstance(value, str) else otherwise
+    except SettingError:
+        return otherwise
+
+
+def _summary(source: Bucket, robot: str, run_id: str, findings: Findings) -> Mapping[str, Any] | None:
+    """None where there is none yet. One that is none is left out, and looked at again the next time."""
+    key = f'{robot}/missions/{run_id}/summary.json'
+    try:
+        told = from_json(source.get(key, MOST_SUMMARY_BYTES), MOST_SUMMARY_BYTES)
+    except ObjectRefused as error:
+        if error.data.get('reason') != 'missing':
+            findings.add(key, str(error))
+        return None
+    except ValueError as error:
+        findings.add(key, f'it is not a summary: {error}')
+        return None
+    if not isinstance(told, dict):
+        findings.add(key, 'it is not a summary')
+        return None
+    return told
+
+
+# -- the file ------------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _opened(path: Path, *, is_new: bool = False) -> Iterator[sqlite3.Connection]:
+    """An index, whoever wrote the file: it must have our tables, and nothing of its own. Raises LakeError."""
+    if not is_new and not path.is_file():
+        raise LakeError(f'there is no index of words at {path}', remedy=REMEDY)
+    try:
+        with closing(sqlite3.connect(path, timeout=30.0)) as db:
+            db.execute('PRAGMA trusted_schema = OFF')
+            if is_new:
+                db.executescript(f'BEGIN; {_SCHEMA} COMMIT;')
+            elif _definitions(db) != _expected():
+                raise LakeError(f'{path} is not an index of words of this version', remedy=f'remove it: {REMEDY}')
+            yield db
+    except sqlite3.Error as error:
+        raise LakeError(f'the index of words {path} cannot be used: {error}', remedy=f'remove it: {REMEDY}') from error
+
+
+def _definitions(db: sqlite3.Connection) -> list[tuple[str, str]]:
+    return sorted(db.execute('SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL'))
+
+
+def _expected() -> list[tuple[str, str]]:
+    with closing(sqlite3.connect(':memory:')) as db:
+        db.executescript(_SCHEMA)
+        return _definitions(db)
+
+
+def put(store: ObjectStore, bucket: str, key: str, path: Path) -> None:
+    """Put the index into the store, in the place of the one that is there. Raises StoreError, LakeError."""
+    body = path.read_bytes()
+    item = SpooledObject(
+        id=0, bucket=bucket, key=key, path=path, size=len(body), sha256=hashlib.sha256(body).hexdigest(),
+        content_type='application/vnd.sqlite3', metadata={}, priority=5, created_ns=time.time_ns(),
+    )  # fmt: skip
+    if store.head(bucket, key) is None:
+        with suppress(ForeignObject):
+            store.put(item)
+            return
+    for _ in range(_TRIES):
+        there = store.changed(bucket, key, '', MOST_BYTES)
+        if there is None or store.replace(bucket, key, body, there[1]):
+            return
+    raise LakeError(f'others put an index at {bucket}/{key} at the same time', remedy='run it again')
+
+
+@contextmanager
+def downloaded(source: Bucket, key: str) -> Iterator[Path]:
+    """The index at a key, as a file for a while. Raises StoreError."""
+    with tempfile.TemporaryDirectory(prefix='shadowhound-search-') as folder:
+        path = Path(folder, 'search.db')
+        path.write_bytes(source.get(key, MOST_BYTES))
+        yield path

@@ -1,0 +1,139 @@
+"""Words: the index is made of the store alone, answers the best first, and obeys nothing that is written in a query."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from lake.making import NOON_NS, add, folder_store
+
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.lake import labels, search
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.select import wanted
+from shadowhound_data_logger.stores import open_store
+
+HOUR = 3600 * SECOND
+MISSIONS = (
+    ('patrol', 'open the door handle in the kitchen', True, [{'name': 'door_opened', 'force_n': 12.5, 'hand': 'left'}], []),
+    ('patrol', 'the handle of the cellar, then the door', False, [], ['the gripper slipped off the Türgriff']),
+    ('explore', 'go up the stairs', True, [{'name': 'stairs_seen', 'steps': 14}], []),
+)
+
+
+@pytest.fixture(scope='module')
+def lake(tmp_path_factory: pytest.TempPathFactory) -> Bucket:
+    root = tmp_path_factory.mktemp('search')
+    settings = folder_store(root)
+    with closing(open_store(settings, UploadSettings())) as store:
+        for number, (kind, command, success, events, errors) in enumerate(MISSIONS):
+            begin_ns = NOON_NS + number * HOUR
+            told = {'mission_id': f'm{number}', 'mission_type': kind, 'mission_command': command, 'success': success,
+                    'start_ns': begin_ns, 'end_ns': begin_ns + 60 * SECOND, 'result': 'FINISHED' if success else 'FAILED',
+                    'events': [{'time': '2026-10-28T12:00:05Z', **event} for event in events],
+                    'errors': [{'error': text} for text in errors]}  # fmt: skip
+            add(store, root, f'thor/missions/run{number}/summary.json', json.dumps(told).encode())
+        add(store, root, 'thor/missions/run3/camera/frame_000001.jpg', b'one that goes on')
+        add(store, root, 'thor/missions/run4/summary.json', b'{"not": json')
+        label = labels.Label(robot='thor', label='stairs', since_ns=NOON_NS + 2 * HOUR, until_ns=NOON_NS + 2 * HOUR + SECOND)
+        labels.write(store, 'thor', [label], by='ann')
+    return Bucket(settings, 'sensor-data')
+
+
+@pytest.fixture(scope='module')
+def index(lake: Bucket, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp('index') / 'search.db'
+    left_out = Findings(lambda _: None)
+    found = search.update(path, lake, left_out)
+    assert (found.missions, found.waiting, found.documents) == (3, 2, 7)
+    assert [one.key for one in left_out] == ['thor/missions/run4/summary.json']
+    return path
+
+
+def missions(index: Path, text: str, **flags: object) -> list[str | None]:
+    return [each['mission_id'] for each in search.search(index, text, wanted(0, **flags))]  # type: ignore[arg-type]
+
+
+def test_words_phrases_and_beginnings(index: Path) -> None:
+    """All words in any order, those of a phrase in its own; letters in any form; the best first."""
+    assert sorted(map(str, missions(index, 'door handle'))) == ['m0', 'm1']
+    assert missions(index, '"door handle"') == ['m0']
+    without = search.search(index, 'DOOR -kitchen', wanted(0), kind='mission')
+    assert [each['mission_id'] for each in without] == ['m1']
+    assert missions(index, 'turgriff') == ['m1']
+    assert sorted(map(str, missions(index, 'stair*'))) == ['None', 'm2', 'm2']
+    assert missions(index, 'kitchen OR cellar') in (['m0', 'm1'], ['m1', 'm0'])
+    (event,) = search.search(index, 'left', wanted(0))
+    assert (event['kind'], event['title'], event['since_ns']) == ('event', 'door_opened', NOON_NS + 5 * SECOND)
+    assert missions(index, 'zebra') == []
+
+
+def test_the_flags_of_a_query(index: Path) -> None:
+    """Robot, time, mission, how it ended, label and ranges."""
+    assert missions(index, 'door handle', success=False) == ['m1']
+    assert missions(index, 'door handle', until='2026-10-28T12:30') == ['m0']
+    assert missions(index, 'door handle', mission='run1') == ['m1']
+    assert missions(index, 'door', robot='tachi') == []
+    assert missions(index, 'up', label='stairs') == ['m2']
+    assert missions(index, 'door', label='stairs') == []
+    assert missions(index, 'handle', ranges=[{'since_ns': NOON_NS + HOUR, 'until_ns': NOON_NS + HOUR}]) == ['m1']
+    assert [each['title'] for each in search.search(index, 'stairs', wanted(0), kind='label')] == ['stairs']
+
+
+def test_an_update_reads_what_is_new(lake: Bucket, index: Path, tmp_path: Path) -> None:
+    """A second one adds nothing, and the same comes of nothing."""
+    again = search.update(index, lake, Findings(lambda _: None))
+    assert (again.missions, again.documents) == (0, 7)
+    fresh = tmp_path / 'search.db'
+    search.update(fresh, lake, Findings(lambda _: None))
+    assert search.search(fresh, 'door', wanted(0)) == search.search(index, 'door', wanted(0))
+
+
+def test_an_index_in_the_store(lake: Bucket, index: Path) -> None:
+    """It takes the place of the one before."""
+    with closing(open_store(lake.settings, UploadSettings())) as store:
+        search.put(store, 'sensor-data', '_search/search.db', index)
+        with closing(sqlite3.connect(index)) as db:
+            db.execute('VACUUM')
+        search.put(store, 'sensor-data', '_search/search.db', index)
+    with search.downloaded(lake, '_search/search.db') as path:
+        assert path.read_bytes() == index.read_bytes()
+        assert missions(path, '"door handle"') == ['m0']
+
+
+@given(st.text(max_size=40) | st.text('"*-()ORNEAD:^+ {}a\'', max_size=20))
+def test_no_query_is_obeyed(index: Path, text: str) -> None:
+    """Whatever is typed is searched for, or refused with what is allowed: it is never a syntax error of SQLite's."""
+    with suppress(SettingError):
+        search.search(index, text, wanted(0))
+
+
+@pytest.mark.parametrize('text', ['', '   ', '"door', '-door', 'door OR', 'OR', '***', '\x00', ' '.join('x' * 40)])
+def test_what_is_no_query_is_told(index: Path, text: str) -> None:
+    """With what is allowed."""
+    with pytest.raises(SettingError, match='phrase'):
+        search.search(index, text, wanted(0))
+
+
+def test_a_file_that_is_no_index(tmp_path: Path, lake: Bucket) -> None:
+    """Neither damage nor tables and triggers of somebody else are taken for ours."""
+    path = tmp_path / 'search.db'
+    with pytest.raises(LakeError, match='no index'):
+        search.search(path, 'door', wanted(0))
+    path.write_bytes(b'no database' * 99)
+    with pytest.raises(LakeError, match='cannot be used'):
+        search.search(path, 'door', wanted(0))
+    path.unlink()
+    search.update(path, lake, Findings(lambda _: None))
+    with closing(sqlite3.connect(path)) as db:
+        db.executescript("CREATE VIEW more AS SELECT load_extension('x');")
+    with pytest.raises(LakeError, match='not an index'):
+        search.search(path, 'door', wanted(0))
