@@ -1,10 +1,14 @@
 #!/usr/bin/env python3
 """What the live page costs and how late it is: CPU of node and page without viewers and with some, and links that are slow.
 
-    scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8]
+    scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8 | --beside 0.5 | --browser | --pairs 7]
+        [--kills 2]
 
 Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a network
-namespace where what the page sends leaves at so many Mbit/s (tc htb; needs root). One line of JSON for each part.
+namespace where what the page sends leaves at so many Mbit/s (tc htb; needs root). ``--beside`` gives a second viewer that reads
+so many Mbit/s, and says what that does to the first. ``--browser`` opens the page in a Chromium: how late items come and are
+drawn, the first frame, an outage of 10 s. ``--pairs`` measures the node's CPU with and without viewers in turns. One line of
+JSON for each part.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ import asyncio
 import json
 import os
 import secrets
+import shutil
 import signal
 import statistics
 import subprocess
@@ -29,6 +34,7 @@ import aiohttp
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 from domains import free_domain
 from e2e.processes import Process, Processes, until
+from live.proxy import CutLink
 
 KINDS = ('camera', 'cloud', 'imu', 'odom', 'joints', 'battery')
 
@@ -41,7 +47,8 @@ class Watcher:
         self.late_ms: dict[str, list[float]] = {}
         self.bytes = 0
 
-    async def run(self, *, reads: bool = True) -> None:
+    async def run(self, *, reads: bool = True, bytes_s: float = 0.0) -> None:
+        """``bytes_s``: it reads no faster."""
         async with (
             aiohttp.ClientSession(headers={'Origin': self.url.rstrip('/')}) as session,
             session.ws_connect(f'{self.url}ws') as ws,
@@ -53,6 +60,8 @@ class Watcher:
             said_s = time.monotonic()
             async for message in ws:
                 self.bytes += len(message.data)
+                if bytes_s:
+                    await asyncio.sleep(len(message.data) / bytes_s)
                 await ws.send_bytes((self.bytes & 0xFFFF_FFFF).to_bytes(4, 'little'))
                 lane, flags = message.data[:2]
                 parts[lane] = (b'' if flags & 1 else parts.get(lane, b'')) + message.data[4:]
@@ -111,6 +120,74 @@ def watched(url: str, count: int, seconds: float, pids: dict[str, int], deaf: in
             'each': [watcher.told(took) for watcher in watchers[deaf:][:2]]}  # fmt: skip
 
 
+def in_browser(url: str, seconds: float) -> dict[str, Any]:
+    """The page in a Chromium with software GL, through a link that is cut for 10 s in the end."""
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415 - for this part alone
+
+    link = CutLink(int(url.rstrip('/').rpartition(':')[2]))
+    try:
+        with sync_playwright() as playwright:
+            flags = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox']
+            browser = playwright.chromium.launch(executable_path=shutil.which('chromium'), args=flags)
+            page = browser.new_page(viewport={'width': 1280, 'height': 800})
+            page.goto(f'http://127.0.0.1:{link.port}/')
+            until(lambda: page.evaluate('shadowhound.drawn.cloud?.length > 20'), 'clouds are drawn')
+            first_ms = page.evaluate('shadowhound.first')
+            page.evaluate('for (const late of [shadowhound.came, shadowhound.drawn]) for (const kind in late) late[kind] = []')
+            page.wait_for_timeout(seconds * 1e3)
+            late = page.evaluate('({came: shadowhound.came, drawn: shadowhound.drawn})')
+            found: dict[str, Any] = {'first_frame_ms': round(first_ms)}
+            for where, kinds in late.items():
+                found[where] = {kind: round(sorted(each)[int(len(each) * 0.95)], 1) for kind, each in kinds.items() if each}
+            link.cut()
+            wrong_ms, end_s = [], time.monotonic() + 10
+            while time.monotonic() < end_s:
+                before_ms = time.monotonic() * 1e3
+                age_ms, at_ms = page.evaluate(
+                    "[Number(document.querySelector('[data-age=imu]').dataset.ms), shadowhound.at().imu]"
+                )
+                wrong_ms.append(abs((before_ms + time.monotonic() * 1e3) / 2 - at_ms - age_ms))
+            count = page.evaluate('shadowhound.count.imu')
+            link.mend()
+            mended_s = time.monotonic()
+            until(lambda: page.evaluate('shadowhound.count.imu') > count, 'it goes on')
+            found |= {'goes_on_s': round(time.monotonic() - mended_s, 2),
+                      'ages_wrong_p95_ms': round(sorted(wrong_ms)[int(len(wrong_ms) * 0.95)])}  # fmt: skip
+            browser.close()
+            return found
+    finally:
+        link.close()
+
+
+def paired(url: str, viewers: int, seconds: float, pairs: int, pids: dict[str, int]) -> dict[str, Any]:
+    """The node's CPU with viewers less that without, in turns, points of a core."""
+    more = []
+    for _ in range(pairs):
+        without, with_viewers = (watched(url, count, seconds, pids)['cpu_percent']['node'] for count in (0, viewers))
+        more.append(round(with_viewers - without, 2))
+    return {'pairs': pairs, 'seconds': seconds, 'viewers': viewers, 'node_points_more': sorted(more),
+            'median': statistics.median(more)}  # fmt: skip
+
+
+def beside(url: str, seconds: float, slow_mbps: float) -> dict[str, Any]:
+    """What a viewer on a slow link does to one beside it: p95 of the fast one alone, and with the slow one."""
+    topics = ['/camera/compressed', '/point_cloud2', '/imu', '/odom', '/joint_states', '/lowstate']
+
+    async def run(*, with_slow: bool) -> dict[str, Any]:
+        fast, slow = Watcher(url, topics), Watcher(url, topics)
+        tasks = [asyncio.create_task(fast.run()), *([asyncio.create_task(slow.run(bytes_s=slow_mbps * 125_000))] * with_slow)]
+        await asyncio.sleep(4)
+        fast.late_ms.clear()
+        await asyncio.sleep(seconds)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        return {kind: row['p95_ms'] for kind, row in fast.told(seconds).items() if kind in KINDS}
+
+    rows = [asyncio.run(run(with_slow=with_slow)) for with_slow in (False, True, False, True)]
+    return {'slow_mbps': slow_mbps, 'alone': [rows[0], rows[2]], 'beside': [rows[1], rows[3]]}
+
+
 def shape(url: str, mbps: float) -> None:
     """What the page sends carries no more, in packets as on a network; all else on this loopback is as fast as ever."""
     port = url.rstrip('/').rpartition(':')[2]
@@ -125,12 +202,15 @@ def shape(url: str, mbps: float) -> None:
         subprocess.run(command.split(), check=True)
 
 
-def main() -> None:
+def main() -> None:  # noqa: PLR0915 - one part after the other
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seconds', type=float, default=20.0)
     parser.add_argument('--viewers', type=int, default=3)
     parser.add_argument('--link', type=float, default=0.0)
     parser.add_argument('--kills', type=int, default=0)
+    parser.add_argument('--beside', type=float, default=0.0)
+    parser.add_argument('--browser', action='store_true')
+    parser.add_argument('--pairs', type=int, default=0)
     parser.add_argument('--scale', type=float, default=1.0)
     given = parser.parse_args()
     if given.link and 'LIVE_BENCH' not in os.environ:
@@ -157,7 +237,13 @@ def main() -> None:
         live, url = serve(0)
         pids = {'node': node.popen.pid, 'live': live.popen.pid}
         until(lambda: node.topic('/imu').get('received', 0) > 50, 'the robot is heard')
-        if given.link:
+        if given.browser:
+            rows = [in_browser(url, given.seconds)]
+        elif given.pairs:
+            rows = [paired(url, given.viewers, given.seconds, given.pairs, pids)]
+        elif given.beside:
+            rows = [beside(url, given.seconds, given.beside)]
+        elif given.link:
             shape(url, given.link)
             rows = [watched(url, 1, given.seconds, pids)]
         else:

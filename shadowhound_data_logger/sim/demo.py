@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console(highlight=False)
     try:
         with fresh_folder(options.folder) as folder:
-            return run(folder, options.duration, options.outage, console, mlflow=options.mlflow)
+            return run(folder, options.duration, options.outage, console, mlflow=options.mlflow, keeps=options.keep)
     except KeyboardInterrupt:
         console.print('\ndemo: stopped. What there is lies in the folder still.')
         return 130
@@ -66,8 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
 
 
-def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, mlflow: bool = True) -> int:
-    """Everything, from an empty folder to the verdict."""
+def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, mlflow: bool = True,
+        keeps: bool = False) -> int:  # fmt: skip
+    """Everything, from an empty folder to the verdict; with ``keeps`` the page and the Tower stay until Ctrl-C."""
     console.print(f'[bold]A Go2 on patrol for {duration_s:g} s, its data logger, and a Tower to log to.')
     console.print(f'All of it on this machine, in {folder}/\n')
     if importlib.util.find_spec('go2_interfaces') is None:
@@ -76,11 +77,12 @@ def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, m
     console.print('Starting the Tower, an S3 server and MLflow (some ten seconds) ...')
     for name in NO_PROXY:
         os.environ[name] = ','.join(filter(None, (os.environ.get(name), '127.0.0.1')))
-    with Tower(folder / 'tower', mlflow=mlflow) as tower:
+    with ExitStack() as stack:
+        tower = stack.enter_context(Tower(folder / 'tower', mlflow=mlflow))
         console.print(f'  S3 server  {tower.endpoint_url}')
         if mlflow:
             console.print(f'  MLflow     {tower.tracking_uri}')
-        record, run_id = _patrol(folder, tower, duration_s, outage_s, console, with_mission=mlflow)
+        record, run_id, page, address = _patrol(folder, tower, duration_s, outage_s, console, with_mission=mlflow, stack=stack)
         drawn = [demo_mission.picture(tower.tracking(READER), run_id, folder / 'mission.png')] if run_id else []
         console.print('\nReading everything back from the S3 server ...\n')
         store = open_store(tower.store_settings(), UploadSettings())
@@ -88,20 +90,33 @@ def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, m
             audit = demo_audit.audit(folder / 'home' / 'spool', demo_processes.ROBOT, record.published, store)
         finally:
             store.close()
+        from shadowhound_data_logger.sim import demo_pictures  # noqa: PLC0415 - matplotlib takes a second to load
+
+        drawn += demo_pictures.live_page(address, folder / 'live.jpg')
+        code = _tell(folder, audit, record, run_id, drawn, console, address if keeps else '')
+        if keeps:
+            with suppress(KeyboardInterrupt):
+                page.wait()
+    return code
+
+
+def _tell(folder: Path, audit: demo_audit.DemoAudit, record: demo_run.Record, run_id: str, drawn: list[Path],
+          console: Console, page: str) -> int:  # fmt: skip
+    """The result, and the exit code that says it."""
     (folder / 'ledger.json').write_text(json.dumps(audit.ledger, indent=2), encoding='utf-8')
     demo_report.show_result(audit, record, console)
     if run_id:
         demo_report.show_mission(demo_mission.summary(audit.bodies, run_id), console)
-    from shadowhound_data_logger.sim import demo_pictures  # noqa: PLC0415 - matplotlib takes a second to load
+    from shadowhound_data_logger.sim import demo_pictures  # noqa: PLC0415
 
     pictures = demo_pictures.draw(folder, audit.bodies, record)
-    demo_report.show_where(folder, [*pictures, *drawn], os.environ, console)
+    demo_report.show_where(folder, [*pictures, *drawn], os.environ, console, page)
     return 1 if audit.problems or record.errors else 0
 
 
 def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, console: Console, *,
-            with_mission: bool) -> tuple[demo_run.Record, str]:  # fmt: skip
-    """The minute itself, and its mission's run, if it is one; afterwards all processes but the Tower have ended."""
+            with_mission: bool, stack: ExitStack) -> tuple[demo_run.Record, str, demo_processes.Child, str]:  # fmt: skip
+    """The minute itself, its mission's run if it is one, and the live page, which the stack ends; the others have ended."""
     environ = demo_processes.environment(folder / 'home', tower.environment(), demo_processes.free_domain())
     console.print(f'Starting the node and the robot (ROS_DOMAIN_ID={environ["ROS_DOMAIN_ID"]}, this machine only) ...')
     with (
@@ -109,10 +124,11 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
         demo_run.StoreOutage(tower, (duration_s - outage_s) / 2, outage_s) as outage,
     ):
         page, address = demo_processes.start_page(folder, environ)
+        stack.enter_context(page)
         console.print(f'Watch it live, while it walks: {address}')
         if outage_s:
             console.print(f'In the middle the S3 server goes away for {outage_s:g} s.\n')
-        with page, ExitStack() as agents:
+        with ExitStack() as agents:
             if with_mission:
                 agent = agents.enter_context(demo_mission.start(folder, environ))
             with demo_report.progress(console, duration_s) as show:
@@ -128,7 +144,7 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
         node.stop(demo_processes.STOP_S)
         node.check()
         console.print(f'The robot has stopped. Asked to end (SIGINT), the node did so in {time.monotonic() - began:.1f} s.')
-    return replace(record, errors=tuple(node.errors())), run_id
+    return replace(record, errors=tuple(node.errors())), run_id, page, address
 
 
 @contextmanager
@@ -156,6 +172,7 @@ def _parser() -> argparse.ArgumentParser:
         '--outage', type=float, default=10.0, metavar='S', help='seconds without the S3 server (default 10; 0: none)'
     )
     parser.add_argument('--folder', type=Path, default=Path('demo'), help='where all of it lies (default demo)')
+    parser.add_argument('--keep', action='store_true', help='keep the live page and the Tower afterwards, until Ctrl-C')
     parser.add_argument('--no-mlflow', dest='mlflow', action='store_false', help='the S3 server only, which starts sooner')
     return parser
 

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import logging
+import os
+import shutil
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +24,8 @@ from shadowhound_data_logger.missions.plots import AMBER, BLUE, DPI, INK, STYLE,
 from shadowhound_data_logger.sim.demo_run import Record
 from shadowhound_data_logger.sim.floor_plan import FloorPlan
 
+log = logging.getLogger(__name__)
+
 CELL_M: Final = 0.03
 """Of the map that the point clouds are drawn into."""
 FLOOR_M: Final = 0.08
@@ -29,6 +35,9 @@ SHEET: Final = (4, 3)
 """Columns and rows of the contact sheet."""
 THUMB: Final = (240, 180)
 GAP: Final = 8
+PAGE_MS: Final = 90_000
+SETTLE_MS: Final = 3000
+"""The page has shown what it was asked for by then; the picture is for people."""
 CAPTION: Final = 18
 
 
@@ -41,6 +50,40 @@ def draw(folder: Path, bodies: Mapping[str, bytes], record: Record) -> list[Path
             delivery(record, folder / 'delivery.png'),
         ]
     return [path for path in made if path is not None]
+
+
+def live_page(address: str, path: Path) -> list[Path]:
+    """The live page with the middle of the patrol, as a Chromium of this machine shows it; nothing where there is none."""
+    chromium = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
+    if chromium is None or find_spec('playwright') is None:
+        return []
+    from playwright.sync_api import Error, sync_playwright  # noqa: PLC0415 - for tests; a demo may be without
+
+    flags = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', *(['--no-sandbox'] if os.geteuid() == 0 else [])]
+    try:
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=chromium, args=flags)
+            page = browser.new_page(viewport={'width': 1280, 'height': 1120})
+            page.set_default_timeout(PAGE_MS)
+            page.goto(address)
+            page.get_by_role('button', name='Back in time').click()
+            page.locator('rect.recorded[data-topic="/odom"]').first.wait_for()
+            missions = page.locator('select[aria-label=Mission]')
+            if missions.count():
+                missions.select_option(index=1)
+            else:
+                page.get_by_role('button', name='1 min', exact=True).click()
+            page.wait_for_timeout(SETTLE_MS)
+            box = page.locator('rect.recorded[data-topic="/odom"]').first.bounding_box()
+            if box is not None:
+                page.mouse.click(box['x'] + 0.6 * box['width'], box['y'])
+            page.wait_for_timeout(SETTLE_MS)
+            page.screenshot(path=path, type='jpeg', quality=82, timeout=PAGE_MS)
+            browser.close()
+    except Error as error:
+        log.warning('there is no picture of the live page: %s', error)
+        return []
+    return [path]
 
 
 def contact_sheet(frames: Mapping[str, bytes], path: Path) -> Path | None:

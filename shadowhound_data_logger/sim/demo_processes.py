@@ -98,6 +98,10 @@ class Child:
         if self.is_running:
             self._process.send_signal(signal.SIGINT)
 
+    def wait(self) -> None:
+        """Until it ends."""
+        self._process.wait()
+
     def stop(self, timeout_s: float) -> None:
         """SIGINT, and SIGKILL after ``timeout_s``; idempotent."""
         self.ask_to_stop()

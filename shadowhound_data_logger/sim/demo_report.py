@@ -146,14 +146,18 @@ def show_mission(summary: Mapping[str, Any], console: Console) -> None:
     console.print('Its run in MLflow has parameters, metrics over time, trajectory, frames, three pictures and a summary.')
 
 
-def show_where(folder: Path, pictures: list[Path], environ: Mapping[str, str], console: Console) -> None:
-    """Where everything is, and how to look at it."""
+def show_where(folder: Path, pictures: list[Path], environ: Mapping[str, str], console: Console, page: str = '') -> None:
+    """Where everything is, and how to look at it; ``page`` is the live page, where it and the Tower stay."""
     prefix = 'scripts/with-env ' if OUR_VARIABLE in environ else ''
     place = shlex.quote(str(folder))
     console.print('\n[bold]Look at')
     for picture in pictures:
         console.print(f'  {picture}', soft_wrap=True)
     console.print(f'  {folder}/node.log: what the node said', soft_wrap=True)
+    if page:
+        console.print(f'\n[bold]The live page stays, with the whole patrol to look back at: {page}')
+        console.print('Ctrl-C ends it, and the Tower.')
+        return
     console.print('\n[bold]Look at the bucket')
     console.print('The Tower has stopped, its data stay. Start it again, with new credentials:')
     console.print(f'  {prefix}python -m shadowhound_data_logger.sim.tower --folder {place}/tower', soft_wrap=True)

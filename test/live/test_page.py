@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from domains import free_domain
 from e2e.processes import Node, Process, Processes, until
+from live.proxy import CutLink
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -266,3 +267,33 @@ def test_nothing_is_wider_than_the_screen(page: Page, tmp_path: Path, width: int
     holds(page, 'document.documentElement.scrollWidth <= innerWidth')
     page.wait_for_timeout(500)
     (tmp_path / f'{width}_{scheme}.png').write_bytes(page.screenshot(full_page=True, timeout=120_000))
+
+
+def test_an_outage_of_ten_seconds(page: Page, watching: Watching) -> None:
+    """The page goes on by itself; the ages that it shows meanwhile are those that the robot's clock says."""
+    if watching.sim.popen.poll() is not None:
+        watching.sim = watching.processes.sim(RATES)
+    link = CutLink(int(watching.url.rstrip('/').rpartition(':')[2]))
+    try:
+        page.goto(f'http://127.0.0.1:{link.port}/')
+        holds(page, 'shadowhound.count.imu > 20')
+        page.evaluate('window.same = true')
+        link.cut()
+        cut_s = time.monotonic()
+        wrong_ms = []
+        while time.monotonic() < cut_s + 10:
+            shown = "[Number(document.querySelector('[data-age=imu]').dataset.ms), shadowhound.at().imu]"
+            before_ms = time.monotonic() * 1e3
+            age_ms, at_ms = page.evaluate(shown)
+            true_ms = (before_ms + time.monotonic() * 1e3) / 2 - at_ms  # one machine: the page's robot has this very clock
+            wrong_ms.append(abs(true_ms - age_ms))
+        link.mend()
+        count = counted(page, 'imu')
+        mended_s = time.monotonic()
+        holds(page, f'shadowhound.count.imu > {count}')
+        assert time.monotonic() - mended_s < 20  # 2 s on a machine of its own: bench/live.py --browser
+        assert page.evaluate('window.same')
+        assert sorted(wrong_ms)[len(wrong_ms) // 2] < 200
+    finally:
+        page.goto('about:blank')
+        link.close()

@@ -21,7 +21,7 @@ const pastRings = Object.fromEntries(Object.keys(rings).map((kind) => [kind, new
 const views = {};
 const ringOf = (kind) => (past.value ? pastRings : rings)[kind];
 // For whoever measures: how late items were when they came and when they were drawn, ms.
-const stats = (window.shadowhound = { came: {}, drawn: {}, count: {}, link: null, ages: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, link.now() - at])) });
+const stats = (window.shadowhound = { came: {}, drawn: {}, count: {}, link: null, ages: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, link.now() - at])), at: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, at])) });
 let link;
 
 function note(where, kind, at) {
@@ -64,6 +64,7 @@ async function showFrame(head, body) {
       canvas.getContext('2d').drawImage(picture, 0, 0);
       picture.close();
       note(stats.drawn, 'camera', now.at);
+      stats.first ??= performance.now();
     } catch { /* a broken frame: the next one comes */ }
   }
   decoding = false;
@@ -142,7 +143,7 @@ past.subscribe((now) => {
 function Age({ kind, children }) {
   const [, again] = useState(0);
   useEffect(() => {
-    const timer = setInterval(() => again((count) => count + 1), 200);
+    const timer = setInterval(() => again((count) => count + 1), 100);
     return () => clearInterval(timer);
   }, []);
   if (past.value && kind !== 'figures') {
