@@ -46,7 +46,7 @@ class SettingGone(SettingError):
     """A parameter of an earlier version; ``data['allowed']`` is what does its job now."""
 
     def __init__(self, name: str, value: object, instead: str) -> None:
-        DataLoggerError.__init__(self, f'{name} = {value!r}: there is no such parameter any more', remedy=f'remove it: {instead}',
+        DataLoggerError.__init__(self, f'{name} = {value!r}: this parameter no longer exists', remedy=f'remove it: {instead}',
                                  name=name, value=value, allowed=instead)  # fmt: skip
 
     def __str__(self) -> str:

@@ -135,7 +135,9 @@ class UploadSettings:
     connect_timeout_s: float = 5.0
     """Not a parameter: of the doctor and of tests."""
     read_timeout_s: float = _setting(30.0, 'Seconds to wait for an answer of the store.', low=0.1, high=600.0)
-    backoff_s: float = _setting(60.0, 'Longest pause between two attempts while the store is away.', low=0.1, high=3600.0)
+    backoff_s: float = _setting(
+        60.0, 'Longest pause between two attempts while the store cannot be reached.', low=0.1, high=3600.0
+    )
     max_mbps: float = _setting(0.0, 'Most megabits a second to an S3 server; 0 is no limit.', low=0.0, high=1e5, live=True)
 
 
@@ -143,7 +145,7 @@ class UploadSettings:
 class ShutdownSettings:
     """What a SIGINT or SIGTERM may take."""
 
-    drain_s: float = _setting(3.0, 'Seconds to go on uploading when the node is stopped.', low=0.0, high=600.0)
+    drain_s: float = _setting(3.0, 'Seconds to continue uploading when the node is stopped.', low=0.0, high=600.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,7 +23,7 @@ _RUSTLS: Final = {'Expired': _EXPIRED, 'NotValidYet': _NOT_YET, 'NotValidForName
 """What rustls calls these, some with ``Context`` behind it (https://docs.rs/rustls/latest/rustls/enum.CertificateError.html)."""
 _TOLD: Final = re.compile(r'InvalidCertificate\(\s*(\w+?)(?:Context)?\b')
 _AUTHORITY: Final = (
-    'the certificate of {server} is that of an authority itself, and rustls takes none such of a server',
+    'the certificate of {server} is that of an authority, which rustls does not accept from a server',
     'make one on Tower that the authority signs',
 )
 _UNKNOWN: Final = (

@@ -107,7 +107,7 @@ def test_a_parameter_that_is_gone_stops_the_start(name: str) -> None:
         error = refused(**{'sensors': ['camera', 'thermal'], 'thermal.topics': ['thermal'], given: 4711})
         assert isinstance(error, SettingGone)
         assert (error.data['name'], error.data['allowed']) == (given, GONE[name].replace('SENSOR', sensor))
-        assert str(error) == f'{given} = 4711: there is no such parameter any more (remove it: {error.data["allowed"]})'
+        assert str(error) == f'{given} = 4711: this parameter no longer exists (remove it: {error.data["allowed"]})'
 
 
 def test_what_is_gone_is_no_parameter() -> None:

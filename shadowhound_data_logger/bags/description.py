@@ -150,5 +150,5 @@ def _whole(told: Mapping[str, Any], name: str) -> int:
 
 def _text(found: object) -> str:
     if not isinstance(found, str):
-        raise TypeError('a list or a number stands where a text should')
+        raise TypeError('a list or a number where text is expected')
     return found

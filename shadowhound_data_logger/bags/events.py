@@ -161,7 +161,7 @@ class Events:
             if not self._settings.enabled:
                 return False, 'no events: neither events.topics nor events.regex names a topic to keep'
             if self._closed:
-                return False, 'no events any more: the node is closing'
+                return False, 'no more events: the node is closing'
             self._triggers += 1
             now_s, event = self._monotonic(), self._current
             unset = self._place.unset() if event is None else event.unset

@@ -129,7 +129,7 @@ def _have(store: ObjectStore, file: RemoteFile, folder: Path, promised: str | No
     if promised and info.sha256 != promised and fingerprint(path)[1] != promised:
         path.unlink()
         raise BagDamaged(f'{file.key} is not in the store what was recorded: its SHA-256 is not {promised}',
-                         remedy='shadowhound-data bag verify tells of all files', path=file.key)  # fmt: skip
+                         remedy='shadowhound-data bag verify checks all files', path=file.key)  # fmt: skip
     return sha256
 
 

@@ -80,5 +80,5 @@ def _last_line(output: bytes, code: int) -> dict[str, Any]:
     try:
         return dict(json.loads(output.splitlines()[-1]))
     except (IndexError, ValueError) as error:
-        remedy = 'is ROS sourced? what it said stands above'
+        remedy = 'is ROS sourced? its output is above'
         raise BagError(f'the recorder ended with exit code {code} and without a word', remedy=remedy) from error

@@ -273,7 +273,7 @@ def _rows(place: BagPlace) -> dict[str, RecordingRows]:
     try:
         return {rows.folder: rows for rows in place.spool.recordings() if is_name(rows.folder, MAX_BAG_BYTES)}
     except sqlite3.Error as error:
-        log.warning('the index does not tell which bags are to be made whole, their slices do: %s', error)
+        log.warning('the index does not say which bags to complete, their slices do: %s', error)
         return {}
 
 

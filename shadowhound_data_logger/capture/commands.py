@@ -149,7 +149,7 @@ class Commands:
         if not paused:
             return True, 'messages are stored again'
         _, spooled = self._flush(end_s - time.monotonic())
-        return True, f'paused: messages are counted and not stored, delivery goes on; {spooled}'
+        return True, f'paused: messages are counted and not stored, delivery continues; {spooled}'
 
     def _trigger(self, name: str = MANUAL, note: str = '', by: str = ASKERS[0]) -> Answer:
         """Begin an event, or make the one that goes on last longer; names the bag."""

@@ -103,7 +103,7 @@ class ExtraTopics:
             else:
                 left_out += 1
         if left_out and not self.left_out:
-            text = '%d topics (%s, ...) are not recorded: beside those that the settings name at most %d are, and %d in all'
+            text = '%d topics (%s, ...) are not recorded: besides those that the settings name, at most %d are, and %d in total'
             log.warning(text, left_out, printable(found[-1]), MAX_FOUND, MAX_EVER)
         self.left_out = left_out
 

@@ -154,7 +154,7 @@ def choose(asked: str, environ: Mapping[str, str]) -> Middleware:
         raise SettingError(SETTING, asked, f'{RMW_AUTO} or {RMW_ROBOT} here: {problem}')
     problem = problem or network.problem
     if not problem and version not in MEASURED:
-        problem = f'{FAST_DDS} {version[0]}.{version[1]} has not been measured beside it'
+        problem = f'{FAST_DDS} {version[0]}.{version[1]} has not been tested with it'
     if asked != RMW_FASTRTPS and problem:
         return Middleware(asked, robot, robot, f"the robot's own: {problem}")
     variables = {RMW: FAST_DDS}

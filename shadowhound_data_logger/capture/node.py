@@ -39,7 +39,7 @@ NO_SERVICE = 'start_type_description_service'
 """A parameter of rclpy since Jazzy."""
 UNHEARD = 'the parameter file has nothing for {name}, so the defaults hold: begin its section with /**, or with that name'
 NO_FRONT = (
-    '{rmw} is not installed here, so nobody offers services, parameters and /diagnostics to the robot: install it, '
+    '{rmw} is not installed here, so services, parameters and /diagnostics are not offered to the robot: install it, '
     'or use `shadowhound-data node`'
 )
 SPIN_S = 0.5

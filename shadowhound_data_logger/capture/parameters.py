@@ -84,7 +84,7 @@ class Parameters:
 
     def _check_known(self, name: str) -> None:
         if instead := gone(name):
-            raise DataLoggerError(f'there is no parameter {name!r} any more', remedy=instead)
+            raise DataLoggerError(f'the parameter {name!r} no longer exists', remedy=instead)
         if not self._node.has_parameter(name):
             known = [each for each in self._node.get_parameters_by_prefix('') if each.partition('.')[0] not in NOT_SETTINGS]
             near = [each for each in known if each.partition('.')[0] == name.partition('.')[0]]

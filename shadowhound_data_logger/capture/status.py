@@ -115,7 +115,7 @@ class Status:
         try:
             usage = self._stages.spool.usage()
         except (OSError, sqlite3.Error) as error:
-            self._complain(f'the status cannot be told: {error}')
+            self._complain(f'the status cannot be gathered: {error}')
             return None
         while self._past and self._past[0][0] < now_s - WINDOW_S:
             self._past.popleft()

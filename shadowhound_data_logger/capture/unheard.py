@@ -81,7 +81,7 @@ class Unheard:
         before = self._rows.pop(topic, None)
         if not publishers:
             if before is not None:
-                log.info('%s: %s knows no publisher any more that %s has not found', topic, self._robot, self._rmw)
+                log.info('%s: %s no longer knows a publisher that %s has not found', topic, self._robot, self._rmw)
             return
         nodes = sorted({node for _, node in publishers.values()} - {''})
         seconds = round(now_s - min(self._since_s[topic, gid] for gid in publishers))

@@ -23,7 +23,7 @@ ENCODE_S: Final = 10.0
 DELIVERY_S: Final = 30.0
 """Objects wait, and nothing moved for so long on top of what a single request may take."""
 _UNWRITTEN: Final = 'nothing more is written to its bag for {s}: does the disk answer?'
-_HANGS_ENCODING: Final = 'one batch has taken {s} so far; others go on meanwhile if there are more encoder threads'
+_HANGS_ENCODING: Final = 'one batch has taken {s} so far; others continue if there are more encoder threads'
 _HANGING: Final[Mapping[str, str]] = {
     'intake': 'it takes no messages for {s} and they are being lost; start the node again if that lasts',
     'spool-writer': 'a commit to the spool has taken {s}: its disk does not answer; look at dmesg and at its cable or card',
@@ -165,7 +165,7 @@ class SilenceDetector:
         if received > self._received:
             self._hear(row, received, now_s)
         if row['unavailable']:
-            return f'nobody can listen to it here: {row["unavailable"]}'
+            return f'it cannot be subscribed to here: {row["unavailable"]}'
         return self._unheard(row, now_s - self._since_s) if self._heard_s is None else self._stopped(row, now_s - self._heard_s)
 
     def _hear(self, row: Mapping[str, Any], received: int, now_s: float) -> None:

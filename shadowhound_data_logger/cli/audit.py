@@ -87,8 +87,8 @@ def _verdict(said: Mapping[str, Any]) -> Text:
     how = 'every byte read back' if said['deep'] else 'by size and checksum'
     if said['unreachable']:
         left = max(said['known'] - said['asked'] - said['asked_earlier'], 0)
-        reason = plain(f': {said["unreachable"]}. {number(left)} objects are not asked for yet: run it again to go on there.')
-        return Text.assemble(('The store is away', 'yellow'), reason)
+        reason = plain(f': {said["unreachable"]}. {number(left)} objects are not checked yet: run it again to continue there.')
+        return Text.assemble(('The store cannot be reached', 'yellow'), reason)
     if said['ok']:
         return Text.assemble(('All of them are there', 'green'), f', {how}.')
     count = sum(piled['count'] for piled in said['findings'].values())

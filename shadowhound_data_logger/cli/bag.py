@@ -413,7 +413,7 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
 def _clock(clock: ClockOf, start_ns: int) -> str:
     """What the times of a bag are worth whose clock was not set."""
     if clock.offset_ns is None:
-        return f'was never set in boot {clock.boot_id}: nobody knows the date, and the times below are by that clock'
+        return f'was never set in boot {clock.boot_id}: the date is not known, and the times below are by that clock'
     began = f'the bag began {shown_time(start_ns + clock.offset_ns)} UTC'
     return f'was not set yet: {began}, and {clock.offset_ns / 1e9:.3f} s are to be added to the times below'
 
@@ -487,7 +487,7 @@ def _verdict(found: VerifiedBag) -> Iterator[RenderableType]:
     if found.state == GROWING:
         yield plain('It is still growing: its manifest, or a slice that it promises, is not there yet.', 'yellow')
     if found.state == FOREIGN:
-        yield plain('It has no manifest, so nobody says what should be in it.', 'dim')
+        yield plain('It has no manifest, so what should be in it is not known.', 'dim')
 
 
 def _told_cut(found: Cut) -> Iterator[str | Text]:

@@ -330,20 +330,20 @@ def _page(said: Mapping[str, Any]) -> list[Any]:
     asked = f'{said["store"]} was asked for {number(said["asked"])} of the {number(said["known"])} objects of {by}'
     lines: list[Any] = [plain(f'{asked}, in {duration(said["took_s"])}.')]
     if said['unproved']:
-        lines.append(plain(f'Of {number(said["unproved"])} no checksum is known: their sizes are compared alone.', 'yellow'))
+        lines.append(plain(f'Of {number(said["unproved"])} no checksum is known: only their sizes are compared.', 'yellow'))
     return [*lines, *finding_lines(said['findings'], WORDS), '', _verdict(said)]
 
 
 def _verdict(said: Mapping[str, Any]) -> Text:
     how = 'every byte read back' if said['deep'] else 'by size and checksum'
     if said['unreachable']:
-        left = plain(f': {said["unreachable"]}. {number(said["known"] - said["asked"])} objects are not asked for.')
+        left = plain(f': {said["unreachable"]}. {number(said["known"] - said["asked"])} objects are not checked.')
         return Text.assemble(('The store cannot be reached', 'yellow'), left)
     if not said['known']:
         return Text.assemble(('Nothing is verified', 'yellow'), f': the catalogue has no such objects.{store_hint()}')
     if said['ok']:
         return Text.assemble(('All of them are there', 'green'), f', {how}.')
     if not said['findings']:
-        return Text.assemble(('All that it tells of are there', 'yellow'), f', {how}; but it is not whole.')
+        return Text.assemble(('All objects that it names are there', 'yellow'), f', {how}; but it is not whole.')
     wrong = len({(one['bucket'], one['key']) for piled in said['findings'].values() for one in piled['first']})
     return Text.assemble((f'{number(wrong)} are not as the catalogue says', 'red'), f', {how}.')

@@ -202,7 +202,7 @@ def notes(found: Mapping[str, Any]) -> list[str]:
 def _other_type(name: str, other: Mapping[str, Any]) -> str:
     by = ', '.join(other['publishers']) or 'a program that is not a ROS node'
     if other['messages'] is None:
-        return f'published as {name} too, by {by}; nobody listened to that, and how many messages it were is not known'
+        return f'published as {name} too, by {by}; it was not listened to, so the number of messages is not known'
     return f'published as {name} too, by {by}; of that {other["messages"]:,} messages were rejected (wrong_type)'
 
 

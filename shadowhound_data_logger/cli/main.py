@@ -104,7 +104,7 @@ def described(error: Exception, arguments: Sequence[str]) -> tuple[str, str, str
     if isinstance(error, DataLoggerError):
         return verb, error.what, error.remedy or error.DEFAULT_REMEDY
     if isinstance(error, click.NoSuchOption) and (instead := GONE.get((verb.partition(' ')[2], error.option_name))):
-        return verb, f'there is no {error.option_name} any more', f'leave it out: {instead}'
+        return verb, f'{error.option_name} no longer exists', f'leave it out: {instead}'
     if isinstance(error, click.ClickException):
         return verb, error.format_message().rstrip('.'), (isinstance(error, BadUsage) and error.remedy) or f'{verb} --help'
     if isinstance(error, OSError):

@@ -58,7 +58,7 @@ def _add(group: click.Group, name: str, do: str, text: str) -> None:
 
 
 _add(node, 'flush', 'flush', 'Write everything received so far to disk, open batches too.')
-_add(node, 'pause', 'pause', 'Store nothing from now on; uploads go on.')
+_add(node, 'pause', 'pause', 'Store nothing from now on; uploads continue.')
 _add(node, 'resume', 'resume', 'Store messages again.')
 _add(bag, 'start', 'bag start', 'Begin a bag and print its name.')
 _add(bag, 'stop', 'bag stop', 'End the bag.')

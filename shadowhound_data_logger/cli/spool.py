@@ -217,7 +217,7 @@ def _state(state: str, reason: str | None) -> Text:
 
 def _check(folder: Path) -> None:
     if not (folder / 'index.db').is_file():
-        remedy = 'SHADOWHOUND_HOME names the folder that it lies in; has the node run here?'
+        remedy = 'has the node run here? SHADOWHOUND_HOME names its folder'
         raise SpoolError(f'there is no spool in {folder}', remedy=remedy)
 
 

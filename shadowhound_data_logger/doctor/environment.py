@@ -136,7 +136,7 @@ def _tracking(context: Context) -> Iterator[Result]:
         yield error(
             'environment.tracking',
             f'MLFLOW_TRACKING_URI is {services.shown(uri)}, which is not an address',
-            'its host or its port is none',
+            'its host or port is invalid',
             'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
         )
     elif _BARE.fullmatch(uri):
@@ -203,7 +203,7 @@ def _node(context: Context) -> Iterator[Result]:
         yield warning(
             'environment.node',
             f'the node (process {found["pid"]}) has another {" and ".join(other)} than this shell',
-            'it was started elsewhere, or before a change: what works here need not work there',
+            'it was started elsewhere, or before a change: what works here may not work there',
             f'{OF_THE_NODE}  # if this shell is right instead: sudo systemctl restart shadowhound-data-logger',
         )
     elif theirs:

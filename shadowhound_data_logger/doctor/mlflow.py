@@ -24,7 +24,7 @@ PROBE: Final = '_doctor'
 LOGS: Final = 'on Tower: docker logs --tail 50 mlflow || docker compose logs --tail 50 mlflow'
 S3_OF_SERVER: Final = (
     "MLflow's own environment on Tower lacks AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY or MLFLOW_S3_ENDPOINT_URL, "
-    'the bucket is missing, or the S3 server is away'
+    'the bucket is missing, or the S3 server cannot be reached'
 )
 
 
@@ -45,7 +45,7 @@ def check(context: Context) -> Iterator[Result]:
             yield warning(
                 'mlflow.open',
                 f'{service.url} asks nobody for a password',
-                'whoever reaches that port reads, changes and deletes missions, and runs the server as they like',
+                'anyone who can reach that port can read, change and delete missions, and administer the server',
                 'on Tower: make tower-secrets, and start MLflow as tower/compose.yaml does (docs/tower.md)',
             )
         missions = f'{context.settings.robot}_missions'
@@ -75,7 +75,7 @@ def _health(rest: MlflowRest, url: str) -> Iterator[Result]:
 
 def _failed(problem: TrackingError, variable: str, robot: str) -> Result:
     status, text = problem.data.get('status', 0), problem.data.get('text', '')
-    cause, remedy = 'the server hangs, or waits for a database that is away', f'{LOGS} ; docker compose restart mlflow'
+    cause, remedy = 'the server hangs, or waits for its database', f'{LOGS} ; docker compose restart mlflow'
     if 'Host header' in text:
         cause, remedy = (
             'MLflow takes requests for its own names only',
@@ -99,7 +99,7 @@ def _failed(problem: TrackingError, variable: str, robot: str) -> Result:
     elif 400 <= status < 500 or 'like an MLflow server' in str(problem):
         cause, remedy = 'something else listens on this port', f'export {variable}=http://TOWER_IP:5001'
     elif status >= 500:
-        cause, remedy = 'the server fails: its database is away, or of another version', f'{LOGS} ; docker compose ps'
+        cause, remedy = 'the server fails: its database cannot be reached, or has another version', f'{LOGS} ; docker compose ps'
     return error('mlflow.answer', str(problem), cause, remedy)
 
 
@@ -175,7 +175,7 @@ def _proxied(rest: MlflowRest, folder: str) -> Result:
             'mlflow.artifacts',
             f'MLflow takes no artifact: {problem}',
             S3_OF_SERVER,
-            f'{LOGS} ; docker exec mlflow env | grep -E "AWS_|MLFLOW_S3" | cut -d= -f1  # the names alone',
+            f'{LOGS} ; docker exec mlflow env | grep -E "AWS_|MLFLOW_S3" | cut -d= -f1  # only the names',
         )
     except TrackingUnavailable as problem:
         return error(

@@ -142,7 +142,7 @@ def error(check: str, seen: str, cause: str, remedy: str, *, fix: tuple[str, ...
 
 def skipped(check: str, why: Result) -> Result:
     """Not asked because of another result."""
-    return Result(check, Severity.SKIPPED, f'not asked, because of {why.check}')
+    return Result(check, Severity.SKIPPED, f'not run, because of {why.check}')
 
 
 def of_error(check: str, problem: DataLoggerError, cause: str = '', *, fix: tuple[str, ...] = ()) -> Result:

@@ -71,7 +71,7 @@ def _check(service: TowerService | None, check: str, context: Context) -> Iterat
         yield info(
             f'{check}.tls',
             f'{service.url} is not encrypted',
-            f'{SENT[service.name]} can be read by whoever is in this network',
+            f'{SENT[service.name]} can be read by everybody in this network',
             'on a network that is not yours: https',
         )
 

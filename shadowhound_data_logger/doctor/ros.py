@@ -203,7 +203,7 @@ def _other_types(one: Heard, sensor: SensorSettings, others: Sequence[str]) -> R
         'ros.type',
         f'{one.topic} is published as {" and as ".join(others)} by {whose}; {sensor.name} logs {one.type} alone',
         'messages of another type are never logged as those of this sensor: they are counted as rejected (wrong_type) where '
-        'their type is installed, and else nobody knows how many there are',
+        'their type is installed, otherwise their number is not known',
         f'ros2 topic info -v {one.topic}  # and stop that publisher; or, where it is the robot: {own}',
     )
 
@@ -213,7 +213,7 @@ def _qos(one: Heard, stream: Stream) -> Iterator[Result]:
         yield warning(
             'ros.qos',
             f'{", ".join(one.deaf)} subscribes to {one.topic} and receives nothing',
-            'it asks for RELIABLE or TRANSIENT_LOCAL, and the publisher offers less; ROS tells nobody',
+            'it asks for RELIABLE or TRANSIENT_LOCAL, and the publisher offers less; ROS does not report this',
             'subscribe with rclpy.qos.qos_profile_sensor_data there; the logger itself follows the publisher',
         )
     if stream.reliable and not all(publisher.reliable for publisher in one.publishers if publisher.type == one.type):

@@ -93,7 +93,7 @@ def _range(environ: Mapping[str, str]) -> Iterator[Result]:
         yield error(
             name,
             'ROS_AUTOMATIC_DISCOVERY_RANGE is OFF',
-            'nobody is found, and ROS_STATIC_PEERS names nobody either',
+            'no other machine is found, and ROS_STATIC_PEERS names none either',
             'export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET',
         )
     elif given == 'LOCALHOST' or only == '1':

@@ -95,7 +95,7 @@ class Examination:
                 continue
             self._waiting.remove(check)
             if time.monotonic() >= end_s:
-                self._found[check.name].append(Result(check.name, Severity.SKIPPED, 'not asked: no time was left'))
+                self._found[check.name].append(Result(check.name, Severity.SKIPPED, 'not run: no time was left'))
                 self._ended.add(check.name)
                 self._tell(check)
                 continue

@@ -54,14 +54,14 @@ SLOW_S: Final = 0.5
 """A small request that takes longer than this keeps four upload threads below eight objects a second."""
 LATENCY_TRIES: Final = 5
 LISTING_BYTES: Final = 1024
-MINIO: Final = "MinIO's open-source server was archived in April 2026: it goes on working, without fixes and security advisories"
+MINIO: Final = "MinIO's open-source server was archived in April 2026: it keeps working, without fixes and security advisories"
 
 
 def check(context: Context) -> Iterator[Result]:
     """See the module."""
     service = services.s3(context)
     if service is None:
-        yield info(NAME, f'no S3 server is set: data go to {context.settings.store.directory}')
+        yield info(NAME, f'not run: this shell names no S3 server; the store is {context.settings.store.directory}')
         return
     if failed := context.failed('network.s3'):
         yield skipped(NAME, failed)
@@ -88,7 +88,9 @@ def _away(problem: StoreError) -> Result:
     if problem.data.get('code') in {'RequestTimeTooSkewed', 'RequestExpired'}:
         return of_error('s3.clock', problem, 'the server refuses signatures that are more than 15 minutes off')
     if problem.data.get('status', 0) >= 500:
-        return of_error('s3.answer', problem, 'the server fails (a full disk, its storage away), or it is not an S3 server')
+        return of_error(
+            's3.answer', problem, 'the server fails (a full disk, storage that it cannot reach), or it is not an S3 server'
+        )
     if 'like an S3 server' in str(problem):
         return of_error('s3.answer', problem, 'another program answers on this port, or a proxy or login page on the way')
     return of_error('s3.answer', problem, 'the connection is bad, or the server is overloaded')
@@ -113,7 +115,7 @@ def _greeting(service: TowerService, context: Context) -> Iterator[Result]:
         yield warning(
             's3.open',
             'the server lists its buckets to somebody without keys',
-            'it was started without credentials: whoever reaches it may do anything',
+            'it was started without credentials: anyone who can reach it may do anything',
             'on Tower: make tower-secrets, and start it with them (docs/tower.md)',
         )
 
@@ -122,7 +124,7 @@ def _no_answer(service: TowerService, reason: object) -> Result:
     remedy = 'on Tower: docker compose logs --tail 50 ; docker compose restart ; df -h'
     if isinstance(reason, TimeoutError):
         seen = f'{service.url} accepts the connection and gives no answer within {ANSWER_S:g} s'
-        return error('s3.answer', seen, 'the server hangs: a full or dead disk, or its storage is away', remedy)
+        return error('s3.answer', seen, 'the server hangs: a full or dead disk, or storage that it cannot reach', remedy)
     return error('s3.answer', f'{service.url} does not speak HTTP: {reason}', 'something else listens on this port', remedy)
 
 

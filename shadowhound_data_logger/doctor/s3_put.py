@@ -57,7 +57,7 @@ def missing_bucket(name: str, endpoint: str) -> Result:
     return error(
         's3.bucket',
         f'there is no bucket {name}',
-        'nobody has created it on this server',
+        'it was not created on this server',
         f'aws --endpoint-url {endpoint} s3 mb s3://{name}  # or: shadowhound-data doctor --fix',
         fix=('bucket', name),
     )

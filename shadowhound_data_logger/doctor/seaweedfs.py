@@ -65,13 +65,13 @@ def check(context: Context) -> Iterator[Result]:
         yield warning(
             'seaweedfs.open',
             f'SeaweedFS serves everybody at {where}',
-            'it was started without the keys and the certificate of its own servers: whoever reaches one of these may make '
-            'himself an administrator, read what is stored or delete it',
+            'it was started without the keys and the certificate of its own servers: anyone who can reach one of these can '
+            'become an administrator, and read or delete what is stored',
             'on Tower: make tower-secrets, and start the servers again (docs/tower.md)',
             ports=[question.port for _, question in found],
         )
     else:
-        yield ok(NAME, 'no port of SeaweedFS beside S3 answers without a key')
+        yield ok(NAME, 'except S3, no port of SeaweedFS answers without a key')
 
 
 def questions(s3_port: int) -> list[Question]:

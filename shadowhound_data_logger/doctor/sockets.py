@@ -139,7 +139,7 @@ def _cyclone(context: Context, *, listens: bool) -> Iterator[Result]:
         yield warning(
             'sockets.cyclone',
             'CYCLONEDDS_URI asks for no receive buffer',
-            'Cyclone DDS takes 1 MB unless it is told',
+            'Cyclone DDS takes 1 MB by default',
             'export CYCLONEDDS_URI=file:///etc/shadowhound/cyclonedds.xml  # with SocketReceiveBufferSize max="10MB": '
             'docs/thor.md',
         )
@@ -188,7 +188,7 @@ def _memory(context: Context, driver: list[Process]) -> Iterator[Result]:
         yield warning(
             'sockets.memory',
             f'/dev/shm has {free >> 20} MB free',  # noqa: S108 - it is only named
-            'Fast DDS shares memory there; docker gives 64 MB unless told',
+            'Fast DDS shares memory there; docker gives 64 MB by default',
             'fastdds shm clean ; in a container: --ipc=host or --shm-size=1g',
             free_bytes=free,
             driver=bool(driver),
@@ -213,7 +213,7 @@ def _driver_profile(context: Context, driver: list[Process]) -> Iterator[Result]
         yield warning(
             'sockets.driver',
             f'the driver (process {without[0].pid}) was started without the shared-memory profile',
-            "the memory is the publisher's: here alone it changes nothing",
+            "the memory is the publisher's: setting it only here changes nothing",
             f'start the driver again with: export {_variable(without[0].environ)}={PROFILE_FILE}',
         )
 

@@ -122,7 +122,7 @@ def _front(found: Mapping[str, Any]) -> Iterator[Result]:
     middleware, front = found['middleware'], found['workers'].get('front')
     cause = (
         f'programs of the robot ({middleware["robot"]}) find no services, parameters and /diagnostics of the node, and '
-        'nobody compares whom the robot finds; messages are logged all the same'
+        'publishers are not compared with those that the robot finds; messages are still logged'
     )
     if front is not None and front['failing']:
         remedy = 'journalctl -u shadowhound-data-logger | grep front  # what it said last; meanwhile: shadowhound-data node'
@@ -175,13 +175,13 @@ def _backlog(usage: SpoolUsage, context: Context, *, runs: bool) -> Result:
     if (oldest_s or 0.0) < OLD_S and (drain_s or 0.0) < LONG_S:
         return ok('spool.backlog', seen, **figures)
     if not runs:
-        return warning('spool.backlog', seen, 'nobody delivers while the node does not run', START, **figures)
+        return warning('spool.backlog', seen, 'nothing is delivered while the node does not run', START, **figures)
     if drain_s is None:
         return warning('spool.backlog', seen, 'Tower is out of reach, or takes nothing', STORE, **figures)
     return warning(
         'spool.backlog',
         seen,
-        'Tower was away for long, or more is logged than the network carries',
+        'Tower could not be reached for long, or more is logged than the network carries',
         'bring the robot to a better network; log less: camera.rate_hz, lidar.rate_hz; upload.max_mbps 0',
         **figures,
     )

@@ -216,9 +216,7 @@ class Reader:
         self._node.destroy_subscription(stuck)
         self._is_stuck = False
         if not self._has_told:
-            log.warning(
-                '%s: listening anew: the middleware gives nothing more since a part of a message was lost', self.plan.topic
-            )
+            log.warning('%s: subscribing again: the middleware gave no messages after a part of one was lost', self.plan.topic)
             self._has_told = True
 
     def _through_rclpy(self, handle: Any) -> Iterator[Taken]:
@@ -277,9 +275,9 @@ def takes_through_librcl(node: Node) -> bool:
         problem = disproof(node)
         _PROVED[rmw] = not problem
         if problem:
-            log.warning('taking messages through rclpy, which does not tell their publishers: through librcl %s', problem)
+            log.warning('taking messages through rclpy, which does not give their publishers: through librcl %s', problem)
         else:
-            log.info('taking messages through librcl, which tells their numbers and publishers; rclpy does not')
+            log.info('taking messages through librcl, which gives their numbers and publishers; rclpy does not')
     return _PROVED[rmw]
 
 

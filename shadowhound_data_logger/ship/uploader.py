@@ -220,7 +220,7 @@ class Uploader:
             gone = not item.path.exists()
             self._settle((Outcome(item, State.QUARANTINED, 'missing' if gone else ruling.quarantine),))
             if gone:  # evicted since it was looked up, as a rule: the index then leaves it as it is
-                log.debug('%s/%s is not in the spool any more', item.bucket, item.key)
+                log.debug('%s/%s is no longer in the spool', item.bucket, item.key)
             else:
                 self._announce_quarantine(item, ruling.quarantine, error)
         self._announce(ruling.notices)

@@ -185,7 +185,7 @@ def _sources(settings: SimSettings) -> list[SimulatedSensor]:
     try:
         from shadowhound_data_logger.sim.go2_messages import go2_sources  # noqa: PLC0415  # it may be missing
     except ImportError as error:
-        _say(f'runs without imu, go2_states and lowstate, for want of go2_interfaces ({error})')
+        _say(f'runs without imu, go2_states and lowstate, because go2_interfaces is missing ({error})')
         return common
     return [*go2_sources(world), *common]
 

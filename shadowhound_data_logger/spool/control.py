@@ -104,7 +104,7 @@ class Connection:
         if isinstance(error, TimeoutError):
             text = f'the node behind {self._path} did not answer within {self._deadline_s:g} s'
             return NodeUnavailable(text, remedy='see what it does: shadowhound-data status')
-        return NodeUnavailable(f'the node behind {self._path} cannot be asked any more: {error}')
+        return NodeUnavailable(f'the node behind {self._path} no longer answers: {error}')
 
 
 def connect(spool: Path, robot: str | None = None, deadline_s: float = PATIENCE_S) -> Connection:

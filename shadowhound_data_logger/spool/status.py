@@ -227,7 +227,7 @@ def _other_types(found: Mapping[str, Any]) -> Iterator[str]:
 def _other_type(topic: str, row: Mapping[str, Any], name: str, other: Mapping[str, Any]) -> str:
     by = ', '.join(other['publishers']) or 'a program that is not a ROS node'
     count = other['messages']
-    what = 'nobody listened to it: how many messages is not known' if count is None else f'{count:,} messages were refused'
+    what = 'it was not listened to: the number of messages is not known' if count is None else f'{count:,} messages were refused'
     return f'{topic} was published as {name} too, by {by}, and is logged as {row["type"] or "nothing"} alone; {what}'
 
 

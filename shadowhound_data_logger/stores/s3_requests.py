@@ -119,7 +119,7 @@ class S3Requests:
                     raise
                 # Another trouble, or over: no word on rights, which would let a put go on without this look.
                 raise StoreUnavailable(
-                    f'{self.endpoint} refused to describe {bucket}/{key} and gave another answer when it was asked why',
+                    f'{self.endpoint} refused to describe {bucket}/{key} and gave another answer when asked why',
                     endpoint=self.endpoint, bucket=bucket, key=key,
                 ) from error  # fmt: skip
         self.confirm(answer, bucket, key)

@@ -212,7 +212,7 @@ def test_a_close_ends_the_event(tmp_path: Path) -> None:
         it.hear(range(5, 8))
         assert it.events.close(WAIT_S)
         assert in_bag(it, only_bag(it)) == list(range(8))
-        assert it.events.trigger('late', 'service') == (False, 'no events any more: the node is closing')
+        assert it.events.trigger('late', 'service') == (False, 'no more events: the node is closing')
 
 
 def test_without_topics_there_is_nothing(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def test_a_pause_spools_what_is_open() -> None:
     commands = stages.commands()
     success, words = ask(commands, 'pause')
     assert success
-    assert 'delivery goes on' in words
+    assert 'delivery continues' in words
     assert '2 objects with 30 messages spooled' in words
     assert stages.asked == ['pause', *STAGES]
     assert ask(commands, 'pause') == (True, 'paused already')

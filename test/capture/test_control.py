@@ -279,7 +279,7 @@ def test_a_node_that_dies_is_noticed(tmp_path: Path) -> None:
                 node, _ = listener.accept()
                 node.sendall(said)
                 node.shutdown(socket.SHUT_WR)
-                with pytest.raises(NodeUnavailable, match='cannot be asked any more'):
+                with pytest.raises(NodeUnavailable, match='no longer answers'):
                     connection.ask('flush')
                 node.close()
         with (

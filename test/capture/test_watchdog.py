@@ -133,7 +133,7 @@ def test_a_publisher_without_a_connection(watch: Watch, *, may_be_silent: bool) 
 def test_a_topic_that_nobody_can_listen_to_here(watch: Watch) -> None:
     """Told at once, with the package that is missing."""
     watch.imu |= {'matched': 0, 'unavailable': 'its message package is not installed here (x)'}
-    assert watch.look() == {'/imu': 'nobody can listen to it here: its message package is not installed here (x)'}
+    assert watch.look() == {'/imu': 'it cannot be subscribed to here: its message package is not installed here (x)'}
 
 
 def test_a_topic_that_is_off_is_not_missed(watch: Watch) -> None:

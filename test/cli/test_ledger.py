@@ -137,7 +137,7 @@ def test_other_types_of_a_topic_are_told() -> None:
     others = {'a/msg/A': {'publishers': ['/x'], 'messages': 1234}, 'b/msg/B': {'publishers': [], 'messages': None}}
     text = shown(a_ledger(odom=a_topic(other_types=others)), 200)
     assert '/odom: published as a/msg/A too, by /x; of that 1,234 messages were rejected (wrong_type)' in text
-    assert 'published as b/msg/B too, by a program that is not a ROS node; nobody listened' in text
+    assert 'published as b/msg/B too, by a program that is not a ROS node; it was not listened to' in text
 
 
 def test_what_is_not_delivered_is_said() -> None:

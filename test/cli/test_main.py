@@ -225,7 +225,7 @@ def test_an_option_that_is_gone(
     """Wrong usage, with what does its job now."""
     code, lines = ended(monkeypatch, capsys, *verb.split(), option, '8')
     assert code == ExitCode.USAGE
-    assert lines == [f'{PROGRAM} {verb}: there is no {option} any more', f'  -> leave it out: {GONE[verb, option]}']
+    assert lines == [f'{PROGRAM} {verb}: {option} no longer exists', f'  -> leave it out: {GONE[verb, option]}']
     assert option not in {name for each in VERBS[verb].params for name in each.opts}
 
 

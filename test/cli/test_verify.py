@@ -116,8 +116,8 @@ def test_a_store_that_is_away(home: Path, monkeypatch: pytest.MonkeyPatch) -> No
     answer = run('--verify')
     assert answer.return_value == 1
     text = ' '.join(answer.output.split())
-    assert 'The store is away' in text
-    assert '3 objects are not asked for yet' in text
+    assert 'The store cannot be reached' in text
+    assert '3 objects are not checked yet' in text
     assert SECRET not in text
     said = as_json('--deep')
     assert (said['findings'], said['asked'], bool(said['unreachable'])) == ({}, 0, True)

@@ -83,7 +83,7 @@ def test_a_publisher_that_outruns_the_node(processes: Processes) -> None:
         node.signal(signal.SIGCONT)
         time.sleep(0.2)
         stops += 1
-        return 'listening anew' in node.log or (os.environ.get('ROS_DISTRO') == 'humble' and stops == 40)
+        return 'subscribing again' in node.log or (os.environ.get('ROS_DISTRO') == 'humble' and stops == 40)
 
     until(is_lost, 'Fast DDS loses its place', 150.0)
     node.received('/plain', node.topic('/plain')['received'] + 50)

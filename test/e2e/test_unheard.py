@@ -48,6 +48,6 @@ def test_a_publisher_where_our_profile_does_not_look_is_an_error(processes: Proc
         machines.join_networks()
         until(lambda: not any(SAID in text for text in findings(node)), 'it is found')
         node.received('/there', 10)
-        assert 'knows no publisher any more' in node.log
+        assert 'no longer knows a publisher' in node.log
         node.signal(signal.SIGINT)
         assert node.wait() == 0

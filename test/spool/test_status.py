@@ -187,7 +187,7 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
             {'bag': {'topics': {'/map': {'type': 'A', 'other_types': {'B': {'publishers': [], 'messages': None}}}}}},
             (
                 '/map was published as B too, by a program that is not a ROS node, and is logged as A alone; '
-                'nobody listened to it: how many messages is not known'
+                'it was not listened to: the number of messages is not known'
             ),
         ),
     ],
