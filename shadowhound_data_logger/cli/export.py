@@ -263,7 +263,7 @@ _times = click.option('--times', type=click.Path(path_type=Path), metavar='FILE'
 @click.option('--degrees', 'is_degrees', is_flag=True, help='Its joints are in degrees: make radians of them.')
 @as_json
 def export_import_lerobot(*, folder: Path, arm: str, times: Path | None, is_degrees: bool, as_json: bool) -> ExitCode:
-    """Store an arm's LeRobotDataset (v2.1, v3.0) as its recording.
+    """Store a LeRobotDataset (v2.1, v3.0) of an arm.
 
     Joints and actions; its videos stay where they are.
     """
@@ -282,7 +282,7 @@ def export_import_lerobot(*, folder: Path, arm: str, times: Path | None, is_degr
 @as_json
 def export_import_hdf5(*, files: tuple[Path, ...], arm: str, times: Path | None, fps: float, joints: str,
                        as_json: bool) -> ExitCode:  # fmt: skip
-    """Store HDF5 demonstrations (ACT, ALOHA) as the recording of an arm.
+    """Store HDF5 demonstrations (ACT, ALOHA) of an arm.
 
     The n-th file is episode n, from 0. Joints and actions; pictures stay where they are.
     """

@@ -162,7 +162,9 @@ SECTIONS: Final = (
         ),
     ),
     Section(
-        'Find it later', 'The catalogue of what the store holds ([lake](lake.md)).', ('catalogue.enabled', 'catalogue.period_s')
+        'Find it later',
+        'The catalogue of what the store holds ([lake](lake.md)).',
+        ('catalogue.enabled', 'catalogue.period_s', 'SENSOR.statistics'),
     ),
     Section(
         'Know what was lost',

@@ -66,8 +66,10 @@ def parsed(arguments: Sequence[str]) -> tuple[click.Command, click.Context]:
 
 
 @pytest.mark.parametrize('name', VERBS)
-def test_every_verb_has_examples_that_parse(name: str) -> None:
+def test_every_verb_has_examples_that_parse(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each is of this verb, or of one of its own; no option in it is unknown, without its value, or missing."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'bumps.json').write_text('[]')  # an answer of `query --json`, which some examples read
     found = examples_of(name)
     assert found
     for example in found:
@@ -75,7 +77,8 @@ def test_every_verb_has_examples_that_parse(name: str) -> None:
         assert program == PROGRAM
         assert ' '.join(verb_of(arguments)).startswith(name)
         if '--help' not in arguments:
-            command, _ = parsed(arguments)
+            command, context = parsed(arguments)
+            context.close()
             assert not isinstance(command, click.Group) or getattr(command, 'invoke_without_command', False)
 
 
