@@ -47,6 +47,8 @@ class Choice:
     topics: Sequence[str] = ()
     regex: str = ''
     """A topic that it is found in is taken as well; without both, all are."""
+    spans: tuple[tuple[int, int], ...] | None = None
+    """Only of these times, in ns since 1970: from the first to before the second, in their order, none meets the next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +135,10 @@ def _cut(source: CutSource, folder: Path, out: Path, choice: Choice, meter: Mete
         raise SettingError('--end', choice.end, f'a time after --start, which is {iso(start_ns)}')
     writer = SliceWriter(folder / f'{out.name}_0.mcap', mode=0o666)
     try:
-        for message in source.messages(MessageFilter(start_ns, end_ns, _chosen(choice))):
-            writer.write(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
+        for first, last in ((start_ns, end_ns),) if choice.spans is None else choice.spans:
+            if (begin := max(first, start_ns)) < (end := min(last, end_ns)):
+                for message in source.messages(MessageFilter(begin, end, _chosen(choice))):
+                    writer.write(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
         info = writer.close()
     finally:
         writer.abort()

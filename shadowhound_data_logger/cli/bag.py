@@ -49,6 +49,7 @@ from shadowhound_data_logger.cli.output import (
     volume,
     with_dates,
 )
+from shadowhound_data_logger.cli.question import ranges_option
 from shadowhound_data_logger.clock import SystemClock, iso
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import NameRefused, StoreUnavailable
@@ -227,6 +228,7 @@ def bag_fetch(*, bag: str, to: Path, robot: str, as_json: bool) -> ExitCode:
 @_bag_or_folder
 @click.option('--start', default='', metavar='TIME', help='From this time on  [default: the start of the bag]')
 @click.option('--end', default='', metavar='TIME', help='Before this time  [default: the end of the bag]')
+@ranges_option
 @click.option(
     '--topics', '--topic', multiple=True, metavar='TOPIC', help='Only these topics: repeat it, or separate them with commas.'
 )
@@ -234,7 +236,8 @@ def bag_fetch(*, bag: str, to: Path, robot: str, as_json: bool) -> ExitCode:
 @click.option('-o', '--output', type=click.Path(path_type=Path), required=True, help='New folder for the bag.')
 @_robot
 @as_json
-def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str, as_json: bool, **wanted: str) -> ExitCode:
+def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str, as_json: bool, ranges: list[Any] | None,
+            **wanted: str) -> ExitCode:  # fmt: skip
     """Copy a span of time or some topics into a new bag.
 
     \b
@@ -243,11 +246,12 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
            -30                     seconds before its end
            1760788805.5            seconds since 1970
 
-    Times are those at which messages were received, as in ros2 bag play. Of a bag in the store, only the chunks that are needed
+    Times are those at which messages were received, as in ros2 bag play; those of --ranges are stamps of messages, which are a
+    little earlier: query --pad 1 makes each longer. Of a bag in the store, only the chunks that are needed
     are read. Exit code 1 when a slice of that time is missing.
     """  # noqa: D301 - click's mark for lines that stay as they are
     names = tuple(name.strip() for each in topics for name in each.split(',') if name.strip())
-    choice = Choice(topics=names, **wanted)
+    choice = Choice(topics=names, spans=None if ranges is None else _spans(ranges), **wanted)
     if isinstance(bag, Path):
         found = cut_folder(bag, output, choice)
     else:
@@ -258,6 +262,14 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
     else:
         print_lines(*_told_cut(found))
     return exit_code(finding=found.missing)
+
+
+def _spans(ranges: list[Any]) -> tuple[tuple[int, int], ...]:
+    """Of an answer: apart from each other, in their order, of whichever robot."""
+    from shadowhound_data_logger.lake.select import Wanted, spans_of, within  # noqa: PLC0415
+
+    (chosen,) = within(Wanted(), (span._replace(robot=None) for span in spans_of(ranges))).chosen
+    return tuple((span.since_ns, span.until_ns + 1) for span in chosen.spans)
 
 
 @bag.command('upload', epilog=examples('bag upload my_bag', 'bag upload my_bag --name patrol_2 --tar-gz'))

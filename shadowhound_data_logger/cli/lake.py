@@ -126,8 +126,9 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
 
 @lake.command('reindex', epilog=examples('lake reindex --robot thor'))
 @click.option('--robot', metavar='NAME', required=True, help='Robot of the objects.')
+@click.option('--statistics', is_flag=True, help='Instead, open objects without statistics of their fields, and add those.')
 @as_json
-def lake_reindex(*, robot: str, as_json: bool) -> ExitCode:
+def lake_reindex(*, robot: str, statistics: bool, as_json: bool) -> ExitCode:
     """Add objects that the catalogue lacks.
 
     It lists the store, and reads the metadata of each object that has no row.
@@ -139,10 +140,13 @@ def lake_reindex(*, robot: str, as_json: bool) -> ExitCode:
     left_out = quietly()
     with the_store() as target, progress() as bar:
         source = default_source(the_store_settings())
-        found = library.reindex(source, target, robot, findings=left_out, tell=lambda so_far: bar.say(
+        make = library.add_statistics if statistics else library.reindex
+        found = make(source, target, robot, findings=left_out, tell=lambda so_far: bar.say(
             f'{number(so_far.listed)} objects listed, {number(so_far.added)} added'))  # fmt: skip
     if as_json:
         print_json(asdict(found))
+    elif statistics:
+        click.echo(f'{number(found.listed)} objects had no statistics; of {number(found.added)} they are there now.')
     else:
         click.echo(
             f'{number(found.listed)} objects are in the store; {number(found.added)} were not in the catalogue and are now.'

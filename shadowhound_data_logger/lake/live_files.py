@@ -71,10 +71,10 @@ def compacted_key(robot: str, date: str, sources: Iterable[str], *, is_backfille
     return of.part_key(robot, date, f'{date.replace("-", "")}_compacted_{digest}{"_mended" * is_backfilled}')
 
 
-def backfilled_key(robot: str, date: str, keys: Iterable[str]) -> str:
+def backfilled_key(robot: str, date: str, keys: Iterable[str], of: TableSchema = OBJECTS) -> str:
     """The key of a part with rows that were missing (``reindex``); ``_mended`` in it is part of the format."""
     digest = hashlib.sha256('\n'.join(sorted(keys)).encode()).hexdigest()[:16]
-    return OBJECTS.part_key(robot, date, f'{date.replace("-", "")}_mended_{digest}')
+    return of.part_key(robot, date, f'{date.replace("-", "")}_mended_{digest}')
 
 
 def is_compacted(key: str) -> bool:

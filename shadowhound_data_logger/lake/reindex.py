@@ -10,10 +10,15 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
-from typing import Final
+from typing import Any, Final
+
+import pyarrow.compute as pc
 
 from shadowhound_data_logger.catalogue import parts
 from shadowhound_data_logger.catalogue.schema import BUCKET, Row, is_row, row_of
+from shadowhound_data_logger.catalogue.statistics import STATISTICS, statistic_rows
+from shadowhound_data_logger.encode.statistics import ALL
+from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
@@ -23,11 +28,13 @@ from shadowhound_data_logger.lake.scan import KEY, folders
 from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
 
 BUCKETS: Final = (BUCKET, 'trajectories')
 PAGE: Final = 10_000
 """Objects that are asked for at a time, and then written down."""
-_TRIES: Final = 3
+STATISTICS_PAGE: Final = 1000
+"""Objects that are opened, of which a part a day is made."""
 
 
 @dataclass(slots=True)
@@ -68,6 +75,48 @@ def reindex(
             found.added += len(rows)
             tell(found)
     found.gone = sum(bucket in buckets for bucket, _ in known)
+    return found
+
+
+def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Callable[[Reindexed], None] = lambda _: None,
+                   findings: Findings | None = None) -> Reindexed:  # fmt: skip
+    """Open the objects of one robot that have no statistics, and add those. Raises StoreError, NameRefused.
+
+    What was added until then stays. Objects that are gone or damaged are in the ``findings``.
+    """
+    from shadowhound_data_logger.lake import query, values  # noqa: PLC0415 - Daft takes half a second
+
+    check_name(robot, 'the robot name')
+    findings, found = Findings() if findings is None else findings, Reindexed()
+    entries = [entry for day in folders(source, Wanted(robot=robot), findings, STATISTICS) for entry in day.entries]
+    every = tables(source, entries, (*KEY, 'field'), findings, of=STATISTICS)
+    told_of = (rows.filter(pc.equal(rows['field'], ALL)) for rows in every)
+    known = {pair for rows in told_of for pair in zip(*(rows[name].to_pylist() for name in KEY), strict=True)}
+    asked = query.objects(source, findings=findings, robot=robot).select(
+        'robot', 'sensor', *KEY, 'topic', 't_start', 't_start_ns'
+    )
+    rows = [row for row in asked.to_pylist() if row['topic'] is not None and (row['bucket'], row['key']) not in known]
+    found.listed = len(rows)
+
+    def told(row: dict[str, Any]) -> list[Row]:
+        of = {**row, 't_start': None if row['t_start'] is None else row['t_start_ns'] // 1000}
+        try:
+            body = Bucket(source.settings, row['bucket']).get(row['key'], MOST_OBJECT_BYTES)
+            return list(statistic_rows(of, values.statistics_of(row['key'], body)))
+        except (LakeError, ObjectRefused) as error:
+            findings.add(row['key'], str(error))
+            return []
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        for start in range(0, len(rows), STATISTICS_PAGE):
+            made = [one for some in pool.map(told, rows[start : start + STATISTICS_PAGE]) for one in some]
+            for _, date, numbered in parts.by_folder(enumerate(made)):
+                part = [row for _, row in numbered]
+                key = backfilled_key(robot, date, {f'{row["bucket"]}/{row["key"]}' for row in part}, STATISTICS)
+                put_part(store, key, robot, parts.encode(part, STATISTICS), len(part))
+                found.parts += 1
+            found.added += sum(row['field'] == ALL for row in made)
+            tell(found)
     return found
 
 

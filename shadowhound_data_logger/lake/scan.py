@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -146,11 +147,11 @@ async def _apart(work: Callable[[], _Answer]) -> _Answer:
         return await asyncio.get_running_loop().run_in_executor(pool, work)
 
 
-def folders(source: Bucket, wanted: Wanted, findings: Findings) -> list[Day]:
+def folders(source: Bucket, wanted: Wanted, findings: Findings, of: TableSchema = OBJECTS) -> list[Day]:
     """The days whose parts can hold what is wanted. Raises StoreError."""
     named = [wanted.robot] if wanted.robot else robots(source)
     with ThreadPoolExecutor(THREADS) as pool:
-        return days(source, named, wanted.dates(time.time_ns()), pool, findings, wanted.has_date)
+        return days(source, named, wanted.dates(time.time_ns()), pool, findings, wanted.has_date, of)
 
 
 def unrepeated(table: pa.Table, of: Sequence[str] = ROW) -> pa.Table:

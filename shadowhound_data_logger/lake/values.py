@@ -44,8 +44,8 @@ from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.decode import cloud_points, extension_of, records
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import OBJECTS, newest, watermarks
-from shadowhound_data_logger.lake.live_files import days, robots
 from shadowhound_data_logger.lake.reading import arrow_schema, narrow, tables
+from shadowhound_data_logger.lake.scan import folders
 from shadowhound_data_logger.lake.select import TimeSpan, Wanted, wanted
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
 
@@ -251,9 +251,7 @@ def _statistics(source: Bucket, asked: Wanted, expression: Expression, findings:
 
 def _read(source: Bucket, asked: Wanted, findings: Findings, names: tuple[str, str]) -> Iterator[pa.Table]:
     """The statistics of a sensor in the time that is asked for, of fields whose names lie between two."""
-    named = [asked.robot] if asked.robot else robots(source)
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = days(source, named, asked.dates(time.time_ns()), pool, findings, asked.has_date, STATISTICS)
+    found = folders(source, asked, findings, STATISTICS)
     entries = [entry for day in sorted(found, key=lambda day: day.robot) for entry in day.entries]
     narrow = Wanted(robot=asked.robot, sensor=asked.sensor, since_ns=asked.since_ns, until_ns=asked.until_ns,
                     bounds=(('field', *names),))  # fmt: skip
@@ -389,7 +387,7 @@ def _runs(row: Mapping[str, Any], body: bytes, expression: Expression) -> Iterat
         met = _met(expression, messages)
     elif extension in {_JPEG, _PCD}:
         points = cloud_points(body) if extension == _PCD else None
-        found = of_jpeg(body) if points is None else of_points(points)
+        found = statistics_of(row['key'], body)
         stamps, met = np.zeros(1, np.int64), np.array([_met_by(expression, found, points)])
     else:
         raise LakeError(f'values cannot be looked for in a .{extension}', remedy='store the sensor as json, jpeg or pcd')
@@ -403,6 +401,23 @@ def _runs(row: Mapping[str, Any], body: bytes, expression: Expression) -> Iterat
         yield int(stamps[first]), int(stamps[end - 1]), int(end - first)
 
 
+def statistics_of(key: str, body: bytes, chosen: Sequence[str] = ()) -> dict[str, Statistic]:
+    """Of the content of an object, as its encoder told them; empty for what none is told of. Raises LakeError."""
+    extension = extension_of(key)
+    if extension == _JSON:
+        return _collected(records(body), chosen)
+    if extension == _PCD:
+        return of_points(cloud_points(body))
+    return of_jpeg(body) if extension == _JPEG else {}
+
+
+def _collected(messages: Sequence[Mapping[str, Any]], chosen: Sequence[str]) -> dict[str, Statistic]:
+    collected = FieldStatistics(chosen)
+    for start in range(0, len(messages), AT_ONCE):
+        collected.add(messages[start : start + AT_ONCE])
+    return collected.told()
+
+
 def _met(expression: Expression, messages: Sequence[Mapping[str, Any]]) -> Mask:
     """Of each message."""
     if isinstance(expression, Joined):
@@ -410,10 +425,7 @@ def _met(expression: Expression, messages: Sequence[Mapping[str, Any]]) -> Mask:
         found: Mask = reduce(join, [_met(part, messages) for part in expression.parts])
         return found
     if expression.function:
-        collected = FieldStatistics([expression.field])
-        for start in range(0, len(messages), AT_ONCE):
-            collected.add(messages[start : start + AT_ONCE])
-        return np.full(len(messages), _met_by(expression, collected.told(), None))
+        return np.full(len(messages), _met_by(expression, _collected(messages, (expression.field,)), None))
     return np.array([any(map(expression.holds, values_of(each, expression.field))) for each in messages], bool)
 
 

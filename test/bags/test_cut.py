@@ -71,6 +71,20 @@ def test_it_has_these_messages_and_no_others(
     assert list(messages_of([cut_folder(origin, tmp_path / 'again', choice).folder / 'again_0.mcap'])) == wanted
 
 
+def test_several_times_are_one_bag(origin: Path, store: MemoryStore, tmp_path: Path) -> None:
+    """In their order, within the start and end that are asked for."""
+    spans = (
+        (T0 - STEP_NS, T0 + 3 * STEP_NS),
+        (T0 + 700 * STEP_NS, T0 + 705 * STEP_NS),
+        (T0 + 1400 * STEP_NS, T0 + 9999 * STEP_NS),
+    )
+    found = cut_remote(store, find_bag(store, 'thor', NAME), tmp_path / 'piece', Choice('0.01', '10', spans=spans))
+    times = [(one.log_ns - T0) // STEP_NS for one in messages_of([found.folder / 'piece_0.mcap']) if one.channel.topic == '/imu']
+    assert times == [1, 2, *range(700, 705)]
+    with pytest.raises(BagError, match='nothing'):
+        cut_folder(origin, tmp_path / 'none', Choice(spans=()))
+
+
 def test_little_more_is_read_than_its_chunks(store: MemoryStore, tmp_path: Path) -> None:
     """Of a second out of fifteen, not a fifth of the bag; of a topic that lies in every fifth chunk, those chunks."""
     bag = find_bag(store, 'thor', NAME)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import orjson
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -27,6 +28,8 @@ from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.lake import query, values
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.reindex import add_statistics
 from shadowhound_data_logger.stores import open_store
 
 SIGNS = {'<': operator.lt, '<=': operator.le, '>': operator.gt, '>=': operator.ge, '=': operator.eq, '!=': operator.ne}
@@ -260,3 +263,35 @@ def test_what_is_no_condition_is_told(text: str) -> None:
 def test_sql_over_columns_stays_sql(text: str) -> None:
     """What has no SENSOR.FIELD outside its texts is a condition on the catalogue's own columns."""
     assert not values.is_about_values(text)
+
+
+def test_statistics_are_made_again_of_the_objects(tmp_path: Path) -> None:
+    """Those that are missing, once; a damaged object is told."""
+    source = filled(tmp_path, BATCHES, [True] * 5 + [False] * 5)
+    damaged = tmp_path / 'store/sensor-data/thor/s/20261028/000009_s.json'
+    damaged.write_bytes(b'no JSON')
+    left_out = Findings(lambda _: None)
+    with closing(open_store(source.settings, UploadSettings())) as store:
+        made = [add_statistics(source, store, 'thor', findings=left_out) for _ in range(2)]
+    assert [(each.listed, each.added) for each in made] == [(5, 4), (1, 0)]
+    assert [one.key for one in left_out] == ['thor/s/20261028/000009_s.json']
+    found = values.ranges('s.a > 11', source)
+    assert (found.opened, found.unknown, len(found.ranges)) == (1, 1, 1)
+
+
+def test_hostile_statistics_are_left_out(tmp_path: Path) -> None:
+    """A part that is none, and rows of another robot, are told; what they spoke of is unknown, not absent."""
+    source = filled(tmp_path, BATCHES, [True] * 10)
+    for number, path in enumerate(sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.parquet'))):
+        if number:
+            path.unlink()
+        else:
+            rows = pq.read_table(path)
+            robots = pa.array(['tachi'] * len(rows))
+            pq.write_table(rows.set_column(0, 'robot', robots), path)
+    folder = tmp_path / 'store/sensor-data/thor/_stats/date=2026-10-28'
+    (folder / 'thor_20261028T999999_x.parquet').write_bytes(b'PAR1 nothing PAR1')
+    left_out = Findings(lambda _: None)
+    found = values.ranges('s.a > 11', source, findings=left_out)
+    assert (len(found.ranges), found.unknown, len(left_out)) == (0, 10, 2)
+    assert len(values.ranges('s.a > 11', source, scan=True, findings=left_out).ranges) == 2
