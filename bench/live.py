@@ -33,8 +33,8 @@ import aiohttp
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 from domains import free_domain
+from e2e.cut_link import CutLink
 from e2e.processes import Process, Processes, until
-from live.proxy import CutLink
 
 KINDS = ('camera', 'cloud', 'imu', 'odom', 'joints', 'battery')
 

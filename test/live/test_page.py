@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from domains import free_domain
+from e2e.cut_link import CutLink
 from e2e.processes import Node, Process, Processes, until
-from live.proxy import CutLink
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

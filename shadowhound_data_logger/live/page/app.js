@@ -3,7 +3,7 @@ import { batch, html, render, signal, useEffect, useRef, useState } from './vend
 import { Cards, Controls, Findings, TopicTable } from './data.js';
 import { Link } from './link.js';
 import { Plot, Ring } from './plots.js';
-import { openRobot, past, show } from './past.js';
+import { busy, openRobot, past, show } from './past.js';
 import { Timeline } from './timeline.js';
 import { span } from './words.js';
 
@@ -148,6 +148,7 @@ function Age({ kind, children }) {
   }, []);
   if (past.value && kind !== 'figures') {
     const before = past.value.shown.find(([topic]) => topic === chosen(kind))?.[2];
+    if (past.value.read === undefined) return html`<span class="age" data-age=${kind}>${busy.value ? 'reading…' : ''}</span>${children}`;
     return html`<span class=${`age ${before === undefined ? 'old' : ''}`} data-age=${kind} data-before=${before ?? ''}>${before === undefined ? 'nothing then' : `${span(Math.max(0, before) / 1000)} before`}</span>${children}`;
   }
   const at = seen.get(kind)?.at;
