@@ -1,7 +1,8 @@
 """The S3 server: what it is, whether it accepts our signature and our objects, and whether it keeps the two promises of a put.
 
 What it leaves behind: ``<robot>/_doctor/probe`` in each bucket that this machine writes to, 64 bytes that are always the
-same, because the robot's keys may delete nothing. On Tower a second object is written and deleted.
+same, because the robot's keys may delete nothing. On Tower a second object is written and deleted. On Tower and Spark
+``_requests/_doctor/inbox.json`` is raced for.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import ssl
 import time
 import uuid
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from email.utils import parsedate_to_datetime
 from typing import TYPE_CHECKING, Final
 from urllib.error import HTTPError, URLError
@@ -40,6 +42,7 @@ from shadowhound_data_logger.errors import (
     SettingError,
     StoreError,
 )
+from shadowhound_data_logger.mailbox import MAILBOX_BUCKET, inbox_key
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.stores.s3_requests import S3Requests
@@ -54,6 +57,9 @@ SLOW_S: Final = 0.5
 """A small request that takes longer than this keeps four upload threads below eight objects a second."""
 LATENCY_TRIES: Final = 5
 LISTING_BYTES: Final = 1024
+RACED: Final = '_doctor'
+"""Has a mailbox, and is no robot."""
+RACERS, RACES = 4, 3
 MINIO: Final = "MinIO's open-source server was archived in April 2026: it keeps working, without fixes and security advisories"
 
 
@@ -154,6 +160,7 @@ def _clock(date: str) -> Iterator[Result]:
 def _use(requests: S3Requests, context: Context) -> Iterator[Result]:
     if context.role is Role.SPARK:
         yield from _read(requests, context)
+        yield from race_mailboxes(requests)
         return
     missing: set[str] = set()
     if context.role is Role.TOWER:
@@ -174,6 +181,7 @@ def _use(requests: S3Requests, context: Context) -> Iterator[Result]:
     yield from s3_put.promises(requests, written[0], context.settings.robot, latency.data['latency_s'])
     if context.role is Role.TOWER:
         yield from _delete(requests, written[0], context.settings.robot)
+        yield from race_mailboxes(requests)
 
 
 def _buckets(requests: S3Requests) -> Iterator[Result]:
@@ -245,6 +253,43 @@ def _read(requests: S3Requests, context: Context) -> Iterator[Result]:
     yield ok(
         's3.read', f'{bucket}/{first.key} can be read', download_mbps=round(mbps, 2), sha256=hashlib.sha256(body).hexdigest()
     )
+
+
+def race_mailboxes(requests: S3Requests) -> Iterator[Result]:
+    """On Spark and Tower: whether of those who replace a mailbox at once one alone wins, and none where there is no mailbox."""
+    check, remedy = 's3.mailbox', 'on Tower: run tower/make_secrets.py and tower/prepare.py again, and restart the server'
+    try:
+        item = s3_put.probe(MAILBOX_BUCKET, inbox_key(RACED))
+        requests.put(item, s3_put.BODY, s3_put.crc32(s3_put.BODY), conditional=True)
+        winners = [_winners(requests, number) for number in range(RACES)]
+        is_made = _is_made(requests, inbox_key(f'{RACED}_{uuid.uuid4().hex}'))
+    except AccessDenied:
+        yield info(
+            check, 'these keys may not ask a robot for what it keeps', 'this Tower was prepared by an earlier version', remedy
+        )
+        return
+    if winners != [1] * RACES:
+        seen = f'of {RACERS} who replaced one version of a mailbox at once {winners} won'
+        yield warning(check, seen, 'the server does not honour If-Match: requests get lost', 'use SeaweedFS 4, or a newer MinIO')
+    elif is_made:
+        yield warning(check, 'If-Match made an object that was not there', 'an error of MinIO before 2025', 'update the server')
+    else:
+        yield ok(check, f'of {RACERS} who replace a mailbox at once one wins')
+
+
+def _winners(requests: S3Requests, number: int) -> int:
+    found = requests.changed(MAILBOX_BUCKET, inbox_key(RACED), '', LISTING_BYTES)
+    assert found is not None  # an ETag is never empty
+    bodies = [b'%d %d' % (number, racer) for racer in range(RACERS)]
+    with ThreadPoolExecutor(RACERS) as pool:
+        return sum(pool.map(lambda body: requests.replace(MAILBOX_BUCKET, inbox_key(RACED), body, found[1]), bodies))
+
+
+def _is_made(requests: S3Requests, key: str) -> bool:
+    try:
+        return requests.replace(MAILBOX_BUCKET, key, b'{}', f'"{"0" * 32}"')
+    except ObjectRefused:
+        return False
 
 
 def _nothing(requests: S3Requests, bucket: str, prefix: str) -> Iterator[Result]:

@@ -14,10 +14,13 @@ from botocore.exceptions import ClientError
 from tower_scripts import make_secrets, prepare
 
 from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.doctor.model import Severity
+from shadowhound_data_logger.doctor.s3 import RACED, race_mailboxes
+from shadowhound_data_logger.doctor.s3_put import single_requests
 from shadowhound_data_logger.errors import AccessDenied, ForeignObject
 from shadowhound_data_logger.lake import pull
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.mailbox import KeptFilter, decode_inbox
+from shadowhound_data_logger.mailbox import KeptFilter, decode_inbox, inbox_key
 from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
@@ -177,3 +180,37 @@ def test_a_mailbox_is_read_by_its_robot_and_written_by_spark(server: Tower, as_u
         monkeypatch.setenv(name, value)
     assert prepare.main(['--robot', 'thor']) == 0
     assert thor.get_object(**place)['Body'].read() == found[0]
+
+
+def test_the_doctor_races_for_a_mailbox(server: Tower) -> None:
+    """With the keys of those who may ask, one wins each time; a robot's may not ask at all."""
+    for user, severity in (('spark', Severity.OK), ('thor', Severity.INFO)):
+        with single_requests(server.store_settings(user)) as requests:
+            (found,) = race_mailboxes(requests)
+        assert (found.check, found.severity) == ('s3.mailbox', severity), found
+
+
+class _Ignoring:
+    """A server that takes every put, whatever its condition says."""
+
+    def __init__(self, *, makes: bool) -> None:
+        self._makes = makes
+
+    def put(self, *_: Any, **__: Any) -> None:
+        """It is there then."""
+
+    def changed(self, *_: Any) -> tuple[bytes, str]:
+        return b'', 'version'
+
+    def replace(self, _: str, key: str, body: bytes, __: str) -> bool:
+        if key != inbox_key(RACED):
+            return self._makes
+        return not self._makes or body.endswith(b' 0')
+
+
+@pytest.mark.parametrize(('makes', 'says'), [(False, 'does not honour If-Match'), (True, 'MinIO')])
+def test_the_doctor_tells_a_server_that_ignores_if_match(makes: bool, says: str) -> None:
+    """Or that makes what is not there."""
+    (found,) = race_mailboxes(_Ignoring(makes=makes))  # type: ignore[arg-type]
+    assert found.is_finding
+    assert says in found.cause
