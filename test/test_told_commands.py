@@ -71,3 +71,22 @@ def test_every_parameter_that_is_set_is_live() -> None:
     sets = [(where, match['name']) for where, match in told(PARAMETER)]
     assert [each for each in sets if each[1] not in live] == []
     assert sets
+
+
+def test_every_link_leads_somewhere() -> None:
+    """In the README and the docs: the file is there, and so is the heading, by the anchor that GitHub gives it."""
+    wrong, seen = [], 0
+    for page in (ROOT / 'README.md', *ROOT.glob('docs/**/*.md')):
+        for target in re.findall(r'\]\((?!https?://)([^)\s]+)\)', page.read_text(encoding='utf-8')):
+            path, _, anchor = target.partition('#')
+            file = (page.parent / path).resolve() if path else page
+            seen += 1
+            if not file.exists() or (anchor and anchor not in _anchors(file)):
+                wrong.append(f'{page.relative_to(ROOT)}: {target}')
+    assert wrong == []
+    assert seen > 100
+
+
+def _anchors(page: Path) -> set[str]:
+    headings = re.findall(r'^#+ (.+)$', page.read_text(encoding='utf-8'), re.MULTILINE)
+    return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}

@@ -104,6 +104,9 @@ def doctor(  # noqa: PLR0913 - one for each option
     else:
         for part in report(results, fixed, context, took_s, verbose=verbose):
             console().print(part)
+        if role is None and context.role is not Role.THOR:
+            guessed = f'This machine was taken for {context.role.value}: --role thor also checks ROS, the disk and the spool.'
+            console().print(plain(f'\n{guessed}', 'dim'))
     return exit_code(finding=left)
 
 

@@ -144,7 +144,7 @@ def _of_index(spool: Path, robot: str, now_ns: int, written: Mapping[str, Any] |
     """What the spool itself tells: what lies in it, and the node's last session."""
     path = spool / 'index.db'
     if not path.is_file():
-        text = f'there is no spool in {spool}: has the node run here? SHADOWHOUND_HOME names its folder'
+        text = f'there is no spool in {spool}: start the node, or name its folder by SHADOWHOUND_HOME'
         return {'spool': None, 'session': None, 'problem': text}
     index = Index(path, read_only=True)
     try:
