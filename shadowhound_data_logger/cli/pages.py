@@ -100,7 +100,7 @@ SECTIONS: Final = (
     Section(
         'Choose how it is stored',
         'What an object is, and what it is called in the bucket ([formats](formats.md)).',
-        ('SENSOR.format', 'SENSOR.batch_s', 'SENSOR.quality', 'SENSOR.dedup', 'SENSOR.key', 'SENSOR.bucket', 'SENSOR.statistics'),
+        ('SENSOR.format', 'SENSOR.batch_s', 'SENSOR.quality', 'SENSOR.dedup', 'SENSOR.key', 'SENSOR.bucket'),
     ),
     Section(
         'Limit the disk',
