@@ -145,3 +145,19 @@ class LakeError(DataLoggerError):
     """A query of the catalogue cannot be answered: an invalid query, or a catalogue that contradicts itself."""
 
     DEFAULT_REMEDY = 'shadowhound-data query --help has examples; lake status describes the catalogue'
+
+
+class PolicyError(DataLoggerError):
+    """A policy cannot be packed, published, activated or rolled back."""
+
+    DEFAULT_REMEDY = 'shadowhound-data policy list shows the policies of this robot'
+
+
+class PolicyRefused(PolicyError):
+    """A policy may not run here; ``data['reason']`` is the short word of docs/policies.md for why."""
+
+    DEFAULT_REMEDY = 'docs/policies.md says what each reason means'
+
+    def __init__(self, reason: str, message: str, *, remedy: str = '', **data: Any) -> None:
+        super().__init__(message, remedy=remedy, reason=reason, **data)
+        self.reason = reason

@@ -96,6 +96,26 @@ def from_json(content: bytes, most: int = MOST_DOCUMENT_BYTES) -> Any:
         raise ValueError('it is too deep') from None
 
 
+def from_strict_json(content: bytes, most: int) -> Any:
+    """As ``from_json``, for what has to have one meaning: raises ValueError also for a name twice in one object, and for NaN."""
+    check_size(len(content), most)
+    try:
+        return json.loads(content, object_pairs_hook=_named_once, parse_constant=_no_number)
+    except RecursionError:
+        raise ValueError('it is too deep') from None
+
+
+def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError('it has a name twice in one object')
+    return found
+
+
+def _no_number(word: str) -> Any:
+    raise ValueError(f'{word} is no number of JSON')
+
+
 def from_yaml(content: str) -> Any:
     """Mappings, sequences and scalars, without aliases: a few bytes of those can stand for any size. Raises ValueError."""
     from ruamel.yaml import YAML  # noqa: PLC0415 - 0.1 s that most need not

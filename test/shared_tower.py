@@ -22,11 +22,13 @@ ROBOTS: Final = ('thor', 'tachi')
 """The latter's password is changed by a test."""
 BUCKETS: Final = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
 USERS: Final = {
-    'thor': [f'{action}:{name}/thor/*' for name in ('sensor-data', 'trajectories', 'imu-data') for action in ('Read', 'Write')],
-    'spark': [f'{action}:{name}' for name in BUCKETS for action in ('Read', 'List')],
+    'thor': [*(f'{action}:{name}/thor/*' for name in ('sensor-data', 'trajectories', 'imu-data') for action in ('Read', 'Write')),
+             'Read:lerobot/policies/*'],
+    'spark': [*(f'{action}:{name}' for name in BUCKETS for action in ('Read', 'List')), 'Write:lerobot'],
     'stranger': ['Read:other'],
-}
-"""Of S3: Thor's keys may put and get what is its own, and neither list nor delete; Spark's may read; one has no business here."""
+}  # fmt: skip
+"""Of S3: Thor's keys may put and get what is its own and get policies, and neither list nor delete; Spark's may read and
+publish; one has no business here."""
 WAIT_S: Final = 180.0
 """For both servers, on a machine on which all workers begin at the same time."""
 

@@ -18,8 +18,8 @@ from shadowhound_data_logger import metadata_words
 
 PACKAGE = 'shadowhound_data_logger'
 ROOT = Path(__file__).parents[1] / PACKAGE
-ORDER = ('contracts', 'stores', 'mcap', 'encode', 'ros', 'spool', 'ship', 'catalogue', 'missions', 'face', 'bags', 'capture',
-         'lake', 'datasets', 'doctor', 'live', 'cli', 'sim')  # fmt: skip
+ORDER = ('contracts', 'stores', 'policies', 'mcap', 'encode', 'ros', 'spool', 'ship', 'catalogue', 'missions', 'face', 'bags',
+         'capture', 'lake', 'datasets', 'doctor', 'live', 'cli', 'sim')  # fmt: skip
 """Each folder may import those before it. The contracts are the modules beside the folders, the face is the package itself."""
 ROS = {'ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'go2_interfaces', 'nav_msgs', 'rcl_interfaces', 'rclpy',
        'rosidl_generator_py', 'sensor_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs'}  # fmt: skip
@@ -28,13 +28,16 @@ ALLOWED = {
     'rclpy': {'capture', 'doctor', 'live', 'ros', 'sim'},
     'aiohttp': {'live'},
     **{name: {'stores'} for name in ('boto3', 'botocore')},
+    'cryptography': {'policies'},
     'mlflow': {'missions'},
+    'onnxruntime': {'policies'},
     'av': {'datasets'},
     'daft': {'datasets', 'lake'},
     'obstore': {'stores'},
     'pyarrow': {'datasets', 'lake', 'live', 'sim'},
 }
-HEAVY = ('rclpy', 'aiohttp', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'obstore', 'pyarrow', 'av')
+HEAVY = ('rclpy', 'aiohttp', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'obstore', 'pyarrow', 'av',
+         'cryptography', 'onnxruntime')  # fmt: skip
 LATE = ('import_module', '__import__')
 MODULES = sorted(ROOT.rglob('*.py'))
 

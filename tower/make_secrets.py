@@ -33,6 +33,8 @@ READ_BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
 ROBOT_BUCKETS = ('sensor-data', 'trajectories')
 MAILBOXES = 'sensor-data/_requests'
 """What is asked of robots: a robot reads its own."""
+POLICIES = 'lerobot/policies'
+"""What every robot reads of the training's bucket: policies, which are signed, and lists of revoked keys."""
 ADMIN = ('Admin', 'Read', 'Write', 'List', 'Tagging')
 NAME = re.compile(r'[a-z0-9][a-z0-9_-]{0,62}')
 """A robot's name leads its keys, and is part of a pattern here: no wildcard may be in it."""
@@ -67,7 +69,7 @@ def actions(user: str) -> list[str]:
             f'Write:{MAILBOXES}/*',
         ]
     own = [f'{action}:{bucket}/{user}/*' for bucket in ROBOT_BUCKETS for action in ('Read', 'Write')]
-    return [*own, f'Read:{MAILBOXES}/{user}/*']
+    return [*own, f'Read:{MAILBOXES}/{user}/*', f'Read:{POLICIES}/*']
 
 
 def new_key() -> dict[str, str]:

@@ -24,6 +24,7 @@ from shadowhound_data_logger.cli.live import live
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.node import node
 from shadowhound_data_logger.cli.output import tell_error
+from shadowhound_data_logger.cli.policy import policy
 from shadowhound_data_logger.cli.pull import pull
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.cli.search import lake_index, search
@@ -36,6 +37,7 @@ SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
     'On the robot': (status, ledger, spool, node, live),
     'On Tower and Spark': (query, search, fetch, pull, bag, lake, label, export),
     'Missions': (missions,),
+    'Policies': (policy,),
 }
 """The verbs by who needs them, in the order of the help."""
 GONE: Final = {

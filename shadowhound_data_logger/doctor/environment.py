@@ -12,9 +12,9 @@ from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.doctor import services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.machine import variables
-from shadowhound_data_logger.doctor.mlflow_rest import LOGIN, login
 from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DEFAULTS
+from shadowhound_data_logger.mlflow_rest import LOGIN, login
 from shadowhound_data_logger.spool import status
 
 KEYS: Final = ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY')

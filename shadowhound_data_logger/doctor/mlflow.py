@@ -15,9 +15,9 @@ from urllib.parse import urlsplit
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.doctor import s3_put, services
 from shadowhound_data_logger.doctor.context import home_of
-from shadowhound_data_logger.doctor.mlflow_rest import MlflowRest
 from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, skipped, warning
 from shadowhound_data_logger.errors import StoreError, TrackingError, TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.mlflow_rest import MlflowRest
 
 NAME: Final = 'mlflow'
 PROBE: Final = '_doctor'
@@ -39,7 +39,7 @@ def check(context: Context) -> Iterator[Result]:
         yield skipped(NAME, failed)
         return
     try:
-        rest = MlflowRest(service, context.environ, home_of(context))
+        rest = MlflowRest(service.url, context.environ, home_of(context))
         yield from _health(rest, service.url)
         if rest.is_open():
             yield warning(

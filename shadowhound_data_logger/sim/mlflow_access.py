@@ -50,8 +50,8 @@ ADMIN_LOGIN: Final = 'TOWER_MLFLOW_PASSWORD'
 """The variable with the password of ``tower``, for ``main``."""
 APP: Final = ('--app-name', 'basic-auth')
 """What ``mlflow server`` has to be told besides."""
-SOURCES: Final = r'\A(runs|models|mlflow-artifacts):/[^\r\n]*\Z'
-"""Where a model's files may come from: from what the server stores itself."""
+SOURCES: Final = r'\A((runs|models|mlflow-artifacts):/|s3://lerobot/policies/)[^\r\n]*\Z'
+"""Where a model's files may come from: from what the server stores itself, and from the policies, which it has no keys for."""
 BODY_BYTES: Final = 32 << 20
 """The longest body of a request that MLflow keeps in memory whole; the inputs of a run
 may have 17 MB. Artifacts are streamed."""
@@ -62,7 +62,9 @@ POLL_S: Final = 0.5
 
 _API: Final = r'/(?:ajax-)?api/[23]\.0/(?:preview/)?mlflow/'
 _ARTIFACTS: Final = r'/(?:ajax-)?api/2\.0/mlflow-artifacts/artifacts(?:/.*)?'
+_ALIAS: Final = _API + r'registered-models/alias'
 _ROBOT: Final = (
+    ('GET', _ALIAS),
     ('GET', _API + r'(?:experiments/get-by-name|experiments/get|runs/get|artifacts/list|metrics/get-history|users/current)'),
     ('POST', _API + r'runs/(?:create|update|search|log-batch|log-metric|log-parameter|set-tag|delete-tag)'),
     ('POST', _API + r'(?:experiments/set-experiment-tag|logged-models/search)'),  # the latter is part of listing artifacts
@@ -114,6 +116,8 @@ def authenticate() -> Authorization | Response:
         return _refusal(403, 'PERMISSION_DENIED', f'the user {user} may not do this on this Tower')
     if user != ADMIN and request.get_data() and not re.fullmatch(_FREE_BODY, request.path) and not _is_plain(request):
         return _refusal(400, 'INVALID_PARAMETER_VALUE', 'a body has to be a JSON object, whose names are as run_id, not as runId')
+    if request.method == 'GET' and re.fullmatch(_ALIAS, request.path):
+        return type(given)('basic', {'username': ADMIN, 'password': ''})  # which version has an alias, everybody may know
     return given
 
 

@@ -23,8 +23,9 @@ from open_seaweed import open_seaweed
 from shared_tower import BUCKETS
 from stores.fake_s3 import FakeS3, hung, refused, served
 
+from shadowhound_data_logger import mlflow_rest
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.doctor import mlflow, mlflow_rest, network, s3, s3_put, seaweedfs
+from shadowhound_data_logger.doctor import mlflow, network, s3, s3_put, seaweedfs
 from shadowhound_data_logger.doctor.model import Result, Role, Severity
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3_requests import S3Requests

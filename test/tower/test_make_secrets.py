@@ -12,7 +12,7 @@ import pytest
 from botocore.configloader import raw_config_parse
 from tower_scripts import TOWER, make_secrets
 
-from shadowhound_data_logger.doctor.mlflow_rest import login
+from shadowhound_data_logger.mlflow_rest import login
 from shadowhound_data_logger.sim import mlflow_access
 
 

@@ -1,4 +1,4 @@
-"""The few requests to an MLflow server that the doctor needs, by hand: MLflow's own client takes seconds to import.
+"""The few requests to an MLflow server that the doctor and policies need, by hand: MLflow's own client takes seconds to import.
 
 https://mlflow.org/docs/latest/api_reference/rest-api.html
 """
@@ -17,12 +17,15 @@ from urllib.error import HTTPError, URLError
 from urllib.parse import quote, urlencode
 from urllib.request import Request, urlopen
 
-from shadowhound_data_logger.doctor.services import ANSWER_S, TowerService
 from shadowhound_data_logger.errors import TrackingError, TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.untrusted import from_json
 
 LOGIN: Final = ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD')
 TEXT: Final = 300
 """Letters of an answer that are shown."""
+ANSWER_S: Final = 4.0
+"""A Tower that needs longer for an answer is not a Tower to work with; the sum of all waits has to fit into the run."""
+MOST_ANSWER_BYTES: Final = 1 << 20
 
 
 class MlflowRest:
@@ -31,14 +34,17 @@ class MlflowRest:
     Raises TrackingUnavailable without an answer, TrackingRefused (data: status, code, text) after others.
     """
 
-    def __init__(self, service: TowerService, environ: Mapping[str, str], home: Path) -> None:
-        """``home`` is the user's, where MLflow's clients look for a user and a password that are not in the environment."""
-        self._url = service.url
+    def __init__(self, url: str, environ: Mapping[str, str], home: Path) -> None:
+        """``url`` is without user and password and a slash at its end.
+
+        ``home`` is the user's, where MLflow's clients look for a user and a password that are not in the environment.
+        """
+        self._url = url
         self.user, password = login(environ, home)
-        self._headers = {'Content-Type': 'application/json', 'User-Agent': 'shadowhound-doctor'}
+        self._headers = {'Content-Type': 'application/json', 'User-Agent': 'shadowhound-data'}
         self._authorization = _authorization(self.user, password, environ.get('MLFLOW_TRACKING_TOKEN', ''))
         self._trust: ssl.SSLContext | None = None
-        if service.tls:
+        if url.startswith('https:'):
             bundle = environ.get('MLFLOW_TRACKING_SERVER_CERT_PATH') or environ.get('REQUESTS_CA_BUNDLE') or None
             self._trust = ssl.create_default_context(cafile=bundle)
             if environ.get('MLFLOW_TRACKING_INSECURE_TLS', '').lower() == 'true':
@@ -47,7 +53,7 @@ class MlflowRest:
     def experiment(self, name: str) -> dict[str, Any] | None:
         """By its name, deleted ones as well."""
         try:
-            answer = self._json('GET', 'experiments/get-by-name?' + urlencode({'experiment_name': name}))
+            answer = self.json('GET', 'experiments/get-by-name?' + urlencode({'experiment_name': name}))
         except TrackingRefused as error:
             if error.data['code'] == 'RESOURCE_DOES_NOT_EXIST':
                 return None
@@ -64,13 +70,13 @@ class MlflowRest:
         return True
 
     def create(self, name: str) -> None:
-        self._json('POST', 'experiments/create', {'name': name})
+        self.json('POST', 'experiments/create', {'name': name})
 
     def restore(self, experiment_id: str) -> None:
-        self._json('POST', 'experiments/restore', {'experiment_id': experiment_id})
+        self.json('POST', 'experiments/restore', {'experiment_id': experiment_id})
 
     def tag(self, experiment_id: str, name: str, value: str) -> None:
-        self._json('POST', 'experiments/set-experiment-tag', {'experiment_id': experiment_id, 'key': name, 'value': value})
+        self.json('POST', 'experiments/set-experiment-tag', {'experiment_id': experiment_id, 'key': name, 'value': value})
 
     def artifact_url(self, path: str) -> str:
         """Of the server's own proxy for artifacts."""
@@ -80,13 +86,16 @@ class MlflowRest:
         """A page of the server, such as ``/health``."""
         return self.ask('GET', f'{self._url}{path}').decode(errors='replace').strip()
 
-    def _json(self, method: str, path: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    def json(self, method: str, path: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """One request of the REST API, such as ``runs/get``, and its answer."""
         data = json.dumps(body).encode() if body is not None else None
         answer = self.ask(method, f'{self._url}/api/2.0/mlflow/{path}', data)
         try:
-            found: dict[str, Any] = json.loads(answer)
+            found = from_json(answer)
         except ValueError as error:
             raise TrackingUnavailable(f'{self._url} does not answer like an MLflow server', code='') from error
+        if not isinstance(found, dict):
+            raise TrackingUnavailable(f'{self._url} does not answer like an MLflow server', code='')
         return found
 
     def ask(self, method: str, url: str, data: bytes | None = None, *, as_stranger: bool = False) -> bytes:
@@ -95,19 +104,21 @@ class MlflowRest:
             headers = self._headers if as_stranger else {**self._headers, **self._authorization}
             request = Request(url, data, headers, method=method)  # noqa: S310 - http(s), see services
             with urlopen(request, timeout=ANSWER_S, context=self._trust) as answer:  # noqa: S310
-                content: bytes = answer.read()
-                return content
+                content: bytes = answer.read(MOST_ANSWER_BYTES + 1)
         except HTTPError as error:
             raise _refused(self._url, error) from error
         except (URLError, OSError, http.client.HTTPException, ValueError) as error:
             reason = getattr(error, 'reason', error)
             what = f'gives no answer within {ANSWER_S:g} s' if isinstance(reason, TimeoutError) else f'cannot be asked: {reason}'
             raise TrackingUnavailable(f'{self._url} {what}', code='') from error
+        if len(content) > MOST_ANSWER_BYTES:
+            raise TrackingUnavailable(f'{self._url} answers with more than {MOST_ANSWER_BYTES:,} bytes', code='')
+        return content
 
 
 def _refused(url: str, error: HTTPError) -> TrackingError:
     with error:
-        text = error.read().decode(errors='replace')
+        text = error.read(MOST_ANSWER_BYTES).decode(errors='replace')
     try:
         said = json.loads(text)
         code, message = str(said['error_code']), str(said.get('message', ''))

@@ -1,0 +1,341 @@
+"""``shadowhound-data policy``: packs, signs and publishes policies; on the robot fetches, verifies, activates and rolls back."""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import click
+
+from shadowhound_data_logger.cli.common import (
+    BadUsage,
+    ExitCode,
+    as_json,
+    examples,
+    robot_name,
+    the_home,
+    the_store,
+)
+from shadowhound_data_logger.cli.output import plain_table, print_json, print_page
+from shadowhound_data_logger.errors import DataLoggerError, PolicyError, PolicyRefused
+from shadowhound_data_logger.missions.active import MissionFinder
+from shadowhound_data_logger.mlflow_rest import MlflowRest
+from shadowhound_data_logger.options import GIBI
+from shadowhound_data_logger.policies import packing, running, signing
+from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.policies.registry import CANARY, CHAMPION, MlflowRegistry
+from shadowhound_data_logger.policies.sync import PolicySettings, PolicySync, SyncResult
+
+JITTER: Final = 0.2
+"""Of the time between two looks: a fleet that was switched on together does not ask together."""
+_Verb = TypeVar('_Verb', bound=Callable[..., Any])
+
+_folder = click.Path(path_type=Path, file_okay=False, exists=True)
+_file = click.Path(path_type=Path, dir_okay=False, exists=True)
+
+
+@click.group()
+def policy() -> None:
+    """Bring trained policies to robots, signed.
+
+    MLflow's registry says which version runs (alias champion), the store has its bytes, and a signature says whether it may run.
+    """
+
+
+# -- on Spark ------------------------------------------------------------------------------------------------------------------
+
+
+@policy.command(epilog=examples('policy keygen spark.key'))
+@click.argument('path', type=click.Path(path_type=Path, dir_okay=False))
+@as_json
+def keygen(*, path: Path, as_json: bool) -> ExitCode:
+    """Make a key that signs policies.
+
+    It stays on the machine that publishes; PATH.pub goes to policies/keys in SHADOWHOUND_HOME of each robot.
+    """
+    name = signing.keygen(path)
+    told = {'key': name, 'private': str(path), 'public': f'{path}.pub'}
+    print_json(told) if as_json else click.echo(f'key {name}: {path} (keep it), {path}.pub (for robots)')
+    return ExitCode.FINE
+
+
+@policy.command(epilog=examples('policy pack outputs/go2_patrol --name go2_patrol --smoke sample.npz -o packed'))
+@click.argument('folder', metavar='DIR', type=_folder)
+@click.option('--name', required=True, help='Name of the registered model.')
+@click.option('--version', type=click.IntRange(1), help="Its version  [default: the registry's next one]")
+@click.option('--serial', type=click.IntRange(1), help='Robots take no new version with a lower one  [default: the version]')
+@click.option('--smoke', type=_file, required=True, metavar='NPZ', help='An array for each input, for the smoke run.')
+@click.option('--dataset', default='', metavar='DIGEST', help='Digest of the training set.')
+@click.option('--run', 'run_id', default='', metavar='ID', help='MLflow run that trained it.')
+@click.option('--robot-type', 'robot_types', multiple=True, default=('go2',), show_default=True, help='Robots it is for.')
+@click.option('--fps', type=click.FloatRange(0.01, 1000.0), default=10.0, show_default=True, help='Steps a second.')
+@click.option('--tolerance', type=click.FloatRange(0.0, min_open=True), default=1e-4, show_default=True,
+              help="How much the sample's output may differ on a robot.")  # fmt: skip
+@click.option('--p99-ms', type=click.FloatRange(0.0, min_open=True), default=100.0, show_default=True,
+              help='The slowest p99 of a step that is allowed.')  # fmt: skip
+@click.option('--failures', type=click.IntRange(0), default=3, show_default=True, help='Failed steps of 100 that are allowed.')
+@click.option('-o', '--output', type=click.Path(path_type=Path), required=True, help='A new folder.')
+@as_json
+def pack(*, folder: Path, name: str, version: int | None, smoke: Path, output: Path, run_id: str, as_json: bool, **given: Any
+         ) -> ExitCode:  # fmt: skip
+    """Make a folder with a manifest of what a training wrote.
+
+    DIR has model.onnx in one file, and beside it .json, .safetensors and .npy files. The model runs once, to note what the smoke
+    run on a robot has to give.
+    """
+    number = version or 1 + max((each.version for each in _registry().versions(name)), default=0)
+    manifest = packing.pack(folder, smoke, output, packing.Packing(name=name, version=number, run=run_id, **given))
+    told = {'policy': manifest.id, 'folder': str(output), 'files': len(manifest.files), 'bytes': manifest.size}
+    print_json(told) if as_json else click.echo(
+        f'{manifest.id}: {len(manifest.files)} files, {manifest.size:,} bytes in {output}'
+    )
+    return ExitCode.FINE
+
+
+@policy.command(epilog=examples('policy sign packed --key spark.key'))
+@click.argument('packed', type=_folder)
+@click.option('--key', type=_file, required=True, help='Private key of policy keygen.')
+def sign(*, packed: Path, key: Path) -> ExitCode:
+    """Sign what was packed."""
+    click.echo(f'signed with the key {packing.sign(packed, key)}')
+    return ExitCode.FINE
+
+
+@policy.command(
+    epilog=examples('policy publish packed --alias champion', 'policy publish packed --alias canary --robots thor,tachi')
+)
+@click.argument('packed', type=_folder)
+@click.option('--alias', 'aliases', multiple=True, help=f'Such as {CHAMPION}, {CANARY} or robot-NAME; may be repeated.')
+@click.option('--robots', default='', metavar='NAMES', help=f'The robots that take it as {CANARY}, with commas between.')
+@as_json
+def publish(*, packed: Path, aliases: tuple[str, ...], robots: str, as_json: bool) -> ExitCode:
+    """Upload a signed policy and register it.
+
+    May be repeated, also to give a version that is there another alias. Nothing is overwritten.
+    """
+    names = [robot.strip() for robot in robots.split(',') if robot.strip()]
+    with the_store() as store:
+        manifest = packing.publish(packed, store, _registry(), aliases, names)
+    told = {'policy': manifest.id, 'aliases': list(aliases), 'robots': names}
+    print_json(told) if as_json else click.echo(f'published {manifest.id}{" as " if aliases else ""}{", ".join(aliases)}')
+    return ExitCode.FINE
+
+
+@policy.command(epilog=examples('policy revoke 0123456789abcdef --key other.key'))
+@click.argument('keys', nargs=-1, required=True)
+@click.option('--key', type=_file, required=True, help='Private key that signs the list; none of those that it revokes.')
+def revoke(*, keys: tuple[str, ...], key: Path) -> ExitCode:
+    """Tell all robots that keys are revoked.
+
+    A robot that runs a policy signed with one of them goes back to one that is not.
+    """
+    with the_store() as store:
+        number = packing.revoke(key, keys, store)
+    click.echo(f'list {number}: {", ".join(keys)}')
+    return ExitCode.FINE
+
+
+# -- on the robot --------------------------------------------------------------------------------------------------------------
+
+
+def _follows(verb: _Verb) -> _Verb:
+    """The options of what a robot follows."""
+    for option in reversed((
+        click.option('--name', envvar='SHADOWHOUND_POLICY', required=True, help='Registered model  [$SHADOWHOUND_POLICY]'),
+        click.option('--robot', envvar='SHADOWHOUND_ROBOT', default='thor', callback=robot_name, show_default=True),
+        click.option('--robot-type', default='go2', show_default=True, help='What the manifest has to be for.'),
+        click.option('--max-mbps', type=click.FloatRange(0.0, 1e5), default=0.0, show_default=True,
+                     help='Most megabits a second to download; 0: no limit.'),
+        click.option('--max-gib', type=click.FloatRange(0.001), default=8.0, show_default=True, help='Most disk for policies.'),
+        click.option('--min-free-gib', type=click.FloatRange(0.0), default=2.0, show_default=True, help='Disk to leave free.'),
+        click.option('--keep', type=click.IntRange(2), default=3, show_default=True, help='Versions to keep on the disk.'),
+        click.option('--now', is_flag=True, help='Activate also while a mission is active.'),
+    )):  # fmt: skip
+        verb = option(verb)
+    return verb
+
+
+@policy.command(epilog=examples('policy sync --name go2_patrol'))
+@_follows
+@as_json
+def sync(*, as_json: bool, **given: Any) -> ExitCode:
+    """Take what the registry says, once."""
+    with _syncing(given) as one:
+        result = one.run()
+    print_json(_told(result)) if as_json else click.echo(_sentence(result))
+    return ExitCode.FINE
+
+
+@policy.command(epilog=examples('policy run --name go2_patrol --max-mbps 20'))
+@click.option('--every', type=click.FloatRange(0.1, 86_400.0), default=30.0, show_default=True, help='Seconds between two looks.')
+@_follows
+def run(*, every: float, **given: Any) -> ExitCode:
+    """Follow the registry until it is interrupted.
+
+    A Tower that is away changes nothing: what is active goes on.
+    """
+    logging.basicConfig(level=logging.INFO, format='%(message)s')
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    said = ''
+    with _syncing(given) as one:
+        while not stop.is_set():
+            try:
+                text = _sentence(one.run(again=False))
+            except (DataLoggerError, OSError) as error:
+                text = f'{error}'
+            if text != said:
+                print(text, file=sys.stderr, flush=True)
+                said = text
+            stop.wait(every * random.uniform(1.0 - JITTER, 1.0 + JITTER))
+    return ExitCode.FINE
+
+
+@policy.command(name='list')
+@as_json
+def list_(*, as_json: bool) -> ExitCode:
+    """List the versions on this robot."""
+    folder = _policies()
+    state, now = folder.state(), folder.current()
+    rows = [{'policy': name, 'active': name == now, 'pinned': name == state.pin, 'why_not': state.bad.get(name, '')}
+            for name in folder.installed()]  # fmt: skip
+    if as_json:
+        print_json(rows)
+    else:
+        table = plain_table('', ('policy', '', 'why not'), ('policy', '', 'why not'))
+        for row in rows:
+            marks = [word for word in ('active', 'pinned') if row[word]]
+            table.add_row(str(row['policy']), ' '.join(marks), str(row['why_not']))
+        print_page(table)
+    return ExitCode.FINE
+
+
+@policy.command()
+@click.argument('name', required=False)
+@as_json
+def show(*, name: str | None, as_json: bool) -> ExitCode:
+    """Describe a version (NAME@7), by default the active one, and verify it."""
+    folder = _policies()
+    found = folder.find(name) if name else folder.current()
+    if found is None:
+        raise PolicyError('no policy is active')
+    try:
+        manifest, why = folder.check(found, folder.state()), ''
+    except PolicyRefused as error:
+        manifest, why = None, f'{error.reason}: {error.what}'
+    told = {'policy': found, 'active': found == folder.current(), 'path': str(folder.versions / found), 'refused': why}
+    if manifest is not None:
+        told |= {'serial': manifest.serial, 'robot_types': list(manifest.robot_types), 'fps': manifest.fps,
+                 'inputs': [spec.name for spec in manifest.inputs], 'outputs': [spec.name for spec in manifest.outputs],
+                 'dataset': manifest.dataset, 'run': manifest.run, 'p99_ms': manifest.p99_ms, 'bytes': manifest.size}  # fmt: skip
+    if as_json:
+        print_json(told)
+    else:
+        for key, value in told.items():
+            click.echo(f'{key}: {", ".join(value) if isinstance(value, list) else value}')
+    return ExitCode.FINDING if why else ExitCode.FINE
+
+
+@policy.command(epilog=examples('policy use go2_patrol@7'))
+@click.argument('name')
+@click.option('--now', is_flag=True, help='Also while a mission is active.')
+def use(*, name: str, now: bool) -> ExitCode:
+    """Activate a version that is on this robot, and pin it."""
+    folder = _policies()
+    found = folder.find(name)
+    if not now and not _no_mission()():
+        raise PolicyError('a mission is active', remedy='wait for its end, or add --now')
+    folder.use(found)
+    click.echo(f'{found} is active and pinned')
+    return ExitCode.FINE
+
+
+@policy.command()
+def rollback() -> ExitCode:
+    """Go back to the last good version, at once.
+
+    What was active is not taken again, unless policy use brings it back.
+    """
+    click.echo(f'active: {_policies().roll_back() or "none"}')
+    return ExitCode.FINE
+
+
+@policy.command()
+def pin() -> ExitCode:
+    """Stay with the active version, whatever the registry says."""
+    click.echo(f'pinned: {_policies().pin()}')
+    return ExitCode.FINE
+
+
+@policy.command()
+def unpin() -> ExitCode:
+    """Follow the registry again."""
+    _policies().unpin()
+    return ExitCode.FINE
+
+
+@policy.command(epilog=examples('policy report --failures 4', 'policy report --p99-ms 180'))
+@click.option('--failures', type=click.IntRange(0), default=0, help='Failed steps among the last 100.')
+@click.option('--p99-ms', type=click.FloatRange(0.0), default=0.0, help='p99 of a step.')
+def report(*, failures: int, p99_ms: float) -> ExitCode:
+    """Say how the active version does; beyond its manifest's limits it is rolled back."""
+    folder = _policies()
+    name = folder.current()
+    if name is None:
+        raise PolicyError('no policy is active')
+    if running.judge(folder, name, folder.check(name, folder.state(), hashes=False), failures, p99_ms):
+        return ExitCode.FINE
+    click.echo(f'{name} is rolled back; active: {folder.current() or "none"}')
+    return ExitCode.FINDING
+
+
+def _policies() -> PolicyFolder:
+    folder = PolicyFolder(the_home())
+    folder.make()
+    return folder
+
+
+@contextmanager
+def _syncing(given: dict[str, Any]) -> Iterator[PolicySync]:
+    is_now = given.pop('now')
+    settings = PolicySettings(
+        max_bytes=int(given.pop('max_gib') * GIBI), min_free_bytes=int(given.pop('min_free_gib') * GIBI), **given
+    )
+    with the_store(1) as store:
+        may_activate = (lambda: True) if is_now else _no_mission(settings.robot)
+        yield PolicySync(_policies(), store, _registry(), settings, may_activate)
+
+
+def _no_mission(robot: str = '') -> Callable[[], bool]:
+    missions = MissionFinder(the_home(), robot or os.environ.get('SHADOWHOUND_ROBOT') or 'thor')
+    return lambda: missions.look() is None
+
+
+def _registry() -> MlflowRegistry:
+    url = os.environ.get('MLFLOW_TRACKING_URI', '')
+    if not url.startswith(('http://', 'https://')) or '@' in url:
+        raise BadUsage('the registry is an MLflow server, and MLFLOW_TRACKING_URI names none', 'set it: http://TOWER_IP:5001')
+    return MlflowRegistry(MlflowRest(url.rstrip('/'), os.environ, Path.home()))
+
+
+def _told(result: SyncResult) -> dict[str, object]:
+    return {'wanted': result.wanted, 'active': result.active, 'done': result.done, 'p99_ms': result.p99_ms}
+
+
+def _sentence(result: SyncResult) -> str:
+    words: dict[str, Sequence[str]] = {
+        'unchanged': ('active, as before: ', result.wanted), 'activated': ('active now: ', result.wanted),
+        'waiting': ('waits for the end of the mission: ', result.wanted), 'pinned': ('pinned: ', result.wanted),
+        'rolled_back': ('its key was revoked; active now: ', result.active or 'none'),
+        'none': ('the registry names no version for this robot; active: ', result.active or 'none'),
+    }  # fmt: skip
+    return ''.join(words[result.done])

@@ -1,0 +1,165 @@
+"""What the files of a policy hold, judged without loading any: nothing in them refers to another file, or is a program."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.errors import PolicyRefused
+from shadowhound_data_logger.policies.manifest import MANIFEST, SIGNATURE, PolicyManifest
+from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json
+
+MOST_HEADER_BYTES: Final = 100 << 20
+"""Of a safetensors file; the library's own bound (https://github.com/huggingface/safetensors)."""
+MOST_ONNX_BYTES: Final = (1 << 31) - 1
+"""Protobuf's own bound on a message."""
+MOST_NODES: Final = 5_000_000
+MOST_DEPTH: Final = 16
+_TENSOR: Final = 'tensor'
+_WITHIN: Final[dict[str, dict[int, str]]] = {
+    'model': {7: 'graph', 20: 'training', 25: 'function'},
+    'training': {1: 'graph', 2: 'graph'},
+    'function': {7: 'node', 11: 'attribute'},
+    'graph': {1: 'node', 5: _TENSOR, 15: 'sparse'},
+    'node': {5: 'attribute'},
+    'attribute': {5: _TENSOR, 6: 'graph', 10: _TENSOR, 11: 'graph', 22: 'sparse', 23: 'sparse'},
+    'sparse': {1: _TENSOR, 2: _TENSOR},
+}
+"""Which fields of a message hold which others, down to the tensors; https://github.com/onnx/onnx/blob/main/onnx/onnx.proto"""
+_EXTERNAL_DATA, _DATA_LOCATION, _OP_TYPE = 13, 14, 4
+_OPERATORS: Final = frozenset({b'EPContext'})
+"""Whose attributes name a file that the runtime loads: an engine that was compiled elsewhere."""
+
+
+def check_files(folder: Path, manifest: PolicyManifest, *, hashes: bool = True) -> None:
+    """Exactly the files of the manifest are in the folder, each a plain file of its size (and hash), with what it may hold.
+
+    Raises PolicyRefused (``link``, ``files``, ``damaged``, ``external``, ``file_type``) and OSError.
+    """
+    named = {file.path: file for file in manifest.files}
+    found = set(_files(folder))
+    if odd := sorted(found ^ {*named, MANIFEST, SIGNATURE}):
+        what = 'is in its folder, and not in the manifest' if odd[0] in found else 'is not there'
+        raise PolicyRefused('files', f'{odd[0]!r} of {manifest.id} {what}')
+    for path, file in named.items():
+        place = folder / path
+        if place.stat().st_size != file.size:
+            raise PolicyRefused('damaged', f'{path} of {manifest.id} has not its {file.size:,} bytes')
+        if hashes:
+            if fingerprint(place)[1] != file.sha256:
+                raise PolicyRefused('damaged', f'{path} of {manifest.id} has another SHA-256 than the manifest says')
+            check_content(place, path)
+
+
+def _files(folder: Path) -> Iterator[str]:
+    """All that is no folder, as paths below it. Raises PolicyRefused for what is neither file nor folder."""
+    for parent, folders, names in os.walk(folder):
+        for name in (*folders, *names):
+            path = Path(parent, name)
+            mode = path.lstat().st_mode
+            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise PolicyRefused('link', f'{path} is a link or a device, not a file')
+            if stat.S_ISREG(mode):
+                yield path.relative_to(folder).as_posix()
+
+
+def check_content(path: Path, name: str) -> None:
+    """Raises PolicyRefused for a file whose content is not what its suffix says, or that refers to another file."""
+    checks = {'.onnx': _check_onnx, '.safetensors': _check_safetensors, '.json': _check_json, '.npy': _check_npy}
+    try:
+        checks[PurePosixPath(name).suffix](path)
+    except ValueError as error:
+        raise PolicyRefused('file_type', f'{name} is not what its name says: {error}') from error
+
+
+def _check_json(path: Path) -> None:
+    check_size(path.stat().st_size, MOST_DOCUMENT_BYTES)
+    from_json(path.read_bytes())
+
+
+def _check_npy(path: Path) -> None:
+    """That it is an array; the smoke run reads it, and takes none of objects."""
+    with path.open('rb') as file:
+        if file.read(6) != b'\x93NUMPY':
+            raise ValueError('it is no array of numpy')
+
+
+def _check_safetensors(path: Path) -> None:
+    """Eight bytes of length and a header in JSON; https://github.com/huggingface/safetensors#format."""
+    size = path.stat().st_size
+    with path.open('rb') as file:
+        length = int.from_bytes(file.read(8), 'little')
+        if not 2 <= length <= min(MOST_HEADER_BYTES, size - 8):
+            raise ValueError('it has no header of safetensors')
+        from_json(file.read(length), MOST_HEADER_BYTES)
+
+
+def _check_onnx(path: Path) -> None:
+    """A model in one file. Raises ValueError for what is no protobuf, PolicyRefused (``external``) for data elsewhere."""
+    size = path.stat().st_size
+    if not 0 < size <= MOST_ONNX_BYTES:
+        raise ValueError(f'it has {size:,} bytes')
+    with path.open('rb') as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        _Onnx(content, path.name).walk('model', 0, size, 0)
+
+
+class _Onnx:
+    """Walks over the messages of a model as far as tensors and operators are in them, and reads no number of any tensor."""
+
+    def __init__(self, content: Any, name: str) -> None:
+        self._content = content
+        self._name = name
+        self._left = MOST_NODES
+
+    def walk(self, message: str, at: int, end: int, depth: int) -> None:
+        if depth > MOST_DEPTH:
+            raise ValueError('it is too deep')
+        within = _WITHIN.get(message, {})
+        while at < end:
+            self._left -= 1
+            if self._left < 0:
+                raise ValueError(f'it has more than {MOST_NODES:,} fields')
+            tag, at = self._varint(at, end)
+            if tag >> 32:  # of which readers of protobuf take the lower half
+                raise ValueError('it is no model')
+            number, kind = tag >> 3, tag & 7
+            begin, at, value = self._field(kind, at, end)
+            if message == _TENSOR and (number == _EXTERNAL_DATA or (number == _DATA_LOCATION and value)):
+                raise PolicyRefused('external', f'{self._name} keeps tensors in other files', remedy='save the model as one file')
+            if message == 'node' and number == _OP_TYPE and self._content[begin:at] in _OPERATORS:
+                raise PolicyRefused('external', f'{self._name} has an operator that loads another file',
+                                    remedy='export the model itself: engines are built on the robot')  # fmt: skip
+            if kind == 2 and number in within:
+                self.walk(within[number], begin, at, depth + 1)
+
+    def _field(self, kind: int, at: int, end: int) -> tuple[int, int, int]:
+        """Where its content begins and ends, and its number where it is one."""
+        value, begin = 0, at
+        if kind == 0:
+            value, after = self._varint(at, end)
+        elif kind == 2:
+            length, begin = self._varint(at, end)
+            after = begin + length
+        elif kind in {1, 5}:
+            after = at + (8 if kind == 1 else 4)
+        else:
+            raise ValueError('it is no model')
+        if after > end:
+            raise ValueError('it is cut off')
+        return begin, after, value
+
+    def _varint(self, at: int, end: int) -> tuple[int, int]:
+        value = shift = 0
+        while at < end and shift < 70:
+            byte = self._content[at]
+            at += 1
+            value |= (byte & 127) << shift
+            if byte < 128:
+                return value, at
+            shift += 7
+        raise ValueError('it is cut off')

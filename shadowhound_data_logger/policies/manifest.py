@@ -1,0 +1,234 @@
+"""What a policy is: ``manifest.json``, which names every file of it, what it takes and gives, and what it promises.
+
+The format is of this package (docs/policies.md). A manifest is believed after its signature was checked (``signing.py``), and its
+fields are checked all the same: a key can sign nonsense.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import PurePosixPath
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import PolicyRefused
+from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.untrusted import from_strict_json, is_path
+
+FORMAT: Final = 1
+MANIFEST: Final = 'manifest.json'
+SIGNATURE: Final = 'manifest.json.sig'
+MOST_MANIFEST_BYTES: Final = 1 << 20
+MOST_FILES: Final = 100
+MOST_POLICY_BYTES: Final = 16 << 30
+MOST_VALUES: Final = 1 << 24
+"""Of one tensor."""
+SUFFIXES: Final = frozenset({'.json', '.safetensors', '.onnx', '.npy'})
+"""Of the files of a policy: formats that hold data, and that no reader executes."""
+ONNX: Final = 'onnx'
+DTYPES: Final = ('float32', 'float64', 'int64', 'int32', 'uint8')
+ID_DIGITS: Final = 16
+_ID: Final = re.compile(rf'([A-Za-z0-9][A-Za-z0-9_.-]{{0,63}})@([1-9][0-9]{{0,8}})#([0-9a-f]{{{ID_DIGITS}}})')
+_SHA256: Final = re.compile(r'[0-9a-f]{64}')
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyFile:
+    """One file of a policy."""
+
+    path: str
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class TensorSpec:
+    """An input or an output of the model."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+    names: tuple[str, ...]
+    """Of its elements along the last axis, in order; empty where nobody said."""
+    units: tuple[str, ...]
+    """Of the same; empty where nobody said."""
+
+
+@dataclass(frozen=True, slots=True)
+class SmokeSample:
+    """One input with the output that the model has to give for it: tensor name -> file (``.npy``)."""
+
+    inputs: Mapping[str, str]
+    outputs: Mapping[str, str]
+    tolerance: float
+    """Most that an element may differ, absolute."""
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyManifest:
+    """A manifest that was checked."""
+
+    name: str
+    version: int
+    serial: int
+    """Grows with each version; a robot takes none below the greatest that ran on it (``folder.py``)."""
+    kind: str
+    model: str
+    robot_types: tuple[str, ...]
+    fps: float
+    """Steps a second."""
+    inputs: tuple[TensorSpec, ...]
+    outputs: tuple[TensorSpec, ...]
+    dataset: str
+    """Digest of the training set; empty where nobody said."""
+    run: str
+    """MLflow run that trained it; empty where nobody said."""
+    smoke: SmokeSample
+    p99_ms: float
+    """The slowest 99th percentile of a step that is allowed."""
+    failures: int
+    """So many failed steps are allowed in a window of ``health.WINDOW``."""
+    files: tuple[PolicyFile, ...]
+    sha256: str
+    """Of the manifest itself, which stands for the whole policy."""
+
+    @property
+    def id(self) -> str:
+        """Such as ``go2_patrol@7#0123456789abcdef``: what missions and the folder of the version are named by."""
+        return f'{self.name}@{self.version}#{self.sha256[:ID_DIGITS]}'
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+        return sum(file.size for file in self.files)
+
+
+def split_id(text: str) -> tuple[str, int, str] | None:
+    """Name, version and the first digits of the manifest's SHA-256; None for what is no id of a policy."""
+    found = _ID.fullmatch(text)
+    return (found[1], int(found[2]), found[3]) if found and '..' not in found[1] else None
+
+
+def parse_manifest(content: bytes) -> PolicyManifest:
+    """Raises PolicyRefused: ``manifest`` for what is none, ``path``, ``twice`` or ``file_type`` for a file that may not be."""
+    try:
+        return _manifest(from_strict_json(content, MOST_MANIFEST_BYTES), hashlib.sha256(content).hexdigest())
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        text = f'no field {error}' if isinstance(error, KeyError) else str(error)
+        raise PolicyRefused('manifest', f'{MANIFEST} is not one of a policy: {text[:200]}') from error
+
+
+def _manifest(given: Any, sha256: str) -> PolicyManifest:
+    if not isinstance(given, dict) or given.get('format') != FORMAT:
+        raise ValueError(f'it has not the format {FORMAT}')
+    smoke, limits = given['smoke'], given['limits']
+    manifest = PolicyManifest(
+        name=_name(given['name']), version=_count(given['version'], 999_999_999), serial=_count(given['serial'], 1 << 53),
+        kind=_one_of(given['kind'], (ONNX,)), model=_text(given['model']), robot_types=_tuple(given['robot_types'], _name, 100),
+        fps=_number(given['fps'], 1e4), inputs=_tuple(given['inputs'], _tensor, 100),
+        outputs=_tuple(given['outputs'], _tensor, 100), dataset=_text(given['dataset']), run=_text(given['run']),
+        smoke=SmokeSample(_texts(smoke['inputs']), _texts(smoke['outputs']), _number(smoke['tolerance'], 1e6)),
+        p99_ms=_number(limits['p99_ms'], 1e6), failures=_count(limits['failures'], 1 << 20, least=0),
+        files=_tuple(given['files'], _file, MOST_FILES), sha256=sha256,
+    )  # fmt: skip
+    _check_files(manifest)
+    return manifest
+
+
+def _check_files(manifest: PolicyManifest) -> None:
+    """Each name once, all that is referred to there, none that is a folder of another."""
+    paths = [file.path for file in manifest.files]
+    lower = [path.lower() for path in (*paths, MANIFEST, SIGNATURE)]
+    if len(set(lower)) < len(lower):
+        raise PolicyRefused('twice', f'{MANIFEST} of {manifest.id} names a file twice')
+    folders = {str(parent) for path in paths for parent in PurePosixPath(path).parents}
+    if folders.intersection(paths):
+        raise PolicyRefused('path', f'{MANIFEST} of {manifest.id} names a file that is a folder of another')
+    referred = [manifest.model, *manifest.smoke.inputs.values(), *manifest.smoke.outputs.values()]
+    if missing := sorted(set(referred) - set(paths)):
+        raise ValueError(f'{missing[0]!r} is not among its files')
+    if {spec.name for spec in manifest.inputs} != set(manifest.smoke.inputs):
+        raise ValueError('the smoke sample has not its inputs')
+    if {spec.name for spec in manifest.outputs} != set(manifest.smoke.outputs):
+        raise ValueError('the smoke sample has not its outputs')
+    if not manifest.model.endswith('.onnx'):
+        raise ValueError(f'the model {manifest.model!r} is no .onnx file')
+    if manifest.size > MOST_POLICY_BYTES:
+        raise PolicyRefused('size', f'{manifest.id} has {manifest.size:,} bytes; more than {MOST_POLICY_BYTES:,} are not taken')
+
+
+def check_file_name(path: str) -> str:
+    """The path unchanged where a policy may have such a file. Raises PolicyRefused: ``path`` or ``file_type``."""
+    parts = path.split('/')
+    if not is_path(path) or len(parts) > 3 or not all(is_name(part, 200) for part in parts):
+        raise PolicyRefused('path', f'a policy cannot have a file {path[:100]!r}: it is not a plain path below its folder')
+    if PurePosixPath(path).suffix not in SUFFIXES:
+        allowed = ' '.join(sorted(SUFFIXES))
+        raise PolicyRefused('file_type', f'a policy cannot have a file {path[:100]!r}: allowed are {allowed}')
+    return path
+
+
+def _file(given: Any) -> PolicyFile:
+    size, sha256 = _count(given['bytes'], MOST_POLICY_BYTES, least=0), _text(given['sha256'])
+    if not _SHA256.fullmatch(sha256):
+        raise ValueError(f'{sha256[:80]!r} is no SHA-256')
+    return PolicyFile(check_file_name(_text(given['path'])), size, sha256)
+
+
+def _tensor(given: Any) -> TensorSpec:
+    spec = TensorSpec(
+        _text(given['name']), _tuple(given['shape'], lambda size: _count(size, MOST_VALUES), 8),
+        _one_of(given['dtype'], DTYPES), _tuple(given['names'], _text, MOST_VALUES), _tuple(given['units'], _text, MOST_VALUES),
+    )  # fmt: skip
+    values = 1
+    for size in spec.shape:
+        values *= size
+    if values > MOST_VALUES:
+        raise ValueError(f'{spec.name[:80]!r} has more than {MOST_VALUES:,} values')
+    last = spec.shape[-1] if spec.shape else 1
+    if any(words and len(words) != last for words in (spec.names, spec.units)):
+        raise ValueError(f'{spec.name[:80]!r} has not one name and unit for each of its {last} elements')
+    return spec
+
+
+def _text(given: Any) -> str:
+    if not isinstance(given, str) or len(given) > 1000 or not given.isprintable():
+        raise ValueError(f'{str(given)[:80]!r} is no printable text')
+    return given
+
+
+def _texts(given: Any) -> Mapping[str, str]:
+    return {_text(name): _text(value) for name, value in given.items()} if isinstance(given, dict) else _text(None)  # type: ignore[return-value]
+
+
+def _name(given: Any) -> str:
+    if not is_name(_text(given)):
+        raise ValueError(f'{given[:80]!r} is no name: letters, digits, "_", "-" and ".", at most 64')
+    return str(given)
+
+
+def _one_of(given: Any, allowed: tuple[str, ...]) -> str:
+    if given not in allowed:
+        raise ValueError(f'{str(given)[:80]!r} is not one of {", ".join(allowed)}')
+    return str(given)
+
+
+def _count(given: Any, most: int, least: int = 1) -> int:
+    if type(given) is not int or not least <= given <= most:
+        raise ValueError(f'{str(given)[:80]} is no whole number from {least} to {most}')
+    return given
+
+
+def _number(given: Any, most: float) -> float:
+    if type(given) not in {int, float} or not isfinite(given) or not 0.0 < given <= most:
+        raise ValueError(f'{str(given)[:80]} is no number above 0, at most {most:g}')
+    return float(given)
+
+
+def _tuple(given: Any, one: Callable[[Any], Any], most: int) -> tuple[Any, ...]:
+    if not isinstance(given, list) or len(given) > most:
+        raise ValueError(f'there is no list of at most {most}')
+    return tuple(one(each) for each in given)

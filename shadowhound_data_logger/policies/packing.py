@@ -1,0 +1,216 @@
+"""A policy on its way out of the machine that trained it: packed with a manifest, signed, and published."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.policies import signing
+from shadowhound_data_logger.policies.content import check_content, check_files
+from shadowhound_data_logger.policies.manifest import (
+    FORMAT,
+    MANIFEST,
+    MOST_MANIFEST_BYTES,
+    ONNX,
+    SIGNATURE,
+    PolicyManifest,
+    check_file_name,
+    parse_manifest,
+)
+from shadowhound_data_logger.policies.registry import BUCKET, ID_TAG, PREFIX, ROBOTS_TAG, MlflowRegistry, source_of
+from shadowhound_data_logger.policies.smoke import open_model, worst_difference
+from shadowhound_data_logger.retry import steadily
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.untrusted import from_json
+
+MODEL: Final = 'model.onnx'
+CONFIG: Final = 'config.json'
+ROBOT_TYPES: Final = ('go2',)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Packing:
+    """What a manifest says that is in no file of the policy."""
+
+    name: str
+    version: int
+    serial: int | None = None
+    """None: the version."""
+    robot_types: Sequence[str] = ROBOT_TYPES
+    fps: float = 10.0
+    dataset: str = ''
+    run: str = ''
+    tolerance: float = 1e-4
+    p99_ms: float = 100.0
+    failures: int = 3
+
+
+def pack(folder: Path, smoke: Path, packed: Path, packing: Packing) -> PolicyManifest:
+    """Copy the files of a policy to ``packed`` and write its manifest; what is promised of the sample is what comes out here.
+
+    ``folder`` has model.onnx and any .json, .safetensors and .npy beside it; config.json may name the elements of inputs and
+    outputs (``input_features`` and ``output_features``: name -> names, units). ``smoke`` is an .npz with an array for each
+    input. Raises PolicyError, PolicyRefused, OSError.
+    """
+    if packed.exists():
+        raise PolicyError(f'{packed} exists already', remedy='name a new folder: what was packed is not overwritten')
+    files = _files(folder)
+    part = packed.with_name(f'{packed.name}.part')
+    shutil.rmtree(part, ignore_errors=True)
+    for name in files:
+        (part / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(folder / name, part / name, follow_symlinks=False)
+    told = _tried(part, smoke)
+    files += [*told['smoke']['inputs'].values(), *told['smoke']['outputs'].values()]
+    listed = []
+    for name in sorted(files):
+        check_content(part / name, name)
+        size, sha256 = fingerprint(part / name)
+        listed.append({'path': name, 'bytes': size, 'sha256': sha256})
+    manifest = {
+        'format': FORMAT, 'name': packing.name, 'version': packing.version, 'serial': packing.serial or packing.version,
+        'kind': ONNX, 'model': MODEL, 'robot_types': list(packing.robot_types), 'fps': packing.fps,
+        'inputs': told['inputs'], 'outputs': told['outputs'], 'dataset': packing.dataset, 'run': packing.run,
+        'smoke': {**told['smoke'], 'tolerance': packing.tolerance},
+        'limits': {'p99_ms': packing.p99_ms, 'failures': packing.failures}, 'files': listed,
+    }  # fmt: skip
+    content = json.dumps(manifest, indent=1).encode() + b'\n'
+    parsed = parse_manifest(content)
+    (part / MANIFEST).write_bytes(content)
+    part.rename(packed)
+    return parsed
+
+
+def _files(folder: Path) -> list[str]:
+    """All files below it. Raises PolicyRefused for what no policy may have."""
+    found = []
+    for path in sorted(folder.rglob('*')):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink():
+            raise PolicyRefused('link', f'{path} is a link', remedy='pack the files themselves')
+        if path.is_file():
+            found.append(check_file_name(name))
+    if MODEL not in found:
+        raise PolicyError(f'{folder} has no {MODEL}', remedy='export the policy to ONNX, as docs/policies.md shows')
+    if any(name == MANIFEST or name.startswith('smoke/') for name in found):
+        raise PolicyError(f'{folder} was packed already', remedy='pack the folder that the training wrote')
+    return found
+
+
+def _tried(part: Path, smoke: Path) -> dict[str, Any]:
+    """Inputs, outputs and the sample of a manifest, from one run of the model. Writes the sample."""
+    import numpy as np  # noqa: PLC0415
+
+    check_content(part / MODEL, MODEL)
+    try:
+        session = open_model(part / MODEL)
+    except ImportError as error:
+        raise PolicyError(f'packing runs the model: {error}', remedy=signing.REMEDY) from error
+    with np.load(smoke, allow_pickle=False) as arrays:
+        given = {spec.name: arrays[spec.name] for spec in session.get_inputs() if spec.name in arrays}
+    if missing := [spec.name for spec in session.get_inputs() if spec.name not in given]:
+        raise PolicyError(f'{smoke} has no array {missing[0]!r}', remedy='np.savez(FILE, **{input name: array})')
+    names = [spec.name for spec in session.get_outputs()]
+    outputs = dict(zip(names, session.run(names, given), strict=True))
+    again = dict(zip(names, session.run(names, given), strict=True))
+    for name, array in outputs.items():
+        if not np.isfinite(array).all() or worst_difference(array, again[name]):
+            raise PolicyError(f'{name} is not finite, or not twice the same for one input')
+    (part / 'smoke').mkdir()
+    placed: dict[str, dict[str, str]] = {}
+    for kind, tensors in (('inputs', given), ('outputs', outputs)):
+        placed[kind] = {name: f'smoke/{kind}_{number}.npy' for number, name in enumerate(tensors)}
+        for name, path in placed[kind].items():
+            np.save(part / path, tensors[name], allow_pickle=False)
+    config = from_json((part / CONFIG).read_bytes()) if (part / CONFIG).is_file() else {}
+    return {'smoke': placed, 'inputs': [_told(name, array, config, 'input_features') for name, array in given.items()],
+            'outputs': [_told(name, array, config, 'output_features') for name, array in outputs.items()]}  # fmt: skip
+
+
+def _told(name: str, array: Any, config: Mapping[str, Any], key: str) -> dict[str, Any]:
+    feature = config.get(key, {}).get(name, {})
+    return {'name': name, 'shape': list(array.shape), 'dtype': str(array.dtype), 'names': feature.get('names', []),
+            'units': feature.get('units', [])}  # fmt: skip
+
+
+def sign(packed: Path, key: Path) -> str:
+    """Sign what was packed, after a look at all of its files; returns the id of the key."""
+    content = _content(packed)
+    manifest = parse_manifest(content)
+    (packed / SIGNATURE).write_bytes(signature := signing.sign(signing.load_key(key), signing.FOR_POLICY, content))
+    check_files(packed, manifest)
+    return str(json.loads(signature)['key'])
+
+
+def publish(packed: Path, store: ObjectStore, registry: MlflowRegistry, aliases: Sequence[str], robots: Sequence[str] = ()
+            ) -> PolicyManifest:  # fmt: skip
+    """Upload a signed policy, register it, and then give it its aliases; may be repeated. Raises PolicyError, StoreError.
+
+    ``robots`` are those that take it as a canary. Nothing is ever overwritten: a version is published once.
+    """
+    if not (packed / SIGNATURE).is_file():
+        raise PolicyError(f'{packed} is not signed', remedy=f'shadowhound-data policy sign {packed} --key KEY')
+    manifest = parse_manifest(_content(packed))
+    check_files(packed, manifest)
+    source = source_of(manifest.robot_types[0], manifest.name, manifest.version)
+    known = registry.versions(manifest.name)
+    if all(each.source != source for each in known):
+        _check_number(manifest, 1 + max((each.version for each in known), default=0))
+    folder = source.removeprefix(f's3://{BUCKET}/')
+    for name in (*(file.path for file in manifest.files), SIGNATURE, MANIFEST):  # the manifest last: with it, all is there
+        size, sha256 = fingerprint(packed / name)
+        item = _item(f'{folder}/{name}', packed / name, size, sha256)
+        steadily(lambda item=item: store.put(item))  # type: ignore[misc]
+    tags = {ID_TAG: manifest.id, 'shadowhound.dataset': manifest.dataset}
+    number = registry.register(manifest.name, source, {key: value for key, value in tags.items() if value}, manifest.run)
+    _check_number(manifest, number)
+    if robots:
+        registry.tag(manifest.name, number, ROBOTS_TAG, ','.join(robots))
+    for alias in aliases:
+        registry.set_alias(manifest.name, alias, number)
+    return manifest
+
+
+def revoke(key: Path, keys: Sequence[str], store: ObjectStore) -> int:
+    """Publish the next signed list of revoked keys; returns its number."""
+    signer, number = signing.load_key(key), 1
+    while steadily(lambda number=number: store.head(BUCKET, revocation_key(number))) is not None:  # type: ignore[misc]
+        number += 1
+    content = signing.revocation(signer, number, keys)
+    path = key.with_name(f'revoked_{number}.json')
+    path.write_bytes(content)
+    steadily(lambda: store.put(_item(revocation_key(number), path, len(content), hashlib.sha256(content).hexdigest())))
+    return number
+
+
+def revocation_key(number: int) -> str:
+    """Where the ``number``-th list is, 1, 2, ...: a robot may list nothing, and asks for the next one."""
+    return f'{PREFIX}/revoked/{number}.json'
+
+
+def _check_number(manifest: PolicyManifest, number: int) -> None:
+    """Raises PolicyError where the registry gives the version another number than its manifest has."""
+    if number != manifest.version:
+        raise PolicyError(f'in the registry this is version {number} of {manifest.name}, and it is packed as {manifest.version}',
+                          remedy=f'pack it with --version {number}, and sign that')  # fmt: skip
+
+
+def _content(packed: Path) -> bytes:
+    with (packed / MANIFEST).open('rb') as file:
+        return file.read(MOST_MANIFEST_BYTES + 1)
+
+
+def _item(key: str, path: Path, size: int, sha256: str) -> SpooledObject:
+    kind = 'application/json' if path.suffix in {'.json', '.sig'} else 'application/octet-stream'
+    return SpooledObject(id=0, bucket=BUCKET, key=key, path=path, size=size, sha256=sha256, content_type=kind,
+                         metadata={words.SENSOR: 'policy'}, priority=5, created_ns=time.time_ns())  # fmt: skip

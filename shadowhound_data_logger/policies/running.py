@@ -1,0 +1,91 @@
+"""The policy that is active, for the program that runs it: its files, kept on the disk and verified; and what it reports."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger import config, disk
+from shadowhound_data_logger.errors import PolicyError
+from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.policies.manifest import PolicyManifest
+
+WINDOW: Final = 100
+"""Steps over which failures and latency are judged."""
+LEAST_STEPS: Final = 20
+"""Of a window before a p99 means anything."""
+
+
+@dataclass(slots=True)
+class ActivePolicy:
+    """A version that stays on the disk for as long as the ``with`` of ``active`` lasts. One thread."""
+
+    id: str
+    """Such as ``go2_patrol@7#0123456789abcdef``."""
+    path: Path
+    """Its folder, with the files that the manifest names; they were verified when it was opened."""
+    manifest: PolicyManifest
+    _folder: PolicyFolder
+    _steps: deque[tuple[bool, float]] = field(default_factory=lambda: deque(maxlen=WINDOW))
+
+    @property
+    def model(self) -> Path:
+        """The file of the model."""
+        return self.path / self.manifest.model
+
+    def is_current(self) -> bool:
+        """Whether it is the active one still: leave the ``with`` and open the next one where it is not."""
+        return self._folder.current() == self.id
+
+    def report(self, latency_s: float, *, failed: bool = False) -> bool:
+        """One step; whether it may go on. A policy that breaks its manifest's limits is rolled back before this returns."""
+        self._steps.append((failed, latency_s * 1000.0))
+        failures = sum(failed for failed, _ in self._steps)
+        slowest = sorted(ms for _, ms in self._steps)
+        p99_ms = slowest[int(0.99 * (len(slowest) - 1))] if len(slowest) >= LEAST_STEPS else 0.0
+        return judge(self._folder, self.id, self.manifest, failures, p99_ms)
+
+
+def judge(folder: PolicyFolder, name: str, manifest: PolicyManifest, failures: int, p99_ms: float) -> bool:
+    """Whether a policy keeps its limits; one that does not is rolled back, and never comes back by itself."""
+    why = ''
+    if failures > manifest.failures:
+        why = f'{failures} steps failed, allowed are {manifest.failures}'
+    elif not p99_ms <= manifest.p99_ms:
+        why = f'a step took {p99_ms:.1f} ms (p99), allowed are {manifest.p99_ms:g} ms'
+    if why:
+        folder.roll_back(why, of=name)
+    return not why
+
+
+@contextmanager
+def active(home: str | os.PathLike[str] | None = None, environ: Mapping[str, str] = os.environ) -> Iterator[ActivePolicy]:
+    """The active policy, verified once more, every hash of it; nobody removes it within the ``with``.
+
+    ``home`` is SHADOWHOUND_HOME's folder. Raises PolicyError where none is active, PolicyRefused where it is not what was signed.
+    """
+    folder = PolicyFolder(config.home({'SHADOWHOUND_HOME': os.fspath(home)} if home else environ))
+    while True:
+        name = folder.current()
+        if name is None:
+            raise PolicyError(f'no policy is active in {folder.path}')
+        try:
+            descriptor = os.open(folder.versions / name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        except FileNotFoundError:
+            if folder.current() == name:
+                raise
+            continue
+        try:
+            disk.lock(descriptor, shared=True)
+            if os.fstat(descriptor).st_nlink and (folder.versions / name).exists():
+                folder.check_owner()
+                manifest = folder.check(name, folder.state())
+                yield ActivePolicy(name, folder.versions / name, manifest, folder)
+                return
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,180 @@
+"""One run of a policy before it may run: a child process with limits, a sample with the output that has to come out.
+
+The child has no environment of ours but the path of Python's packages, no network where the system lets it leave that, and
+limits of memory, time and files. What it says is read with a bound.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, PolicyManifest, SmokeSample, parse_manifest
+from shadowhound_data_logger.untrusted import from_json
+
+SMOKE_S: Final = 60.0
+MEMORY_BYTES: Final = 8 << 30
+"""Of address space, which the runtime reserves much of."""
+MOST_ANSWER_BYTES: Final = 64 << 10
+WARM_UP: Final = 10
+RUNS: Final = 200
+RUNS_S: Final = 5.0
+"""No further run begins after that."""
+LEAST_RUNS: Final = 20
+MOST_ARRAY_BYTES: Final = 1 << 28
+_NEW_USER, _NEW_NET = 0x10000000, 0x40000000
+_PDEATHSIG, _NO_NEW_PRIVS = 1, 38
+_REASONS: Final = frozenset({'nan', 'output', 'slow', 'inputs', 'pickle', 'runtime', 'memory'})
+
+
+def run_smoke(folder: Path, manifest: PolicyManifest, *, limit_s: float = SMOKE_S) -> float:
+    """The p99 of a step on this machine, ms.
+
+    Raises PolicyRefused: ``nan`` ``output`` ``slow`` ``inputs`` ``pickle`` ``memory`` ``time`` or ``smoke`` (it crashed), and
+    PolicyError where this machine has no onnxruntime.
+    """
+    with tempfile.TemporaryDirectory(prefix='shadowhound-policy-') as empty, tempfile.TemporaryFile() as output:
+        environ = {'PATH': '/usr/bin:/bin', 'HOME': empty, 'TMPDIR': empty, 'LANG': 'C.UTF-8',
+                   'PYTHONPATH': os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))}  # fmt: skip
+        command = [sys.executable, '-B', '-m', __name__, str(folder.absolute())]  # its limits would cut off files of bytecode
+        try:
+            ran = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.DEVNULL, env=environ,
+                                 cwd=empty, timeout=limit_s, check=False, start_new_session=True)  # fmt: skip
+        except subprocess.TimeoutExpired as error:
+            raise PolicyRefused('time', f'the smoke run of {manifest.id} took more than {limit_s:g} s') from error
+        output.seek(0)
+        told = output.read(MOST_ANSWER_BYTES)
+    try:
+        answer = from_json(told, MOST_ANSWER_BYTES)
+        reason, text, p99_ms = str(answer['reason']), str(answer['text'])[:300], float(answer['p99_ms'])
+    except (ValueError, KeyError, TypeError) as error:
+        what = f'signal {-ran.returncode}' if ran.returncode < 0 else f'exit code {ran.returncode}'
+        raise PolicyRefused('smoke', f'the smoke run of {manifest.id} ended with {what}') from error
+    if reason == 'runtime':
+        raise PolicyError(f'a policy cannot be run here: {text}', remedy="pip install 'shadowhound_data_logger[policies]'")
+    if reason:
+        raise PolicyRefused(reason if reason in _REASONS else 'smoke', f'{manifest.id}: {text}')
+    if not p99_ms <= manifest.p99_ms:
+        text = f'{manifest.id} takes {p99_ms:.1f} ms (p99) on this machine, allowed are {manifest.p99_ms:g} ms'
+        raise PolicyRefused('slow', text)
+    return p99_ms
+
+
+def load_arrays(folder: Path, files: Any) -> dict[str, Any]:
+    """Tensor name -> array. Raises ValueError for an array of objects, whose file is a pickle, or one that is too large."""
+    import numpy as np  # noqa: PLC0415 - in the child, and on Spark
+
+    found = {}
+    for name, file in files.items():
+        path = folder / file
+        if path.stat().st_size > MOST_ARRAY_BYTES:
+            raise ValueError(f'{file} has more than {MOST_ARRAY_BYTES:,} bytes')
+        found[name] = np.load(path, allow_pickle=False)
+    return found
+
+
+def open_model(path: Path) -> Any:
+    """A session of onnxruntime on one core: what a robot has to spare."""
+    import onnxruntime  # type: ignore[import-untyped, unused-ignore] # noqa: PLC0415 - of the extra
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    return onnxruntime.InferenceSession(path.read_bytes(), options, providers=['CPUExecutionProvider'])
+
+
+def worst_difference(expected: Any, found: Any) -> float:
+    """Of two arrays, the largest between two elements; infinite where the shapes differ."""
+    import numpy as np  # noqa: PLC0415
+
+    if expected.shape != found.shape:
+        return float('inf')
+    return float(np.max(np.abs(expected.astype('f8') - found.astype('f8')), initial=0.0))
+
+
+def _try(folder: Path) -> tuple[str, str, float]:
+    """The reason against it (empty for none), in words, and the p99 in ms."""
+    import numpy as np  # noqa: PLC0415
+
+    try:
+        import onnxruntime  # noqa: F401, PLC0415
+    except ImportError as error:
+        return 'runtime', str(error), 0.0
+    manifest = parse_manifest((folder / MANIFEST).read_bytes()[:MOST_MANIFEST_BYTES])
+    sample: SmokeSample = manifest.smoke
+    try:
+        inputs, outputs = load_arrays(folder, sample.inputs), load_arrays(folder, sample.outputs)
+    except (ValueError, EOFError) as error:
+        return 'pickle', f'its sample cannot be read as arrays of numbers: {error}', 0.0
+    session = open_model(folder / manifest.model)
+    if [spec.name for spec in session.get_inputs()] != [spec.name for spec in manifest.inputs]:
+        return 'inputs', 'the model has other inputs than the manifest, or in another order', 0.0
+    for spec in manifest.inputs:
+        given = inputs[spec.name]
+        if given.shape != spec.shape or given.dtype != spec.dtype:
+            return 'inputs', f'the sample of {spec.name} has another shape or type than the manifest says', 0.0
+    names = [spec.name for spec in manifest.outputs]
+    for spec, found in zip(manifest.outputs, session.run(names, inputs), strict=True):
+        if found.shape != spec.shape or found.dtype != spec.dtype:
+            return 'output', f'{spec.name} has the shape {found.shape}, {spec.shape} is promised', 0.0
+        if not np.isfinite(found).all():
+            return 'nan', f'{spec.name} is not finite', 0.0
+        worst = worst_difference(outputs[spec.name], found)
+        if not worst <= sample.tolerance:
+            return 'output', f'{spec.name} differs by {worst:.3g} from what is promised, allowed is {sample.tolerance:g}', 0.0
+    return '', '', _p99_ms(session, names, inputs)
+
+
+def _p99_ms(session: Any, names: list[str], inputs: dict[str, Any]) -> float:
+    took_s: list[float] = []
+    for _ in range(WARM_UP):
+        session.run(names, inputs)
+    end = time.monotonic() + RUNS_S
+    while len(took_s) < RUNS and (len(took_s) < LEAST_RUNS or time.monotonic() < end):
+        begin = time.perf_counter()
+        session.run(names, inputs)
+        took_s.append(time.perf_counter() - begin)
+    return sorted(took_s)[int(0.99 * (len(took_s) - 1))] * 1000.0
+
+
+def _confine() -> None:
+    """What the system lets us leave: network, privileges, memory, files; and this process ends with its parent."""
+    libc = ctypes.CDLL(None)
+    parent = os.getppid()
+    libc.prctl(_PDEATHSIG, 9, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(1)
+    if libc.unshare(_NEW_NET):
+        libc.unshare(_NEW_USER | _NEW_NET)  # refused in many containers: then it has the network of its parent
+    libc.prctl(_NO_NEW_PRIVS, 1, 0, 0, 0)
+    for what, most in ((resource.RLIMIT_AS, MEMORY_BYTES), (resource.RLIMIT_FSIZE, MOST_ANSWER_BYTES), (resource.RLIMIT_CORE, 0),
+                       (resource.RLIMIT_CPU, int(SMOKE_S)), (resource.RLIMIT_NOFILE, 256)):  # fmt: skip
+        with suppress(ValueError, OSError):
+            resource.setrlimit(what, (most, most))
+
+
+def main() -> None:
+    """The child: tries the policy in the folder that it is given."""
+    _confine()
+    try:
+        reason, text, p99_ms = _try(Path(sys.argv[1]))
+    except MemoryError:
+        reason, text, p99_ms = 'memory', f'it needs more than {MEMORY_BYTES:,} bytes of memory', 0.0
+    except Exception as error:  # noqa: BLE001 - whatever a runtime says of a model
+        what = 'memory' if 'bad_alloc' in str(error) or 'Failed to allocate' in str(error) else 'smoke'
+        reason, text, p99_ms = what, f'{type(error).__name__}: {error}', 0.0
+    sys.stdout.write(json.dumps({'reason': reason, 'text': text[:1000], 'p99_ms': p99_ms}))
+
+
+if __name__ == '__main__':
+    main()

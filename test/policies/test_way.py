@@ -1,0 +1,69 @@
+"""The way of a policy from Spark to a robot and out again, against a real MLflow server and a real SeaweedFS."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import boto3
+import pytest
+from click.testing import CliRunner
+from policies.models import linear, trained
+
+from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.policies import active
+from shadowhound_data_logger.sim.tower import Tower
+
+pytestmark = [pytest.mark.seaweedfs, pytest.mark.long('an MLflow server, and a process for each smoke run')]
+
+
+def test_the_way_of_a_policy(tower: Tower, tmp_path: Path) -> None:
+    """Keygen, pack, sign and publish on Spark; sync, list, show, rollback, use, pin and unpin on Thor; all by the verbs."""
+    keys = tower.environment()
+    admin = boto3.client('s3', endpoint_url=tower.endpoint_url, region_name='us-east-1',
+                         aws_access_key_id=keys['AWS_ACCESS_KEY_ID'],
+                         aws_secret_access_key=keys['AWS_SECRET_ACCESS_KEY'])  # fmt: skip
+    if 'lerobot' not in {bucket['Name'] for bucket in admin.list_buckets()['Buckets']}:
+        admin.create_bucket(Bucket='lerobot')
+    name = f'patrol_{uuid4().hex[:8]}'
+    spark = tower.environment('spark') | tower.tracking('spark') | {'SHADOWHOUND_HOME': str(tmp_path / 'spark_home')}
+    thor = tower.environment('thor') | tower.tracking('thor') | {'SHADOWHOUND_HOME': str(tmp_path / 'thor'),
+                                                                'SHADOWHOUND_POLICY': name}  # fmt: skip
+
+    def run(environ: dict[str, str], *arguments: str) -> Any:
+        done = CliRunner().invoke(cli, ['policy', *arguments], env=environ, catch_exceptions=False)
+        assert done.exit_code == 0 or done.return_value == 0, done.output
+        return json.loads(done.output) if '--json' in arguments else done.output
+
+    def publish(version: int) -> str:
+        folder = trained(tmp_path / f'trained_{version}', linear(0.1 * version))
+        packed = str(tmp_path / f'packed_{version}')
+        made = run(spark, 'pack', str(folder), '--name', name, '--smoke', f'{folder}.npz', '--p99-ms', '5000',
+                   '-o', packed, '--json')  # fmt: skip
+        run(spark, 'sign', packed, '--key', str(key))
+        run(spark, 'publish', packed, '--alias', 'champion')
+        return str(made['policy'])
+
+    key = tmp_path / 'spark.key'
+    run(spark, 'keygen', str(key))
+    first = publish(1)
+    assert first.startswith(f'{name}@1#')
+    run(thor, 'list', '--json')
+    (tmp_path / 'thor' / 'policies' / 'keys' / 'spark.pub').write_bytes((tmp_path / 'spark.key.pub').read_bytes())
+    assert run(thor, 'sync', '--json')['done'] == 'activated'
+    with active(tmp_path / 'thor') as policy:
+        assert policy.id == first
+        assert [spec.names for spec in policy.manifest.inputs] == [('x', 'y', 'yaw')]
+    second = publish(2)
+    assert run(thor, 'sync', '--json')['active'] == second
+    assert run(thor, 'sync', '--json')['done'] == 'unchanged'
+    assert first in run(thor, 'rollback')
+    assert [(row['policy'], row['active'], bool(row['why_not'])) for row in run(thor, 'list', '--json')] == [
+        (first, True, False), (second, False, True)]  # fmt: skip
+    run(thor, 'use', f'{name}@2')
+    assert run(thor, 'sync', '--json') == {'wanted': second, 'active': second, 'done': 'pinned', 'p99_ms': None}
+    run(thor, 'unpin')
+    run(thor, 'pin')
+    assert run(thor, 'show', '--json')['policy'] == second
