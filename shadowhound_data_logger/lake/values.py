@@ -10,7 +10,7 @@ opened, and what they say counts: the answer is that of a loop over all messages
 
 from __future__ import annotations
 
-import hashlib
+import math
 import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -38,7 +38,7 @@ from shadowhound_data_logger.encode.statistics import (
     covers,
     values_of,
 )
-from shadowhound_data_logger.errors import DataLoggerError, LakeError, ObjectRefused, SettingError, StoreError
+from shadowhound_data_logger.errors import DataLoggerError, LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.decode import cloud_points, extension_of, records
@@ -68,8 +68,11 @@ _TEXT: Final = re.compile(r"'[^']*'")
 _SIGNS: Final = {'=': '==', '<>': '!='}
 _JSON, _JPEG, _PCD = 'json', 'jpg', 'pcd'
 _KEY: Final = ('bucket', 'key', 't_start_ns')
-_OBJECT: Final = ('robot', 'topic', *_KEY, 't_end_ns', 'count', 'sha256')
+_TIMES: Final = ('robot', 'topic', 't_start_ns', 't_end_ns', 'count')
+_OBJECT: Final = (*_TIMES, 'bucket', 'key')
+_WHOLE: Final = ('t_start_ns', 'field', 'count', 'nan_count')
 _STATISTIC: Final = (*_KEY, 'field', *NUMBERS)
+Bound = tuple[str, float, float]
 Mask = NDArray[np.bool_]
 
 
@@ -214,11 +217,8 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
     source = source or query.default_source()
     flags = {**flags, 'sensor': sensor}
     asked = query.labelled(source, wanted(time.time_ns(), **flags), findings)
-    with query.answering():
-        frame = query.objects(source, findings=findings, **flags).select(*_OBJECT, 't_start')
-        rows = frame.to_arrow().cast(narrow([*_OBJECT, 't_start'])).combine_chunks()
-    rows = rows.filter(pc.is_valid(rows['t_start'])).sort_by([('robot', 'ascending'), ('t_start_ns', 'ascending')])
-    told = _Told(rows, _statistics(source, asked, expression, findings))
+    rows, statistics, objects = _candidates(source, asked, flags, expression, findings)
+    told = _Told(rows, statistics)
     may, must, is_known = told.judged(expression)
     to_open = np.flatnonzero(may & ~must & (is_known | scan))
     found = [*_whole(rows, np.flatnonzero(must), sensor)]
@@ -233,30 +233,114 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
         joined = joined if chosen.keys else _clipped(joined, chosen.spans)
     padded = _joined_ranges((replace(each, since_ns=each.since_ns - round(pad_s * SECOND), until_ns=each.until_ns + round(
         pad_s * SECOND)) for each in joined), 0) if pad_s else joined  # fmt: skip
-    return ValueAnswer(tuple(padded), len(rows), len(to_open), unread, tuple(_freshness(source, asked, rows, findings)),
+    return ValueAnswer(tuple(padded), len(objects), len(to_open), unread, tuple(_freshness(source, asked, objects, findings)),
                   () if found or not told.is_lacking(expression) else tuple(_fields_of(source, asked, findings)))  # fmt: skip
 
 
-def _statistics(source: Bucket, asked: Wanted, expression: Expression, findings: Findings) -> pa.Table:
-    """The rows of the fields that are asked for, and of the objects as a whole, once each."""
-    names = sorted({each.field for each in leaves(expression)})
+def _candidates(source: Bucket, asked: Wanted, flags: Mapping[str, Any], expression: Expression,
+                findings: Findings) -> tuple[pa.Table, pa.Table, pa.Table]:  # fmt: skip
+    """The objects that have to be judged, their statistics, and the times of all objects.
+
+    Where every object has statistics of all its fields, those that a first comparison rules out are left out, and most row groups
+    are not even read. Keys and names make most of a part's bytes: they are read only where an object has to be told by them.
+    """
+    times = _catalogue(source, flags, _TIMES, findings)
+    lead = _lead(expression)
+    if lead is not None:
+        whole = _read_all(source, asked, findings, (ALL, ALL), _WHOLE)
+        is_plain = len(pc.unique(times['robot'])) == 1 and not pc.any(pc.greater(whole['nan_count'], 0)).as_py()
+        stamps, told = np.sort(_stamps(times)), np.sort(_stamps(whole))
+        if is_plain and np.array_equal(stamps, told) and (np.diff(stamps) > 0).all():
+            return *_led(source, asked, expression, lead, findings, times, whole), times
+    rows = _catalogue(source, flags, _OBJECT, findings).sort_by([('robot', 'ascending'), ('t_start_ns', 'ascending')])
+    return rows, _statistics(source, asked, leaves(expression), findings), times
+
+
+def _led(source: Bucket, asked: Wanted, expression: Expression, lead: Comparison, findings: Findings, times: pa.Table,
+         whole: pa.Table) -> tuple[pa.Table, pa.Table]:  # fmt: skip
+    """The objects for which the first comparison may hold, each told from all others by its time, and their statistics."""
+    first = _statistics(source, asked, [lead], findings, _bounds_of(lead))
+    some, _ = _by_statistics(lead, {name: _numbers(first, name) for name in NUMBERS})
+    first = first.filter(pa.array(some))
+    chosen = _stamps(first)
+    others = [leaf for leaf in leaves(expression) if leaf != lead]
+    tables_of = [first, *([_only_at(_statistics(source, asked, others, findings), chosen)] if others else [])]
+    found = pa.concat_tables([table.select(_STATISTIC) for table in tables_of])
+    keys = found.select(['bucket', 'key', 't_start_ns']).group_by(list(_KEY)).aggregate([])
+    objects = _only_at(times, chosen).join(keys, keys='t_start_ns', join_type='inner')
+    common = _only_at(whole, chosen).join(keys, keys='t_start_ns', join_type='inner')
+    nothing = {name: pa.nulls(len(common), pa.float64()) for name in ('first', 'last', 'min', 'max', 'mean')}
+    wholes = pa.table({**{name: common[name] for name in common.column_names}, **nothing}).select(_STATISTIC)
+    objects = objects.select([name for name in _OBJECT if name in objects.column_names])
+    return objects.sort_by('t_start_ns').combine_chunks(), pa.concat_tables([found, wholes.cast(found.schema)]).combine_chunks()
+
+
+def _lead(expression: Expression) -> Comparison | None:
+    """A comparison that must hold for the expression to hold."""
+    if isinstance(expression, Comparison):
+        return expression
+    return next((found for part in expression.parts if (found := _lead(part))), None) if expression.word == 'and' else None
+
+
+def _bounds_of(leaf: Comparison) -> tuple[Bound, ...]:
+    """What a statistic must be at least and at most where the comparison may hold."""
+    name = leaf.function or {'>': 'max', '>=': 'max', '<': 'min', '<=': 'min'}.get(leaf.sign)
+    if name is None or leaf.sign in {'==', '!='} or name in {'count', 'nan_count'}:
+        return ()
+    low, high = (leaf.number, math.inf) if leaf.sign in {'>', '>='} else (-math.inf, leaf.number)
+    return ((name, low, high),)
+
+
+def _catalogue(source: Bucket, flags: Mapping[str, Any], columns: Sequence[str], findings: Findings) -> pa.Table:
+    with query.answering():
+        found = query.objects(source, findings=findings, **flags).select(*columns, 't_start').to_arrow()
+    found = found.cast(narrow([*columns, 't_start'])).combine_chunks()
+    return found.filter(pc.is_valid(found['t_start'])).select(columns)
+
+
+def _stamps(table: pa.Table) -> NDArray[np.int64]:
+    return np.asarray(table['t_start_ns'].to_numpy())
+
+
+def _only_at(table: pa.Table, stamps: NDArray[np.int64]) -> pa.Table:
+    return table.filter(pc.is_in(table['t_start_ns'], value_set=pa.array(stamps)))
+
+
+def _statistics(source: Bucket, asked: Wanted, of: Sequence[Comparison], findings: Findings,
+                bounds: tuple[Bound, ...] | None = None) -> pa.Table:  # fmt: skip
+    """The rows of the fields that are asked for; without bounds those of the objects as a whole, too."""
+    names = sorted({each.field for each in of})
+    is_wide = bounds is None
     found = [arrow_schema(STATISTICS).empty_table().select(_STATISTIC)]
-    for table in _read(source, asked, findings, (ALL, f'{names[-1]}.\U0010ffff')):
-        kept = pc.equal(table['field'], ALL)
+    for table in _read(source, asked, findings, (ALL if is_wide else names[0], f'{names[-1]}.\U0010ffff'), bounds=bounds or ()):
+        kept = pc.equal(table['field'], ALL) if is_wide else pa.scalar(value=False)
         for name in names:
             kept = pc.or_(kept, pc.or_(pc.equal(table['field'], name), pc.starts_with(table['field'], f'{name}.')))
         found.append(table.filter(kept).select(_STATISTIC))
     return pa.concat_tables(found).combine_chunks()
 
 
-def _read(source: Bucket, asked: Wanted, findings: Findings, names: tuple[str, str]) -> Iterator[pa.Table]:
+def _read_all(source: Bucket, asked: Wanted, findings: Findings, names: tuple[str, str], columns: Sequence[str]) -> pa.Table:
+    nothing = arrow_schema(STATISTICS).empty_table().select(columns)
+    found = (
+        table.filter(pc.equal(table['field'], ALL)).select(columns) for table in _read(source, asked, findings, names, columns)
+    )
+    return pa.concat_tables([nothing, *found]).combine_chunks()
+
+
+def _read(source: Bucket, asked: Wanted, findings: Findings, names: tuple[str, str], columns: Sequence[str] = (),
+          bounds: tuple[Bound, ...] = ()) -> Iterator[pa.Table]:  # fmt: skip
     """The statistics of a sensor in the time that is asked for, of fields whose names lie between two."""
     found = folders(source, asked, findings, STATISTICS)
     entries = [entry for day in sorted(found, key=lambda day: day.robot) for entry in day.entries]
-    narrow = Wanted(robot=asked.robot, sensor=asked.sensor, since_ns=asked.since_ns, until_ns=asked.until_ns,
-                    bounds=(('field', *names),))  # fmt: skip
-    for table in tables(source, entries, ('sensor', *_STATISTIC), findings, narrow, STATISTICS):
-        yield table.filter(pc.equal(table['sensor'], asked.sensor))
+    narrowed = Wanted(robot=asked.robot, sensor=asked.sensor, since_ns=asked.since_ns, until_ns=asked.until_ns,
+                      bounds=(('field', *names), *bounds))  # fmt: skip
+    for table in tables(source, entries, ('sensor', *(columns or _STATISTIC)), findings, narrowed, STATISTICS):
+        kept = pc.equal(table['sensor'], asked.sensor)
+        for low, keep in ((asked.since_ns, pc.greater_equal), (asked.until_ns, pc.less)):
+            if low is not None:
+                kept = pc.and_(kept, keep(table['t_start_ns'], low))
+        yield table.filter(pc.fill_null(kept, fill_value=False))
 
 
 def _fields_of(source: Bucket, asked: Wanted, findings: Findings) -> list[str]:
@@ -357,12 +441,9 @@ def _opened(source: Bucket, rows: pa.Table, numbers: NDArray[np.intp], expressio
 
     def body(row: dict[str, Any]) -> bytes | DataLoggerError:
         try:
-            found = Bucket(source.settings, row['bucket']).get(row['key'], MOST_OBJECT_BYTES)
+            return Bucket(source.settings, row['bucket']).get(row['key'], MOST_OBJECT_BYTES)
         except ObjectRefused as error:
             return error
-        if row['sha256'] is not None and hashlib.sha256(found).hexdigest() != row['sha256']:
-            return StoreError('its content is not what its row says')
-        return found
 
     with ThreadPoolExecutor(THREADS, 'lake-values') as pool:
         for start in range(0, len(numbers), OPENED_AT_A_TIME):

@@ -177,7 +177,7 @@ def test_it_is_what_a_loop_over_all_messages_finds(
     source = filled(root, batches, told, data.draw(st.sampled_from([(), ('a', 'n')])))
     if data.draw(st.booleans()):
         with closing(open_store(source.settings, UploadSettings())) as store:
-            assert len([*compact(source, store, now=lambda: LATER)]) == any(told)
+            assert len([*compact(source, store, now=lambda: LATER)]) <= any(told)
     seen = [[json.loads(orjson.dumps(message)) for message in messages] for messages in batches]
     for text in conditions:
         found = values.ranges(text, source, scan=True, join_s=0.0)
