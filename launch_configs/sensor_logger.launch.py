@@ -12,7 +12,7 @@ from typing import Any
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo, RegisterEventHandler, SetEnvironmentVariable, TimerAction
-from launch.conditions import IfCondition
+from launch.conditions import IfCondition, LaunchConfigurationNotEquals
 from launch.event_handlers import OnProcessExit
 from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
@@ -70,6 +70,19 @@ def live_page() -> Action:
     )
 
 
+def policies() -> Action:
+    """What follows the registry for a trained policy, where one is named; it starts again whatever ends it."""
+    return Node(
+        package='shadowhound_data_logger',
+        executable='shadowhound-data',
+        arguments=['policy', 'run', '--name', LaunchConfiguration('policy')],
+        condition=LaunchConfigurationNotEquals('policy', ''),
+        output='screen',
+        respawn=True,
+        respawn_delay=RESTART_AFTER_S,
+    )
+
+
 def generate_launch_description() -> LaunchDescription:
     """What `ros2 launch` asks for."""
     return LaunchDescription(
@@ -78,8 +91,10 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument('namespace', default_value='', description='Namespace of the robot, for several robots.'),
             DeclareLaunchArgument('live', default_value='false', description='Serve the live page too.'),
             DeclareLaunchArgument('live_bind', default_value='127.0.0.1', description='Where it listens.'),
+            DeclareLaunchArgument('policy', default_value='', description='Follow the registry for this policy.'),
             *profile(),
             *logger(),
             live_page(),
+            policies(),
         ]
     )

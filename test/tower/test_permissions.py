@@ -130,6 +130,23 @@ def test_training_sets_are_sparks(as_user: Connect) -> None:
     assert 'Contents' not in spark.list_objects_v2(Bucket='lerobot', Prefix=key)
 
 
+def test_policies_are_read_by_robots_and_nothing_else_there(as_user: Connect) -> None:
+    """A robot gets each object below policies, and neither lists, writes nor deletes there, nor sees what is beside it."""
+    spark, thor, key = as_user('spark'), as_user('thor'), 'policies/go2/go2_patrol_v7/manifest.json'
+    for name in (key, 'policies_of_others/x', 'datasets/x'):
+        spark.put_object(Bucket='lerobot', Key=name, Body=b'one')
+    assert thor.get_object(Bucket='lerobot', Key=key)['Body'].read() == b'one'
+    assert not _is_denied(thor.head_object, Bucket='lerobot', Key=key)
+    for name in ('policies_of_others/x', 'datasets/x'):
+        assert _is_denied(thor.get_object, Bucket='lerobot', Key=name)
+    assert _is_denied(thor.put_object, Bucket='lerobot', Key=key, Body=b'two')
+    assert _is_denied(thor.put_object, Bucket='lerobot', Key='policies/new', Body=b'two')
+    assert _is_denied(thor.delete_object, Bucket='lerobot', Key=key)
+    assert _is_denied(thor.copy_object, Bucket='lerobot', Key='policies/copy', CopySource=f'lerobot/{key}')
+    for prefix in ('', 'policies/'):
+        assert _is_denied(thor.list_objects_v2, Bucket='lerobot', Prefix=prefix)
+
+
 def test_mlflow_has_its_bucket_alone(as_user: Connect) -> None:
     """It reads, writes and deletes artifacts, and nothing else."""
     mlflow = as_user('mlflow')
