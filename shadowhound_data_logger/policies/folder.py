@@ -61,7 +61,7 @@ class PolicyState:
     revoked: list[str] = field(default_factory=list)
     """Keys that were revoked."""
     revocations: int = 0
-    """How many lists of them were read."""
+    """How many lists of them were read, the first ones, without a gap."""
 
 
 class PolicyFolder:

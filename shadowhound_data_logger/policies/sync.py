@@ -221,23 +221,25 @@ class PolicySync:
 
     def _revoke(self) -> bool:
         """Read the lists of revoked keys that are new; whether the active version went because of them."""
-        while (number := self.folder.state().revocations + 1) <= MOST_LISTS:
+        is_whole = True  # a list that was exchanged on its way is asked for again, and so are all after it
+        for number in range(self.folder.state().revocations + 1, MOST_LISTS + 1):
+            key = revocation_key(number)
             try:
-                content = steadily(lambda: self.store.get(BUCKET, revocation_key(number), signing.MOST_REVOCATION_BYTES),
+                content = steadily(lambda key=key: self.store.get(BUCKET, key, signing.MOST_REVOCATION_BYTES),  # type: ignore[misc]
                                    pause=self.pause)  # fmt: skip
             except ObjectRefused as error:
                 if error.data.get('reason') != 'missing':
                     raise
                 break
-            state = self.folder.state()
             try:
-                found = signing.read_revocation(content, number, self.folder.keys(), state.revoked)
+                found = signing.read_revocation(content, number, self.folder.keys(), self.folder.state().revoked)
             except PolicyRefused as error:
                 log.warning('a list of revoked keys counts for nothing: %s', error)
-                found = frozenset()
+                is_whole = False
+                continue
             with self.folder.changing() as state:
                 state.revoked = sorted({*state.revoked, *found})
-                state.revocations = number
+                state.revocations = number if is_whole else state.revocations
         return self._drop_revoked()
 
     def _drop_revoked(self) -> bool:
