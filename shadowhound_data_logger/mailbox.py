@@ -68,8 +68,10 @@ class KeptFilter:
     mission: str | None = None
     """How the id of a mission or of its run begins."""
     mission_type: str | None = None
-    keys: tuple[str, ...] = ()
-    """Patterns, one of which its key matches: ``*`` stands for any letters, ``?`` for one."""
+    keys: frozenset[str] = frozenset()
+    """Its key is one of these, or matches one of the patterns."""
+    patterns: tuple[str, ...] = ()
+    """``*`` stands for any letters, ``?`` for one."""
 
     def to_json(self) -> dict[str, Any]:
         """What is given, in the form that the id is the hash of."""
@@ -77,8 +79,8 @@ class KeptFilter:
         said |= {name: value for name in ('since_ns', 'until_ns') if (value := getattr(self, name)) is not None}
         if self.near is not None:
             said['near'] = [float(value) for value in self.near]
-        if self.keys:
-            said['keys'] = sorted(set(self.keys))
+        if self.keys or self.patterns:
+            said['keys'] = sorted(self.keys.union(self.patterns))
         return said
 
     def takes(self, key: str, sensor: str, topic: str | None, begin_ns: int, end_ns: int, metadata: Mapping[str, str]) -> bool:
@@ -97,7 +99,9 @@ class KeptFilter:
                 return False
         if self.near is not None and not _is_near(metadata.get(words.POSE, ''), *self.near):
             return False
-        return not self.keys or key in self.keys or any(_matches(pattern, key) for pattern in self.keys if _is_wild(pattern))
+        if not self.keys and not self.patterns:
+            return True
+        return key in self.keys or any(_matches(pattern, key) for pattern in self.patterns)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -229,7 +233,11 @@ def _read_want(said: Any) -> KeptFilter:
     if near is not None and not _is_circle(near):
         raise RequestRefused('near', 'near is not x, y and a radius in metres')
     given = {name: said[name] for name in (*_WORDS, 'since_ns', 'until_ns') if name in said}
-    return KeptFilter(**given, near=None if near is None else (near[0], near[1], near[2]), keys=tuple(keys))
+    circle = None if near is None else (near[0], near[1], near[2])
+    return KeptFilter(
+        **given, near=circle, keys=frozenset(key for key in keys if not _is_wild(key)),
+        patterns=tuple(key for key in keys if _is_wild(key)),
+    )  # fmt: skip
 
 
 def _is_circle(near: Any) -> bool:

@@ -151,27 +151,27 @@ def _want(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, le
     from shadowhound_data_logger.lake.select import wanted  # noqa: PLC0415
 
     asked = wanted(now_ns, **{name: value for name, value in flags.items() if name not in {'where', 'success'}})
-    sensor, keys = asked.sensor, tuple[str, ...]()
+    sensor, patterns = asked.sensor, tuple[str, ...]()
     if bag is not None:
         if not _BAG.fullmatch(bag) or sensor not in {None, BAG_SENSOR}:
             raise BadUsage(
                 f'--bag {bag!r} is not the name of a bag, or another sensor is asked for', '`shadowhound-data bag list`'
             )
-        sensor, keys = BAG_SENSOR, (f'{robot}/rosbags/{bag}/*',)
+        sensor, patterns = BAG_SENSOR, (f'{robot}/rosbags/{bag}/*',)
     want = KeptFilter(
         sensor=sensor, topic=asked.topic, since_ns=asked.since_ns, until_ns=asked.until_ns, near=asked.near,
-        mission=asked.mission, mission_type=asked.mission_type, keys=keys,
+        mission=asked.mission, mission_type=asked.mission_type, patterns=patterns,
     )  # fmt: skip
     if not want.to_json() and 'where' not in flags:
         raise BadUsage('nothing says what to ask for', "name a --sensor, a --bag or a time; --bag '*' is all bags")
     if 'success' in flags:
         raise BadUsage('a robot does not know how missions ended', 'name the --mission')
     if 'where' in flags:
-        want = replace(want, keys=_keys(source, robot, want, flags['where'], left_out))
+        want = replace(want, patterns=(), keys=_keys(source, robot, want, flags['where'], left_out))
     return want
 
 
-def _keys(source: Any, robot: str, want: KeptFilter, where: str, left_out: Any) -> tuple[str, ...]:
+def _keys(source: Any, robot: str, want: KeptFilter, where: str, left_out: Any) -> frozenset[str]:
     """The keys of what SQL chooses."""
     from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415
     from shadowhound_data_logger.lake import query  # noqa: PLC0415
@@ -181,7 +181,7 @@ def _keys(source: Any, robot: str, want: KeptFilter, where: str, left_out: Any) 
         raise BadUsage(
             f'--where chooses {len(keys):,} objects: more than {MOST_KEYS:,} cannot be asked for by name', 'ask for less'
         )
-    return tuple(keys)
+    return frozenset(keys)
 
 
 def _expiry_ns(text: str) -> int:

@@ -42,8 +42,12 @@ STEP_S: Final = 0.25
 """Between two releases while something is asked for."""
 WINDOW: Final = 64
 """Released objects that wait for delivery at most: what is asked for later has its turn after these."""
-WINDOW_BYTES: Final = 8 << 20
-"""The same in bytes, but one object always may go."""
+WINDOW_S: Final = 5.0
+"""The same in seconds of the link, but one object always may go."""
+WINDOW_BYTES: Final = 4 << 20
+"""The same where the pace of the link is not known."""
+LEAST_WINDOW, MOST_WINDOW = 1 << 20, 16 << 20
+"""In bytes."""
 TELL_S: Final = 30.0
 """Between two answers of how far a request is."""
 MOST_REQUESTS: Final = 4096
@@ -218,10 +222,12 @@ class RequestServer:
 
     def _release(self, rows: Sequence[RequestRow]) -> bool:
         """Let the next objects wait for delivery; whether there are any."""
+        mbps = self._mbps()
+        window = WINDOW_BYTES if mbps is None else min(max(round(WINDOW_S * mbps * 125_000), LEAST_WINDOW), MOST_WINDOW)
         count, size = self._spool.released()
-        if not rows or count > WINDOW // 2 or size > WINDOW_BYTES // 2:
+        if not rows or count > WINDOW // 2 or size > window // 2:
             return False
-        room, room_bytes = WINDOW - count, WINDOW_BYTES - size
+        room, room_bytes = WINDOW - count, window - size
         queues = {row.id: deque(self._spool.next_requested(row.id, room)) for row in rows}
         chosen: dict[int, int] = {}
         while len(chosen) < room and (row := self._next([row for row in rows if queues[row.id]])) is not None:
