@@ -124,7 +124,10 @@ def test_without_a_server_the_store_is_a_folder(processes: Processes) -> None:
     [
         ({'camera.rate_hertz': 2.0}, ('camera.rate_hertz = 2.0', 'camera.enabled', 'camera.rate_hz')),
         ({'intake.poll_s': 0.1}, ('intake.poll_s = 0.1: this parameter no longer exists', 'remove it: topics are drained')),
-        ({'imu.batch_count': 10}, ('imu.batch_count = 10: there is no such', 'imu.batch_s limits an object in time')),
+        (
+            {'imu.batch_count': 10},
+            ('imu.batch_count = 10: this parameter no longer exists', 'imu.batch_s limits an object in time'),
+        ),
         ({'queue.max_bytes': 17}, ('queue.max_bytes = 17', 'at least')),
         ({'imu.topics': ['no topic!']}, ("imu.topics = ['no topic!']", 'valid topic names')),
         ({'events.regex': '.*', 'events.conditions': ['x: t!:f < 1']}, ("events.conditions = 'x: t!:f < 1'", 'valid topic')),
