@@ -170,6 +170,7 @@ def test_what_cannot_be_asked_for_is_said(field: Field, arguments: tuple[str, ..
     assert run('pull', '--list') == []
 
 
+@pytest.mark.long('a picture by matplotlib')
 def test_the_pace_of_the_link_says_how_long_a_pull_takes(field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The median of what the robot measured lately; the same by place is a picture."""
     field.records(1, 2)
