@@ -164,7 +164,7 @@ def test_the_command_line_does_what_the_services_do(operated: Operated) -> None:
     operated.publisher.publish('/asked', texts(range(COUNT)), 0.0)
     assert tell(operated, 'flush') == (True, f'1 object with {COUNT} messages spooled')
     assert operated.station.flush() == '0 objects with 0 messages spooled'
-    assert tell(operated, 'pause')[1].endswith(f'delivery goes on; {operated.station.flush()}')
+    assert tell(operated, 'pause')[1].endswith(f'delivery continues; {operated.station.flush()}')
     assert operated.station.pause(paused=True) == tell(operated, 'pause')[1] == 'paused already'
     assert operated.station.pause(paused=False) == 'messages are stored again'
     assert tell(operated, 'resume') == (True, 'not paused')
