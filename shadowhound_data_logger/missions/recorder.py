@@ -24,6 +24,7 @@ from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, new_folder, safe_type, stamped
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.missions.story import BATTERY, FAILED, FINISHED, TEMPERATURE
+from shadowhound_data_logger.policies.folder import PolicyFolder
 
 log = logging.getLogger(__name__)
 
@@ -262,6 +263,8 @@ class Beginning:
             log.warning('the mission type %.80r cannot be part of a name: using %s there', given, safe_type(given))
         start = {'k': 'start', 't': time_ns, 'type': given, 'command': values.text(mission_command), 'robot': self.robot,
                  'pid': os.getpid()}  # fmt: skip
+        if policy := PolicyFolder(self.home).current():
+            start['policy'] = policy
         if time_ns < EARLIEST_SANE_NS:  # of which boot the clock is that this time is of
             start['boot_id'] = self.clock.boot_id
         try:

@@ -1,9 +1,9 @@
 """What a mission's journal says as a whole: its first and last values, its counts, and how the run ends.
 
-The records of a journal, by their ``k``: ``start`` (type, command, robot), ``metrics`` (m: key -> value, s: step), ``frame``,
-``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``refused`` (reason), ``end`` (status, what the agent
-stated), and of the node ``poses``. Every record has ``t``, ns since 1970 UTC. ``summary_of`` makes ``summary.json`` of it, the
-same in the run, in the store and in the mission's folder.
+The records of a journal, by their ``k``: ``start`` (type, command, robot, policy), ``metrics`` (m: key -> value, s: step),
+``frame``, ``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``refused`` (reason), ``end`` (status, what the
+agent stated), and of the node ``poses``. Every record has ``t``, ns since 1970 UTC. ``summary_of`` makes ``summary.json`` of
+it, the same in the run, in the store and in the mission's folder.
 """
 
 from __future__ import annotations
@@ -136,6 +136,7 @@ class Story:
             'mission_command': self.start['command'][:MAX_PARAM],
             'robot': self.start['robot'],
             'timestamp': utc(int(self.start['t'])).isoformat(),
+            **({'policy': self.start['policy']} if 'policy' in self.start else {}),
         }
 
     def final_params(self) -> dict[str, str]:
@@ -176,6 +177,7 @@ def summary_of(story: Story, mission_id: str, run: Run, sent: MissionSent, pictu
     return {
         'mission_id': mission_id, 'run_id': run.run_id, 'run_name': stamped(start['type'], int(start['t'])),
         'robot': start['robot'], 'mission_type': start['type'], 'mission_command': start['command'],
+        'policy': start.get('policy'),
         'start': iso(int(start['t'])), 'end': iso(int(end['t'])), 'start_ns': int(start['t']), 'end_ns': int(end['t']),
         'result': end['status'], 'success': story.success, 'ended_by': end.get('by', 'agent'),
         'errors': [*story.errors, *([end['error']] if end.get('error') else [])],
