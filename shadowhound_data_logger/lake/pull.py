@@ -69,10 +69,6 @@ class PullState:
     answer: dict[str, Any] | None
     """The newest one."""
 
-    @property
-    def is_over(self) -> bool:
-        return self.state in FINAL
-
 
 def kept(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa.Table:
     """Rows of what a robot keeps and the filter takes, with the columns of ``catalogue.schema.KEPT``. Raises StoreError."""
