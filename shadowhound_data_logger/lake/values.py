@@ -46,7 +46,7 @@ from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import OBJECTS, newest, watermarks
 from shadowhound_data_logger.lake.reading import arrow_schema, narrow, tables
 from shadowhound_data_logger.lake.scan import folders
-from shadowhound_data_logger.lake.select import TimeSpan, Wanted, wanted
+from shadowhound_data_logger.lake.select import LONGEST_BATCH_NS, TimeSpan, Wanted, wanted
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
 
 ALLOWED: Final = (
@@ -234,7 +234,7 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
     padded = _joined_ranges((replace(each, since_ns=each.since_ns - round(pad_s * SECOND), until_ns=each.until_ns + round(
         pad_s * SECOND)) for each in joined), 0) if pad_s else joined  # fmt: skip
     return ValueAnswer(tuple(padded), len(objects), len(to_open), unread, tuple(_freshness(source, asked, objects, findings)),
-                  () if found or not told.is_lacking(expression) else tuple(_fields_of(source, asked, findings)))  # fmt: skip
+                  () if found or unread else tuple(_fields_instead(source, asked, expression, objects, findings)))  # fmt: skip
 
 
 def _candidates(source: Bucket, asked: Wanted, flags: Mapping[str, Any], expression: Expression,
@@ -343,11 +343,17 @@ def _read(source: Bucket, asked: Wanted, findings: Findings, names: tuple[str, s
         yield table.filter(pc.fill_null(kept, fill_value=False))
 
 
-def _fields_of(source: Bucket, asked: Wanted, findings: Findings) -> list[str]:
+def _fields_instead(source: Bucket, asked: Wanted, expression: Expression, objects: pa.Table, findings: Findings) -> list[str]:
+    """The fields of the newest objects, where one that is asked for is not among them."""
+    newest_ns = pc.max(objects['t_start_ns']).as_py()
+    if newest_ns is None:
+        return []
     found: set[str] = set()
-    for table in _read(source, asked, findings, (ALL, '\U0010ffff')):
+    for table in _read(source, replace(asked, since_ns=newest_ns - LONGEST_BATCH_NS), findings, (ALL, '\U0010ffff')):
         found.update(pc.unique(table['field']).to_pylist())
-    return sorted(found - {ALL})
+    found -= {ALL}
+    is_there = all(any(covers(leaf.field, name) for name in found) for leaf in leaves(expression))
+    return [] if is_there else sorted(found)
 
 
 class _Told:
@@ -371,11 +377,6 @@ class _Told:
         self._has[self._rows[whole]] = True
         self._left_out = np.zeros(self._objects, bool)
         self._left_out[self._rows[whole]] = self._values['nan_count'][whole] > 0
-
-    def is_lacking(self, expression: Expression) -> bool:
-        """Whether an object has statistics, and none has those of a field that is asked for."""
-        names = [each.field for each in leaves(expression)]
-        return bool(self._has.any()) and not all(any(covers(name, each) for each in self._names) for name in names)
 
     def judged(self, expression: Expression) -> tuple[Mask, Mask, Mask]:
         """Whether the condition may hold in an object; must hold in all of it; may hold by what is known alone."""

@@ -196,6 +196,8 @@ def test_only_what_may_hold_it_is_opened(tmp_path: Path) -> None:
     assert (found.objects, found.opened, found.unknown) == (10, 2, 0)
     assert [(each.since_ns - NOON_NS) / SECOND for each in found.ranges] == [480.4, 540.3]
     assert values.ranges('s.a >= 0', source).opened == 0
+    assert values.ranges('s.b > 1', source).fields == ('a',)
+    assert values.ranges('s.a > 99', source).fields == ()
     assert [values.ranges('max(s.a) > 12', source).opened, len(values.ranges('max(s.a) > 12', source).ranges)] == [0, 1]
 
 
