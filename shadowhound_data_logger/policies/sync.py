@@ -194,7 +194,9 @@ class PolicySync:
             raise PolicyRefused('disk', text, remedy='--max-gib and --min-free-gib say how much policies may take')
 
     def _download(self, key: str, size: int, sha256: str, path: Path) -> None:
-        """Goes on for as long as each attempt brings something."""
+        """Goes on for as long as each attempt brings something; what an earlier one brought whole is not fetched again."""
+        if path.is_file() and disk.fingerprint(path) == (size, sha256):
+            return
         wanted = ObjectInfo(BUCKET, key, size, sha256)
         had = -1
         cap = _Cap(self.settings.max_mbps, self.pause)

@@ -363,6 +363,24 @@ def test_no_mission_is_disturbed_and_no_version_in_use_removed(second: Scene) ->
     assert second.folder.clean(1) == [first]
 
 
+def test_what_is_there_is_not_fetched_again(second: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine without the runtime of the smoke run downloads a version once, not at each look."""
+
+    def without_runtime(*_: object) -> float:
+        raise PolicyError('no runtime')
+
+    fetched: list[str] = []
+    content = second.store.content
+    monkeypatch.setattr(second.store, 'content', lambda *asked: fetched.append(asked[1]) or content(*asked))
+    with monkeypatch.context() as patch:
+        patch.setattr(sync, 'run_smoke', without_runtime)
+        for _ in range(2):
+            with pytest.raises(PolicyError, match='no runtime'):
+                second.robot.run()
+    assert second.robot.run().done == 'activated'
+    assert sum(key.endswith('model.onnx') for key in fetched) == 1
+
+
 def test_a_full_disk_while_activating_changes_nothing(second: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     before = second.folder.current()
 
