@@ -11,6 +11,7 @@ was told and the name of an event or label count four times).
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import sqlite3
 import tempfile
@@ -62,6 +63,10 @@ _FOUND: Final = (
     'SELECT kind, robot, mission_id, run_id, mission_type, success, since_ns, until_ns, bucket, key, title,'
     " snippet(words, -1, '', '', ' ... ', 16) AS excerpt, -bm25(words, 4.0, 1.0) AS score"
     ' FROM words JOIN documents ON documents.id = words.rowid WHERE words MATCH ?'
+)
+_REACHES: Final = (
+    "EXISTS (SELECT 1 FROM json_each(?) AS span WHERE ifnull(json_extract(span.value, '$[0]'), robot) = robot"
+    " AND since_ns <= json_extract(span.value, '$[2]') AND until_ns >= json_extract(span.value, '$[1]'))"
 )
 _TERM: Final = re.compile(r'\s*(?P<not>-)?(?:"(?P<phrase>[^"]*)"|(?P<word>[^\s"]+))(?P<prefix>\*)?')
 
@@ -165,9 +170,7 @@ def _conditions(asked: Wanted, kind: str | None) -> tuple[list[str], list[Any]]:
     if asked.until_ns is not None:
         must('since_ns < ?', asked.until_ns)
     for chosen in asked.chosen:
-        spans = chosen.spans[:MOST_DOCUMENTS]
-        must('(' + ' OR '.join(['0', *('(robot = ifnull(?, robot) AND since_ns <= ? AND until_ns >= ?)' for _ in spans)]) + ')',
-             *(each for span in spans for each in (span.robot, span.until_ns, span.since_ns)))  # fmt: skip
+        must(_REACHES, json.dumps(chosen.spans))
     if asked.label is not None:
         must("EXISTS (SELECT 1 FROM documents AS said JOIN words AS named ON named.rowid = said.id WHERE said.kind = 'label'"
              ' AND said.robot = documents.robot AND said.since_ns <= documents.until_ns AND said.until_ns >= documents.since_ns'

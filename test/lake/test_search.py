@@ -84,7 +84,12 @@ def test_the_flags_of_a_query(index: Path) -> None:
     assert missions(index, 'door', robot='tachi') == []
     assert missions(index, 'up', label='stairs') == ['m2']
     assert missions(index, 'door', label='stairs') == []
-    assert missions(index, 'handle', ranges=[{'since_ns': NOON_NS + HOUR, 'until_ns': NOON_NS + HOUR}]) == ['m1']
+    times = [
+        {'since_ns': NOON_NS + HOUR, 'until_ns': NOON_NS + HOUR},
+        *({'since_ns': at, 'until_ns': at} for at in range(0, 9999, 2)),
+    ]
+    assert missions(index, 'handle', ranges=times) == ['m1']
+    assert missions(index, 'handle', ranges=[{**times[0], 'robot': 'tachi'}]) == []
     assert [each['title'] for each in search.search(index, 'stairs', wanted(0), kind='label')] == ['stairs']
 
 
