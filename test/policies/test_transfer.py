@@ -1,0 +1,146 @@
+"""Policies over a bad link: 100 MB over a connection that is cut 20 times, and no faster than the cap."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import boto3
+import pytest
+from policies.models import Aliases, Spark, linear
+
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.policies import sync
+from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.s3 import S3Store
+
+pytestmark = [pytest.mark.seaweedfs, pytest.mark.long('100 MB, and seconds under a cap')]
+
+CUTS = 20
+
+
+class CuttingFront:
+    """Passes connections on to a server, and cuts all of them each time that so many bytes came back, ``CUTS`` times."""
+
+    def __init__(self, to: int, every: int) -> None:
+        self._to = to
+        self._every = every
+        self._lock = threading.Lock()
+        self._listener = socket.create_server(('127.0.0.1', 0))
+        self._threads: list[threading.Thread] = []
+        self._sockets: list[socket.socket] = []
+        self._is_over = False
+        self._begin(self._serve)
+        self.port: int = self._listener.getsockname()[1]
+        self.passed = 0
+        self.cuts = 0
+
+    def close(self) -> None:
+        self._is_over = True
+        socket.create_connection(('127.0.0.1', self.port)).close()
+        self._threads[0].join(60)
+        self._listener.close()
+        for one in self._sockets:
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads[1:]:
+            thread.join(60)
+
+    def _begin(self, what: object, *arguments: socket.socket) -> None:
+        thread = threading.Thread(target=what, args=arguments)  # type: ignore[arg-type]
+        self._threads.append(thread)
+        thread.start()
+
+    def _serve(self) -> None:
+        with suppress(OSError):
+            while not self._is_over:
+                client, _ = self._listener.accept()
+                server = socket.create_connection(('127.0.0.1', self._to))
+                self._sockets += client, server
+                self._begin(self._pass, client, server)
+                self._begin(self._pass_and_cut, server, client)
+
+    def _pass(self, source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):
+            while content := source.recv(1 << 16):
+                target.sendall(content)
+        self._end(source, target)
+
+    def _pass_and_cut(self, source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):
+            while content := source.recv(1 << 16):
+                target.sendall(content)
+                with self._lock:
+                    self.passed += len(content)
+                    is_cut = self.cuts < CUTS and self.passed >= self._every * (self.cuts + 1)
+                    self.cuts += is_cut
+                if is_cut:
+                    break
+        self._end(source, target)
+
+    def _end(self, *both: socket.socket) -> None:
+        for one in both:
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+
+
+@pytest.fixture
+def spark(seaweed: Tower, tmp_path: Path) -> Iterator[Spark]:
+    """Version 1 of 100 MB and version 2 of 10 MB, in the bucket."""
+    spark = Spark(tmp_path / 'spark')
+    settings = seaweed.store_settings()
+    client = boto3.client('s3', endpoint_url=settings.endpoint_url, region_name='us-east-1',
+                          aws_access_key_id=settings.access_key_id, aws_secret_access_key=settings.secret_access_key)  # fmt: skip
+    with suppress(client.exceptions.BucketAlreadyOwnedByYou, client.exceptions.BucketAlreadyExists):
+        client.create_bucket(Bucket='lerobot')
+    keys = []
+    for version, floats in ((1, 25_000_000), (2, 2_500_000)):
+        packed, _ = spark.packed(version, linear(0.1 * version, extra=floats))
+        for path in packed.rglob('*'):
+            if path.is_file():
+                keys.append(f'policies/go2/go2_patrol_v{version}/{path.relative_to(packed).as_posix()}')
+                client.put_object(Bucket='lerobot', Key=keys[-1], Body=path.read_bytes())
+    yield spark
+    for key in keys:
+        client.delete_object(Bucket='lerobot', Key=key)
+
+
+def follow(seaweed: Tower, spark: Spark, home: Path, version: int, port: int | None = None, max_mbps: float = 0.0) -> None:
+    """A robot takes a version, its smoke run aside."""
+    folder = PolicyFolder(home)
+    folder.make()
+    shutil.copy(spark.public, folder.path / 'keys')
+    registry = Aliases()
+    registry.say('champion', version)
+    url = f'http://127.0.0.1:{port}' if port else seaweed.endpoint_url
+    with closing(S3Store(replace(seaweed.store_settings(), endpoint_url=url), UploadSettings())) as store:
+        store.open()
+        settings = sync.PolicySettings(name='go2_patrol', robot='thor', min_free_bytes=0, max_mbps=max_mbps)
+        pause = time.sleep if max_mbps else lambda _: None  # a cap waits; what waits after a cut need not here
+        assert sync.PolicySync(folder, store, registry, settings, pause=pause).run().done == 'activated'
+
+
+def test_a_link_that_is_cut_and_one_that_is_capped(
+    seaweed: Tower, spark: Spark, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twenty cuts cost at most a twentieth of the bytes; under a cap of 40 Mbit/s it is no faster."""
+    monkeypatch.setattr(sync, 'run_smoke', lambda *_: 1.0)
+    size = sum(path.stat().st_size for path in (spark.folder / 'packed_1').rglob('*') if path.is_file())
+    with closing(CuttingFront(urlsplit(seaweed.endpoint_url).port or 0, size // (CUTS + 1))) as front:
+        follow(seaweed, spark, tmp_path / 'cut', 1, front.port)
+        assert front.cuts == CUTS
+        assert size <= front.passed <= 1.05 * size, front.passed / size
+    size = sum(path.stat().st_size for path in (spark.folder / 'packed_2').rglob('*') if path.is_file())
+    begin = time.monotonic()
+    follow(seaweed, spark, tmp_path / 'capped', 2, max_mbps=40.0)
+    mbps = size * 8e-6 / (time.monotonic() - begin)
+    assert mbps <= 44.0
