@@ -160,6 +160,22 @@ def test_a_revoked_key(second: Scene) -> None:
     assert second.folder.state().revoked == [other.key_id]
 
 
+def test_a_list_of_revoked_keys_that_was_exchanged_on_its_way(second: Scene) -> None:
+    """Junk in its place hides it for no longer than the junk is there."""
+    first = second.folder.current()
+    other = Spark(second.path / 'other')
+    shutil.copy(other.public, second.folder.path / 'keys' / 'other.pub')
+    packing.revoke(other.key, [second.spark.key_id], second.store)
+    path = second.path / 'store' / 'lerobot' / packing.revocation_key(1)
+    told = path.read_bytes()
+    second.registry.say('champion', 1)
+    for junk in (b'', b'{}', b'[' * 50_000):
+        path.write_bytes(junk)
+        assert second.robot.run().active == first
+    path.write_bytes(told)
+    assert second.robot.run().done == 'rolled_back'
+
+
 @pytest.mark.parametrize(('path', 'reason'), [
     ('model.pkl', 'file_type'), ('model.pt', 'file_type'), ('run.py', 'file_type'), ('lib.so', 'file_type'),
     ('none', 'file_type'), ('../model.json', 'path'), ('/etc/a.json', 'path'), ('a/../../b.json', 'path'), ('a//b.json', 'path'),
