@@ -48,7 +48,7 @@ def test_every_verb_and_option_exists() -> None:
             continue
         options = {name for each in command.params for name in (*each.opts, *each.secondary_opts)} | {'--help'}
         wrong += [
-            f'{where}: {word} of {match[0]}' for word in re.findall(r'(?<=\s)--[a-z-]+', match['rest']) if word not in options
+            f'{where}: {word} of {match[0]}' for word in re.findall(r'(?<=\s)--[a-z][a-z0-9-]*', match['rest']) if word not in options
         ]
         seen.add(match['verb'])
     assert wrong == []

@@ -199,6 +199,7 @@ VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
 """Name, default, meaning of each variable that config.py reads for the node and the command line."""
 OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ('SHADOWHOUND_PARAMETERS', '', 'The parameter file: read by the systemd unit and the doctor, not by the node itself.'),
+    ('SHADOWHOUND_POLICY', '', 'The registered model that `policy sync` and `policy run` follow.'),
     ('SHADOWHOUND_LIVE_BIND', '`127.0.0.1`', 'Where the live page listens: read by its systemd unit.'),
     (
         'AWS_SHARED_CREDENTIALS_FILE',

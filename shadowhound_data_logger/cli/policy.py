@@ -42,7 +42,7 @@ _folder = click.Path(path_type=Path, file_okay=False, exists=True)
 _file = click.Path(path_type=Path, dir_okay=False, exists=True)
 
 
-@click.group()
+@click.group(epilog=examples('policy publish packed --alias champion', 'policy sync --name go2_patrol'))
 def policy() -> None:
     """Bring trained policies to robots, signed.
 
@@ -178,7 +178,7 @@ def sync(*, as_json: bool, **given: Any) -> ExitCode:
 @click.option('--every', type=click.FloatRange(0.1, 86_400.0), default=30.0, show_default=True, help='Seconds between two looks.')
 @_follows
 def run(*, every: float, **given: Any) -> ExitCode:
-    """Follow the registry until it is interrupted.
+    """Follow the registry until interrupted.
 
     A Tower that is away changes nothing: what is active goes on.
     """
@@ -200,7 +200,7 @@ def run(*, every: float, **given: Any) -> ExitCode:
     return ExitCode.FINE
 
 
-@policy.command(name='list')
+@policy.command(name='list', epilog=examples('policy list', 'policy list --json'))
 @as_json
 def list_(*, as_json: bool) -> ExitCode:
     """List the versions on this robot."""
@@ -219,11 +219,11 @@ def list_(*, as_json: bool) -> ExitCode:
     return ExitCode.FINE
 
 
-@policy.command()
+@policy.command(epilog=examples('policy show', 'policy show go2_patrol@7'))
 @click.argument('name', required=False)
 @as_json
 def show(*, name: str | None, as_json: bool) -> ExitCode:
-    """Describe a version (NAME@7), by default the active one, and verify it."""
+    """Describe and verify the active version, or NAME@7."""
     folder = _policies()
     found = folder.find(name) if name else folder.current()
     if found is None:
@@ -259,7 +259,7 @@ def use(*, name: str, now: bool) -> ExitCode:
     return ExitCode.FINE
 
 
-@policy.command()
+@policy.command(epilog=examples('policy rollback'))
 def rollback() -> ExitCode:
     """Go back to the last good version, at once.
 
@@ -269,14 +269,14 @@ def rollback() -> ExitCode:
     return ExitCode.FINE
 
 
-@policy.command()
+@policy.command(epilog=examples('policy pin'))
 def pin() -> ExitCode:
     """Stay with the active version, whatever the registry says."""
     click.echo(f'pinned: {_policies().pin()}')
     return ExitCode.FINE
 
 
-@policy.command()
+@policy.command(epilog=examples('policy unpin'))
 def unpin() -> ExitCode:
     """Follow the registry again."""
     _policies().unpin()
@@ -287,7 +287,10 @@ def unpin() -> ExitCode:
 @click.option('--failures', type=click.IntRange(0), default=0, help='Failed steps among the last 100.')
 @click.option('--p99-ms', type=click.FloatRange(0.0), default=0.0, help='p99 of a step.')
 def report(*, failures: int, p99_ms: float) -> ExitCode:
-    """Say how the active version does; beyond its manifest's limits it is rolled back."""
+    """Report how the active version does.
+
+    Beyond the limits of its manifest it is rolled back.
+    """
     folder = _policies()
     name = folder.current()
     if name is None:

@@ -225,7 +225,7 @@ def test_a_spool_that_cannot_be_read_is_said_once(setting: Setting, caplog: pyte
         assert setting.status.look() is None
         assert setting.status.look() is None
     (record,) = caplog.records
-    assert 'the status cannot be told' in record.message
+    assert 'the status cannot be gathered' in record.message
 
 
 def broken() -> Any:

@@ -18,7 +18,7 @@ import shadowhound_data_logger
 from shadowhound_data_logger.cli import main as main_module
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode
 from shadowhound_data_logger.cli.main import GONE, PROGRAM, SECTIONS, cli, described, main, verb_of
-from shadowhound_data_logger.errors import BagError, DataLoggerError, SettingError, SettingGone
+from shadowhound_data_logger.errors import BagError, DataLoggerError, PolicyRefused, SettingError, SettingGone
 
 
 def verbs(command: click.Command = cli, path: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
@@ -69,7 +69,10 @@ def parsed(arguments: Sequence[str]) -> tuple[click.Command, click.Context]:
 def test_every_verb_has_examples_that_parse(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each is of this verb, or of one of its own; no option in it is unknown, without its value, or missing."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / 'bumps.json').write_text('[]')  # an answer of `query --json`, which some examples read
+    for file in ('bumps.json', 'sample.npz', 'spark.key', 'other.key'):  # which some examples read
+        (tmp_path / file).write_text('[]')
+    for folder in ('packed', 'outputs/go2_patrol'):
+        (tmp_path / folder).mkdir(parents=True)
     found = examples_of(name)
     assert found
     for example in found:
@@ -145,7 +148,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def made(kind: type[Exception]) -> Exception:
     if issubclass(kind, SettingError):
         return kind('camera.rate_hz', 'fast', 'a number')
-    return kind('it went wrong in /here')
+    return kind('reason', 'it went wrong in /here') if issubclass(kind, PolicyRefused) else kind('it went wrong in /here')
 
 
 def test_every_class_of_errors_has_a_remedy(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -32,7 +32,7 @@ STRING = 'std_msgs/msg/String'
 
 @dataclass(frozen=True, slots=True)
 class Objects:
-    """What the store holds of one robot (or below ``robot/sensor``), but for ledger, catalogue and gap journal."""
+    """What the store holds of one robot (or below ``robot/sensor``), but for bookkeeping, as ledger and catalogue."""
 
     contents: Mapping[str, bytes]
     """Key -> content."""
@@ -40,8 +40,7 @@ class Objects:
 
     @classmethod
     def of(cls, store: ObjectStore, bucket: str, robot: str) -> Objects:
-        books = f'{robot}/_ledger/', f'{robot}/_catalog/', f'{robot}/_gaps/'
-        keys = [info.key for info in store.list(bucket, f'{robot}/') if not info.key.startswith(books)]
+        keys = [info.key for info in store.list(bucket, f'{robot}/') if not info.key.startswith(f'{robot}/_')]
         infos = {key: store.head(bucket, key) for key in keys}
         return cls({key: store.get(bucket, key) for key in keys}, {key: info for key, info in infos.items() if info})
 
