@@ -47,9 +47,8 @@ def test_every_verb_and_option_exists() -> None:
             wrong.append(f'{where}: {match[0]}')
             continue
         options = {name for each in command.params for name in (*each.opts, *each.secondary_opts)} | {'--help'}
-        wrong += [
-            f'{where}: {word} of {match[0]}' for word in re.findall(r'(?<=\s)--[a-z][a-z0-9-]*', match['rest']) if word not in options
-        ]
+        words = re.findall(r'(?<=\s)--[a-z][a-z0-9-]*', match['rest'])
+        wrong += [f'{where}: {word} of {match[0]}' for word in words if word not in options]
         seen.add(match['verb'])
     assert wrong == []
     assert seen == set(cli.commands)
