@@ -114,11 +114,11 @@ def export(  # noqa: PLR0913 - the flags of the command
         built = _build(ready, options, fps, source.settings, folder / WORK, settings=settings, workers=workers, say=say)
         task = task_of(folder)
 
-        def added(plan: EpisodePlan) -> None:
+        def recorded(plan: EpisodePlan) -> None:
             if task is not None:
                 write_recordings(task, plan, source.settings, folder / WORK / 'look')
 
-        _put_together(made, built, options, settings, result, added)
+        _put_together(made, built, options, settings, result, recorded)
         if task is not None and made.rows:
             result.absent = synchronize(task)
         return result
@@ -273,7 +273,7 @@ def _tracks_of(plan: EpisodePlan) -> dict[str, Track]:
 
 
 def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings: Mapping[str, Any], result: Exported,
-                  added: Callable[[EpisodePlan], None]) -> None:  # fmt: skip
+                  recorded: Callable[[EpisodePlan], None]) -> None:  # fmt: skip
     folder = made.folder
     report: dict[str, Any] = {'settings': settings, 'episodes': _told_before(folder), 'dropped': made.dropped}
     new: dict[str, Path] = {}
@@ -284,11 +284,11 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
             continue
         split = split_of(mission, options.validation)
         try:
+            recorded(plan)
             made.add(told, work, options, split)
         except LakeError as error:
             result.refused[mission] = error.what
             continue
-        added(plan)
         result.added.append(told)
         new[mission] = work
         kept = {name: value for name, value in told.items() if name not in {'histograms', 'sizes'}}

@@ -28,6 +28,8 @@ from shadowhound_data_logger.datasets.lerobot import OURS, SOURCE_TABLE, VIDEO, 
 from shadowhound_data_logger.datasets.plan import EpisodePlan
 from shadowhound_data_logger.datasets.series import Recordings, Series
 from shadowhound_data_logger.disk import replacing
+from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.keys import is_name, printable
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.mcap.slice_info import Channel
@@ -61,17 +63,18 @@ def write_recordings(task: Path, plan: EpisodePlan, settings: StoreSettings, wor
     try:
         of_robot = Recordings(place, store, plan.tracks, plan.topics, (begin, plan.mission.end_ns), plan.bags, work)
         with of_robot as recordings:
-            folder = _fresh(task / GO2 / name)
+            folder = _fresh(_folder(task, GO2, name))
             if (odometry := recordings.best('odom')) is not None:
                 _write_odometry(folder / 'odometry.mcap', recordings.series(odometry, decode.ODOMETRY))
             if (joints := recordings.best('joints')) is not None:
                 _write_joints(folder / 'joint_states.csv', recordings.series(joints, ('position',)), None)
-        _write_json(folder / 'detections.json', list(_detections(plan, place)))
+        if seen := list(_detections(plan, place)):
+            _write_json(folder / 'detections.json', seen)
         if plan.arm is None or plan.arm.clock is None:
             return
         own = tuple(int(each) for each in plan.arm.clock.other_ns(np.array([begin, plan.mission.end_ns])))
         with Recordings(place, store, plan.arm.tracks, plan.arm.topics, (own[0], own[1]), plan.bags, work) as recordings:
-            folder = _fresh(task / ARM / name)
+            folder = _fresh(_folder(task, ARM, name))
             for sensor in (ARM_JOINTS, ARM_COMMANDS):
                 if (recording := recordings.best(sensor)) is not None:
                     series = recordings.series(recording, ('position',))
@@ -85,7 +88,7 @@ def synchronize(task: Path) -> list[str]:
     made = Lerobot(task / SET)
     for row in made.rows:
         for key in made.video_keys():
-            target = task / GO2 / row[f'{OURS}mission_id'] / f'camera_{key.rpartition(".")[2]}.mp4'
+            target = _folder(task, GO2, row[f'{OURS}mission_id']) / f'camera_{key.rpartition(".")[2]}.mp4'
             target.parent.mkdir(parents=True, exist_ok=True)
             if not target.is_file():
                 part = target.with_suffix('.part')
@@ -95,7 +98,10 @@ def synchronize(task: Path) -> list[str]:
         text = io.TextIOWrapper(file, 'utf-8', newline='')
         _write_timestamps(made, text)
         text.detach()  # which flushes
-    found = {row[f'{OURS}mission_id']: _read_json(task / GO2 / row[f'{OURS}mission_id'] / 'detections.json') for row in made.rows}
+    found = {
+        row[f'{OURS}mission_id']: _read_json(_folder(task, GO2, row[f'{OURS}mission_id']) / 'detections.json')
+        for row in made.rows
+    }
     if any(found.values()):
         told = [{'episode_index': row['episode_index'], 'mission_id': row[f'{OURS}mission_id'],
                  'detections': found[row[f'{OURS}mission_id']]} for row in made.rows]  # fmt: skip
@@ -108,7 +114,14 @@ def synchronize(task: Path) -> list[str]:
 def forget(task: Path, mission_id: str) -> None:
     """Remove what was recorded in a mission."""
     for part in (GO2, ARM):
-        rmtree(task / part / mission_id, ignore_errors=True)
+        rmtree(_folder(task, part, mission_id), ignore_errors=True)
+
+
+def _folder(task: Path, part: str, mission_id: str) -> Path:
+    """Of a mission. Its id comes from a store: raises LakeError for one that would lead out of the task's folder."""
+    if not is_name(mission_id):
+        raise LakeError(f'the mission {printable(mission_id)!r} has a name that no folder can have')
+    return task / part / mission_id
 
 
 def _fresh(folder: Path) -> Path:

@@ -27,6 +27,7 @@ from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.sim import demo_audit, demo_mission, demo_processes, demo_report, demo_run
 from shadowhound_data_logger.sim.mlflow_access import READER
+from shadowhound_data_logger.sim.so_arm import NAMESPACE
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 
@@ -54,7 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console(highlight=False)
     try:
         with fresh_folder(options.folder) as folder:
-            return run(folder, options.duration, options.outage, console, mlflow=options.mlflow, keeps=options.keep)
+            return run(
+                folder, options.duration, options.outage, console, mlflow=options.mlflow, keeps=options.keep, arm=options.arm
+            )
     except KeyboardInterrupt:
         console.print('\ndemo: stopped. What there is lies in the folder still.')
         return 130
@@ -67,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, mlflow: bool = True,
-        keeps: bool = False) -> int:  # fmt: skip
+        keeps: bool = False, arm: bool = False) -> int:  # fmt: skip
     """Everything, from an empty folder to the verdict; with ``keeps`` the page and the Tower stay until Ctrl-C."""
     console.print(f'[bold]A Go2 on patrol for {duration_s:g} s, its data logger, and a Tower to log to.')
     console.print(f'All of it on this machine, in {folder}/\n')
@@ -82,7 +85,8 @@ def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, m
         console.print(f'  S3 server  {tower.endpoint_url}')
         if mlflow:
             console.print(f'  MLflow     {tower.tracking_uri}')
-        record, run_id, page, address = _patrol(folder, tower, duration_s, outage_s, console, with_mission=mlflow, stack=stack)
+        record, run_id, page, address = _patrol(folder, tower, duration_s, outage_s, console, with_mission=mlflow, with_arm=arm,
+                                                stack=stack)  # fmt: skip
         drawn = [demo_mission.picture(tower.tracking(READER), run_id, folder / 'mission.png')] if run_id else []
         console.print('\nReading everything back from the S3 server ...\n')
         store = open_store(tower.store_settings(), UploadSettings())
@@ -114,13 +118,14 @@ def _tell(folder: Path, audit: demo_audit.DemoAudit, record: demo_run.Record, ru
     return 1 if audit.problems or record.errors else 0
 
 
-def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, console: Console, *,
-            with_mission: bool, stack: ExitStack) -> tuple[demo_run.Record, str, demo_processes.Child, str]:  # fmt: skip
+def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, console: Console, *,  # noqa: PLR0913 - as asked for
+            with_mission: bool, with_arm: bool, stack: ExitStack
+            ) -> tuple[demo_run.Record, str, demo_processes.Child, str]:  # fmt: skip
     """The minute itself, its mission's run if it is one, and the live page, which the stack ends; the others have ended."""
     environ = demo_processes.environment(folder / 'home', tower.environment(), demo_processes.free_domain())
     console.print(f'Starting the node and the robot (ROS_DOMAIN_ID={environ["ROS_DOMAIN_ID"]}, this machine only) ...')
     with (
-        demo_processes.start_logger(folder, environ) as node,
+        demo_processes.start_logger(folder, environ, arm=NAMESPACE if with_arm else '') as node,
         demo_run.StoreOutage(tower, (duration_s - outage_s) / 2, outage_s) as outage,
     ):
         page, address = demo_processes.start_page(folder, environ)
@@ -129,6 +134,9 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
         if outage_s:
             console.print(f'In the middle the S3 server goes away for {outage_s:g} s.\n')
         with ExitStack() as agents:
+            if with_arm:
+                module = 'shadowhound_data_logger.sim.so_arm'
+                agents.enter_context(demo_processes.Child(module, (), environ, folder / 'so_arm.log'))
             if with_mission:
                 agent = agents.enter_context(demo_mission.start(folder, environ))
             with demo_report.progress(console, duration_s) as show:
@@ -173,6 +181,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--folder', type=Path, default=Path('demo'), help='where all of it lies (default demo)')
     parser.add_argument('--keep', action='store_true', help='keep the live page and the Tower afterwards, until Ctrl-C')
+    parser.add_argument('--arm', action='store_true', help='with a simulated SO-ARM100, its clock 37 ms ahead (docs/datasets.md)')
     parser.add_argument('--no-mlflow', dest='mlflow', action='store_false', help='the S3 server only, which starts sooner')
     return parser
 

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from datasets.recorded import House, Mission, x_of
+from datasets.test_arm import record_arm
 
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
@@ -116,3 +117,20 @@ def test_what_was_exported_is_proved(house: House, tmp_path: Path) -> None:
     export(tmp_path / 'set', house.source, PATROLS, ExportOptions())
     with_lerobot(tmp_path, str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
     assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None).wrong == []
+
+
+def test_a_robot_with_its_arm(tmp_path: Path) -> None:
+    """Two sets of a task, each loaded by lerobot, and merged: the state at every tick is what was written, joint by joint."""
+    place = House(tmp_path / 'house')
+    for number in range(2):
+        record_arm(place, place.record(Mission(f'm{number}', begin_s=100 * number, seconds=2, sensors=('camera', 'odom'))))
+        export(
+            tmp_path / f'set{number}', place.source, {'mission': f'm{number}'}, ExportOptions(state=('velocity',), arm='soarm')
+        )
+    with_lerobot(tmp_path, '--merge', str(tmp_path / 'all'), str(tmp_path / 'set0'), str(tmp_path / 'set1'))
+    with_lerobot(tmp_path, str(tmp_path / 'out.npz'), str(tmp_path / 'all'))
+    told, made = np.load(tmp_path / 'out.npz'), [Lerobot(tmp_path / f'set{number}') for number in range(2)]
+    for key in ('observation.state', 'action'):
+        written = np.concatenate([each.numbers(each.rows[0], key) for each in made])
+        assert written.shape[1] == 9
+        assert told[key] == pytest.approx(written)

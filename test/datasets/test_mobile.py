@@ -19,8 +19,9 @@ from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.datasets.export import Exported, drop, export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.lerobot import Lerobot
-from shadowhound_data_logger.datasets.mobile import SET
+from shadowhound_data_logger.datasets.mobile import SET, forget
 from shadowhound_data_logger.datasets.video import video_frames
+from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.sim import so_arm
 from shadowhound_data_logger.stores import open_store
 
@@ -107,3 +108,13 @@ def test_detections_are_handed_on_and_a_mission_is_taken_out(house: House, tmp_p
     assert {row['mission_id'] for row in rows_of(task / 'synchronized/timestamps.csv')} == {'fetch0'}
     assert not (task / 'synchronized/detections.json').exists()
     assert np.all([path.name != 'fetch1' for path in task.rglob('*')])
+
+
+def test_a_mission_leads_nowhere_else(tmp_path: Path) -> None:
+    """Its id comes from a store: one that is a way out of the folder is refused, and nothing is removed."""
+    kept = tmp_path / 'kept'
+    kept.mkdir()
+    for name in ('../../kept', '..', '', str(kept)):
+        with pytest.raises(LakeError, match='a name that no folder can have'):
+            forget(tmp_path / 'fetch', name)
+    assert kept.is_dir()
