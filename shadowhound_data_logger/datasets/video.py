@@ -7,7 +7,9 @@ frames a second, exactly: the stream's time base is that or a fraction of it.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -54,6 +56,8 @@ class VideoWriter:
         self._stream.height, self._stream.width = self._size
         self._stream.pix_fmt = PIXELS
         self._stream.codec_context.time_base = Fraction(1, self._fps)
+        with _same_scheduling():
+            self._stream.codec_context.open(strict=False)
         return self
 
     def add(self, pixels: NDArray[np.uint8]) -> None:
@@ -67,6 +71,24 @@ class VideoWriter:
         if error is None:
             self._file.mux(self._stream.encode(None))
         self._file.close()
+
+
+@contextmanager
+def _same_scheduling() -> Iterator[None]:
+    """Threads that become or are made real-time ones meanwhile get the scheduling that the caller had.
+
+    SVT-AV1, run by root, gives its threads and its caller SCHED_FIFO at 99 (seen with PyAV 18.1): everything else on the machine
+    would wait for them.
+    """
+    if sys.platform != 'linux':
+        yield
+        return
+    before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    yield
+    for thread in Path('/proc/self/task').iterdir():
+        with suppress(ProcessLookupError):
+            if os.sched_getscheduler(int(thread.name)) == os.SCHED_FIFO != before:
+                os.sched_setscheduler(int(thread.name), before, parameters)
 
 
 def video_frames(path: Path) -> Iterator[tuple[float, NDArray[np.uint8]]]:

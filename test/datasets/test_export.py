@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,11 @@ from datasets.recorded import House, Mission, lost, x_of
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.datasets.export import Exported, drop, export, resumed, split_of
-from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.datasets.features import AV1, ExportOptions
 from shadowhound_data_logger.datasets.lerobot import DATA, OURS, Lerobot, matrix
 from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in, fetch_dataset, upload
 from shadowhound_data_logger.datasets.verify import seen_in_folder, seen_in_store, verify
-from shadowhound_data_logger.datasets.video import video_frames
+from shadowhound_data_logger.datasets.video import VideoWriter, video_frames
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.stores.directory import DirectoryStore
@@ -342,3 +343,11 @@ def test_lerobot_doctor_finds_nothing_wrong(exported: Exported) -> None:
     assert [
         (each.name, message.message) for each in results.results for message in each.messages if message.severity is Severity.FAIL
     ] == []
+
+
+def test_a_video_is_no_real_time_process(tmp_path: Path) -> None:
+    """Where root writes it, SVT-AV1 would have its way before everything else on the machine; elsewhere it may not."""
+    before = os.sched_getscheduler(0)
+    with VideoWriter(tmp_path / 'a.mp4', 10, (64, 64), AV1) as video:
+        video.add(np.zeros((64, 64, 3), np.uint8))
+        assert {os.sched_getscheduler(int(thread.name)) for thread in Path('/proc/self/task').iterdir()} == {before}
