@@ -30,6 +30,7 @@ def late(_sensor: str, number: int) -> int:
 
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.long('imports torch and lerobot'),
     pytest.mark.timeout(1500),
     pytest.mark.skipif(not PYTHON.is_file(), reason=f'there is no lerobot at {PYTHON} (docs/development.md)'),

@@ -23,6 +23,7 @@ PYTHON: Final = Path(os.environ.get('SHADOWHOUND_TRAIN', '~/.cache/shadowhound/t
 MAIN: Final = [sys.executable, '-m', 'shadowhound_data_logger.cli.main']
 
 
+@pytest.mark.slow
 @pytest.mark.long('trains with torch, and starts an MLflow server')
 @pytest.mark.timeout(900)
 @pytest.mark.skipif(not PYTHON.is_file(), reason=f'there is no torch at {PYTHON} (docs/development.md)')

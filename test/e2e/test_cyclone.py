@@ -64,6 +64,7 @@ def test_large_messages_come_as_they_do_to_cyclone_dds(processes: Processes, kin
     assert row['published'] == row['received'] + row['missed']
 
 
+@pytest.mark.slow
 @pytest.mark.long('a node that is stopped until Fast DDS loses its place')
 def test_a_publisher_that_outruns_the_node(processes: Processes) -> None:
     """It no longer has the parts that the node lacks, and Fast DDS loses its place: nothing is invented, the topic goes on.

@@ -13,6 +13,7 @@ from torture import losses
 pytestmark = pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')  # imported by children
 
 
+@pytest.mark.slow
 @pytest.mark.long('a minute of losses')
 def test_the_ledger_says_what_was_lost(tmp_path: Path) -> None:
     """The node stopped, starved, killed and away, a publisher killed and replaced: each figure is that of the numbers sent."""

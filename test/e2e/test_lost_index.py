@@ -9,6 +9,7 @@ import pytest
 from torture import lost_index
 
 
+@pytest.mark.slow
 @pytest.mark.long('two minutes of damage')
 def test_everything_goes_on_without_its_index(tmp_path: Path) -> None:
     """Deleted, cut and overwritten, with kills after it: nothing is stored twice or overwritten, and every claim is true.

@@ -97,6 +97,7 @@ def test_a_mission_has_its_data_and_nothing_else_is_stored(
     assert {key.split('/')[1] for key in objects.infos} >= {'camera', 'imu', 'lidar', 'lowstate', 'odom', 'states'}
 
 
+@pytest.mark.slow
 @pytest.mark.long('half a minute')
 def test_a_run_has_what_the_node_measured(processes: Processes, tower: Tower, monkeypatch: pytest.MonkeyPatch) -> None:
     """A real MLflow server has the whole mission of an agent that only starts and ends it, and the objects name its run."""

@@ -16,7 +16,7 @@ from missions.server import Server, complete, until
 
 from shadowhound_data_logger import MissionDataLogger
 
-pytestmark = [pytest.mark.seaweedfs, pytest.mark.slow]
+pytestmark = pytest.mark.seaweedfs
 
 EXECUTOR: Final = """
 class MissionExecutor:

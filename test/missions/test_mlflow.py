@@ -21,7 +21,7 @@ from shadowhound_data_logger.missions.folder import MISSIONS, missions, read_jso
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.tracking import DUPLICATE_TAG, MISSION_TAG, MlflowTracking
 
-pytestmark = [pytest.mark.seaweedfs, pytest.mark.slow]
+pytestmark = pytest.mark.seaweedfs
 
 
 def fly(logger: MissionDataLogger, command: str, tmp_path: Path) -> str:
@@ -91,6 +91,7 @@ def test_a_run_lives_while_its_mission_does(server: Server, warm_home: Path) -> 
     until(lambda: complete(warm_home, 2), 'both are sent')
 
 
+@pytest.mark.slow
 @pytest.mark.long('a kill')
 def test_tower_away_for_the_whole_mission(server: Server, home: Path, tmp_path: Path) -> None:
     """No call waits for it; when it is back, after the robot's next start, the run is whole with the original times."""

@@ -327,7 +327,6 @@ def test_a_node_that_logged_an_error_is_told(tmp_path: Path, line: str) -> None:
 @pytest.mark.long('a whole demo')
 @pytest.mark.ros
 @pytest.mark.seaweedfs
-@pytest.mark.slow
 def test_a_short_demo_ends_well(tmp_path: Path) -> None:
     """With a real Tower, the real node, a mission and the simulated robot: exit code 0, a ledger that balances, four pictures."""
     pytest.importorskip('rclpy')

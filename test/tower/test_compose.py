@@ -98,6 +98,7 @@ def test_mlflow_asks_for_passwords_and_never_runs_as_root(services: dict[str, An
     assert 'exec setpriv --reuid=mlflow' in secured['mlflow']['entrypoint'][2]
 
 
+@pytest.mark.slow
 @pytest.mark.long('an MLflow server of its own')
 def test_mlflow_starts_from_one_file(services: dict[str, Any], tmp_path: Path) -> None:
     """As in its container, where the rest of the package is not: it knows users and experiments, and stops when told."""
