@@ -112,7 +112,10 @@ print((rss() - before) / limit, ring.bytes / limit)
 """
 
 
-@pytest.mark.parametrize('size', [20, 300, 50_000, 921_600])
+MORE = [pytest.param(size, marks=pytest.mark.long('a process for each')) for size in (300, 921_600)]
+
+
+@pytest.mark.parametrize('size', [20, 50_000, *MORE])
 def test_memory_is_bounded_by_the_limit_of_bytes(size: int) -> None:
     """Filled four times over, the process grew by the limit and a tenth at most, whether messages are small or large."""
     ran = subprocess.run([sys.executable, '-c', PROGRAM, str(size)], capture_output=True, text=True, check=True, timeout=60)

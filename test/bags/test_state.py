@@ -57,7 +57,7 @@ def test_each_change_is_told_alone(state: BagState) -> None:
     assert ([one.number for one in rows.slices], rows.missing) == ([2], ())
 
 
-@pytest.mark.parametrize('size', [1 << 20, 64 << 20])
+@pytest.mark.parametrize('size', [1 << 20, pytest.param(64 << 20, marks=pytest.mark.long('64 MB'))])
 def test_a_record_takes_a_hundredth_of_a_slice(tmp_path: Path, size: int) -> None:
     """However many slices a bag has: the newest are in it, and so is what was lost last."""
     topics = tuple(replace(IMU, topic=f'/robot/topic_{number}', qos='q' * 400) for number in range(20))

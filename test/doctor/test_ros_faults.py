@@ -141,6 +141,7 @@ def test_no_go2_interfaces(scene: Scene, domain: int, tmp_path: Path) -> None:
     assert 'ros.topics' in found  # and all else was asked as well
 
 
+@pytest.mark.long('a robot and a node with Cyclone DDS')
 def test_a_robot_with_cyclone_dds_is_heard_as_the_node_hears_it(scene: Scene, domain: int) -> None:
     """Through Fast DDS, with numbers, though the variables of the shell name an RMW that numbers nothing."""
     pytest.importorskip('cyclonedds')

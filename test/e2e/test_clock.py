@@ -118,6 +118,7 @@ def test_a_clock_that_is_set_later(robot: Robot) -> None:
     assert 'set_later' in robot.clocks_of('_ledger'), 'that of the stop in 1970'
 
 
+@pytest.mark.long('ten seconds of a clock that is not set')
 def test_bags_of_a_clock_that_is_set_later(robot: Robot, tmp_path: Path) -> None:
     """Each has the date at which it began, also one that ended before anybody knew it; none spans the moment, nothing is lost."""
     robot.node.stop()

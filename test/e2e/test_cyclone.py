@@ -21,7 +21,7 @@ COUNT = 200
 SENSORS = {'sensors': ['plain'], 'plain.topics': ['plain'], 'plain.rate_hz': 0.0, 'plain.batch_s': 0.2}
 
 
-@pytest.mark.parametrize('reliable', [False, True])
+@pytest.mark.parametrize('reliable', [False, pytest.param(True, marks=pytest.mark.long('a robot of its own'))])
 def test_the_account_of_a_cyclone_robot_is_exact(processes: Processes, *, reliable: bool) -> None:
     """Its messages are numbered for us, though its own RMW would not tell; the first line says how we listen."""
     node = processes.node(None, SENSORS, environ=CYCLONE)

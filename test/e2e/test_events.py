@@ -89,6 +89,7 @@ def test_what_came_before_a_trigger_and_after_it_is_in_a_bag(
     assert node.stop()['events'][TOPIC]['received'] == 30
 
 
+@pytest.mark.long('fifteen seconds of events')
 def test_conditions_and_what_an_agent_logs_trigger(processes: Processes, seaweed: Tower, store: ObjectStore) -> None:
     """Over all topics of the robot, from the subscriptions that serve objects and a bag as well; nothing of it is lost."""
     parameters = {

@@ -57,6 +57,9 @@ def wire(seaweed: Tower) -> Iterator[Wire]:
         yield proxy
 
 
+MORE = pytest.mark.long('four seconds each')
+
+
 @pytest.fixture(scope='module')
 def wired(shared: Processes, seaweed: Tower, wire: Wire) -> Talk:
     """A node that reaches the server by the wire."""
@@ -68,10 +71,10 @@ def wired(shared: Processes, seaweed: Tower, wire: Wire) -> Talk:
     [
         pytest.param(REFUSE, 'refused the connection (is the S3 server running?', id='refused connection'),
         pytest.param(HANG, 'gave no answer within 1 s (does the server hang?', id='hung connection'),
-        pytest.param((500, 'InternalError'), 'answers with a server error (500 InternalError)', id='server error'),
+        pytest.param((500, 'InternalError'), 'answers with a server error (500 InternalError)', id='server error', marks=MORE),
         pytest.param((503, 'SlowDown'), 'is overloaded (503 SlowDown)', id='overload'),
         pytest.param((403, 'SignatureDoesNotMatch'), 'refuses the signature: the secret key is wrong', id='wrong secret'),
-        pytest.param((403, 'RequestTimeTooSkewed'), 'the clocks of this machine and of', id='wrong clock'),
+        pytest.param((403, 'RequestTimeTooSkewed'), 'the clocks of this machine and of', id='wrong clock', marks=MORE),
     ],
 )
 def test_a_store_that_fails_and_recovers(

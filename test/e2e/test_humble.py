@@ -111,7 +111,13 @@ def humble(folder: Path, rmw: str) -> dict[str, str]:
 
 
 @newer
-@pytest.mark.parametrize(('rmw', 'grades'), [(FAST_DDS, {'exact'}), (CYCLONE_DDS, {'estimated', 'received-only'})])
+@pytest.mark.parametrize(
+    ('rmw', 'grades'),
+    [
+        pytest.param(FAST_DDS, {'exact'}, marks=pytest.mark.long('a robot and a node of each middleware')),
+        (CYCLONE_DDS, {'estimated', 'received-only'}),
+    ],
+)
 def test_all_is_stored_and_what_is_not_known_is_null(
     processes: Processes, seaweed: Tower, stored: Callable[..., Objects], tmp_path: Path, rmw: str, grades: set[str]
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import pytest
 from e2e.bag_reading import Bag, bags
 from e2e.processes import Processes, until
 from e2e.reading import STRING, decode, texts
@@ -25,6 +26,7 @@ def latched(bag: Bag) -> list[tuple[str, str]]:
     return sorted((each.topic, decode(STRING, each.cdr).data) for each in bag.messages() if each.topic != TALK)
 
 
+@pytest.mark.long('twelve seconds of bags')
 def test_what_is_latched_is_at_the_start_of_every_bag(
     processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
 ) -> None:

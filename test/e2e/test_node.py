@@ -183,6 +183,7 @@ def without_go2_interfaces() -> dict[str, str]:
 HIDE_GO2 = "import sys\nsys.modules['go2_interfaces'] = None\n"
 
 
+@pytest.mark.long('a node of its own')
 def test_go2_interfaces_is_not_installed(processes: Processes, tmp_path: Path) -> None:
     """Its topics cost one warning each, and the others go on."""
     (tmp_path / 'hidden').mkdir()

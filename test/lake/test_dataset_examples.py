@@ -50,6 +50,7 @@ def test_a_policy_is_trained_and_its_run_is_in_mlflow(tmp_path: Path) -> None:
 
 
 @pytest.mark.seaweedfs
+@pytest.mark.long('processes that import much')
 def test_frames_are_judged_by_several_processes(tmp_path: Path, seaweed: Tower) -> None:
     """Every frame of the robot once, and no secret in what the processes say."""
     pytest.importorskip('daft')

@@ -24,7 +24,7 @@ def run_of(tracking: MlflowTracking) -> Run:
     return tracking.run_of('patrol_1', 'patrol', 1_760_788_800_000, {'mlflow.user': 'thor'})
 
 
-@pytest.fixture(params=['sqlite', 'file'])
+@pytest.fixture(params=[pytest.param('sqlite', marks=pytest.mark.long('makes a database of MLflow')), 'file'])
 def tracking(request: pytest.FixtureRequest, database: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MlflowTracking:
     monkeypatch.setenv('MLFLOW_ALLOW_FILE_STORE', 'true')
     monkeypatch.setenv('MLFLOW_DISABLE_TELEMETRY', 'true')

@@ -73,6 +73,7 @@ def test_a_mission_is_in_mlflow_and_in_the_store(server: Server, warm_home: Path
     check(server, 'whole', warm_home)
 
 
+@pytest.mark.long('seconds of a heartbeat')
 def test_a_run_lives_while_its_mission_does(server: Server, warm_home: Path) -> None:
     """What was logged is in the run before the mission ends, and a mission of another logger has a run of its own."""
     one, two = (MissionDataLogger(home=warm_home, start_timeout_s=60.0) for _ in range(2))

@@ -131,7 +131,7 @@ def test_the_go2_messages_belong_together(some_seconds: Run) -> None:
     assert -2.8 < front_right < -0.8
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long('a robot of its own'))])
 def test_a_signal_ends_it_with_its_account(number: signal.Signals, domain: int) -> None:
     """SIGINT and SIGTERM both lead to the line of JSON and exit code 0, soon."""
     process = subprocess.Popen(
@@ -166,6 +166,7 @@ def _wait_for_publisher(process: subprocess.Popen[str], domain: int) -> bool:
     return False
 
 
+@pytest.mark.long('a robot of its own')
 def test_without_go2_interfaces_it_runs_with_the_rest(tmp_path: Path, domain: int) -> None:
     """The topics of go2_interfaces are missing, all others are there, and one line on stderr says so."""
     missing = tmp_path / 'go2_interfaces'

@@ -289,6 +289,7 @@ def test_the_lifecycle_deletes_for_nobody_else(opened: Running, closed: Running)
     assert closed.client(closed.robot).get_object(Bucket='sensor-data', Key='thor/kept')['Body'].read() == b'one'
 
 
+@LONG
 def test_no_method_answers(opened: Running, closed: Running) -> None:
     """All that this version of SeaweedFS offers by gRPC, as the one without keys tells it."""
     servers = [server for server in closed.ports if server != 'admin']
@@ -386,6 +387,7 @@ def test_a_neighbour_reaches_s3_and_mlflow_alone(closed: Running) -> None:
     assert reach(closed.host, sorted(listening), closed.namespace) == {s3, s3 + GRPC, s3 - PORTS['s3'] + 5001}
 
 
+@pytest.mark.long('a Tower of its own')
 def test_a_tower_knocks_at_its_own_ports_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After its start, at the address of others and at its own: another Tower beside it is none of its business."""
     asked: set[tuple[str, int]] = set()
