@@ -50,6 +50,7 @@ CERTIFICATE_DAYS = 36500
 """It is for SeaweedFS's own servers alone, which trust this one certificate and no authority: new files replace it."""
 CA_FILE = '/etc/shadowhound/ca.pem'
 """Where Thor and Spark keep the certificate of a private authority."""
+S3_PORT, MLFLOW_PORT = 9000, 5001
 
 
 class Refused(Exception):
@@ -131,13 +132,16 @@ def logins(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
     return json.dumps(digests, indent=1) + '\n'
 
 
-def environment(user: str, key: Mapping[str, str], host: str, scheme: str) -> str:
+def environment(user: str, key: Mapping[str, str], settings: Mapping[str, str]) -> str:
     """What a machine needs to reach this Tower as this user, for a shell and for systemd's EnvironmentFile alike."""
-    store = f'{scheme}://{host}:9000'
+    scheme, offset = settings['TOWER_SCHEME'], int(settings['TOWER_OFFSET'])
+    server = f'{scheme}://{settings["TOWER_HOST"]}'
+    store = f'{server}:{S3_PORT + offset}'
     values = {
         **({'AWS_CA_BUNDLE': CA_FILE, 'MLFLOW_TRACKING_SERVER_CERT_PATH': CA_FILE} if scheme == 'https' else {}),
         'AWS_ENDPOINT_URL': store, 'AWS_ACCESS_KEY_ID': key['accessKey'], 'AWS_SECRET_ACCESS_KEY': key['secretKey'],
-        'AWS_DEFAULT_REGION': 'us-east-1', 'MLFLOW_TRACKING_URI': f'{scheme}://{host}:5001', 'MLFLOW_S3_ENDPOINT_URL': store,
+        'AWS_DEFAULT_REGION': 'us-east-1', 'MLFLOW_TRACKING_URI': f'{server}:{MLFLOW_PORT + offset}',
+        'MLFLOW_S3_ENDPOINT_URL': store,
     }  # fmt: skip
     if user != NO_LOGIN:
         values |= {'MLFLOW_TRACKING_USERNAME': user, 'MLFLOW_TRACKING_PASSWORD': key['password']}
@@ -158,11 +162,14 @@ def has_certificate(folder: Path) -> bool:
     return (folder / 'tls' / 'tower.crt').is_file()
 
 
-def own_settings(folder: Path, host: str | None, users: Mapping[str, Sequence[Mapping[str, str]]]) -> dict[str, str]:
+def own_settings(
+    folder: Path, host: str | None, offset: int | None, users: Mapping[str, Sequence[Mapping[str, str]]]
+) -> dict[str, str]:
     """What the servers themselves need; passwords that exist stay."""
     before = read_env(folder / '.env')
     tower, mlflow = users['tower'][0], users['mlflow'][0]
     return {
+        'TOWER_OFFSET': str(int(before.get('TOWER_OFFSET') or 0) if offset is None else offset),
         'TOWER_HOST': host or before.get('TOWER_HOST') or '127.0.0.1',
         'TOWER_SCHEME': 'https' if has_certificate(folder) else 'http',
         'POSTGRES_PASSWORD': before.get('POSTGRES_PASSWORD') or secrets.token_hex(24),
@@ -201,10 +208,12 @@ def seaweed_environment(before: Mapping[str, str]) -> dict[str, str]:
     return {**signing, 'WEED_GRPC_CA': CERTIFICATE, **pairs}
 
 
-def make(
-    folder: Path, host: str | None, robots: Sequence[str], rotate: Sequence[str] = (), retire: Sequence[str] = ()
-) -> list[str]:
-    """Write all files anew from what is there and what is asked for; returns the users. Raises Refused for a bad name."""
+def make(folder: Path, host: str | None, robots: Sequence[str], rotate: Sequence[str] = (), retire: Sequence[str] = (), *,
+         offset: int | None = None) -> list[str]:  # fmt: skip
+    """Write all files anew from what is there and what is asked for; returns the users. Raises Refused for a bad name.
+
+    ``offset`` is what the servers add to their ports; None for what it was before.
+    """
     hidden = folder / 'secrets'
     hidden.mkdir(mode=0o700, parents=True, exist_ok=True)
     hidden.chmod(0o700)
@@ -223,7 +232,7 @@ def make(
         users[name].insert(0, new_key())
     for name in retire:
         del users[name][1:]
-    settings = own_settings(folder, host, users)
+    settings = own_settings(folder, host, offset, users)
     write(hidden / 'users.json', json.dumps(users, indent=1) + '\n')
     write(hidden / 's3.json', seaweed(users))
     if not all((hidden / name).is_file() for name in (CERTIFICATE, CERTIFICATE_KEY)):
@@ -235,7 +244,7 @@ def make(
     write(folder / '.env', lines(settings))
     for name, keys in users.items():
         write(hidden / f'{name}.credentials', credentials(name, keys[0]))
-        write(hidden / f'{name}.env', environment(name, keys[0], settings['TOWER_HOST'], settings['TOWER_SCHEME']))
+        write(hidden / f'{name}.env', environment(name, keys[0], settings))
     return list(users)
 
 
@@ -244,6 +253,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description='Make the credentials of a Tower. What is there already stays.')
     parser.add_argument('--folder', type=Path, default=HERE, help='where .env and secrets/ go (default: beside this script)')
     parser.add_argument('--host', help='the address that Thor and Spark reach this Tower at; without one it listens on 127.0.0.1')
+    parser.add_argument('--offset', type=int, metavar='N', help='what the servers add to their ports (run.py --offset)')
     parser.add_argument(
         '--robot', action='append', default=[], metavar='NAME', help='a robot (default: thor); more than one allowed'
     )
@@ -251,7 +261,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--retire', action='append', default=[], metavar='USER', help='only the newest key stays')
     options: Any = parser.parse_args(arguments)
     try:
-        users = make(options.folder, options.host, options.robot or ['thor'], options.rotate, options.retire)
+        users = make(
+            options.folder, options.host, options.robot or ['thor'], options.rotate, options.retire, offset=options.offset
+        )
     except (Refused, OSError, ValueError) as error:
         print(f'make_secrets: {error}', file=sys.stderr)
         return 2

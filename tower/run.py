@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Final
 
 import make_secrets
+from make_secrets import MLFLOW_PORT, S3_PORT
 
 from shadowhound_data_logger.doctor import seaweedfs
 from shadowhound_data_logger.errors import DataLoggerError
@@ -34,7 +35,7 @@ from shadowhound_data_logger.sim import mlflow_access
 from shadowhound_data_logger.sim.servers import GRPC, Server, ServerFailed, find_program, seaweed_sockets
 
 HERE: Final = Path(__file__).resolve().parent
-S3_PORT, MLFLOW_PORT, POSTGRES_PORT, MASTER_PORT = 9000, 5001, 5432, 9333
+POSTGRES_PORT, MASTER_PORT = 5432, 9333
 LOOPBACK: Final = '127.0.0.1'
 EVERY_ADDRESS: Final = ('0.0.0.0', '::')  # noqa: S104 - as it may be asked for
 READY_S: Final = 120.0
@@ -311,9 +312,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if (options.folder / '.env').exists():
-            make_secrets.make(options.folder, None, [])  # what a newer version needs besides
+            make_secrets.make(options.folder, None, [], offset=options.offset)  # what a newer version needs besides
         else:
-            make_secrets.make(options.folder, options.bind, ['thor'])
+            make_secrets.make(options.folder, options.bind, ['thor'], offset=options.offset)
         bind = options.bind or make_secrets.read_env(options.folder / '.env')['TOWER_HOST']
         users = make_secrets.load_users(options.folder / 'secrets' / 'users.json')
         tower = Runner(options.folder, bind, options.offset)

@@ -53,6 +53,17 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
     assert tachi['SHADOWHOUND_ROBOT'] == 'tachi'
 
 
+def test_the_files_of_users_name_the_ports_of_their_tower(tmp_path: Path) -> None:
+    """Also when a key is changed later; a Tower at the usual ports gets these back."""
+    make_secrets.make(tmp_path, '192.168.1.10', ['thor'], offset=1000)
+    make_secrets.make(tmp_path, None, [], rotate=['thor'])
+    thor = make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')
+    assert thor['AWS_ENDPOINT_URL'] == thor['MLFLOW_S3_ENDPOINT_URL'] == 'http://192.168.1.10:10000'
+    assert thor['MLFLOW_TRACKING_URI'] == 'http://192.168.1.10:6001'
+    make_secrets.make(tmp_path, None, [], offset=0)
+    assert make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')['MLFLOW_TRACKING_URI'] == 'http://192.168.1.10:5001'
+
+
 def test_an_older_folder_gets_what_it_lacks(tmp_path: Path) -> None:
     """The signing keys and the certificate of SeaweedFS are added, once, beside keys and passwords that stay."""
     make_secrets.make(tmp_path, '192.168.1.10', ['thor'])

@@ -72,10 +72,11 @@ def processes(tmp_path: Path) -> Iterator[Processes]:
 
 
 def environment(folder: Path, user: str, offset: int) -> dict[str, str]:
-    """Of the file that make_secrets.py wrote, with the ports of this Tower and the authority where it is."""
+    """Of the file that the Tower wrote, with the authority where it is here."""
     found: dict[str, str] = make_secrets.read_env(folder / 'secrets' / f'{user}.env')
-    text = json.dumps(found).replace(':9000', f':{9000 + offset}').replace(':5001', f':{5001 + offset}')
-    return json.loads(text.replace('/etc/shadowhound/ca.pem', str(folder / 'tls' / 'ca.pem')))  # type: ignore[no-any-return]
+    assert found['AWS_ENDPOINT_URL'].endswith(f':{9000 + offset}')
+    assert found['MLFLOW_TRACKING_URI'].endswith(f':{5001 + offset}')
+    return json.loads(json.dumps(found).replace('/etc/shadowhound/ca.pem', str(folder / 'tls' / 'ca.pem')))  # type: ignore[no-any-return]
 
 
 def rotate(folder: Path, file: Path, secrets: list[str]) -> None:
