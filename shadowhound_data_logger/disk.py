@@ -64,10 +64,10 @@ def lock(file: int | IO[bytes], *, wait: bool = True, shared: bool = False) -> b
 
 
 @contextmanager
-def flock(path: Path, *, wait: bool = True, mode: int = 0o600) -> Iterator[bool]:
+def flock(path: Path, *, wait: bool = True, shared: bool = False, mode: int = 0o600) -> Iterator[bool]:
     """The same on a file that is made for it, with this mode; yields whether it was had."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, mode)
     try:
-        yield lock(descriptor, wait=wait)
+        yield lock(descriptor, wait=wait, shared=shared)
     finally:
         os.close(descriptor)

@@ -2,6 +2,9 @@
 
 One a home works at a time (a lock that dies with it); others wait. It outlives the agent until all is sent, or Tower was
 away for ``LINGER_S``: what is left then waits for the next start. Standard input wakes it; its end is that of the agent.
+
+One whose agent is gone makes way for one whose agent lives, because that one may know a better address or password. Whoever
+waits holds a second lock, shared, which dies with it as well.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import shutil
 import signal
 import sqlite3
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
@@ -75,6 +79,10 @@ LOOK_EVERY_S: Final = 0.5
 """How often the journals are looked at when nobody wakes it."""
 LINGER_S: Final = 600.0
 """How long it tries on after the agent ended and nothing gets through."""
+HANG_S: Final = 3.0
+"""How long a request that hangs may keep it from making way."""
+WAITING: Final = 'replay.waiting'
+"""Beside the missions: locked, shared, by those that wait for an agent that lives."""
 KEEP_S: Final = 30 * 86_400.0
 """How long a mission that has arrived stays on the robot; looked at when a sender starts."""
 NICE: Final = 5
@@ -255,6 +263,52 @@ class Parent:
         self.gone = bool(ready and not said) or os.getppid() != self._pid
         return bool(said)
 
+    def has_ended(self) -> bool:
+        """The same as ``gone``, asked of the system, from any thread."""
+        poll = select.poll()
+        poll.register(self._descriptor, 0)
+        return bool(poll.poll(0)) or os.getppid() != self._pid
+
+
+class Successor:
+    """Looks whether a sender of an agent that lives waits for this one, whose agent is gone.
+
+    Life: New; start once; stop once. It owns its thread. A request that hangs does not hold it up: ``HANG_S`` after it saw one,
+    it ends the process, which is as safe as any kill of it.
+    """
+
+    def __init__(self, waiting: Path, parent: Parent, end: Callable[[int], object] = os._exit) -> None:
+        self._waiting = waiting
+        self._parent = parent
+        self._end = end
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name='successor', daemon=True)
+        self.waits = False
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self.waits:
+            if self._stopped.wait(LOOK_EVERY_S):
+                return
+            self.waits = self._parent.has_ended() and self._somebody_waits()
+        log.info('a sender of another agent takes over')
+        if not self._stopped.wait(HANG_S):
+            self._end(0)
+
+    def _somebody_waits(self) -> bool:
+        try:
+            with flock(self._waiting, wait=False) as free:
+                return not free
+        except OSError as error:
+            log.warning('%s cannot be looked at: %s', self._waiting, error)
+            return False
+
 
 def run(replay: Replay, parent: Parent, stopping: Callable[[], bool]) -> None:
     """Until all is sent and the agent is gone; or for ``LINGER_S`` after the last success."""
@@ -284,12 +338,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.nice(NICE)
     logging.basicConfig(level=logging.INFO, format='%(asctime)s %(levelname)s %(message)s')
     parent = Parent(sys.stdin.fileno())
+    folder: Path = options.home / MISSIONS
     with ExitStack() as opened:
-        while not opened.enter_context(flock(options.home / MISSIONS / LOCK, wait=False)):
-            opened.close()
-            parent.wait(LOOK_EVERY_S)
-            if parent.gone or asked:
-                return 0
+        if not _locked(folder, opened, parent, lambda: bool(asked)):
+            return 0
+        successor = Successor(folder / WAITING, parent)
+        successor.start()
+        opened.callback(successor.stop)
         settings, clock = Settings.load({}, {**os.environ, 'SHADOWHOUND_HOME': str(options.home)}), SystemClock.of_this_machine()
         tracking = open_tracking(options.home, options.experiment)
         dating = Dating(clock, settings.clock.hold_s, lambda: clock_record.read(settings.spool_path, settings.robot)['offsets'])
@@ -297,8 +352,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.home, tracking, Spooler(settings, clock), Drawing(), settle=lambda folder: give_date(folder, dating)
         )
         opened.callback(replay.close)
-        run(replay, parent, lambda: bool(asked))
+        run(replay, parent, lambda: bool(asked) or successor.waits)
     return 0
+
+
+def _locked(folder: Path, opened: ExitStack, parent: Parent, stopping: Callable[[], bool]) -> bool:
+    """Wait until no other process sends; whether that came before the agent's end. Raises OSError."""
+    with flock(folder / WAITING, shared=True):
+        while not opened.enter_context(flock(folder / LOCK, wait=False)):
+            opened.close()
+            parent.wait(LOOK_EVERY_S)
+            if parent.gone or stopping():
+                return False
+    return True
 
 
 def open_tracking(home: Path, experiment: str) -> MlflowTracking:

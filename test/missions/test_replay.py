@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import random
+import socket
 import subprocess
 import sys
+import threading
 import time
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,7 +23,7 @@ from shadowhound_data_logger.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, Run, missions, read_json
 from shadowhound_data_logger.missions.overview import report
-from shadowhound_data_logger.missions.replay import KEEP_S, LINGER_S, Gate, Parent, Replay, open_tracking, run
+from shadowhound_data_logger.missions.replay import KEEP_S, LINGER_S, Gate, Parent, Replay, Successor, open_tracking, run
 
 
 class Now:
@@ -225,6 +228,48 @@ def test_a_second_one_waits_and_ends_with_its_agent(tmp_path: Path) -> None:
             waiting.wait(1.0)
         waiting.stdin.close()
         assert waiting.wait(60.0) == 0
+
+
+def test_one_whose_agent_is_gone_makes_way_for_another(tmp_path: Path) -> None:
+    """As soon as somebody waits; while its own agent lives it does not, and a request that hangs ends with its process."""
+    waiting, ends = tmp_path / 'replay.waiting', threading.Event()
+    reader, writer = os.pipe()
+    parent = Parent(reader)
+    successor = Successor(waiting, parent, lambda _: ends.set())
+    successor.start()
+    try:
+        with flock(waiting, shared=True):
+            fly(tmp_path)
+            replay, looks = new_replay(tmp_path, FakeTracking(fail=lambda _: True)), iter([False, False, True])
+            run(replay, parent, lambda: successor.waits or next(looks))
+            assert not successor.waits
+            os.close(writer)
+            run(replay, parent, lambda: successor.waits)
+            assert ends.wait(60.0)
+    finally:
+        successor.stop()
+        os.close(reader)
+
+
+@pytest.mark.long('two processes that load MLflow')
+def test_a_corrected_address_is_used_though_an_earlier_sender_is_stuck(tmp_path: Path) -> None:
+    """The address of an agent that was killed answers nothing; the sender of the next agent takes over and sends the mission."""
+    mission_id = fly(tmp_path)
+    command = [sys.executable, '-m', 'shadowhound_data_logger.missions.replay', '--home', str(tmp_path), '--experiment', 'x']
+    with socket.create_server(('127.0.0.1', 0)) as silent, ExitStack() as running:
+        environ = {**os.environ, 'MLFLOW_TRACKING_URI': f'http://127.0.0.1:{silent.getsockname()[1]}'}
+        first = running.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, env=environ))
+        running.callback(first.kill)
+        assert first.stdin is not None
+        silent.settimeout(60.0)
+        asked, _ = silent.accept()
+        running.callback(asked.close)
+        first.stdin.close()
+        environ['MLFLOW_TRACKING_URI'] = f'sqlite:///{tmp_path}/mlflow.db'
+        second = running.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, env=environ))
+        running.callback(second.kill)
+        assert first.wait(60.0) == 0
+        until(lambda: MissionFolder(tmp_path / MISSIONS / mission_id).sent().complete, 'the mission is sent', 120.0)
 
 
 def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
