@@ -16,7 +16,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
 from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.missions import copies, values
@@ -43,6 +43,7 @@ class Mission:
     def __init__(self, folder: MissionFolder, journal: Journal, frame_artifact_every_s: float, clock: Clock) -> None:
         self.folder = folder
         self._clock = clock
+        self._began_ns = clock.boot_ns()
         self._journal = journal
         self._frames = copies.Spares(folder.files)
         self._every_s = frame_artifact_every_s
@@ -123,7 +124,8 @@ class Mission:
     def end(self, success: bool = True, distance_m: float | None = None, duration_s: float | None = None, *,
             status: str | None = None, error: str | None = None) -> None:  # fmt: skip
         """The last record: FINISHED or FAILED unless ``status`` (KILLED) says otherwise. What is not stated is measured."""
-        stated: dict[str, Any] = {'success': values.truth(success)}
+        elapsed_s = (self._clock.boot_ns() - self._began_ns) / SECOND
+        stated: dict[str, Any] = {'success': values.truth(success), 'elapsed_s': round(elapsed_s, 6)}
         for name, value in (('distance_m', distance_m), ('duration_s', duration_s)):
             try:
                 stated[name] = None if value is None else values.number(value, name)

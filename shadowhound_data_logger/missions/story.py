@@ -2,8 +2,8 @@
 
 The records of a journal, by their ``k``: ``start`` (type, command, robot, policy), ``metrics`` (m: key -> value, s: step),
 ``frame``, ``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``refused`` (reason), ``end`` (status, what the
-agent stated), and of the node ``poses``. Every record has ``t``, ns since 1970 UTC. ``summary_of`` makes ``summary.json`` of
-it, the same in the run, in the store and in the mission's folder.
+agent stated, elapsed_s: how long it took), and of the node ``poses``. Every record has ``t``, ns since 1970 UTC. ``summary_of``
+makes ``summary.json`` of it, the same in the run, in the store and in the mission's folder.
 """
 
 from __future__ import annotations
@@ -108,12 +108,16 @@ class Story:
 
     @property
     def duration_s(self) -> float:
-        """What the agent states when it is positive, else the time from start to end."""
+        """What the agent states when it is positive, else what was measured."""
         stated = self.end.get('duration_s')
         return float(stated) if stated is not None and stated > 0 else self.measured_s
 
     @property
     def measured_s(self) -> float:
+        """From start to end by a clock that never steps; of an agent that died, by the times of its records."""
+        elapsed_s = self.end.get('elapsed_s')
+        if elapsed_s is not None:
+            return float(elapsed_s)
         return max(0, int(self.end.get('t', self.last_ns)) - int(self.start.get('t', 0))) / SECOND
 
     @property

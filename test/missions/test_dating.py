@@ -48,6 +48,20 @@ def fly(home: Path, clocks: Clocks, *, is_set_meanwhile: bool = False) -> Missio
     return next(missions(home))
 
 
+@pytest.mark.parametrize('step_s', [-3600, 3600])
+def test_a_mission_takes_as_long_as_it_does(tmp_path: Path, clocks: Clocks, step_s: int) -> None:
+    """A clock that is set back or forward in the middle of it changes when it ended, and not how long it took."""
+    clocks.set(NOON_NS)
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        clocks.wait(10)
+        clocks.set(NOON_NS + step_s * SECOND)
+        logger.end_mission(True, 1.0, 0.0)
+    found = overview(next(missions(tmp_path)))
+    assert found is not None
+    assert found['duration_s'] == 10.0
+
+
 def sender(home: Path, clocks: Clocks, tracking: FakeTracking, spooler: FakeSpooler, **offsets: int) -> Replay:
     dating = Dating(clocks, 600.0, lambda: {name.replace('_', '-'): offset for name, offset in offsets.items()})
     return Replay(home, tracking, spooler, FakeDrawing(), settle=lambda folder: give_date(folder, dating), rng=random.Random(1))  # type: ignore[arg-type]
