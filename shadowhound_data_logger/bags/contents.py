@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import cache
@@ -73,6 +73,9 @@ class Plain:
         self._open(places)
         return {channel.topic for place in places for channel in self._index(place).channels.values()}
 
+    def clock(self) -> Mapping[str, str]:
+        return self._told.clock if self._told is not None else {}
+
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
         places = [place for place in range(len(self._sources)) if self._may_have(place, wanted)]
         self._open(places)
@@ -111,6 +114,9 @@ class Packed:
 
     def topics(self) -> set[str]:
         return {topic.name for topic in self._told.topics}
+
+    def clock(self) -> Mapping[str, str]:
+        return self._told.clock
 
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
         is_by_message = 'message' in self._told.compression

@@ -1,5 +1,7 @@
 """A piece of a bag as a new bag: a span of time and some of the topics, message by message as they were recorded.
 
+Where the clock of the bag was not set, the times stay as they are, and metadata.yaml says of the piece what it says of the bag.
+
 Of an MCAP slice in a store only the summary and the chunks that are needed are read. What is not plain MCAP (SQLite, or
 compressed outside the storage) is downloaded first.
 """
@@ -9,7 +11,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -79,6 +81,9 @@ class CutSource(Protocol):
 
     def topics(self) -> set[str]: ...
 
+    def clock(self) -> Mapping[str, str]:
+        """Of its description."""
+
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]: ...
 
 
@@ -147,7 +152,7 @@ def _cut(source: CutSource, folder: Path, out: Path, choice: Choice, meter: Mete
         if missing:
             raise BagError(f'what was recorded then is in {", ".join(missing)}, which is not there', remedy=COMES)
         raise _nothing(source, choice, start_ns, end_ns)
-    (folder / METADATA).write_bytes(metadata_yaml([info], ros_distro=''))
+    (folder / METADATA).write_bytes(metadata_yaml([info], ros_distro='', custom_data=source.clock()))
     return Cut(out, info.messages, sum(count > 0 for count in info.counts.values()), info.bytes, info.t_start_ns, info.t_end_ns,
                meter.bytes, meter.requests, bag_bytes, _absent(source, choice), missing)  # fmt: skip
 

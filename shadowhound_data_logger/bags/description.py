@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.index import McapIndex
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
@@ -14,6 +16,8 @@ from shadowhound_data_logger.untrusted import check_size, from_yaml
 
 MOST_QOS_BYTES: Final = 64 << 10
 """Of one topic's profiles: some 200 publishers."""
+MOST_BOOT_ID: Final = 100
+"""Letters."""
 _LATEST_NS: Final = 1 << 63
 
 
@@ -53,6 +57,8 @@ class Description:
     messages: int
     t_start_ns: int
     t_end_ns: int
+    clock: Mapping[str, str] = field(default_factory=dict)
+    """Where the clock was not set: how its times are known, by the words of ``metadata_words.py``. Else empty."""
 
     @property
     def duration_s(self) -> float:
@@ -118,7 +124,23 @@ def _described(found: Mapping[str, Any]) -> Description:
         distro=_text(found.get('ros_distro') or ''), topics=tuple(_topics(found['topics_with_message_count'] or ())),
         parts=tuple(_part(path, told.get(path)) for path in paths), messages=messages,
         t_start_ns=start if messages else 0, t_end_ns=start + _whole(found['duration'], 'nanoseconds') if messages else 0,
+        clock=_clock(found.get('custom_data')),
     )  # fmt: skip
+
+
+def _clock(custom: object) -> dict[str, str]:
+    """Of the custom data of a bag whose clock was not set; what is not as we write it says nothing."""
+    if not isinstance(custom, Mapping):
+        return {}
+    known, boot_id, offset_ns = (custom.get(word) for word in (words.CLOCK, words.BOOT_ID, words.CLOCK_OFFSET_NS))
+    if known not in {words.SET_LATER, words.UNSET} or not isinstance(boot_id, str) or len(boot_id) > MOST_BOOT_ID:
+        return {}
+    found = {words.CLOCK: str(known), words.BOOT_ID: boot_id}
+    if known == words.UNSET:
+        return found
+    if not isinstance(offset_ns, str) or not re.fullmatch('[0-9]{1,19}', offset_ns) or int(offset_ns) >= _LATEST_NS:
+        return {}
+    return {**found, words.CLOCK_OFFSET_NS: offset_ns}
 
 
 def _topics(found: Iterable[Mapping[str, Any]]) -> Iterable[DescribedTopic]:

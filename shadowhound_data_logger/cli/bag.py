@@ -14,10 +14,11 @@ import click
 from rich.console import RenderableType
 from rich.text import Text
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.cut import COMES, Choice, Cut, cut_folder, cut_remote
 from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.info import BagInfo, info_folder, info_of
-from shadowhound_data_logger.bags.manifest import ClockOf, Missing
+from shadowhound_data_logger.bags.manifest import Missing
 from shadowhound_data_logger.bags.overview import BagRow, bag_overview
 from shadowhound_data_logger.bags.record import DEADLINE_S, record
 from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
@@ -405,7 +406,7 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
         'robot': found.robot or (manifest.robot if manifest else ''),
         'mission': f'{mission.type}, run {mission.run_id or "-"}, id {mission.mission_id or "-"}' if mission else '',
         'event': ', '.join(f'{each.name} by {each.by}' for each in event.triggers) if event else '',
-        'clock': _clock(manifest.clock, told.t_start_ns) if manifest and manifest.clock else '',
+        'clock': _clock(told.clock, told.t_start_ns) if told.clock else '',
         'began': f'{shown_time(told.t_start_ns)} UTC' if told.messages else '-',
         'ended': f'{shown_time(told.t_end_ns)} UTC' if told.messages else '-',
         'duration': duration(told.duration_s), 'messages': f'{number(told.messages)} on {len(told.topics)} topics',
@@ -422,12 +423,13 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
     yield from _lost(manifest.missing if manifest else ())
 
 
-def _clock(clock: ClockOf, start_ns: int) -> str:
+def _clock(clock: Mapping[str, str], start_ns: int) -> str:
     """What the times of a bag are worth whose clock was not set."""
-    if clock.offset_ns is None:
-        return f'was never set in boot {clock.boot_id}: the date is not known, and the times below are by that clock'
-    began = f'the bag began {shown_time(start_ns + clock.offset_ns)} UTC'
-    return f'was not set yet: {began}, and {clock.offset_ns / 1e9:.3f} s are to be added to the times below'
+    if words.CLOCK_OFFSET_NS not in clock:
+        return f'was never set in boot {clock[words.BOOT_ID]}: the date is not known, and the times below are by that clock'
+    offset_ns = int(clock[words.CLOCK_OFFSET_NS])
+    began = f'the bag began {shown_time(start_ns + offset_ns)} UTC'
+    return f'was not set yet: {began}, and {offset_ns / 1e9:.3f} s are to be added to the times below'
 
 
 def _lost(missing: Sequence[Missing]) -> Iterator[RenderableType]:
@@ -483,7 +485,7 @@ def _info_json(found: BagInfo) -> dict[str, Any]:
         'files': [
             {**parts.get(name, {'name': name}), 'bytes': size, 'where': where} for name, (size, where) in found.files.items()
         ],
-        'missing': list(found.missing), 'read_bytes': found.read_bytes,
+        'clock': dict(told.clock) or None, 'missing': list(found.missing), 'read_bytes': found.read_bytes,
         'manifest': json.loads(found.manifest.to_json()) if found.manifest else None,
     }  # fmt: skip
 

@@ -9,15 +9,19 @@ from pathlib import Path
 
 import pytest
 from bags.real_bags import IMU, NAME, STEP_NS, T0, by_rosbags, messages_of, stored, write_ours, write_rosbags
+from click.testing import CliRunner
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from ruamel.yaml import YAML
 from stores.spooled import QUICK
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
+from shadowhound_data_logger.bags.info import info_folder
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
+from shadowhound_data_logger.cli.bag import bag
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.mcap.messages import RecordedMessage
+from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
@@ -139,6 +143,31 @@ def test_a_piece_tells_qos_as_humble_reads_it(tmp_path: Path) -> None:
     assert next(messages_of([found.folder / 'piece_0.mcap'])).channel.qos == numbers
     told = YAML(typ='safe').load(found.folder / 'metadata.yaml')['rosbag2_bagfile_information']
     assert told['topics_with_message_count'][0]['topic_metadata']['offered_qos_profiles'] == numbers
+
+
+@pytest.mark.parametrize('clock', [
+    {'clock': 'set_later', 'boot_id': 'b', 'clock_offset_ns': '1760788778000000000'}, {'clock': 'unset', 'boot_id': 'b'},
+])  # fmt: skip
+def test_the_clock_of_a_bag_is_that_of_its_piece(tmp_path: Path, clock: dict[str, str]) -> None:
+    """Of a piece of a piece as well; ``bag info`` shows it."""
+    infos = write_ours(tmp_path / 'early', slices=1, each=20, is_ended=False)
+    (tmp_path / 'early' / 'metadata.yaml').write_bytes(metadata_yaml(infos, ros_distro='humble', custom_data=clock))
+    cut_folder(tmp_path / 'early', tmp_path / 'piece', Choice('0.05'))
+    cut_folder(tmp_path / 'piece', tmp_path / 'smaller', Choice('0.05'))
+    assert info_folder(tmp_path / 'smaller').description.clock == clock
+    said = CliRunner().invoke(bag, ['info', str(tmp_path / 'smaller')], standalone_mode=False).stdout
+    assert ('was not set yet' if 'clock_offset_ns' in clock else 'was never set in boot b') in said
+
+
+@pytest.mark.parametrize('custom', [
+    {'clock': 'set_later', 'boot_id': 'b'}, {'clock': 'set_later', 'boot_id': 'b', 'clock_offset_ns': '9' * 5000},
+    {'clock': 'set_later', 'boot_id': 'b' * 5000, 'clock_offset_ns': '1'}, {'clock': 'unset'}, {'clock': 'set'},
+])  # fmt: skip
+def test_a_clock_that_nobody_wrote_is_none(tmp_path: Path, custom: dict[str, str]) -> None:
+    """Of others' custom data nothing is believed."""
+    infos = write_ours(tmp_path / 'early', slices=1, each=2, is_ended=False)
+    (tmp_path / 'early' / 'metadata.yaml').write_bytes(metadata_yaml(infos, ros_distro='humble', custom_data=custom))
+    assert info_folder(tmp_path / 'early').description.clock == {}
 
 
 @pytest.mark.parametrize(('choice', 'error', 'text'), [
