@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
@@ -23,6 +24,7 @@ from shadowhound_data_logger.cli.common import (
     examples,
     exit_code,
     store_hint,
+    the_home,
     the_store,
     the_store_settings,
 )
@@ -161,14 +163,16 @@ def lake_reindex(*, robot: str, statistics: bool, as_json: bool) -> ExitCode:
 @click.option('--catalogue', type=click.Path(exists=True, file_okay=False, path_type=Path), metavar='DIR',
               help='Catalogue of another store, downloaded by `fetch ROBOT/_catalog/ --to DIR`.')  # fmt: skip
 @click.option('--deep', is_flag=True, help='Read every object back.')
+@click.option('--again', is_flag=True, help='Verify from the beginning, even if a run was interrupted.')
 @as_json
-def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool, as_json: bool) -> ExitCode:
+def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool, again: bool, as_json: bool) -> ExitCode:
     """Check that the store has what the catalogue says.
 
     It asks for every object, its size and its checksum.
 
     All objects, or those that the flags select. If data was moved to another store, name the catalogue of the old one as well:
-    only it shows what the new one lost along with its rows. Exit code 1 when something is not as the catalogue says, or when no
+    only it shows what the new one lost along with its rows. Started again with the same flags within a week, an interrupted run
+    resumes where it stopped. Exit code 1 when something is not as the catalogue says, or when no
     object was selected.
     """
     if catalogue and 'success' in flags:
@@ -185,10 +189,17 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
         if not len(theirs) and catalogue:
             raise BadUsage(f'there are no rows in {catalogue}', f'shadowhound-data fetch ROBOT/_catalog/ --to {catalogue}')
         rows, lacking = (theirs.joined(own), theirs.lacking(own)) if catalogue else (own, [])
-    with closing(open_reader(store)) as target, progress('read back' if deep else 'asked for', len(rows), of='objects') as bar:
-        found = audit(rows, target, deep=deep, threads=THREADS, keys=None, tell=bar.have)
+    with closing(open_reader(store)) as target:
         where = target.describe()
-    said = {'store': where, 'catalogue': catalogue and str(catalogue), **_said(rows, found, lacking, deep=deep)}
+        asked = json.dumps([where, deep, catalogue and str(catalogue.resolve()), flags], sort_keys=True)
+        with library.Unfinished(rows, the_home() / 'verify', asked, again=again) as left:
+            earlier = left.earlier()
+            with progress('read back' if deep else 'asked for', len(rows), of='objects') as bar:
+                bar.have(earlier)
+                found = audit(left, target, deep=deep, threads=THREADS, keys=None, tell=bar.have)
+            if found.away is None:
+                left.finish()
+    said = {'store': where, 'catalogue': catalogue and str(catalogue), **_said(rows, found, lacking, earlier, deep=deep)}
     said['took_s'] = round(time.monotonic() - begun_s, 3)
     said['left_out'] = [asdict(one) for one in left_out]
     said['ok'] = said['ok'] and not said['left_out']
@@ -317,13 +328,14 @@ def _share(part: float, whole: float) -> str:
     return '100 %' if part == whole else f'{min(99.9, max(0.1, 100 * part / whole)):.1f} %'
 
 
-def _said(rows: Rows, found: Audit, lacking: list[Any], *, deep: bool) -> dict[str, Any]:
+def _said(rows: Rows, found: Audit, lacking: list[Any], earlier: int, *, deep: bool) -> dict[str, Any]:
     piled = findings(found)
     if lacking:
         first = [{'bucket': one.bucket, 'key': one.key, 'detail': f'{one.size} bytes'} for one in lacking]
         piled[UNLISTED] = {'count': len(first), 'first': first}
     return {
-        'deep': deep, 'known': len(rows), 'asked': found.asked, 'sound': found.sound, 'unproved': rows.unproved(),
+        'deep': deep, 'known': len(rows), 'asked': found.asked, 'asked_earlier': earlier, 'sound': earlier + found.sound,
+        'unproved': rows.unproved(),
         'findings': piled, 'unreachable': None if found.away is None else str(found.away),
         'ok': found.away is None and not piled and len(rows) > 0,
     }  # fmt: skip
@@ -332,6 +344,7 @@ def _said(rows: Rows, found: Audit, lacking: list[Any], *, deep: bool) -> dict[s
 def _page(said: Mapping[str, Any]) -> list[Any]:
     by = f'its own catalogue and the one in {said["catalogue"]}' if said['catalogue'] else 'its own catalogue'
     asked = f'{said["store"]} was asked for {number(said["asked"])} of the {number(said["known"])} objects of {by}'
+    asked += f' ({number(said["asked_earlier"])} more by an earlier run)' if said['asked_earlier'] else ''
     lines: list[Any] = [plain(f'{asked}, in {duration(said["took_s"])}.')]
     if said['unproved']:
         lines.append(plain(f'Of {number(said["unproved"])} no checksum is known: only their sizes are compared.', 'yellow'))
@@ -341,7 +354,10 @@ def _page(said: Mapping[str, Any]) -> list[Any]:
 def _verdict(said: Mapping[str, Any]) -> Text:
     how = 'every byte read back' if said['deep'] else 'by size and checksum'
     if said['unreachable']:
-        left = plain(f': {said["unreachable"]}. {number(said["known"] - said["asked"])} objects are not checked.')
+        left = plain(
+            f': {said["unreachable"]}. {number(said["known"] - said["asked"] - said["asked_earlier"])} '
+            'objects are not checked yet: run it again to continue there.'
+        )
         return Text.assemble(('The store cannot be reached', 'yellow'), left)
     if not said['known']:
         return Text.assemble(('Nothing is verified', 'yellow'), f': the catalogue has no such objects.{store_hint()}')

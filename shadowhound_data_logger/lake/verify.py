@@ -2,22 +2,41 @@
 
 A store that lost a part of its own catalogue does not know what else it lost. So the catalogue of another store, fetched into a
 folder, can be laid beside it.
+
+An audit that is cut short, by a kill or a store that is away, goes on where it stopped: what it found sound is noted in a file.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import logging
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Final
+from pathlib import Path
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
 
+from shadowhound_data_logger.disk import lock
+from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.model import ObjectInfo
 
-PAGE: Final = 10_000
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+log = logging.getLogger(__name__)
+
+PAGE: Final = 1_000
+"""Objects asked for between two notes of what was sound: what an interruption costs."""
+DIGEST_BYTES: Final = 16
+KEEP_S: Final = 7 * 86_400.0
+"""How long what an audit found sound counts, if nobody goes on with it."""
 _KEY: Final = ('bucket', 'key')
 _SAID: Final = (*_KEY, 'bytes', 'sha256')
 
@@ -47,9 +66,6 @@ class Rows:
         for start in range(0, len(ordered), PAGE):
             yield list(enumerate(_infos(ordered.slice(start, PAGE)), start))
 
-    def note(self, ids: Iterable[int]) -> None:
-        """Nowhere: an audit that was cut short starts again, or asks for fewer days."""
-
     def unproved(self) -> int:
         """Of how many no SHA-256 is known: of these the size alone is compared."""
         return int(self.table['sha256'].null_count)
@@ -62,6 +78,79 @@ class Rows:
         """Those that have no row in the other."""
         left = self.table.join(other.table.select(_KEY), keys=list(_KEY), join_type='left anti')
         return _infos(left.sort_by([(name, 'ascending') for name in _KEY]))
+
+
+class Unfinished:
+    """The rows that no earlier run of the same question found sound, and a file of those that were: 16 bytes a row.
+
+    Life: New; enter once; read by one thread; ``finish`` where it came to its end; leave once. Without a folder that can be
+    written nothing is noted.
+    """
+
+    def __init__(self, rows: Rows, folder: Path, question: str, *, again: bool = False) -> None:
+        """``question`` is what was asked of whom; ``again`` forgets what an earlier run found."""
+        self._rows = rows
+        self._path = folder / f'{hashlib.sha256(question.encode()).hexdigest()[:32]}.sound'
+        self._again = again
+        self._file: IO[bytes] | None = None
+        self._known: frozenset[bytes] = frozenset()
+        self._page: dict[int, bytes] = {}
+
+    def __enter__(self) -> Self:
+        """Raises LakeError where another process asks the same."""
+        try:
+            self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            for path in self._path.parent.glob('*.sound'):
+                if (path == self._path and self._again) or time.time() - path.stat().st_mtime > KEEP_S:
+                    path.unlink()
+            file = self._path.open('a+b', buffering=0)
+        except OSError as error:
+            log.warning('an interruption will cost what was asked so far: %s', error)
+            return self
+        if not lock(file, wait=False):
+            file.close()
+            raise LakeError('the same objects are being verified by another process', remedy='wait for it')
+        self._file = file
+        file.seek(0)
+        found = file.read()
+        whole = len(found) - len(found) % DIGEST_BYTES
+        file.truncate(whole)
+        self._known = frozenset(found[place : place + DIGEST_BYTES] for place in range(0, whole, DIGEST_BYTES))
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def earlier(self) -> int:
+        """How many of the rows an earlier run found sound."""
+        return sum(_digest(info) in self._known for page in self._rows.pages() for _, info in page) if self._known else 0
+
+    def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]:
+        for page in self._rows.pages():
+            self._page = {number: _digest(info) for number, info in page}
+            if left := [one for one in page if self._page[one[0]] not in self._known]:
+                yield left
+
+    def note(self, ids: Iterable[int]) -> None:
+        """These are sound."""
+        if self._file is not None:
+            try:
+                self._file.write(b''.join(self._page[number] for number in ids))
+            except OSError as error:
+                log.warning('an interruption will cost what is asked from here on: %s', error)
+                self._file.close()
+                self._file = None
+
+    def finish(self) -> None:
+        """The audit came to its end: the next one starts again."""
+        if self._file is not None:
+            self._path.unlink(missing_ok=True)
+
+
+def _digest(info: ObjectInfo) -> bytes:
+    said = json.dumps((info.bucket, info.key, info.size, info.sha256))
+    return hashlib.blake2b(said.encode(), digest_size=DIGEST_BYTES).digest()
 
 
 def _infos(table: pa.Table) -> list[ObjectInfo]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import click
+import pyarrow as pa
 import pytest
 from click.testing import CliRunner, Result
 from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, row
@@ -17,6 +19,9 @@ from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import LakeError, StoreUnavailable
+from shadowhound_data_logger.lake import verify
+from shadowhound_data_logger.ship.audit import _judge
 from shadowhound_data_logger.stores import open_store
 
 TIMES = [NOON_NS + second * SECOND for second in range(5)]
@@ -116,6 +121,49 @@ def test_nothing_to_verify_is_no_success(home: Path) -> None:
     answer = run(home, '--sensor', 'lidar')
     assert answer.return_value == 1
     assert 'Nothing is verified' in answer.stdout
+
+
+def test_an_interrupted_run_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With what was not asked yet and what was wrong, also after a kill that cut off its notes; a run that ended starts anew."""
+    file(home, KEYS[0]).unlink()
+    answered: list[Any] = []
+
+    def judge(*arguments: Any, **options: Any) -> Any:
+        if len(answered) == 5:
+            raise StoreUnavailable('the store is away')
+        answered.append(_judge(*arguments, **options))
+        return answered[-1]
+
+    monkeypatch.setattr(verify, 'PAGE', 2)
+    monkeypatch.setattr('shadowhound_data_logger.cli.lake.THREADS', 1)
+    with monkeypatch.context() as patched:
+        patched.setattr('shadowhound_data_logger.ship.audit._judge', judge)
+        assert as_json(home)['unreachable']
+    (notes,) = (home / 'verify').iterdir()
+    assert notes.stat().st_size == 4 * verify.DIGEST_BYTES
+    with notes.open('ab') as torn:
+        torn.write(b'half')
+    assert as_json(home, '--sensor', 'camera')['asked'] == 5  # another question
+    said = as_json(home)
+    assert (said['asked'], said['asked_earlier'], said['sound']) == (7, 4, 10)
+    assert found(said) == {'missing': KEYS[:1]}
+    assert list((home / 'verify').iterdir()) == []
+    assert as_json(home)['asked'] == 11
+
+
+def test_one_question_is_asked_by_one_process(home: Path, tmp_path: Path) -> None:
+    """The other is told so; a home that cannot be written is verified all the same; what was found long ago is forgotten."""
+    nothing = verify.Rows(pa.table({name: [] for name in ('bucket', 'key', 'bytes', 'sha256')}))
+    with verify.Unfinished(nothing, tmp_path / 'verify', 'x'):
+        with pytest.raises(LakeError, match='another process'), verify.Unfinished(nothing, tmp_path / 'verify', 'x'):
+            pass
+        (old,) = (tmp_path / 'verify').iterdir()
+        os.utime(old, (0, 0))
+    with verify.Unfinished(nothing, tmp_path / 'verify', 'y'):
+        assert not old.exists()
+    shutil.rmtree(home / 'verify', ignore_errors=True)
+    (home / 'verify').write_text('')
+    assert as_json(home)['asked'] == 11
 
 
 def test_bad_usage(home: Path) -> None:
