@@ -58,7 +58,8 @@ def read_parameters(path: Path, node: str | None = None) -> dict[str, Any]:
         given = yaml.safe_load(path.read_text(encoding='utf-8')) or {}
         flat: dict[str, Any] = {}
         for section, content in _sections(given):
-            if _pattern(section).fullmatch(node or f'/{NODE}') or (node is None and section.endswith(f'/{NODE}')):
+            of_any = node is None and section.rpartition('/')[2] in {NODE, '*', '**'}
+            if of_any or _pattern(section).fullmatch(node or f'/{NODE}'):
                 flat |= _flat(content)
     except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError) as error:
         text = f'{path} is not a parameter file: {error}'

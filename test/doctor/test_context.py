@@ -81,6 +81,10 @@ def test_a_parameter_file(tmp_path: Path) -> None:
     path.write_text('/**:\n  ros__parameters: {robot: tachi}\nsensor_logger_node:\n  ros__parameters:\n    imu: {batch_s: 2.0}\n'
                     'other:\n  ros__parameters: {x: 1}\n')  # fmt: skip
     assert read_parameters(path) == {'robot': 'tachi', 'imu.batch_s': 2.0}
+    for section in ('/tachi/sensor_logger_node', '/tachi/**', '/**/sensor_logger_node', '/tachi:\n  sensor_logger_node'):
+        depth = 2 * section.count('\n')
+        path.write_text(f'{section}:\n{depth * " "}  ros__parameters: {{robot: tachi}}\n')
+        assert read_parameters(path) == {'robot': 'tachi'}, section
     path.write_text('sensor_logger_node: {}')
     with pytest.raises(ParametersUnreadable, match='is not a parameter file'):
         read_parameters(path)
