@@ -210,11 +210,12 @@ def judge_files(found: Found, server: Server, flight: Flight, run_id: str, objec
 
 
 def judge_marks(found: Found, flights: Sequence[Flight], objects: Mapping[str, ObjectInfo]) -> None:
-    """Of the sensors' objects. At both ends of a mission the node may be as late as ``NOTICED_NS``."""
+    """Of the sensors' objects: no folder of those begins with ``_``. At both ends the node may be as late as ``NOTICED_NS``."""
     spans = {flight.folder.mission_id: flight.span_ns for flight in flights}
     runs = {flight.folder.mission_id: run.run_id for flight in flights if (run := flight.folder.run())}
     for key, info in objects.items():
-        if key.split('/')[1] in {'missions', '_ledger', '_catalog', '_gaps'} or 't_start_ns' not in info.metadata:
+        folder = key.split('/')[1]
+        if folder == 'missions' or folder.startswith('_') or 't_start_ns' not in info.metadata:
             continue
         at_ns, said = int(info.metadata['t_start_ns']), info.metadata.get('mission_id')
         found.looked['marked' if said else 'unmarked'] += 1
