@@ -38,6 +38,8 @@ DEFAULT_EXPIRY_NS: Final = 7 * 24 * 3600 * SECOND
 DEFAULT_PRIORITY: Final = 5
 BAG_SENSOR: Final = 'bag'
 """Its objects are slices: one is wanted where its time overlaps the time that is asked for."""
+LEAST_SPARED: Final = 64 << 10
+"""Bytes that cutting a slice has to spare: a cut is three objects."""
 _ID: Final = re.compile(r'[0-9a-f]{32}')
 _PATTERN: Final = re.compile(r"[A-Za-z0-9!_.'()=+@*?/-]+")
 _WORDS: Final = ('sensor', 'topic', 'mission', 'mission_type')
@@ -82,6 +84,17 @@ class KeptFilter:
         if self.keys or self.patterns:
             said['keys'] = sorted(self.keys.union(self.patterns))
         return said
+
+    def bytes_of(self, key: str, sensor: str, size: int, begin_ns: int, end_ns: int, metadata: Mapping[str, str]) -> int:
+        """About how many bytes of an object are wanted: fewer than it has of a slice that is cut at a time that is asked for.
+
+        A slice whose times are not those of its messages, since the clock was set later, is sent whole.
+        """
+        if sensor != BAG_SENSOR or not key.endswith('.mcap') or words.CLOCK in metadata:
+            return size
+        since_ns, until_ns = max(self.since_ns or begin_ns, begin_ns), min(self.until_ns or end_ns + 1, end_ns + 1)
+        wanted = size * max(until_ns - since_ns, 1) // max(end_ns + 1 - begin_ns, 1)
+        return max(wanted, 1) if size - wanted >= LEAST_SPARED else size
 
     def takes(self, key: str, sensor: str, topic: str | None, begin_ns: int, end_ns: int, metadata: Mapping[str, str]) -> bool:
         """Whether an object is wanted; ``metadata`` as it will have it in the store."""

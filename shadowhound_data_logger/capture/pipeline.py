@@ -16,6 +16,7 @@ from typing import Any
 from rclpy.node import Node
 
 from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags.kept import KeptCut, sweep
 from shadowhound_data_logger.bags.naming import BAGS
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
@@ -284,10 +285,11 @@ class Pipeline:
         ships = {settings.bag.ship, *(sensor.ship for sensor in settings.sensors)}
         if ON_REQUEST not in ships and not self.spool.has_kept():
             return
+        sweep(settings.home, settings.robot)
         self._link = link = LinkTrack(self.uploader.status, track.marks, settings.robot, self._clock)
         self._requests = RequestServer(self.spool, self._store, settings.keep, settings.robot, self._clock,
                                        put=partial(self.writer.put, wait=False), released=self.uploader.wake,
-                                       mbps=lambda: link.mbps)  # fmt: skip
+                                       cutter=partial(KeptCut, settings.home), mbps=lambda: link.mbps)  # fmt: skip
 
     def _settled(self, ids: Collection[int]) -> None:
         self.uploader.settled(ids)

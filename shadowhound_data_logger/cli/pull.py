@@ -32,7 +32,7 @@ _BAG: Final = re.compile(r'[A-Za-z0-9_.*?-]+')
     )
 )
 @question
-@click.option('--bag', metavar='NAME', help="Slices of this bag; '*' stands for any letters. A slice is sent whole.")
+@click.option('--bag', metavar='NAME', help="Slices of this bag; '*' stands for any letters.")
 @click.option('--priority', type=click.IntRange(0, 9), default=DEFAULT_PRIORITY, show_default=True, help='0 is sent first.')
 @click.option('--expires', metavar='AGE', default='7d', show_default=True, help='Ask for so long, such as 2h or 30d.')
 @click.option('--by', metavar='NAME', help='Who asks  [default: the user]')
@@ -67,11 +67,12 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
                 click.echo(f'Asked {robot} to leave request {cancel}.', err=True)
                 return ExitCode.FINE
             want = _want(source, robot, flags, bag, left_out)
-            rows = lake.known(source, robot, want, left_out).select(('bytes', 'where', 'reason')).to_pylist()
+            rows = lake.known(source, robot, want, left_out).to_pylist()
             found = [row for row in rows if row['where'] == ON_ROBOT]
             lost = Counter(row['reason'] or 'unknown' for row in rows if row['where'] == LOST)
-            said = {'robot': robot, 'objects': len(found), 'bytes': sum(row['bytes'] for row in found), 'lost': dict(lost),
-                    'want': want.to_json(), 'mbps': link.pace_mbps(source, robot, left_out)}  # fmt: skip
+            size = sum(lake.size_of(want, row) for row in found)
+            said: dict[str, Any] = {'robot': robot, 'objects': len(found), 'bytes': size, 'lost': dict(lost),
+                                    'want': want.to_json(), 'mbps': link.pace_mbps(source, robot, left_out)}  # fmt: skip
             said['seconds'] = 8e-6 * said['bytes'] / said['mbps'] if said['mbps'] else None
             if not as_json:
                 click.echo(_found_sentence(said))
@@ -120,7 +121,9 @@ def _sentence(answer: Mapping[str, Any]) -> str:
     known = outcomes if isinstance(outcomes, dict) else {}
     parts = [f'{state} {each.get("objects")}' for state, each in known.items() if isinstance(each, dict)]
     why = f' ({answer["why"]})' if answer.get('why') else ''
-    return f'{answer.get("time")}  {answer["state"]}{why}: of {answer.get("objects")} objects {", ".join(parts) or "none"}'
+    bags = answer.get('bags')
+    cut = f'; cut out as bag {", ".join(map(str, bags))}' if isinstance(bags, list) and bags else ''
+    return f'{answer.get("time")}  {answer["state"]}{why}: of {answer.get("objects")} objects {", ".join(parts) or "none"}{cut}'
 
 
 def _is_finding(answer: Mapping[str, Any]) -> bool:

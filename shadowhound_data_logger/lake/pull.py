@@ -9,7 +9,7 @@ import hashlib
 import random
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,6 +52,8 @@ TRIES: Final = 60
 """To be the one who replaces the mailbox: with a hundred at it, one in a hundred wins each time."""
 PAUSE_S: Final = 0.2
 """The longest pause between two tries; it doubles ten times."""
+MOST_OF_ONE: Final = 128
+"""Open requests of one requester: others need room in the mailbox, too."""
 MOST_ANSWER_BYTES: Final = 1 << 20
 _DAY_NS: Final = 24 * 3600 * 10**9
 
@@ -89,6 +91,12 @@ def known(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> p
     return rows.filter(pa.array([_takes(want, row) for row in rows.to_pylist()], pa.bool_()))
 
 
+def size_of(want: KeptFilter, row: Mapping[str, Any]) -> int:
+    """About how many bytes of a kept object a request makes a robot send: of a slice at its ends a part."""
+    begin_ns = row['t_start_ns'] or 0
+    return want.bytes_of(row['key'], row['sensor'] or '', row['bytes'] or 0, begin_ns, row['t_end_ns'] or begin_ns, {})
+
+
 def _takes(want: KeptFilter, row: dict[str, Any]) -> bool:
     metadata = {name: row[name] for name in ('mission_id', 'run_id', 'mission_type') if row[name] is not None}
     if row['x'] is not None and row['y'] is not None:
@@ -111,6 +119,8 @@ def ask(store: ObjectStore, source: Bucket, robot: str, want: KeptFilter, *, by:
             if asked.id == request.id and not any(entry.get('cancel') == asked.id for entry in left):
                 request = asked
                 return None
+        if sum(asked.by == by for asked in _requests(robot, left)) >= MOST_OF_ONE:
+            raise LakeError(f'{by} has {MOST_OF_ONE} requests open', remedy='wait until some are answered, or cancel one')
         return [*(entry for entry in left if request.id not in {entry.get('id'), entry.get('cancel')}), request.to_json()]
 
     _change(store, robot, add)

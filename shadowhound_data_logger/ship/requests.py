@@ -1,7 +1,8 @@
 """Serves what is asked for of what the robot keeps: polls the mailbox, makes requests rows, releases objects, answers.
 
 A request is a row before anything is done about it, and each answer is spooled in the transaction that notes it. Objects are
-released a few at a time, so that requests share the link by their priorities: no requester waits for another one to be done.
+released a few at a time, so that requests share the link by their priorities: no requester waits for another one to be done. Of
+slices that reach beyond the time that is asked for a bag of that time is cut, some milliseconds of work at each step.
 """
 
 from __future__ import annotations
@@ -11,15 +12,17 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from operator import itemgetter
+from typing import Any, Final, NamedTuple, Protocol
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import SECOND, Clock, iso
 from shadowhound_data_logger.config import KeepSettings
-from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError
+from shadowhound_data_logger.errors import AccessDenied, DataLoggerError, ObjectRefused, StoreError
 from shadowhound_data_logger.mailbox import (
+    LATEST_NS,
     MAILBOX_BUCKET,
     MOST_INBOX_BYTES,
     PullCancel,
@@ -31,7 +34,16 @@ from shadowhound_data_logger.mailbox import (
     read_entry,
 )
 from shadowhound_data_logger.model import DataObject, SpooledObject
-from shadowhound_data_logger.spool.request_table import ACTIVE, CANCELLED, DONE, EXPIRED, REFUSED, KeptObject, RequestRow
+from shadowhound_data_logger.spool.request_table import (
+    ACTIVE,
+    CANCELLED,
+    DONE,
+    EXPIRED,
+    REFUSED,
+    KeptObject,
+    KeptSlice,
+    RequestRow,
+)
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.worker import Worker
@@ -51,7 +63,7 @@ LEAST_WINDOW, MOST_WINDOW = 1 << 20, 16 << 20
 TELL_S: Final = 30.0
 """Between two answers of how far a request is."""
 MOST_REQUESTS: Final = 4096
-"""That are remembered at a time."""
+"""That are remembered at a time; beyond it those are forgotten that were answered first."""
 AT_A_TIME: Final = 64
 """New requests of one look: each is tried on all that is kept."""
 REMEMBER_NS: Final = 30 * 24 * 3600 * SECOND
@@ -59,6 +71,37 @@ REMEMBER_NS: Final = 30 * 24 * 3600 * SECOND
 TIDY_S: Final = 60.0
 ANSWERS: Final = '_answers'
 """The sensor of answers."""
+CUT_S: Final = 0.05
+"""Of cutting, at each step: a fifth of the time."""
+
+
+class SliceCut(Protocol):
+    """A range of time out of kept slices as a bag of its own (``bags/kept.py``)."""
+
+    @property
+    def slices(self) -> Sequence[KeptSlice]: ...
+
+    @property
+    def places(self) -> Sequence[tuple[str, str]]:
+        """(bucket, key) of the objects that it becomes, which no other content has."""
+
+    def work(self) -> Generator[None, None, list[DataObject]]:
+        """Cut, and yield after each piece of work; at last the objects. Raises DataLoggerError, OSError."""
+
+    def clear(self) -> None:
+        """Remove what it wrote and the spool did not take."""
+
+
+Cutter = Callable[[Sequence[KeptSlice], int, int, int], SliceCut]
+"""From slices of one bag and a range in Unix nanoseconds, with a priority."""
+
+
+class _Cutting(NamedTuple):
+    """The cut that is being made."""
+
+    row: RequestRow
+    cut: SliceCut
+    work: Generator[None, None, list[DataObject]]
 
 
 class RequestServer:
@@ -69,7 +112,7 @@ class RequestServer:
     """
 
     def __init__(self, spool: Spool, store: ObjectStore, settings: KeepSettings, robot: str, clock: Clock, *,  # noqa: PLR0913 - each is a neighbour
-                 put: Callable[[DataObject], None], released: Callable[[Sequence[SpooledObject]], None],
+                 put: Callable[[DataObject], None], released: Callable[[Sequence[SpooledObject]], None], cutter: Cutter,
                  mbps: Callable[[], float | None] = lambda: None,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
         """``put`` takes answers to be spooled, ``released`` hears of objects that may be shipped; ``mbps`` is the pace."""
@@ -80,10 +123,13 @@ class RequestServer:
         self._clock = clock
         self._put = put
         self._released = released
+        self._cutter = cutter
         self._mbps = mbps
         self._monotonic = monotonic
         self._version = ''
         self._poll_at_s = self._tidy_at_s = 0.0
+        self._is_clear = False
+        self._cutting: _Cutting | None = None
         self._answering: dict[str, int] = {}
         """Request -> the number of its answer that is on its way into the spool."""
         self._served: dict[str, float] = {}
@@ -114,6 +160,9 @@ class RequestServer:
     def step(self) -> bool:
         """One look at everything; whether it released anything. Raises OSError or sqlite3.Error where the spool is of no use."""
         now_s = self._monotonic()
+        if not self._is_clear:
+            self._spool.clear_requests()
+            self._is_clear = True
         if now_s >= self._poll_at_s:
             self._poll_at_s = now_s + self._settings.poll_s
             self._poll()
@@ -122,7 +171,8 @@ class RequestServer:
         for row in rows:
             if row.is_open and row.expires_ns <= now_ns:
                 self._spool.close_request(row.id, EXPIRED)
-        is_busy = self._release([row for row in rows if row.is_open and row.expires_ns > now_ns])
+        rows = [row for row in rows if row.is_open and row.expires_ns > now_ns]
+        is_busy = self._release(rows) | self._cut({row.id for row in rows})
         for row in self._spool.requests():
             if row.told != row.state or row.is_open:
                 self._answer(row)
@@ -169,9 +219,13 @@ class RequestServer:
                 cancels.append(read)
             elif row is None or (not row.is_open and row.told == row.state and read.made_ns > row.made_ns):
                 new.append(read)
-        if len(known) + len(new) > MOST_REQUESTS:
-            self._refuse('too_many', 'too many requests are remembered')
-            new = new[: max(0, MOST_REQUESTS - len(known))]
+        new = _in_turn(new)
+        if (beyond := len(known) + len(new) - MOST_REQUESTS) > 0:
+            self._spool.forget_requests(self._clock.wall_ns(), beyond)
+            known = {row.id: row for row in self._spool.requests()}
+            if len(new) > (room := max(0, MOST_REQUESTS - len(known))):
+                self._refuse('too_many', 'too many requests are open')
+                new = new[:room]
         known |= {row.id: row for row in self._accept(new[:AT_A_TIME], known)}
         for cancel in cancels:
             row = known.get(cancel.id)
@@ -185,13 +239,15 @@ class RequestServer:
             return
         answers = {request.id: known[request.id].answers if request.id in known else self._answers_before(request.id)
                    for request in new}  # fmt: skip
-        chosen: dict[str, list[int]] = {request.id: [] for request in new}
+        chosen: dict[str, list[tuple[int, int]]] = {request.id: [] for request in new}
         gone: dict[str, list[KeptObject]] = {request.id: [] for request in new}
         for item in self._spool.kept():
             for request in new:
                 if request.want.takes(item.key, item.sensor, item.topic, item.t_start_ns, item.t_end_ns, item.metadata):
                     if item.is_here:
-                        chosen[request.id].append(item.id)
+                        size = request.want.bytes_of(item.key, item.sensor, item.bytes, item.t_start_ns, item.t_end_ns,
+                                                     item.metadata)  # fmt: skip
+                        chosen[request.id].append((item.id, size))
                     else:
                         gone[request.id].append(item)
         now_ns = self._clock.wall_ns()
@@ -231,7 +287,10 @@ class RequestServer:
         queues = {row.id: deque(self._spool.next_requested(row.id, room)) for row in rows}
         chosen: dict[int, int] = {}
         while len(chosen) < room and (row := self._next([row for row in rows if queues[row.id]])) is not None:
-            number, size = queues[row.id].popleft()
+            number, size, is_cut = queues[row.id].popleft()
+            if is_cut:
+                self._begin_cut(row)
+                continue
             if (count or chosen) and size > room_bytes:
                 break
             if number not in chosen:
@@ -241,6 +300,60 @@ class RequestServer:
         if chosen:
             self._released(self._spool.release(list(chosen.items())))
         return bool(chosen)
+
+    def _begin_cut(self, row: RequestRow) -> None:
+        """Unless one is being made: of the oldest bag of which a request wants parts of slices."""
+        if self._cutting is not None or not (slices := self._spool.to_cut(row.id)):
+            return
+        folder = slices[0].key.rpartition('/')[0]
+        wanted = json.loads(row.wanted)
+        cut = self._cutter([each for each in slices if each.key.rpartition('/')[0] == folder], wanted.get('since_ns', 0),
+                           wanted.get('until_ns', LATEST_NS), row.priority)  # fmt: skip
+        if self._spool.has(*cut.places[-1]):  # for another request, or before the node died
+            self._set_cut(row, cut, cut.places)
+        else:
+            self._cutting = _Cutting(row, cut, cut.work())
+
+    def _cut(self, open_ids: Collection[str]) -> bool:
+        """Some of the work; whether there is any. Slices that cannot be cut are sent whole."""
+        if self._cutting is None:
+            return False
+        row, cut, work = self._cutting
+        if row.id not in open_ids:
+            self._cutting = None
+            work.close()
+            return False
+        end_s = self._monotonic() + CUT_S
+        try:
+            while self._monotonic() < end_s:
+                next(work)
+        except StopIteration as done:
+            self._cutting = None
+            self._take(row, cut, done.value)
+        except (DataLoggerError, OSError) as error:
+            self._cutting = None
+            self._send_whole(row, cut, error)
+        return True
+
+    def _take(self, row: RequestRow, cut: SliceCut, made: Sequence[DataObject]) -> None:
+        """The spool has what was cut, then the request does: a death between the two leaves it to be found."""
+        try:
+            placed = self._spool.commit(made)
+        except OSError as error:
+            self._send_whole(row, cut, error)
+            return
+        finally:
+            cut.clear()
+        self._set_cut(row, cut, [(item.bucket, item.key) for item in made])
+        self._released(placed)
+
+    def _set_cut(self, row: RequestRow, cut: SliceCut, places: Sequence[tuple[str, str]]) -> None:
+        size = self._spool.set_cut(row.id, [each.id for each in cut.slices], places)
+        self._served[row.requester] += size / (10 - row.priority)
+
+    def _send_whole(self, row: RequestRow, cut: SliceCut, error: Exception) -> None:
+        log.warning('%d slices are sent whole, since they cannot be cut: %s', len(cut.slices), error)
+        self._spool.set_whole(row.id, [each.id for each in cut.slices])
 
     def _next(self, rows: Sequence[RequestRow]) -> RequestRow | None:
         """Of the requester who was served least, the most important request, of these the oldest."""
@@ -259,15 +372,17 @@ class RequestServer:
         """Spool the next answer of a request, if one is due."""
         if self._answering.get(row.id, 0) > row.answers:
             return
-        progress = self._spool.progress(row.id)
-        if row.is_open and progress.is_over:
+        if row.is_open and self._spool.is_over(row.id):
             self._spool.close_request(row.id, DONE)
             row = replace(row, state=DONE)
-        if not row.is_open and progress.outcomes.get('pending'):
-            return  # what was released goes on its way, and the last answer tells of it
         now_ns = self._clock.wall_ns()
         if row.told == row.state and (not row.is_open or now_ns - row.told_ns < TELL_S * SECOND):
             return
+        if not row.is_open:
+            self._spool.let_go(row.id)
+        progress = self._spool.progress(row.id)
+        if not row.is_open and progress.outcomes.get('pending'):
+            return  # what was released goes on its way, and the last answer tells of it
         number = row.answers + 1
         self._answering[row.id] = number
         said: dict[str, Any] = {
@@ -279,12 +394,23 @@ class RequestServer:
             'outcomes': {state: {'objects': count, 'bytes': size} for state, (count, size) in progress.outcomes.items()},
             'lost': [{'key': key, 'state': state, 'reason': reason, 'when': iso(settled_ns) if settled_ns else None}
                      for key, state, reason, settled_ns in progress.lost],
+            'bags': [key.split('/')[2] for key in progress.manifests],
         }  # fmt: skip
         self._put(DataObject(
             bucket=MAILBOX_BUCKET, key=answer_key(self._robot, row.id, number), body=json.dumps(said, indent=1).encode(),
             content_type='application/json', sensor=ANSWERS, topic=None, type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns,
             priority=0, protected=True, metadata={words.ROBOT: self._robot}, answers=(row.id, number, row.state),
         ))  # fmt: skip
+
+
+def _in_turn(requests: Sequence[PullRequest]) -> list[PullRequest]:
+    """The first of each requester, then the second of each, and so on: one who asks often does not come before all others."""
+    turns = Counter[str]()
+    order = []
+    for place, request in enumerate(requests):
+        turns[request.by] += 1
+        order.append((turns[request.by], place, request))
+    return [request for *_, request in sorted(order, key=itemgetter(0, 1))]
 
 
 def _gone(items: Sequence[KeptObject]) -> dict[str, Any]:

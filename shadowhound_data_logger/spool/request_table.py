@@ -1,15 +1,17 @@
 """The rows of what was asked for: each request with what it found among the kept objects, and what became of that.
 
 An object that an open request waits for is not evicted (``Index.may_go``). What became of each is written by a trigger, in the
-transaction that changes the object (schema.py).
+transaction that changes the object (schema.py). Of a slice that is cut a request counts fewer bytes than it has: an estimate,
+until the cut takes its place. Requests may be of very many objects, so nothing here changes more than ``PIECE`` rows at a time.
 """
 
 from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from shadowhound_data_logger import metadata_words as words
@@ -20,6 +22,9 @@ _COLUMNS: Final = (
     'id, requester, priority, made_ns, expires_ns, received_ns, wanted, state, why, objects, bytes, gone, answers, told, told_ns'
 )
 _HERE: Final = "('kept', 'pending')"
+PIECE: Final = 512
+"""Rows that are changed in one transaction: some 10 ms."""
+_OPEN: Final = "SELECT id FROM requests WHERE state = 'active'"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +81,25 @@ class KeptObject(NamedTuple):
         return self.state in {'kept', 'pending'}
 
 
+class WaitingObject(NamedTuple):
+    """What a request waits for and nobody has released."""
+
+    id: int
+    bytes: int
+    is_cut: bool
+    """Only a part of it is wanted."""
+
+
+class KeptSlice(NamedTuple):
+    """A slice of which a request wants a part; times in Unix nanoseconds."""
+
+    id: int
+    key: str
+    path: Path
+    sha256: str
+    metadata: Mapping[str, str]
+
+
 class Progress(NamedTuple):
     """What became of what a request found."""
 
@@ -83,11 +107,8 @@ class Progress(NamedTuple):
     """``kept``, ``pending``, ``delivered``, ... -> objects, bytes."""
     lost: tuple[tuple[str, str, str, int], ...]
     """(key, state, reason, when in Unix nanoseconds) of the first of those that are lost."""
-
-    @property
-    def is_over(self) -> bool:
-        """Whether nothing of it is waited for."""
-        return not any(self.outcomes.get(state, (0, 0))[0] for state in ('kept', 'pending'))
+    manifests: tuple[str, ...]
+    """Keys of the manifests of the first bags that were cut for it."""
 
 
 class RequestTable:
@@ -106,21 +127,27 @@ class RequestTable:
         """Of those that are not over."""
         return [name for (name,) in self._db.execute('SELECT id FROM requests WHERE state = ?', (ACTIVE,))]
 
-    def accept(self, row: RequestRow, chosen: Iterable[int]) -> RequestRow:
-        """Write the request with what it chose, as far as that is here still; one of the same id is replaced."""
-        self._db.execute('DELETE FROM requested WHERE request = ?', (row.id,))
+    def add(self, request: str, chosen: Sequence[tuple[int, int]]) -> None:
+        """Some (id, bytes) of what a request chose, as far as they are here still; its row comes after all of them."""
         self._db.executemany(
-            f'INSERT OR IGNORE INTO requested SELECT ?, id, bytes, state FROM objects WHERE id = ? AND state IN {_HERE}',  # noqa: S608
-            ((row.id, number) for number in chosen),
+            "INSERT OR REPLACE INTO requested SELECT ?1, id, CASE state WHEN 'kept' THEN min(bytes, ?3) ELSE bytes END, state"  # noqa: S608 - own constants only
+            f' FROM objects WHERE id = ?2 AND state IN {_HERE}',
+            ((request, number, size) for number, size in chosen),
         )
-        count = 'SELECT count(*), ifnull(sum(bytes), 0) FROM requested WHERE request = ?'
-        objects, size = self._db.execute(count, (row.id,)).fetchone()
-        row = replace(row, objects=objects, bytes=size)
+
+    def accept(self, row: RequestRow) -> RequestRow:
+        """Write the request, which has what was added to it; one of the same id is replaced."""
+        row = self._counted(row)
         self._db.execute(
             f'INSERT OR REPLACE INTO requests ({_COLUMNS}) VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',  # noqa: S608 - own constants only
             tuple(getattr(row, name) for name in _COLUMNS.split(', ')),
         )
         return row
+
+    def _counted(self, row: RequestRow) -> RequestRow:
+        count = 'SELECT count(*), ifnull(sum(bytes), 0) FROM requested WHERE request = ?'
+        objects, size = self._db.execute(count, (row.id,)).fetchone()
+        return replace(row, objects=objects, bytes=size)
 
     def known(self, robot: str) -> Iterator[KeptObject]:
         """What is kept of a robot, what was asked for and is on its way, and what left for good within the last hour."""
@@ -143,19 +170,72 @@ class RequestTable:
             )  # fmt: skip
 
     def close(self, request: str, state: str, why: str) -> None:
-        """What it has not released is nobody's any more, as far as this request goes."""
+        """End it; ``let_go`` follows."""
         self._db.execute('UPDATE requests SET state = ?, why = ? WHERE id = ? AND state = ?', (state, why, request, ACTIVE))
-        self._db.execute("UPDATE requested SET outcome = 'unsent' WHERE request = ? AND outcome = 'kept'", (request,))
+
+    def let_go(self, request: str) -> bool:
+        """Of a request that is over: some of what it has not released is nobody's any more; whether there may be more."""
+        some = "SELECT id FROM requested WHERE request = ?1 AND outcome = 'kept' LIMIT ?2"
+        query = f"UPDATE requested SET outcome = 'unsent' WHERE request = ?1 AND id IN ({some})"  # noqa: S608 - own constants only
+        return self._db.execute(query, (request, PIECE)).rowcount == PIECE
+
+    def clear(self, request: str) -> bool:
+        """Drop some of what a request chose when it was made before; whether there may be more."""
+        some = 'SELECT id FROM requested WHERE request = ?1 LIMIT ?2'
+        query = f'DELETE FROM requested WHERE request = ?1 AND id IN ({some})'  # noqa: S608 - own constants only
+        return self._db.execute(query, (request, PIECE)).rowcount == PIECE
+
+    def clear_unfinished(self) -> bool:
+        """Drop some of what was added to a request that has no row, or was added again to one that is over; as ``clear``.
+
+        Only the death of a process leaves such.
+        """
+        some = f"SELECT request, id FROM requested WHERE outcome = 'kept' AND request NOT IN ({_OPEN}) LIMIT ?"  # noqa: S608 - own constants only
+        query = f'DELETE FROM requested WHERE (request, id) IN ({some})'  # noqa: S608 - own constants only
+        return self._db.execute(query, (PIECE,)).rowcount == PIECE
+
+    def to_cut(self, request: str) -> list[tuple[int, str, str, str, Mapping[str, str]]]:
+        """(id, bucket, key, SHA-256, metadata) of the kept slices of which it wants a part, the oldest first."""
+        found = self._db.execute(
+            'SELECT id, bucket, key, sha256, metadata FROM requested JOIN objects USING (id) WHERE request = ?'
+            " AND outcome = 'kept' AND requested.bytes < objects.bytes ORDER BY id", (request,),
+        )  # fmt: skip
+        return [(number, bucket, key, sha256, json.loads(metadata)) for number, bucket, key, sha256, metadata in found]
+
+    def set_whole(self, request: str, ids: Iterable[int]) -> None:
+        """These are sent whole."""
+        size = 'SELECT bytes FROM objects WHERE objects.id = requested.id'
+        query = f'UPDATE requested SET bytes = ({size}) WHERE request = ? AND id = ?'  # noqa: S608 - own constants only
+        self._db.executemany(query, ((request, number) for number in ids))
+        self._recount(request)
+
+    def set_cut(self, request: str, ids: Iterable[int], made: Iterable[tuple[int, int, str]]) -> None:
+        """In place of these slices it waits for what was cut out of them: (id, bytes, state)."""
+        self._db.executemany('DELETE FROM requested WHERE request = ? AND id = ?', ((request, number) for number in ids))
+        self._db.executemany('INSERT OR REPLACE INTO requested VALUES (?, ?, ?, ?)', ((request, *each) for each in made))
+        self._recount(request)
+
+    def _recount(self, request: str) -> None:
+        sums = 'SELECT count(*), ifnull(sum(bytes), 0) FROM requested WHERE request = ?1'
+        self._db.execute(f'UPDATE requests SET (objects, bytes) = ({sums}) WHERE id = ?1', (request,))  # noqa: S608
 
     def take_answer(self, request: str, number: int, told: str, now_ns: int) -> bool:
         """Whether this answer is the next one; it is given then, and tells this state."""
         query = 'UPDATE requests SET answers = ?, told = ?, told_ns = ? WHERE id = ? AND answers = ?'
         return self._db.execute(query, (number, told, now_ns, request, number - 1)).rowcount > 0
 
-    def waiting(self, request: str, limit: int) -> list[tuple[int, int]]:
-        """(id, bytes) of what it waits for and nobody has released."""
-        query = "SELECT id, bytes FROM requested WHERE request = ? AND outcome = 'kept' ORDER BY id LIMIT ?"
-        return self._db.execute(query, (request, limit)).fetchall()
+    def waiting(self, request: str, limit: int) -> list[WaitingObject]:
+        """What it waits for and nobody has released, the oldest first."""
+        query = (
+            'SELECT id, requested.bytes, requested.bytes < objects.bytes FROM requested JOIN objects USING (id)'
+            " WHERE request = ? AND outcome = 'kept' ORDER BY id LIMIT ?"
+        )
+        return [WaitingObject(number, size, bool(is_cut)) for number, size, is_cut in self._db.execute(query, (request, limit))]
+
+    def is_over(self, request: str) -> bool:
+        """Whether nothing of it is waited for."""
+        query = 'SELECT 1 FROM requested WHERE request = ? AND outcome = ? LIMIT 1'
+        return not any(self._db.execute(query, (request, outcome)).fetchone() for outcome in ('kept', 'pending'))
 
     def released(self) -> tuple[int, int]:
         """Requested objects that wait for delivery, and their bytes."""
@@ -173,10 +253,17 @@ class RequestTable:
             "SELECT key, outcome, ifnull(reason, ''), ifnull(settled_ns, 0) FROM requested JOIN objects USING (id)"
             " WHERE request = ? AND outcome IN ('evicted', 'quarantined') ORDER BY id LIMIT ?", (request, most_lost),
         )  # fmt: skip
-        return Progress(outcomes, tuple(lost.fetchall()))
+        cut = self._db.execute(
+            "SELECT key FROM requested JOIN objects USING (id) WHERE request = ? AND key LIKE '%/manifest.json'"
+            ' ORDER BY id LIMIT ?', (request, most_lost),
+        )  # fmt: skip
+        return Progress(outcomes, tuple(lost.fetchall()), tuple(key for (key,) in cut))
 
-    def forget(self, before_ns: int) -> None:
-        """Those that are over, and of which the last answer was given before then."""
-        old = 'SELECT id FROM requests WHERE state <> ? AND told = state AND told_ns < ?'
-        self._db.execute(f'DELETE FROM requested WHERE request IN ({old})', (ACTIVE, before_ns))  # noqa: S608 - own constants only
-        self._db.execute(f'DELETE FROM requests WHERE id IN ({old})', (ACTIVE, before_ns))  # noqa: S608 - own constants only
+    def answered(self, before_ns: int, most: int | None = None) -> list[str]:
+        """Those that are over, and of which the last answer was given before then; the first ones, as many as are asked for."""
+        query = 'SELECT id FROM requests WHERE state <> ? AND told = state AND told_ns < ? ORDER BY told_ns LIMIT ?'
+        return [request for (request,) in self._db.execute(query, (ACTIVE, before_ns, -1 if most is None else most))]
+
+    def forget(self, request: str) -> None:
+        """Drop the row of a request that was cleared."""
+        self._db.execute('DELETE FROM requests WHERE id = ?', (request,))

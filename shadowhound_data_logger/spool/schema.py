@@ -160,9 +160,11 @@ CREATE TABLE requested (
   request TEXT NOT NULL, id INTEGER NOT NULL, bytes INTEGER NOT NULL, outcome TEXT NOT NULL,
   PRIMARY KEY (request, id)) WITHOUT ROWID;
 CREATE INDEX requested_objects ON requested (id);
+CREATE INDEX requested_waiting ON requested (request, id) WHERE outcome = 'kept';
+CREATE INDEX requested_released ON requested (request, id, bytes) WHERE outcome = 'pending';
 CREATE TRIGGER answered AFTER UPDATE OF state ON objects
     WHEN OLD.state <> NEW.state AND EXISTS (SELECT 1 FROM requested WHERE requested.id = NEW.id) BEGIN
-  UPDATE requested SET outcome = NEW.state WHERE id = NEW.id;
+  UPDATE requested SET outcome = NEW.state, bytes = NEW.bytes WHERE id = NEW.id;
 END;
 """  # noqa: S608 - own constants only
 """What stays on the robot until somebody asks for it, and who asked (request_table.py).

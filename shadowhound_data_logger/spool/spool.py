@@ -35,7 +35,15 @@ from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index, lost, spooled
 from shadowhound_data_logger.spool.recovery import any_alive, open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
-from shadowhound_data_logger.spool.request_table import KeptObject, Progress, RequestRow
+from shadowhound_data_logger.spool.request_table import (
+    PIECE,
+    KeptObject,
+    KeptSlice,
+    Progress,
+    RequestRow,
+    RequestTable,
+    WaitingObject,
+)
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, evict_old, fits, make_room
 from shadowhound_data_logger.spool.session import Session, carry
 from shadowhound_data_logger.spool.usage import SpoolUsage, usage_of
@@ -258,9 +266,18 @@ class Spool:
         """What became of what a request found; waits for no commit. Raises sqlite3.Error."""
         return self._view.requests.progress(request)
 
-    def next_requested(self, request: str, limit: int) -> list[tuple[int, int]]:
-        """(id, bytes) of what a request still waits for and nobody has released, the oldest first. Raises sqlite3.Error."""
+    def is_over(self, request: str) -> bool:
+        """Whether a request waits for nothing; waits for no commit. Raises sqlite3.Error."""
+        return self._view.requests.is_over(request)
+
+    def next_requested(self, request: str, limit: int) -> list[WaitingObject]:
+        """What a request still waits for and nobody has released, the oldest first. Raises sqlite3.Error."""
         return self._view.requests.waiting(request, limit)
+
+    def to_cut(self, request: str) -> list[KeptSlice]:
+        """Kept slices of which a request wants a part, the oldest first. Raises sqlite3.Error."""
+        return [KeptSlice(number, key, self._tree.path(State.KEPT, None, bucket, key), sha256, metadata)
+                for number, bucket, key, sha256, metadata in self._view.requests.to_cut(request)]  # fmt: skip
 
     def released(self) -> tuple[int, int]:
         """Requested objects that wait for delivery, and their bytes. Raises sqlite3.Error."""
@@ -275,20 +292,60 @@ class Spool:
             index.open()
             yield from index.requests.known(self._robot)
 
-    def accept(self, row: RequestRow, chosen: Iterable[int]) -> RequestRow:
-        """Make a request a row, with what it chose of what is kept; returns the row as it is then. Raises as ``commit``."""
+    def accept(self, row: RequestRow, chosen: Sequence[tuple[int, int]]) -> RequestRow:
+        """Make a request a row, with the (id, bytes) that it chose of what is kept; returns the row as it is then.
+
+        Fewer bytes than an object has are of a slice that is cut. Raises as ``commit``; before the row nothing of it counts.
+        """
+        self._in_pieces(lambda table: table.clear(row.id))
+        for begin in range(0, len(chosen), PIECE):
+            with self._lock, self._index.transaction():
+                self._index.requests.add(row.id, chosen[begin : begin + PIECE])
         with self._lock, self._index.transaction():
-            return self._index.requests.accept(row, chosen)
+            return self._index.requests.accept(row)
 
     def close_request(self, request: str, state: str, why: str = '') -> None:
         """End a request; what it has not released is free to go. Raises as ``commit``."""
         with self._lock, self._index.transaction():
             self._index.requests.close(request, state, why)
+        self.let_go(request)
 
-    def forget_requests(self, before_ns: int) -> None:
-        """Drop those that were answered before then. Raises as ``commit``."""
+    def let_go(self, request: str) -> None:
+        """Of a request that is over: what it has not released is free to go. Raises as ``commit``."""
+        self._in_pieces(lambda table: table.let_go(request))
+
+    def set_whole(self, request: str, ids: Collection[int]) -> None:
+        """These slices cannot be cut: the request wants all of them. Raises as ``commit``."""
         with self._lock, self._index.transaction():
-            self._index.requests.forget(before_ns)
+            self._index.requests.set_whole(request, ids)
+
+    def set_cut(self, request: str, ids: Collection[int], places: Iterable[tuple[str, str]]) -> int:
+        """A request waits for these (bucket, key) in place of the slices that they were cut out of; returns their bytes.
+
+        Raises as ``commit``.
+        """
+        with self._lock, self._index.transaction():
+            rows = [row for bucket, key in places if (row := self._index.row(bucket, key)) is not None]
+            self._index.requests.set_cut(request, ids, [(row['id'], row['bytes'], row['state']) for row in rows])
+        return sum(row['bytes'] for row in rows)
+
+    def forget_requests(self, before_ns: int, most: int | None = None) -> None:
+        """Drop those that were answered before then, the first ones first, ``most`` at most. Raises as ``commit``."""
+        for request in self._view.requests.answered(before_ns, most):
+            self._in_pieces(lambda table: table.clear(request))  # noqa: B023 - called at once
+            with self._lock, self._index.transaction():
+                self._index.requests.forget(request)
+
+    def clear_requests(self) -> None:
+        """Drop what a process left that died while it accepted a request. Raises as ``commit``."""
+        self._in_pieces(RequestTable.clear_unfinished)
+
+    def _in_pieces(self, step: Callable[[RequestTable], bool]) -> None:
+        """Until it says that there is no more to do; others have their turn between two."""
+        more = True
+        while more:
+            with self._lock, self._index.transaction():
+                more = step(self._index.requests)
 
     def release(self, wanted: Sequence[tuple[int, int]]) -> list[SpooledObject]:
         """Let kept objects (id, priority) wait for delivery, all or none. As ``bind``, what is not kept any more is left out."""

@@ -3,140 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from spool.making import NOON_NS, FakeClock, assert_whole, make, receive, rows
+from ship.asking import Desk, frame
+from spool.making import NOON_NS, assert_whole, rows
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import KeepSettings, SpoolSettings
-from shadowhound_data_logger.mailbox import (
-    MAILBOX_BUCKET,
-    KeptFilter,
-    PullCancel,
-    PullRequest,
-    answers_prefix,
-    encode_inbox,
-    inbox_key,
-)
-from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
-from shadowhound_data_logger.ship.requests import WINDOW, RequestServer
-from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.stores.memory import MemoryStore
-
-KEEP = KeepSettings(poll_s=10.0)
-
-
-def frame(number: int, *, body: bytes = b'', **fields: Any) -> DataObject:
-    """A picture that stays on the robot, one a second."""
-    stamp_ns = NOON_NS + number * SECOND
-    said = {words.ROBOT: 'thor', words.POSE: f'{number} 0 0 odom', words.SHIP: words.ON_REQUEST, **fields.pop('metadata', {})}
-    return make(f'thor/camera/20251018/{number:06d}_front.jpg', body or b'%06d' % number, t_start_ns=stamp_ns, t_end_ns=stamp_ns,
-                metadata=said, **fields)  # fmt: skip
-
-
-class Desk:
-    """A robot with its spool and a store, and somebody who asks."""
-
-    def __init__(self, root: Path, keep: KeepSettings = KEEP) -> None:
-        self.root = root
-        self.clock = FakeClock()
-        self.clock.now_ns = NOON_NS + 3600 * SECOND
-        self.now_s = 0.0
-        self.store = MemoryStore()
-        self.keep = keep
-        self.version = ''
-        self.entries: list[Any] = []
-        self.released: list[SpooledObject] = []
-        self._put_inbox(b'{"format":1,"entries":[]}')
-        self.open()
-
-    def open(self) -> None:
-        """The node starts."""
-        self.spool = Spool(self.root, SpoolSettings(min_free_bytes=0), self.clock, 'thor', self.keep)
-        self.spool.open()
-        self.server = RequestServer(self.spool, self.store, self.keep, 'thor', self.clock, put=self._commit,
-                                    released=self.released.extend, monotonic=lambda: self.now_s)  # fmt: skip
-
-    def _commit(self, item: DataObject) -> None:
-        self.spool.commit([item])
-
-    def _put_inbox(self, body: bytes) -> None:
-        path = self.root.parent / 'inbox'
-        path.write_bytes(body)
-        import hashlib
-
-        self.store.put(
-            SpooledObject(
-                0,
-                MAILBOX_BUCKET,
-                inbox_key('thor'),
-                path,
-                len(body),
-                hashlib.sha256(body).hexdigest(),
-                'application/json',
-                {},
-                0,
-                0,
-            )
-        )
-
-    def keeps(self, *items: DataObject) -> None:
-        receive(self.spool, sum(item.samples for item in items))
-        assert self.spool.commit(items) == []
-
-    def write(self, body: bytes) -> None:
-        """Somebody replaces the mailbox."""
-        found = self.store.changed(MAILBOX_BUCKET, inbox_key('thor'), '', 1 << 30)
-        assert found
-        assert self.store.replace(MAILBOX_BUCKET, inbox_key('thor'), body, found[1])
-
-    def ask(self, *, by: str = 'spark', priority: int = 5, expires_s: int = 3600, **want: Any) -> str:
-        now_ns = self.clock.now_ns
-        request = PullRequest(robot='thor', by=by, made_ns=now_ns, expires_ns=now_ns + expires_s * SECOND, priority=priority,
-                              want=KeptFilter(**want))  # fmt: skip
-        self.entries.append(request.to_json())
-        self.write(encode_inbox(self.entries))
-        return request.id
-
-    def step(self, seconds: float = 10.0) -> None:
-        self.now_s += seconds
-        self.clock.now_ns += round(seconds * SECOND)
-        self.server.step()
-
-    def deliver(self, most: int = 1000) -> int:
-        """The store takes what is pending."""
-        items = self.spool.pending(most)
-        for item in items:
-            self.store.put(item)
-        self.spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
-        return len(items)
-
-    def answers(self, request: str) -> list[dict[str, Any]]:
-        """What the store has, in order."""
-        while self.deliver():
-            pass
-        found = [
-            json.loads(self.store.get(MAILBOX_BUCKET, info.key))
-            for info in self.store.list(MAILBOX_BUCKET, answers_prefix('thor', request))
-        ]
-        return sorted(found, key=lambda answer: answer['number'])
-
-    def finish(self) -> None:
-        """Until nothing happens any more."""
-        for _ in range(60):
-            self.step()
-            self.deliver()
-            if not self.spool.released()[0] and not any(row.is_open for row in self.spool.requests()):
-                break
-        self.step()
-
-    def state(self, number: int) -> str:
-        return next(row['state'] for row in rows(self.root) if row['key'].endswith(f'{number:06d}_front.jpg'))
+from shadowhound_data_logger.config import KeepSettings
+from shadowhound_data_logger.mailbox import KeptFilter, PullCancel, PullRequest, encode_inbox
+from shadowhound_data_logger.ship.requests import WINDOW
+from shadowhound_data_logger.spool.request_table import RequestTable
 
 
 @pytest.fixture
@@ -334,3 +216,69 @@ def test_a_hostile_mailbox_is_refused(desk: Desk) -> None:
     desk.write(json.dumps({'format': 1, 'entries': [{}, good]}).encode())
     desk.step()
     assert len(desk.released) == 1
+
+
+def test_a_death_while_many_objects_are_accepted_leaves_no_half_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A request is accepted in pieces, so that nobody waits for long; before its row nothing of it counts, nor bars eviction."""
+    monkeypatch.setattr('shadowhound_data_logger.spool.spool.PIECE', 4)
+    desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
+    desk.keeps(*(frame(number) for number in range(10)))
+    with closing(desk.spool):
+        real, calls = RequestTable.add, Counter[str]()
+
+        def add(table: RequestTable, request: str, chosen: Sequence[tuple[int, int]]) -> None:
+            calls[request] += 1
+            if calls[request] == 3:
+                raise OSError('it died')
+            real(table, request, chosen)
+
+        monkeypatch.setattr(RequestTable, 'add', add)
+        request = desk.ask(sensor='camera')
+        with pytest.raises(OSError, match='it died'):
+            desk.step()
+        assert desk.spool.requests() == []
+        assert len(desk.spool.next_requested(request, 100)) == 8
+    desk.entries.clear()
+    desk.write(encode_inbox([]))  # the requester took it out again
+    desk.open()
+    with closing(desk.spool):
+        desk.step()
+        assert desk.spool.next_requested(request, 100) == []
+        request = desk.ask(sensor='camera')
+        desk.finish()
+        assert desk.answers(request)[-1]['outcomes'] == {'delivered': {'objects': 10, 'bytes': 60}}
+        assert_whole(desk.root)
+
+
+def test_a_requester_that_floods_keeps_nobody_waiting(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One asks for all in more ways than are looked at together; another one's few objects are among the first that are sent."""
+    monkeypatch.setattr('shadowhound_data_logger.ship.requests.AT_A_TIME', 6)
+    size = 60 << 10
+    desk.keeps(*(frame(n, body=b'%06d' % n * (size // 6)) for n in range(80)))
+    for number in range(20):
+        desk.ask(by='flood', priority=0, sensor='camera', until_ns=NOON_NS + (80 + number) * SECOND)
+    desk.ask(by='other', priority=9, sensor='camera', since_ns=NOON_NS + 75 * SECOND)
+    desk.step()
+    assert set(range(75, 80)) <= {int(item.key[-16:-10]) for item in desk.released}
+
+
+def test_a_request_expires_in_the_middle_of_a_slice_of_many(desk: Desk) -> None:
+    """What was released arrives, the rest stays here and may be evicted and asked for again; the last answer has both."""
+    size = 200 << 10
+    for number in range(0, 60, 20):
+        desk.keeps(*(frame(n, body=b'%06d' % n * (size // 6)) for n in range(number, number + 20)))
+    request = desk.ask(sensor='camera', expires_s=15)
+    desk.step()
+    desk.deliver()
+    desk.step(10.0)
+    desk.finish()
+    last = desk.answers(request)[-1]
+    assert last['state'] == 'expired'
+    counts = {name: each['objects'] for name, each in last['outcomes'].items()}
+    assert set(counts) == {'delivered', 'unsent'}
+    assert sum(counts.values()) == 60
+    again = desk.ask(sensor='camera', expires_s=3600)
+    assert again == request
+    desk.finish()
+    assert desk.answers(request)[-1]['state'] == 'done'
+    assert {row['state'] for row in rows(desk.root) if row['sensor'] == 'camera'} == {'delivered'}

@@ -1,0 +1,122 @@
+"""A range of time out of slices that the robot keeps, as a small bag of its own: what a request for a few seconds sends.
+
+The bag's name is of what is in it, so that the same range is cut and sent once, whoever asks.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Generator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, MissionOf, SliceEntry, topics_of
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, slice_file
+from shadowhound_data_logger.bags.objects import SENSOR, ros_distro
+from shadowhound_data_logger.bags.remote import natural
+from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.keys import MAX_BAG_BYTES
+from shadowhound_data_logger.mcap.index import read_index
+from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.mcap.ranges import LocalFile
+from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.mcap.slice_info import SliceInfo
+from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.model import DataObject, FileBody
+from shadowhound_data_logger.spool.request_table import KeptSlice
+
+CUTTING: Final = 'cutting'
+"""The folder of what is being cut, by robot, in SHADOWHOUND_HOME."""
+
+
+def sweep(home: Path, robot: str) -> None:
+    """Remove what a process of this robot was cutting when it died."""
+    shutil.rmtree(home / CUTTING / robot, ignore_errors=True)
+
+
+class KeptCut:
+    """A cut out of kept slices of one bag.
+
+    New; ``work`` once; nothing of it is left on the disk but what ``work`` returned, which the spool takes over.
+    """
+
+    def __init__(self, home: Path, slices: Sequence[KeptSlice], since_ns: int, until_ns: int, priority: int) -> None:
+        """From ``since_ns``, before ``until_ns``, Unix nanoseconds. ``slices`` are of one bag, one at least."""
+        self.slices = sorted(slices, key=lambda each: natural(each.key))
+        self._span = since_ns, until_ns
+        self._priority = priority
+        self.robot, _, self._of, _ = slices[0].key.split('/')
+        said = '\n'.join((*(each.sha256 for each in self.slices), str(since_ns), str(until_ns)))
+        mark = f'_cut_{hashlib.sha256(said.encode()).hexdigest()[:8]}'
+        self.bag = f'{self._of[: MAX_BAG_BYTES - len(mark)]}{mark}'
+        self._folder = home / CUTTING / self.robot / self.bag
+
+    @property
+    def places(self) -> list[tuple[str, str]]:
+        """(bucket, key) of the objects that it becomes."""
+        return [(BUCKET, key_of(self.robot, self.bag, file)) for file in (slice_file(self.bag, 0), METADATA, MANIFEST)]
+
+    def work(self) -> Generator[None, None, list[DataObject]]:
+        """Cut, and yield after each chunk; at last the objects, none where nothing was recorded then.
+
+        Raises BagDamaged for a slice that cannot be read, OSError.
+        """
+        shutil.rmtree(self._folder, ignore_errors=True)
+        self._folder.mkdir(mode=0o700, parents=True)
+        writer = SliceWriter(self._folder / slice_file(self.bag, 0), ros_distro=ros_distro())
+        try:
+            for each in self.slices:
+                yield from self._copy(each, writer)
+            info = writer.close()
+        except BaseException:
+            writer.abort()
+            self.clear()
+            raise
+        if not info.messages:
+            self.clear()
+            return []
+        return self._objects(info)
+
+    def clear(self) -> None:
+        """Remove what it wrote."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _copy(self, each: KeptSlice, writer: SliceWriter) -> Generator[None, None, None]:
+        """A chunk at a time: several would be read ahead."""
+        source = LocalFile(each.path)
+        index = read_index(source)
+        if not index.is_indexed:
+            raise BagDamaged(f'{source.name} has no index', path=source.name)
+        wanted = MessageFilter(*self._span, lambda _: True)
+        for chunk in index.chunks:
+            for message in read_messages(source, replace(index, chunks=(chunk,)), wanted):
+                writer.write(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
+            yield
+
+    def _objects(self, info: SliceInfo) -> list[DataObject]:
+        said = self.slices[0].metadata
+        marks = {name: said[name] for name in (words.ROBOT, words.MISSION_ID, words.RUN_ID) if name in said}
+        marks |= {words.BAG: self.bag, words.CUT_OF: self._of}
+        mission = MissionOf(self._of.rsplit('_', 2)[0], said.get(words.MISSION_ID), said.get(words.RUN_ID))
+        manifest = Manifest(
+            bag=self.bag, robot=self.robot, mission=mission if mission.mission_id or mission.run_id else None, state=COMPLETE,
+            missing=(), topics=topics_of([info]), slices=(SliceEntry.of(info, self.places[0][1]),),
+        )  # fmt: skip
+        times = {words.T_START_NS: str(info.t_start_ns), words.T_END_NS: str(info.t_end_ns)}
+        bodies: tuple[tuple[FileBody | bytes, str, dict[str, str]], ...] = (
+            (FileBody(info.path, info.bytes, info.sha256), 'application/octet-stream',
+             {words.SLICE: '0', words.MESSAGES: str(info.messages), **times}),
+            (metadata_yaml([info], ros_distro=ros_distro()), 'application/yaml', {}),
+            (manifest.to_json(), 'application/json', {}),
+        )  # fmt: skip
+        return [
+            DataObject(
+                bucket=bucket, key=key, body=body, content_type=kind, sensor=SENSOR, topic=None, type='', samples=0,
+                t_start_ns=info.t_start_ns, t_end_ns=info.t_end_ns, priority=self._priority, protected=True,
+                metadata={**marks, **more},
+            )
+            for (bucket, key), (body, kind, more) in zip(self.places, bodies, strict=True)
+        ]  # fmt: skip
