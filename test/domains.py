@@ -11,9 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from segments import free_orphans
 
 from shadowhound_data_logger.doctor.machine import domains
+from shadowhound_data_logger.ros.shared_memory import orphans
 from shadowhound_data_logger.sim.demo_processes import DOMAINS
 
 
@@ -34,6 +34,6 @@ def free_domain() -> Iterator[int]:
             yield domain
         finally:
             os.close(lock)
-            free_orphans()
+            orphans(is_freed=True)
         return
     pytest.fail('no ROS domain is free')

@@ -6,7 +6,6 @@ every object of the store is compared with it, and what is missing must belong t
 
 from __future__ import annotations
 
-import fcntl
 import random
 import re
 import signal
@@ -47,7 +46,6 @@ PARAMETERS: Final[dict[str, Any]] = {
 }  # fmt: skip
 """Every message is stored; and a store that is back is noticed within the life of a node."""
 READY: Final = re.compile(r'\[(\d+\.\d+)\].*: logging ')
-SHARED_MEMORY: Final = Path('/dev/shm')  # noqa: S108 - where Fast DDS keeps its segments is fixed
 
 
 @dataclass(slots=True)
@@ -120,10 +118,8 @@ class Killer:
 
     def _kill(self) -> None:
         node = self._nodes[-1]
-        segments = _segments(node.popen.pid)
         self._kills.append(Kill(time.time(), float('inf')))
         node.kill()
-        _remove_dead(segments)
         found = ledger.imbalances(ledger.read(node.home / 'spool', ROBOT))
         self._unbalanced += [f'after kill {len(self._kills)}: {line}' for line in found]
 
@@ -136,25 +132,6 @@ def _ready(node: Node) -> float:
     """When the node listened, by its own log, s since 1970."""
     found = READY.search(node.log)
     return float(found[1]) if found else float('inf')
-
-
-def _segments(pid: int) -> set[str]:
-    """The segments of shared memory that a process uses, its own and others'."""
-    maps = Path(f'/proc/{pid}/maps').read_text()
-    return set(re.findall(rf'{SHARED_MEMORY}/(fastdds_[0-9a-f]{{16}})\b', maps))
-
-
-def _remove_dead(segments: set[str]) -> None:
-    """What ``fastdds shm clean`` does: a killed process leaves 33 MB of memory, whose lock nobody holds any more."""
-    for name in segments:
-        lock = SHARED_MEMORY / f'{name}_el'
-        try:
-            with lock.open('rb') as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            continue
-        for path in (SHARED_MEMORY / name, lock, SHARED_MEMORY / f'sem.{name}_mutex'):
-            path.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -29,11 +29,12 @@ from matplotlib.figure import Figure
 
 from bench._proc import memory
 from shadowhound_data_logger.missions.plots import AMBER, BLUE, DPI, INK, STYLE, TEAL
+from shadowhound_data_logger.ros.shared_memory import FOLDER
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.control import NAME, Connection
 from torture._command import Bar, parser, progress, verdict, workshop
-from torture.kills import ROBOT, SHARED_MEMORY, running
+from torture.kills import ROBOT, running
 
 MINUTES: Final = 15.0
 SHORT_MINUTES: Final = 2.0
@@ -195,7 +196,7 @@ class Robot:
 
 def _look(node: Node, said: Mapping[str, Any], now_s: float) -> Look:
     proc, index = Path('/proc', str(node.popen.pid)), node.home / 'spool' / 'index.db'
-    mapped = {line.rpartition(' ')[2] for line in (proc / 'maps').read_text().splitlines() if f' {SHARED_MEMORY}/' in line}
+    mapped = {line.rpartition(' ')[2] for line in (proc / 'maps').read_text().splitlines() if f' {FOLDER}/' in line}
     sizes = [_size(Path(path)) for path in mapped]
     threads = next(line for line in (proc / 'status').read_text().splitlines() if line.startswith('Threads:'))
     objects = said['objects']

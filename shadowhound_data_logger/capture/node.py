@@ -26,6 +26,7 @@ from shadowhound_data_logger.capture.middleware import SETTING, Middleware
 from shadowhound_data_logger.capture.parameters import Parameters
 from shadowhound_data_logger.capture.pipeline import Pipeline, Ros
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
+from shadowhound_data_logger.ros.shared_memory import orphans
 from shadowhound_data_logger.ros_arguments import NODE, rules_for
 
 log = logging.getLogger(__name__)
@@ -132,6 +133,13 @@ def give_back() -> None:
         trim(0)
 
 
+def free_shared_memory() -> None:
+    """What processes that were killed left in /dev/shm, such as the node before this one."""
+    if found := orphans(is_freed=True):
+        freed = sum(each.bytes for each in found)
+        log.info('freed %.0f MB of shared memory (%d segments) that killed processes had left', freed / 1e6, len(found))
+
+
 def refuse(rest: list[str]) -> int:
     """Answer arguments that are not for ROS; the exit code."""
     if rest[0] in {'-h', '--help'}:
@@ -158,6 +166,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
     with middleware.profiled(os.environ):
         node, name = make_node(arguments, is_public=not middleware.is_foreign)
     logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
+    free_shared_memory()
     node.get_logger().info(f'listening by {middleware.describe()}')
     if '--params-file' in arguments and not Parameters(node).given():  # which is not an error to rcl
         node.get_logger().warning(UNHEARD.format(name=name))

@@ -67,7 +67,9 @@ def _is_of(check: str, name: str) -> bool:
 )
 @as_json
 @click.option(
-    '--fix', is_flag=True, help='Repair what is safe (modes of files, missing buckets); the rest is printed for you to paste.'
+    '--fix',
+    is_flag=True,
+    help='Repair what is safe (modes of files, missing buckets, orphaned shared memory); the rest is printed for you to paste.',
 )
 @click.option(
     '--timeout', type=click.FloatRange(0.5, 600.0), default=TIMEOUT_S, show_default=True, help='Seconds for all checks.'

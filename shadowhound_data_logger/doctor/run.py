@@ -1,4 +1,4 @@
-"""Runs checks side by side, and repairs what ``--fix`` may: modes of files with keys, and missing buckets.
+"""Runs checks side by side, and repairs what ``--fix`` may: modes of files with keys, missing buckets, orphaned shared memory.
 
 It ends in time; what hangs, crashes or is not reached is in the answer as well.
 """
@@ -22,6 +22,7 @@ from shadowhound_data_logger.doctor.context import to_child
 from shadowhound_data_logger.doctor.model import Check, Context, Result, Severity, error
 from shadowhound_data_logger.doctor.s3_put import single_requests
 from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.ros.shared_memory import orphans
 
 TIMEOUT_S: Final = 12.0
 """With the start of Python, a run on a dead network ends within 15 s."""
@@ -200,6 +201,9 @@ def _fixed(what: tuple[str, ...], context: Context) -> str:
         if kind == 'mode':
             Path(name).chmod(int(rest[0], 8))
             return f'chmod {rest[0]} {name}'
+        if kind == 'segments':
+            freed = orphans(Path(name), is_freed=True)
+            return f'freed {sum(each.bytes for each in freed) / 1e6:.0f} MB in {name}'
         _create(name, context)
     except (OSError, DataLoggerError) as problem:
         return f'not done: {problem}'

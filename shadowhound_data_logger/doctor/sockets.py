@@ -13,6 +13,7 @@ from shadowhound_data_logger.doctor.model import Context, Result, error, info, o
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, middleware, running
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.options import IMAGE, POINT_CLOUD
+from shadowhound_data_logger.ros.shared_memory import orphans
 
 NAME: Final = 'sockets'
 PROFILES: Final = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
@@ -179,6 +180,18 @@ def _profile(context: Context) -> Result:
 
 
 def _memory(context: Context, driver: list[Process]) -> Iterator[Result]:
+    found = orphans(folder := context.root / 'dev/shm')
+    if found:
+        size = sum(each.bytes for each in found)
+        yield warning(
+            'sockets.orphans',
+            f'killed processes have left {size / 1e6:.0f} MB in {folder} ({len(found)} segments)',
+            'Fast DDS frees its shared memory only where a process ends by itself',
+            'shadowhound-data doctor --fix  # the node frees it as well when it starts',
+            fix=('segments', str(folder)),
+            segments=len(found),
+            bytes=size,
+        )
     try:
         disk = os.statvfs(context.root / 'dev/shm')
     except OSError:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import os
+import re
 import signal
 import time
 from collections.abc import Callable
@@ -13,6 +15,7 @@ from e2e.processes import Node, Processes, published, until
 from e2e.reading import TYPES, Objects, decode, stamp_ns
 from e2e.witness import recorded
 
+from shadowhound_data_logger.ros.shared_memory import FOLDER, orphans
 from shadowhound_data_logger.sim.tower import Tower
 
 SECOND = 10**9
@@ -116,3 +119,25 @@ def test_kill_and_restart_under_load(processes: Processes, seaweed: Tower, store
     for name in ('camera', 'odom', 'lidar'):
         seconds = [int(info.metadata['t_start_ns']) // SECOND for key, info in objects.infos.items() if f'/{name}/' in key]
         assert len(seconds) == len(set(seconds)), 'a restart within a second keeps nothing of it twice'
+
+
+@pytest.mark.long('a kill')
+def test_the_next_node_frees_the_shared_memory_of_a_killed_one(processes: Processes) -> None:
+    """And that of nobody who lives."""
+    other, dead = processes.node(home='other', robot='other'), processes.node()
+    segments = {node: set(re.findall(rf'{FOLDER}/fast(?:dds|rtps)_[0-9a-f]{{16}}\b', _maps(node))) for node in (other, dead)}
+    owned = segments[dead] - segments[other]
+    dead.kill()
+    left = [path for path in map(Path, owned) if path.exists()]
+    if not left:
+        pytest.skip('this middleware leaves nothing behind')
+    for path in left:
+        os.utime(f'{path}_el', (0, 0))  # as if it had been killed long ago
+    assert {Path(path).name for path in left} <= {each.name for each in orphans()}
+    processes.node()
+    assert not [path for path in left if path.exists()]
+    assert all(Path(path).exists() for path in segments[other] - owned)
+
+
+def _maps(node: Node) -> str:
+    return Path(f'/proc/{node.popen.pid}/maps').read_text()

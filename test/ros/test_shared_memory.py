@@ -1,0 +1,72 @@
+"""Shared memory of killed processes: what is freed, and what is left alone."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.ros.shared_memory import Orphan, orphans
+
+DEAD, ALIVE, YOUNG = 'fastrtps_0123456789abcdef', 'fastdds_00000000000000aa', 'fastdds_00000000000000bb'
+OTHERS = ('fastrtps_port7411', 'fastrtps_port7411_el', 'fast_datasharing_01.0f.78.fd.2f.45.bd.0f.00.00.00.00_0.0.6.3',
+          'fastdds_00000000000000cc', 'fastdds-profile.xml', 'fastdds_0123_el')  # fmt: skip
+
+
+@pytest.fixture
+def shm(tmp_path: Path) -> Path:
+    """Three segments with their locks, and what is none of ours, all of long ago but one."""
+    for name in (*OTHERS, *(f'{segment}{end}' for segment in (DEAD, ALIVE, YOUNG) for end in ('', '_el'))):
+        (tmp_path / name).write_bytes(b'x' * 8192 if '_el' not in name else b'')
+        os.utime(tmp_path / name, (0, 0))
+    now = time.time()
+    os.utime(tmp_path / f'{YOUNG}_el', (now, now + 3600))
+    return tmp_path
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_only_what_nobody_holds_is_freed(shm: Path) -> None:
+    """Not that of a process that lives or starts, nor ports, nor what has no lock; to look at them changes nothing."""
+    before = names(shm)
+    with flock(shm / f'{ALIVE}_el'):
+        assert [each.name for each in orphans(shm)] == [DEAD]
+        assert names(shm) == before
+        assert orphans(shm, is_freed=True) == [Orphan(DEAD, 8192)]
+        assert names(shm) == before - {DEAD, f'{DEAD}_el'}
+        assert orphans(shm, is_freed=True) == []
+
+
+def test_what_belongs_to_another_user_stays(shm: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever may remove it: root, say."""
+    before, mine = names(shm), os.geteuid()
+    monkeypatch.setattr(os, 'geteuid', lambda: mine + 1)
+    assert orphans(shm, is_freed=True) == []
+    assert names(shm) == before
+
+
+def test_a_lock_that_is_none_is_left_alone(shm: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Anybody may write there: links are not followed, and a pipe holds nobody up."""
+    outside = tmp_path_factory.mktemp('outside') / 'file'
+    outside.write_text('precious')
+    os.utime(outside, (0, 0))
+    link, pipe = shm / 'fastdds_00000000000000dd_el', shm / 'fastdds_00000000000000ee_el'
+    link.symlink_to(outside)
+    os.mkfifo(pipe)
+    os.utime(pipe, (0, 0))
+    segment = shm / f'{DEAD}'
+    segment.unlink()
+    segment.symlink_to(outside)
+    assert [each.name for each in orphans(shm, is_freed=True)] == [ALIVE]
+    assert outside.read_text() == 'precious'
+    assert {link.name, pipe.name} <= names(shm)
+
+
+def test_a_machine_without_such_a_folder(tmp_path: Path) -> None:
+    """Nothing is freed, and nothing fails."""
+    assert orphans(tmp_path / 'none', is_freed=True) == []
