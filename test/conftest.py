@@ -43,7 +43,7 @@ ONE_SENDER = ('test/missions/test_guide.py', 'test/missions/test_mlflow.py')
 """Files whose missions one process sends, which has loaded MLflow."""
 WAITING = ('test/doctor/', 'test/e2e/', 'test/missions/', 'test/sim/', 'test/tower/')
 """Folders whose tests mostly wait for other processes."""
-MAKE_WAY = 10
+MAKE_WAY = os.nice(0) + 10
 """How nice the other workers are."""
 
 
@@ -123,8 +123,8 @@ def pytest_collection_finish() -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """What runs beside a robot leaves it the core, servers and children included."""
-    if hasattr(item.config, 'workerinput') and not has_robot(item.nodeid) and os.nice(0) < MAKE_WAY:
-        os.nice(MAKE_WAY)
+    if hasattr(item.config, 'workerinput') and not has_robot(item.nodeid) and (more := MAKE_WAY - os.nice(0)) > 0:
+        os.nice(more)
 
 
 @pytest.fixture(autouse=True)
