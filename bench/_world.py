@@ -143,26 +143,26 @@ class World:
     def spool(self) -> Path:
         return self.folder / 'home' / 'spool'
 
-    def program(self, name: str, *arguments: str) -> Program:
+    def program(self, name: str, *arguments: str, environ: Mapping[str, str] | None = None) -> Program:
         """A program of this folder, such as ``imu_publisher.py``, or whatever ``-m`` names."""
         first, *rest = arguments
-        return self.command(name, sys.executable, first if first.startswith('-') else str(HERE / first), *rest)
+        return self.command(name, sys.executable, first if first.startswith('-') else str(HERE / first), *rest, environ=environ)
 
-    def command(self, name: str, *words: str) -> Program:
-        """Any other command, in the environment of this world."""
+    def command(self, name: str, *words: str, environ: Mapping[str, str] | None = None) -> Program:
+        """Any other command, in the environment of this world, with what else ``environ`` has."""
         log = self.folder / f'{len(self._programs)}-{name}.log'
-        program = Program(name, words, self._environ, log)
+        program = Program(name, words, {**self._environ, **(environ or {})}, log)
         self._programs.append(program)
         return program
 
     def node(self, parameters: Mapping[str, Any] | None = None, file: Path | None = None,
-             program: Sequence[str] = NODE) -> Program:  # fmt: skip
-        """A ``sensor_logger_node``, once it is ready: flat parameters come after those of the file."""
+             program: Sequence[str] = NODE, environ: Mapping[str, str] | None = None) -> Program:  # fmt: skip
+        """A ``sensor_logger_node``, once it is ready: flat parameters come after the file's, ``environ`` as of ``command``."""
         own = self.folder / f'{len(self._programs)}-node.yaml'
         own.write_text(json.dumps({'/**': {'ros__parameters': dict(parameters or {})}}), encoding='utf-8')
         files = [str(path) for path in (file, own) if path is not None]
         given = ['--ros-args', *(word for path in files for word in ('--params-file', path))]
-        node = self.program('sensor_logger_node', *program, *given)
+        node = self.program('sensor_logger_node', *program, *given, environ=environ)
         until(lambda: 'logging ' in node.log.read_text(encoding='utf-8', errors='replace'), 'the node to start', node)
         return node
 

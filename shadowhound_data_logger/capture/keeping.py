@@ -26,6 +26,8 @@ PREVIEW_BYTES: Final = 5 << 10
 """Of a preview, at most: with one a second 41 kbit/s a camera."""
 PREVIEW_SIZE: Final = 192, 192
 """Pixels that a preview fits into."""
+DECODED_SIZE: Final = 160, 120
+"""A JPEG is decoded at a half, a quarter or an eighth of its size, of which this still is a part: 640 x 480 at a quarter."""
 QUALITIES: Final = (60, 40, 20)
 PREVIEWS: Final = '_previews'
 """The folder of previews; a preview's sensor has this behind its name."""
@@ -124,7 +126,7 @@ def _small(picture: bytes | None) -> bytes | None:
     with open_image(picture) as opened:
         if opened.mode not in {'RGB', 'L', 'RGBA', 'P'}:
             return None
-        opened.draft('RGB', PREVIEW_SIZE)  # a JPEG is decoded at an eighth of its size where that suffices
+        opened.draft('RGB', DECODED_SIZE)
         small = opened.convert('RGB')
     small.thumbnail(PREVIEW_SIZE)
     for quality in QUALITIES:

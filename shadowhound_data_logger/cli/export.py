@@ -105,11 +105,12 @@ def _missions(command: _Command) -> _Command:
 @click.option('--clock', type=click.Path(path_type=Path), metavar='FILE',
               help='Events that both robot and arm timed, in addition to those recorded: CSV with robot_ns,arm_ns.')  # fmt: skip
 @click.option('--wait', is_flag=True, help='Wait until it is known what each mission lacks.')
+@click.option('--pull', is_flag=True, help='Ask robots for what they keep of these missions, and wait until it has come.')
 @click.option('--dry-run', is_flag=True, help='Only say what would be exported.')
 @click.option('--workers', type=click.IntRange(1, 64), default=1, show_default=True, metavar='N', help='Episodes at a time.')
 @as_json
-def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task: bool, wait: bool, dry_run: bool,  # noqa: PLR0913
-                   workers: int, as_json: bool, **how: Any) -> ExitCode:  # fmt: skip
+def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task: bool, wait: bool, pull: bool,  # noqa: PLR0913
+                   dry_run: bool, workers: int, as_json: bool, **how: Any) -> ExitCode:  # fmt: skip
     """Add missions to the LeRobot data set NAME (v3.0).
 
     Missions that are already in it stay as they are. Exit code 1 when a mission was refused or waits: the report says why.
@@ -117,6 +118,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
     with _exporting():
         from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415
         from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset, upload  # noqa: PLC0415
+        from shadowhound_data_logger.lake.pull import bring  # noqa: PLC0415
         from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
 
         check_name(name, 'the name of the data set')
@@ -132,8 +134,12 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
             with the_store() as store:
                 if not (folder / 'meta/info.json').is_file() and store.head(place.bucket, f'{place.prefix}meta/info.json'):
                     fetch_dataset(place, folder, store, bar.say)
+        source = default_source(the_store_settings())
+        if pull and not dry_run:
+            with _exporting():
+                bring(source, flags, say=bar.say, findings=left_out)
         result = library.export(
-            folder, default_source(the_store_settings()), flags, options, workers=workers, wait=wait, is_dry=dry_run,
+            folder, source, flags, options, workers=workers, wait=wait, is_dry=dry_run,
             findings=left_out, say=bar.say,
         )  # fmt: skip
         if result.digest and not dry_run:

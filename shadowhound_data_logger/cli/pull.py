@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import re
 import time
 from collections import Counter
@@ -56,7 +55,7 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
 
         source, left_out = default_source(the_store_settings()), quietly()
         robot = flags.get('robot') or _only_robot(source)
-        name = by or re.sub(r'[^A-Za-z0-9_.-]', '_', getpass.getuser())
+        name = by or lake.requester()
         if not is_name(name):
             raise BadUsage(f'--by {name!r} is not a name', 'use letters, digits, "_", "-" and "."')
         with the_store() as store:

@@ -51,7 +51,7 @@ class MissionDataset:
     def __init__(
         self, source: Bucket | Path | str | None = None, *, anchor: str = 'camera',
         align: Mapping[str, float | Near | Window] | None = None, size: tuple[int, int] | None = None,
-        drop_incomplete: bool = False, causal: bool = False, **flags: Any,
+        drop_incomplete: bool = False, causal: bool = False, pull: bool = False, **flags: Any,
     ) -> None:  # fmt: skip
         """``source``: None for the store that the environment names, or a folder of ``shadowhound-data fetch``.
 
@@ -59,7 +59,8 @@ class MissionDataset:
         no message counts that is later than its frame, as a robot would not have had it yet. ``flags`` are
         those of ``lake.objects``, for the anchor's objects. ``drop_incomplete`` leaves out objects about whose time the catalogue
         knows nothing of an aligned sensor; a stream leaves out single messages as well. Objects without a date are not in it.
-        Raises SettingError, StoreError, LakeError.
+        With ``pull`` robots are asked for what they keep of these sensors, and it waits until that has come; the log says how far
+        it is. Raises SettingError, StoreError, LakeError.
         """
         from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no Daft
 
@@ -69,6 +70,8 @@ class MissionDataset:
         self._place, asked = selecting.place(source)
         self.left_out = Findings()
         """What of the catalogue is not in it, since it is not part of one; a child that was forked or spawned has none of it."""
+        if pull:
+            selecting.pull(asked, source, (anchor, *self.aligned), flags, self.left_out)
         self._selection = selecting.select(asked, anchor, self.aligned, size, flags, self.left_out)
         self._drop_incomplete = drop_incomplete
         self._chosen = [self._complete(track) for track in self._selection.anchors]

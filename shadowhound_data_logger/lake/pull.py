@@ -5,13 +5,17 @@ Requesters share a mailbox (mailbox.py): each reads it, and replaces it on the c
 
 from __future__ import annotations
 
+import getpass
 import hashlib
 import random
+import re
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,11 +26,12 @@ from shadowhound_data_logger.catalogue.schema import KEPT, ON_ROBOT
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import days
+from shadowhound_data_logger.lake.live_files import days, robots
 from shadowhound_data_logger.lake.reading import arrow_schema, tables
 from shadowhound_data_logger.lake.scan import KEY, folders, superseding
-from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.lake.select import Wanted, wanted
 from shadowhound_data_logger.mailbox import (
+    BAG_SENSOR,
     DEFAULT_EXPIRY_NS,
     DEFAULT_PRIORITY,
     MAILBOX_BUCKET,
@@ -42,9 +47,11 @@ from shadowhound_data_logger.mailbox import (
     read_entry,
 )
 from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.options import UploadSettings
 from shadowhound_data_logger.retry import steadily
+from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.untrusted import from_json
+from shadowhound_data_logger.untrusted import from_json, visible
 
 FINAL: Final = frozenset({'done', 'expired', 'cancelled', 'refused'})
 """States after which a request gets no answer any more."""
@@ -55,6 +62,11 @@ PAUSE_S: Final = 0.2
 MOST_OF_ONE: Final = 128
 """Open requests of one requester: others need room in the mailbox, too."""
 MOST_ANSWER_BYTES: Final = 1 << 20
+LOOK_S: Final = 2.0
+LOOKS: Final = 90
+"""For the rows of what has come: a robot tells them each minute."""
+_OF_ROBOT: Final = ('robot', 'since', 'until', 'near', 'mission', 'mission_type')
+"""What of a query a robot can be asked for; the rest chooses among what has come."""
 _DAY_NS: Final = 24 * 3600 * 10**9
 
 
@@ -163,14 +175,70 @@ def newest_answer(source: Bucket, robot: str, request: str) -> dict[str, Any] | 
 
 
 def wait(source: Bucket, robot: str, request: str, *, tell: Callable[[dict[str, Any] | None], None] = lambda _: None,
-         every_s: float = 2.0, made_ns: int = 0) -> dict[str, Any]:  # fmt: skip
+         made_ns: int = 0) -> dict[str, Any]:  # fmt: skip
     """The last answer to a request that was made then, once there is one; ``tell`` hears of the newest. Raises StoreError."""
     while True:
         answer = newest_answer(source, robot, request)
         tell(answer)
         if answer is not None and _is_last(answer, made_ns):
             return answer
-        time.sleep(every_s)
+        time.sleep(LOOK_S)
+
+
+def requester() -> str:
+    """The user of this process, as a name."""
+    return re.sub(r'[^A-Za-z0-9_.-]', '_', getpass.getuser())
+
+
+def bring(source: Bucket, flags: Mapping[str, Any], *, sensors: Collection[str] | None = None,
+          say: Callable[[str], None] = lambda _: None, findings: Findings | None = None) -> int:  # fmt: skip
+    """Ask every robot for what it keeps of these sensors (None: all but bags), and wait until that is in the catalogue.
+
+    ``flags`` are those of a query; ``near`` holds for the first of the sensors alone, since few others know a place. Returns how
+    many objects were asked for. Raises LakeError where a robot refuses or a request expires, SettingError, StoreError.
+    """
+    asked = wanted(time.time_ns(), **{name: flags[name] for name in _OF_ROBOT if flags.get(name) is not None})
+    findings = Findings() if findings is None else findings
+    total, requests = 0, list[PullRequest]()
+    with closing(open_store(source.settings, UploadSettings())) as store:
+        for robot in robots(source) if asked.robot is None else [asked.robot]:
+            want = KeptFilter(
+                since_ns=asked.since_ns, until_ns=asked.until_ns, mission=asked.mission, mission_type=asked.mission_type
+            )
+            there = Counter(row['sensor'] for row in kept(source, robot, want, findings).to_pylist())
+            for sensor in sorted(there) if sensors is None else sensors:
+                if there[sensor] and sensor != BAG_SENSOR:
+                    near = asked.near if sensors is not None and sensor == next(iter(sensors)) else None
+                    requests.append(ask(store, source, robot, replace(want, sensor=sensor, near=near), by=requester()))
+                    total += there[sensor]
+    for request in requests:
+        _await(source, request, say, findings)
+    return total
+
+
+def _await(source: Bucket, request: PullRequest, say: Callable[[str], None], findings: Findings) -> None:
+    """Until a request is done, and the catalogue knows of what came."""
+
+    def tell(answer: Mapping[str, Any] | None) -> None:
+        say(f'waiting for {request.robot}: {request.want.sensor}, {visible(_how_far(answer))}')
+
+    answer = wait(source, request.robot, request.id, tell=tell, made_ns=request.made_ns)
+    if answer['state'] != 'done':
+        raise LakeError(f'{request.robot} did not send all of {request.want.sensor}: {visible(_how_far(answer))}',
+                        remedy='`shadowhound-data pull --list`, or ask again')  # fmt: skip
+    for _ in range(LOOKS):
+        if not kept(source, request.robot, request.want, findings).num_rows:
+            return
+        say(f'waiting for the catalogue of {request.robot}: {request.want.sensor}')
+        time.sleep(LOOK_S)
+
+
+def _how_far(answer: Mapping[str, Any] | None) -> str:
+    if answer is None:
+        return 'asked'
+    outcomes = answer.get('outcomes')
+    sent = outcomes.get('delivered') if isinstance(outcomes, dict) else None
+    return f'{answer["state"]}, {sent.get("objects") if isinstance(sent, dict) else 0} of {answer.get("objects")} objects'
 
 
 def _is_last(answer: dict[str, Any], made_ns: int) -> bool:

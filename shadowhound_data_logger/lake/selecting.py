@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,15 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prefetch import Place
+from shadowhound_data_logger.lake.pull import bring
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.untrusted import MOST_MEMBERS
 
 from daft import col  # isort: skip
+
+log = logging.getLogger(__name__)
 
 
 def place(source: Bucket | Path | str | None) -> tuple[Place, Bucket]:
@@ -42,6 +46,15 @@ def fetched(folder: Path) -> Bucket:
     """A folder of fetched objects as a lake: their rows lie in it as well (``fetched.keep_rows``)."""
     whole = folder.absolute()
     return Bucket(StoreSettings(directory=whole.parent), whole.name)
+
+
+def pull(
+    lake: Bucket, source: Bucket | Path | str | None, sensors: Sequence[str], flags: Mapping[str, Any], findings: Findings
+) -> None:
+    """Have robots send what they keep of these sensors. Raises SettingError for a folder, and as ``bring``."""
+    if isinstance(source, (str, Path)):
+        raise SettingError('pull', True, 'a store as the source: robots are asked through one')
+    bring(lake, flags, sensors=sensors, say=log.info, findings=findings)
 
 
 def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], size: tuple[int, int] | None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +13,25 @@ from click.testing import CliRunner
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive
 
 from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags.kept import KeptCut
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
+from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import link
 from shadowhound_data_logger.lake import pull as lake
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
+from shadowhound_data_logger.lake.dataset import MissionDataset
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.mailbox import KeptFilter
 from shadowhound_data_logger.model import Outcome, State
 from shadowhound_data_logger.ship.requests import RequestServer
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.directory import DirectoryStore
+
+NOON = '2025-10-18T12:00:00Z'
 
 
 class Field:
@@ -42,7 +48,8 @@ class Field:
         self.spool.open()
         self.catalogue = CatalogueWriter(home / 'spool', CatalogueSettings(), 'thor', self.clock, lambda: self.now_s, keeps=True)
         self.server = RequestServer(self.spool, self.store, KeepSettings(), 'thor', self.clock, put=self.commit,
-                                    released=lambda _: None, monotonic=lambda: self.now_s)  # fmt: skip
+                                    released=lambda _: None, cutter=partial(KeptCut, home),
+                                    monotonic=lambda: self.now_s)  # fmt: skip
 
     def commit(self, *items: Any) -> None:
         self.spool.commit(items)
@@ -189,3 +196,34 @@ def test_the_pace_of_the_link_says_how_long_a_pull_takes(field: Field, tmp_path:
     told = run('lake', 'coverage', '--since', '2025-10-18', '--until', '2025-10-19', '--wifi', str(target))
     assert [one['mbps'] for one in told] == [0.0, 1.0, 2.0, 9.0]
     assert target.read_bytes().startswith(b'\x89PNG')
+
+
+def test_a_data_set_asks_for_what_is_kept(field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It waits until that has come and the catalogue knows of it; what nobody asked for stays. A folder has no robot to ask."""
+    field.records(*range(6))
+    monkeypatch.setattr(lake.time, 'sleep', lambda _: field.passes())
+    assert len(MissionDataset(field.source, since=NOON)) == 0
+    made = MissionDataset(field.source, since=NOON, near=(3.0, 0.0, 1.0), pull=True)
+    assert made.stamps_ns.tolist() == [NOON_NS + number * SECOND for number in (2, 3, 4)]
+    assert field.kept() == [0, 1, 5]
+    assert lake.bring(field.source, {'since': NOON}) == 3
+    assert field.kept() == []
+    assert lake.bring(field.source, {'since': NOON}) == 0
+    (tmp_path / 'folder' / 'thor' / '_catalog').mkdir(parents=True)
+    with pytest.raises(SettingError, match='pull'):
+        MissionDataset(tmp_path / 'folder', pull=True)
+
+
+def test_a_pull_that_a_robot_does_not_finish_is_said(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With how far it came."""
+    field.records(1)
+    field.server._release = lambda _: False  # type: ignore[method-assign] # it has no link
+
+    def sleep(_: float) -> None:
+        field.passes()
+        field.clock.now_ns += 8 * 24 * 3600 * SECOND
+
+    monkeypatch.setattr(lake.time, 'sleep', sleep)
+    monkeypatch.setattr(lake.time, 'time_ns', lambda: field.clock.now_ns)
+    with pytest.raises(LakeError, match='expired, 0 of 1 objects'):
+        lake.bring(field.source, {'since': NOON})

@@ -1,0 +1,116 @@
+"""Links to a server that carry so many bits a second, as the kernel shapes them (tc-htb(8)), in a network of the benchmark's own.
+
+A link is a port on which what comes is passed on to the server; a token bucket on the loopback device holds all packets to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from types import TracebackType
+from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+BURST: Final = '32kb'
+QUEUE: Final = 100
+"""Packets that wait for the link at most, as in a radio: 0.4 s at 3 Mbit/s."""
+MTU: Final = 1500
+PIECE_BYTES: Final = 64 << 10
+_INSIDE: Final = 'SHADOWHOUND_BENCH_NETWORK'
+
+
+def in_own_network() -> None:
+    """Start this program again in a network namespace of its own, unless it is in one; exits without the right to make one."""
+    if not os.environ.get(_INSIDE):
+        if not (shutil.which('unshare') and shutil.which('tc')):
+            raise SystemExit('unshare(1) and tc(8) are needed')
+        os.environ[_INSIDE] = 'yes'
+        mapped = [] if os.geteuid() == 0 else ['--user', '--map-root-user']
+        os.execvp('unshare', ['unshare', '--net', *mapped, sys.executable, *sys.argv])  # noqa: S606 - this very program
+    _ran('ip', 'link', 'set', 'lo', 'up', 'mtu', str(MTU), 'multicast', 'on')
+
+
+class ShapedLinks:
+    """Links to one server, each with a rate of its own. ``with``; owns one thread."""
+
+    def __init__(self, url: str, mbps: list[float]) -> None:
+        self._server = urlsplit(url)
+        self._mbps = mbps
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name='links', daemon=True)
+        self.urls: list[str] = []
+        """Of the links, in the order of their rates."""
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        _ran('tc', 'qdisc', 'add', 'dev', 'lo', 'root', 'handle', '1:', 'htb')  # what has no class is not held back
+        for place, mbps in enumerate(self._mbps, 16):
+            port = asyncio.run_coroutine_threadsafe(self._listen(), self._loop).result(10)
+            rate, own = f'{mbps}mbit', f'1:{place}'
+            _ran(
+                'tc',
+                'class',
+                'add',
+                'dev',
+                'lo',
+                'parent',
+                '1:',
+                'classid',
+                own,
+                'htb',
+                'rate',
+                rate,
+                'ceil',
+                rate,
+                'burst',
+                BURST,
+            )
+            _ran('tc', 'qdisc', 'add', 'dev', 'lo', 'parent', own, 'pfifo', 'limit', str(QUEUE))
+            _ran('tc', 'filter', 'add', 'dev', 'lo', 'parent', '1:', 'protocol', 'ip', 'u32', 'match', 'ip', 'dport', str(port),
+                 '0xffff', 'flowid', own)  # fmt: skip
+            self.urls.append(f'http://127.0.0.1:{port}')
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(10)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _end(self) -> None:
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+
+    async def _listen(self) -> int:
+        server = await asyncio.start_server(self._pass_on, '127.0.0.1', 0)
+        return int(server.sockets[0].getsockname()[1])
+
+    async def _pass_on(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError, asyncio.CancelledError):
+            to_server = await asyncio.open_connection(self._server.hostname, self._server.port)
+            await asyncio.gather(_copy(reader, to_server[1]), _copy(to_server[0], writer))
+
+
+async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    with contextlib.suppress(OSError):
+        while piece := await reader.read(PIECE_BYTES):
+            writer.write(piece)
+            await writer.drain()
+    with contextlib.suppress(OSError):
+        writer.close()
+
+
+def _ran(*command: str) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f'{" ".join(command)} failed: {done.stderr.strip()}')
