@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 """What the live page costs and how late it is: CPU of node and page without viewers and with some, and links that are slow.
 
-    scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8 | --beside 0.5 | --browser | --pairs 7]
+    scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8 [--video] | --beside 0.5 | --browser | --pairs 7]
         [--kills 2]
 
 Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a network
-namespace where what the page sends leaves at so many Mbit/s (tc htb; needs root). ``--beside`` gives a second viewer that reads
-so many Mbit/s, and says what that does to the first. ``--browser`` opens the page in a Chromium: how late items come and are
-drawn, the first frame, an outage of 10 s. ``--pairs`` measures the node's CPU with and without viewers in turns. One line of
-JSON for each part.
+namespace where what the page sends leaves at so many Mbit/s (tc htb; needs root); with ``--video`` the viewer takes the camera as
+WebRTC and decodes it. ``--beside`` gives a second viewer that reads so many Mbit/s, and says what that does to the first.
+``--browser`` opens the page in a Chromium: how late items come and are drawn, the first frame, an outage of 10 s. ``--pairs``
+measures the node's CPU with and without viewers in turns. One line of JSON for each part.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
+import aiortc
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 from domains import free_domain
@@ -46,6 +47,7 @@ class Watcher:
         self.url, self.topics = url, topics
         self.late_ms: dict[str, list[float]] = {}
         self.bytes = 0
+        self.takes_video = False
 
     async def run(self, *, reads: bool = True, bytes_s: float = 0.0) -> None:
         """``bytes_s``: it reads no faster."""
@@ -54,6 +56,9 @@ class Watcher:
             session.ws_connect(f'{self.url}ws') as ws,
         ):
             await ws.send_json({'watch': self.topics})
+            if self.takes_video:
+                video = Video(self.late_ms)
+                await ws.send_json({'watch': self.topics[1:], 'video': {'topic': self.topics[0], 'offer': await video.offer()}})
             parts: dict[int, bytes] = {}
             if not reads:
                 await asyncio.sleep(3600)
@@ -68,6 +73,8 @@ class Watcher:
                 if flags & 2:
                     whole = parts.pop(lane)
                     head = json.loads(whole[4 : 4 + int.from_bytes(whole[:4], 'little')])
+                    if head['kind'] == 'video':
+                        await video.told(head)
                     if 'at' in head and head['kind'] in KINDS:  # one machine, one monotonic clock
                         self.late_ms.setdefault(head['kind'], []).append(time.monotonic() * 1e3 - head['at'])
                 if time.monotonic() - said_s > 1:
@@ -83,6 +90,35 @@ class Watcher:
         return found
 
 
+class Video:
+    """A receiver of video: how late decoded frames are. aiortc gives a frame when the next one begins to arrive."""
+
+    def __init__(self, late_ms: dict[str, list[float]]) -> None:
+        self.late_ms = late_ms
+        self.pc = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
+        self.first_ms: float | None = None
+
+    async def offer(self) -> str:
+        self.pc.addTransceiver('video', direction='recvonly')
+        self.pc.on('track', lambda track: setattr(self, 'task', asyncio.create_task(self.read(track))))
+        await self.pc.setLocalDescription(await self.pc.createOffer())
+        return self.pc.localDescription.sdp
+
+    async def told(self, head: dict[str, Any]) -> None:
+        if 'answer' in head:
+            await self.pc.setRemoteDescription(aiortc.RTCSessionDescription(head['answer'], 'answer'))
+        elif 'rtp' in head:
+            self.first_ms = head['at']
+        elif 'problem' in head:
+            raise SystemExit(head['problem'])
+
+    async def read(self, track: aiortc.MediaStreamTrack) -> None:
+        while True:
+            frame = await track.recv()  # its pts begin with 0
+            if self.first_ms is not None:
+                self.late_ms.setdefault('camera', []).append(time.monotonic() * 1e3 - self.first_ms - frame.pts / 90)
+
+
 def cpu_s(pid: int) -> float:
     fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
@@ -93,14 +129,16 @@ def private_mb(pid: int) -> float:
     return round(sum(int(line.split()[1]) for line in lines if line.startswith('Private_')) / 1024, 1)
 
 
-def watched(url: str, count: int, seconds: float, pids: dict[str, int], deaf: int = 0) -> dict[str, Any]:
+def watched(url: str, count: int, seconds: float, pids: dict[str, int], *, deaf: int = 0, video: bool = False) -> dict[str, Any]:
     """So many viewers for so long, ``deaf`` of which read nothing: what each gets, and the CPU of the processes, % of a core."""
     topics = ['/camera/compressed', '/point_cloud2', '/imu', '/odom', '/joint_states', '/lowstate']
     watchers = [Watcher(url, topics) for _ in range(count)]
+    for watcher in watchers:
+        watcher.takes_video = video
 
     async def run() -> tuple[float, dict[str, float]]:
         tasks = [asyncio.create_task(watcher.run(reads=place >= deaf)) for place, watcher in enumerate(watchers)]
-        await asyncio.sleep(4)  # discovery
+        await asyncio.sleep(15 if video else 4)  # discovery; receivers of video learn what their link carries
         for watcher in watchers:
             watcher.late_ms.clear()
         sizes = [watcher.bytes for watcher in watchers]
@@ -197,7 +235,8 @@ def shape(url: str, mbps: float) -> None:
         'tc class add dev lo parent 1: classid 1:1 htb rate 10gbit quantum 60000',
         f'tc class add dev lo parent 1: classid 1:2 htb rate {mbps}mbit burst 8kb',
         'tc qdisc add dev lo parent 1:2 bfifo limit 200kb',
-        f'tc filter add dev lo parent 1: protocol ip u32 match ip sport {port} 0xffff flowid 1:2',
+        f'tc filter add dev lo parent 1: protocol ip prio 1 u32 match ip sport {port} 0xffff flowid 1:2',
+        'tc filter add dev lo parent 1: protocol ip prio 2 u32 match ip tos 0x88 0xfc flowid 1:2',  # video
     ):
         subprocess.run(command.split(), check=True)
 
@@ -207,6 +246,7 @@ def main() -> None:  # noqa: PLR0915 - one part after the other
     parser.add_argument('--seconds', type=float, default=20.0)
     parser.add_argument('--viewers', type=int, default=3)
     parser.add_argument('--link', type=float, default=0.0)
+    parser.add_argument('--video', action='store_true')
     parser.add_argument('--kills', type=int, default=0)
     parser.add_argument('--beside', type=float, default=0.0)
     parser.add_argument('--browser', action='store_true')
@@ -218,6 +258,7 @@ def main() -> None:  # noqa: PLR0915 - one part after the other
         sys.exit(subprocess.run(command, env={**os.environ, 'LIVE_BENCH': '1'}, check=False).returncode)
     if given.link:
         subprocess.run(['ip', 'link', 'set', 'lo', 'up'], check=True)
+        subprocess.run(['ip', 'addr', 'add', '192.0.2.1/32', 'dev', 'lo'], check=True)  # aiortc's viewer takes no 127.0.0.1
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         domain = stack.enter_context(free_domain())
         processes = Processes(Path(folder), domain, f'r{secrets.token_hex(4)}')
@@ -245,7 +286,7 @@ def main() -> None:  # noqa: PLR0915 - one part after the other
             rows = [beside(url, given.seconds, given.beside)]
         elif given.link:
             shape(url, given.link)
-            rows = [watched(url, 1, given.seconds, pids)]
+            rows = [watched(url, 1, given.seconds, pids, video=given.video)]
         else:
             rows = [watched(url, count, given.seconds, pids) for count in (0, 1, given.viewers, 0)]
             rows.append(watched(url, given.viewers, given.seconds / 2, pids, deaf=given.viewers - 1))

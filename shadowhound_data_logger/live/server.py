@@ -18,6 +18,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from hashlib import sha256
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -39,13 +40,14 @@ from shadowhound_data_logger.live.access import (
 )
 from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures
 from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
-from shadowhound_data_logger.live.kinds import KINDS, LiveItem
+from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem
 from shadowhound_data_logger.live.relay import Relay
 from shadowhound_data_logger.live.viewer import Viewer
 from shadowhound_data_logger.spool.control import connect
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.live.topics import Topics
+    from shadowhound_data_logger.live.webrtc import CameraVideo
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +68,9 @@ DOCTOR_S: Final = 60.0
 """What the doctor found is told again for so long, however many ask."""
 AF41: Final = 34 << 2
 """DSCP of interactive video (RFC 4594), in the byte where IP has it."""
+NO_WEBRTC: Final = 'the robot has no WebRTC: install the extra webrtc of shadowhound_data_logger'
+NARROW_S: Final = 10.0
+"""A link that carried no full frames for so long is told to take video."""
 SILENT_S: Final = 15.0
 """A viewer that says nothing for so long is gone: the page says something each second."""
 ACTS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -113,7 +118,13 @@ class _Connected:
     viewer: Viewer
     who: SignIn
     address: str
+    at: str
+    """The address of ours that it reached."""
     tasks: list[asyncio.Task[None]] = field(default_factory=list)
+    narrow_s: float | None = None
+    """Since when its link carries no full frames."""
+    asks: asyncio.Task[None] | None = None
+    """For video."""
 
 
 class LiveServer:
@@ -131,6 +142,9 @@ class LiveServer:
         self._topics: Topics | None = None
         self._relay: Relay | None = None
         self._told_topics: LiveItem | None = None
+        self._video: CameraVideo | None = None
+        self.no_video = '' if find_spec('aiortc') and find_spec('av') else NO_WEBRTC
+        """Why cameras are sent as JPEG alone; empty where WebRTC is to be had."""
         self._pool = ThreadPoolExecutor(2, 'spool')
         self._reading = asyncio.Lock()
         self._asking = asyncio.Lock()
@@ -176,6 +190,8 @@ class LiveServer:
         if self._runner is not None:
             await self._runner.cleanup()
         await self._history.close()
+        if self._video is not None:
+            await self._video.close()
         if self._relay is not None:
             await self._relay.close()
         if self._topics is not None:
@@ -226,6 +242,7 @@ class LiveServer:
             for one in self._viewers:
                 if item.topic in one.viewer.watched and one.viewer.size(item.topic) == item.size:
                     one.viewer.offer(item)
+            self._offer_video(item)
 
     def _on_relayed(self, item: LiveItem) -> None:
         if item.kind == 'topics':
@@ -233,6 +250,11 @@ class LiveServer:
         for one in self._viewers:
             if not item.topic or item.topic in one.viewer.watched:
                 one.viewer.offer(item)
+        self._offer_video(item)
+
+    def _offer_video(self, item: LiveItem) -> None:
+        if self._video is not None and item.kind == 'camera' and item.size == FULL:
+            self._video.offer(item)
 
     def _offer_catalogue(self, one: _Connected) -> None:
         if self._told_topics is not None:
@@ -247,6 +269,8 @@ class LiveServer:
         for one in self._viewers:
             for topic in one.viewer.watched:
                 wanted.setdefault(topic, set()).add(one.viewer.size(topic))
+        for topic in self._video.topics if self._video is not None else ():
+            wanted.setdefault(topic, set()).add(FULL)
         before = self._wanted
         self._wanted = {topic: frozenset(sizes) for topic, sizes in wanted.items()} if self._viewers else None
         if self._wanted != before:
@@ -262,6 +286,10 @@ class LiveServer:
             began_s = time.monotonic()
             if self._topics is not None:
                 self._topics.worker.look()
+            if self._video is not None:
+                self._video.tick()
+                for one in self._viewers:
+                    one.viewer.has_video = self._video.has(one)
             if self._viewers and not self._settings.is_of_store:
                 try:
                     await self._tell_figures(with_ledger=rounds % LEDGER_EVERY == 0)
@@ -269,6 +297,7 @@ class LiveServer:
                     log.exception('the figures cannot be read')
                 for one in self._viewers:
                     one.viewer.choose_sizes()
+                    self._suggest_video(one, began_s)
                 self._rewatch()
                 if (
                     self._settings.uploads_mbps
@@ -279,6 +308,21 @@ class LiveServer:
                     self._loop.run_in_executor(self._pool, self._lease)
             rounds += 1
             await asyncio.sleep(max(0.05, began_s + FIGURES_S - time.monotonic()))
+
+    def _suggest_video(self, one: _Connected, now_s: float) -> None:
+        """Once a link was narrow for a while."""
+        sizes = [one.viewer.size(topic) for topic in one.viewer.watched if self._kind_of(topic) == 'camera']
+        if self.no_video or all(size == FULL for size in sizes):
+            one.narrow_s = None
+        elif one.narrow_s is None:
+            one.narrow_s = now_s
+        elif now_s - one.narrow_s >= NARROW_S:
+            one.narrow_s = now_s
+            one.viewer.offer(LiveItem('', 'video', head={'narrow': True}))
+
+    def _kind_of(self, topic: str) -> str:
+        kind = KINDS.get(self._graph.get(topic, ''))
+        return '' if kind is None else kind.name
 
     async def _tell_figures(self, *, with_ledger: bool) -> None:
         async with self._reading:
@@ -345,7 +389,8 @@ class LiveServer:
 
     @property
     def _about(self) -> dict[str, Any]:
-        return {'robot': self._settings.robot, 'has_live': not self._settings.is_of_store or self._relay is not None}
+        return {'robot': self._settings.robot, 'has_live': not self._settings.is_of_store or self._relay is not None,
+                'no_video': self.no_video}  # fmt: skip
 
     async def _sign_in(self, request: web.Request) -> web.StreamResponse:
         address = request.remote or ''
@@ -463,7 +508,8 @@ class LiveServer:
         if len(self._viewers) >= MOST_VIEWERS:
             return _problem(429, f'{MOST_VIEWERS} viewers are here, which is the most there may be', {'Retry-After': '10'})
         ws = web.WebSocketResponse(max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0)
-        one = _Connected(Viewer(), self._who(request), request.remote or '')
+        own = request.transport.get_extra_info('sockname') if request.transport is not None else None
+        one = _Connected(Viewer(), self._who(request), request.remote or '', own[0] if own else '')
         self._viewers.add(one)  # before anything waits: the cap counts those that are coming
         try:
             await ws.prepare(request)
@@ -474,6 +520,10 @@ class LiveServer:
             await asyncio.wait(one.tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             self._viewers.discard(one)
+            if one.asks is not None:
+                one.asks.cancel()
+            if self._video is not None:
+                self._video.end(one)
             for task in one.tasks:
                 task.cancel()
             for task in one.tasks:
@@ -507,8 +557,37 @@ class LiveServer:
                 if isinstance(watched, list):
                     viewer.watch(topic for topic in watched[:MOST_WATCHED] if isinstance(topic, str))
                     self._rewatch()
+                if 'video' in said:
+                    self._ask_video(one, said['video'])
             elif message.type in (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR):
                 return
+
+    def _ask_video(self, one: _Connected, said: Any) -> None:
+        """A viewer takes a topic as video, or no longer."""
+        if one.asks is not None:
+            one.asks.cancel()
+            one.asks = None
+        if isinstance(said, dict):
+            one.asks = asyncio.create_task(self._take_video(one, said))
+        elif self._video is not None:
+            self._video.end(one)
+
+    async def _take_video(self, one: _Connected, said: Mapping[str, Any]) -> None:
+        def tell(what: Mapping[str, Any]) -> None:
+            one.viewer.offer(LiveItem('', 'video', head=what))
+
+        if not self.no_video and self._video is None:
+            try:
+                webrtc = await self._loop.run_in_executor(self._pool, import_module, 'shadowhound_data_logger.live.webrtc')
+            except ImportError as error:
+                self.no_video = f'{NO_WEBRTC} ({error})'
+            else:
+                if self._video is None:  # another viewer asked meanwhile
+                    self._video = webrtc.CameraVideo(self._rewatch)
+        if self._video is None:
+            tell({'problem': self.no_video})
+        else:
+            await self._video.take(one, said, (one.at, one.address), tell)
 
 
 def _parsed(text: str) -> dict[str, Any]:

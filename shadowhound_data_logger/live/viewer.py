@@ -37,6 +37,9 @@ UP: Final = 1.6
 FIRST_RATE: Final = 500_000.0
 """Bytes a second that a link is taken for until it was measured."""
 
+BESIDE_VIDEO: Final = 0.15
+"""Of the link, for clouds while video has its own way."""
+
 
 class _Lane:
     """A bulk item on its way."""
@@ -60,6 +63,8 @@ class Viewer:
         """Bytes a second that the link carries, as measured."""
         self.replaced = 0
         """Bulk items that were replaced by newer ones before they were sent."""
+        self.has_video = False
+        """Whether it gets its camera as video beside this: then bulk items are paced, and do not measure the link."""
         self._now = now
         self._rows: dict[str, deque[LiveItem]] = {}
         self._slots: dict[str, LiveItem] = {}
@@ -71,6 +76,7 @@ class Viewer:
         self._bytes: dict[str, int] = {}
         self._sent = self._acked = 0
         self._measured: deque[tuple[int, int, float]] = deque()
+        self._bulk_s = 0.0  # when bulk may be sent again, beside video
 
     def watch(self, topics: Iterable[str]) -> None:
         """From now on these and no others."""
@@ -107,7 +113,7 @@ class Viewer:
             if rows:
                 self._rows[topic] = self._rows.pop(topic)  # the others have their turn first
                 return self._count(bytes((SMALL_LANE, BEGIN | END, 0, 0)) + rows.popleft().packed)
-        return self._bulk()
+        return None if self.has_video and self._now() < self._bulk_s else self._bulk()
 
     def acknowledge(self, received: int) -> None:
         """The browser has received so many bytes, modulo 2^32. What it cannot have received is left out."""
@@ -141,10 +147,11 @@ class Viewer:
             body = self._slots.pop(topic).packed
             lane = self._lanes[topic] = _Lane(self._free_lane(), body)
             flags = BEGIN
-            if len(body) >= LEAST_MEASURED:
+            if len(body) >= LEAST_MEASURED and not self.has_video:
                 self._measured.append((self._sent + len(body), self._acked, self._now()))
         part = lane.body[lane.at : lane.at + min(CHUNK, self.window // 3)]
         lane.at += len(part)
+        self._bulk_s = max(self._bulk_s, self._now()) + len(part) / (self.rate * BESIDE_VIDEO) if self.has_video else 0.0
         self._virtual = max(self._used.get(topic, 0.0), self._virtual)
         self._used[topic] = self._virtual + len(part) / WEIGHTS[self._kinds[topic]]
         if lane.at >= len(lane.body):

@@ -5,6 +5,7 @@ import { Link } from './link.js';
 import { Plot, Ring } from './plots.js';
 import { busy, openRobot, past, show } from './past.js';
 import { Timeline } from './timeline.js';
+import { Video, VideoChoice } from './video.js';
 import { span } from './words.js';
 
 const calm = matchMedia('(prefers-reduced-motion: reduce)');
@@ -23,6 +24,7 @@ const ringOf = (kind) => (past.value ? pastRings : rings)[kind];
 // For whoever measures: how late items were when they came and when they were drawn, ms.
 const stats = (window.shadowhound = { came: {}, drawn: {}, count: {}, link: null, ages: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, link.now() - at])), at: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, at])) });
 let link;
+let video;
 
 function note(where, kind, at) {
   const now = link?.now() ?? null;
@@ -44,7 +46,8 @@ function chosen(kind) {
 
 const KINDS = ['camera', 'cloud', 'odom', 'imu', 'joints', 'battery', 'state'];
 function rewatch() {
-  link?.watch(past.value ? [] : KINDS.map(chosen).filter(Boolean));
+  video?.want(past.value ? null : chosen('camera') ?? null);
+  link?.watch(past.value ? [] : KINDS.map(chosen).filter((topic) => topic && topic !== video?.shown));
 }
 
 let decoding = false;
@@ -70,8 +73,21 @@ async function showFrame(head, body) {
   decoding = false;
 }
 
+function drawVideo(element, at) {
+  const canvas = views.camera;
+  if (past.value || !canvas) return;
+  note(stats.came, 'camera', at);
+  seen.set('camera', { at });
+  stats.count.camera = (stats.count.camera ?? 0) + 1;
+  if (canvas.width !== element.videoWidth) canvas.width = element.videoWidth;
+  if (canvas.height !== element.videoHeight) canvas.height = element.videoHeight;
+  canvas.getContext('2d').drawImage(element, 0, 0);
+  note(stats.drawn, 'camera', at);
+}
+
 function onItem(head, body) {
   const { kind } = head;
+  if (kind === 'video') return video.take(head);
   if (past.value && kind !== 'topics' && kind !== 'figures') return; // on its way when somebody looked back
   stats.count[kind] = (stats.count[kind] ?? 0) + 1;
   if (head.at !== undefined) {
@@ -169,7 +185,7 @@ function Panel({ title, kind, className = '', tools, children }) {
 function Camera() {
   const canvas = useRef(null);
   useEffect(() => { views.camera = canvas.current; }, []);
-  return html`<${Panel} title="Camera" kind="camera" className="camera"><div class="stage"><canvas ref=${canvas} width="640" height="480" role="img" aria-label="The newest frame of the camera"></canvas></div></${Panel}>`;
+  return html`<${Panel} title="Camera" kind="camera" className="camera" tools=${video && !past.value && html`<${VideoChoice} video=${video} lacks=${session.value.no_video} />`}><div class="stage"><canvas ref=${canvas} width="640" height="480" role="img" aria-label="The newest frame of the camera"></canvas></div></${Panel}>`;
 }
 
 function Cloud() {
@@ -293,7 +309,8 @@ function start() {
     return;
   }
   if (link) return;
-  link = stats.link = new Link({ onItem, onState: (state) => { connection.value = state; if (state === 'lost') check(); } });
+  link = stats.link = new Link({ onItem, onState: (state) => { connection.value = state; if (state === 'lost') { video.lost(); check(); } else video.follow(); } });
+  video = stats.video = new Video({ link, onFrame: drawVideo, onChange: rewatch });
 }
 
 // Whether the cookie is still good: a token that was replaced ends it.

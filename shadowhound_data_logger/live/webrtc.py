@@ -1,0 +1,410 @@
+"""The camera as video: VP8 over WebRTC, encoded once for all who take it. Importing this loads aiortc (the extra ``webrtc``).
+
+The newest JPEG of a topic is decoded and encoded on a thread of its own, and its packets go to each peer. RTP timestamps are the
+times at which messages came, at 90 kHz, so the page knows how old each frame is. Packets go to the viewer's own address alone:
+candidates of an offer give ports and no addresses, and no STUN server is asked. aiortc has no interface for three things that are
+needed: the rate that a receiver can take, when it lacks a key frame, and where timestamps begin. They are read from the insides
+of the versions that setup.py names.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import socket
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from fractions import Fraction
+from threading import Condition
+from typing import Any, Final
+
+import av
+import numpy as np
+import simplejpeg
+from aiortc import MediaStreamTrack, RTCConfiguration, RTCPeerConnection, RTCRtpSender, RTCSessionDescription
+from aiortc.exceptions import InvalidAccessError, InvalidStateError, OperationError
+from aiortc.rtp import RTCP_PSFB_APP, RTCP_PSFB_FIR, RTCP_PSFB_PLI, RtcpPsfbPacket, unpack_remb_fci
+
+from shadowhound_data_logger.live.kinds import LiveItem
+from shadowhound_data_logger.worker import Worker
+
+log = logging.getLogger(__name__)
+
+MOST_PEERS: Final = 8
+MOST_ENCODED: Final = 2
+"""Topics that are encoded at a time."""
+MOST_SIDE: Final = 1920
+"""Pixels; of a larger frame no more is encoded than these."""
+CLOCK_HZ: Final = 90_000
+"""Of RTP timestamps of video (RFC 7741)."""
+LEAST_RATE, FIRST_RATE, MOST_RATE = 150_000, 500_000, 1_500_000
+"""Bits a second of a topic."""
+RATE_SHARE: Final = 0.85
+"""Of what a receiver says that its link carries."""
+RAISE_EVERY_S: Final = 4.0
+"""A new rate begins with a key frame, so a better one waits."""
+KEY_EVERY_S: Final = 0.7
+"""Key frames that receivers ask for come no more often."""
+MOST_WAITING: Final = 10
+"""Packets of a peer whose turn does not come; then it goes on with the next key frame."""
+CONNECT_S: Final = 10.0
+_TICKS_PER_MS: Final = CLOCK_HZ // 1000
+_CANDIDATE: Final = re.compile(r'a=candidate:\S+ 1 udp \d+ \S+ (\d{1,5}) typ host', re.IGNORECASE)
+_MOST_CANDIDATES: Final = 8
+_BROKEN: Final = (InvalidAccessError, InvalidStateError, OperationError, ValueError, LookupError, TypeError, AttributeError,
+                  AssertionError, OSError, RuntimeError)  # fmt: skip
+"""What aiortc raises for an offer that is none."""
+
+
+class OfferRefused(Exception):
+    """A viewer cannot take video; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Encoded:
+    packet: Any
+    """av.Packet."""
+    at_ms: float
+
+
+class _VideoEncoder:
+    """Makes VP8 of the newest JPEG of a topic, on the thread ``video``. The condition guards what waits and what is asked for."""
+
+    def __init__(self, topic: str, made: Callable[[str, _Encoded], None]) -> None:
+        self._topic, self._made = topic, made
+        self._changed = Condition()
+        self._waiting: tuple[float, bytes] | None = None
+        self._wants_key = True
+        self._key_s = -KEY_EVERY_S
+        self._rate = FIRST_RATE
+        self._codec: Any = None
+        self._last_pts = -1
+        self.encoded = self.keys = 0
+        """Frames so far, and those of them that need no other."""
+        self.worker = Worker('video', self._step)
+
+    def offer(self, at_ms: float, jpeg: bytes) -> None:
+        with self._changed:
+            self._waiting = at_ms, jpeg
+            self._changed.notify()
+
+    def ask_key(self) -> None:
+        with self._changed:
+            self._wants_key = True
+
+    def set_rate(self, rate: int) -> None:
+        with self._changed:
+            self._rate = rate
+
+    def close(self) -> None:
+        self.worker.stop()
+        with self._changed:
+            self._changed.notify()
+        if not self.worker.join(5.0):
+            log.warning('the thread that encodes video does not end')
+
+    def _step(self) -> None:
+        with self._changed:
+            if self._waiting is None:
+                self._changed.wait(0.5)
+            if self._waiting is None:
+                return
+            (at_ms, jpeg), self._waiting = self._waiting, None
+            rate = self._rate
+            is_key = self._wants_key and time.monotonic() - self._key_s >= KEY_EVERY_S
+            if is_key:
+                self._wants_key, self._key_s = False, time.monotonic()
+        try:
+            frame = _frame(jpeg)
+        except ValueError:
+            return  # the age of the last one that was good is on the page
+        pts = round(at_ms * _TICKS_PER_MS)
+        if pts <= self._last_pts:
+            return
+        self._last_pts = frame.pts = pts
+        frame.time_base = Fraction(1, CLOCK_HZ)
+        codec = self._codec_for(frame, rate)
+        if is_key:
+            frame.pict_type = av.video.frame.PictureType.I
+        for packet in codec.encode(frame):
+            packet.pts, packet.time_base = pts, frame.time_base
+            self.encoded += 1
+            self.keys += bool(packet.is_keyframe)
+            self._made(self._topic, _Encoded(packet, at_ms))
+
+    def _codec_for(self, frame: Any, rate: int) -> Any:
+        codec = self._codec
+        if codec is None or (codec.width, codec.height, codec.bit_rate) != (frame.width, frame.height, rate):
+            codec = av.CodecContext.create('libvpx', 'w')
+            codec.width, codec.height, codec.pix_fmt = frame.width, frame.height, 'yuv420p'
+            codec.time_base, codec.framerate = Fraction(1, CLOCK_HZ), Fraction(30)
+            codec.bit_rate, codec.gop_size, codec.qmin, codec.qmax, codec.thread_count = rate, 3000, 4, 56, 1
+            codec.options = {
+                'deadline': 'realtime', 'cpu-used': '-6', 'lag-in-frames': '0', 'minrate': str(rate), 'maxrate': str(rate),
+                'bufsize': str(rate // 2), 'max-intra-rate': '400', 'undershoot-pct': '100', 'overshoot-pct': '15',
+                'static-thresh': '1', 'noise-sensitivity': '0',
+            }  # fmt: skip
+            self._codec = codec
+        return codec
+
+
+def _frame(jpeg: bytes) -> Any:
+    """A frame (av.VideoFrame, yuv420p) with even sides of at most MOST_SIDE pixels. Raises ValueError."""
+    height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
+    least = -(-max(height, width) // MOST_SIDE)
+    pixels = simplejpeg.decode_jpeg(jpeg, 'RGB', fastdct=True, fastupsample=True,
+                                    min_height=height // least, min_width=width // least)  # fmt: skip
+    every = -(-max(pixels.shape[:2]) // MOST_SIDE)
+    pixels = pixels[::every, ::every]
+    height, width = (side - side % 2 for side in pixels.shape[:2])
+    if not height or not width:
+        raise ValueError('a frame without pixels')
+    return av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels[:height, :width]), 'rgb24').reformat(format='yuv420p')
+
+
+class _PacketTrack(MediaStreamTrack):  # type: ignore[misc]
+    """What one peer is sent: packets that all peers of a topic share."""
+
+    kind = 'video'
+
+    def __init__(self, ask_key: Callable[[], None], sent: Callable[[_Encoded], None]) -> None:
+        super().__init__()
+        self._ask_key, self._sent = ask_key, sent
+        self._waiting: asyncio.Queue[_Encoded] = asyncio.Queue()
+        self._last: _Encoded | None = None
+        self._needs_key = True
+        self._is_asked = False
+
+    async def recv(self) -> Any:
+        """Called by the sender, once it is connected, for each packet after the one before was sent."""
+        if not self._is_asked:
+            self._is_asked = True
+            self._ask_key()
+        if self._last is not None:
+            self._sent(self._last)
+        self._last = await self._waiting.get()
+        return self._last.packet
+
+    def offer(self, encoded: _Encoded) -> None:
+        if not self._is_asked:
+            return
+        if self._waiting.qsize() >= MOST_WAITING:
+            while not self._waiting.empty():
+                self._waiting.get_nowait()
+            self._needs_key = True
+            self._ask_key()
+        if self._needs_key and not encoded.packet.is_keyframe:
+            return
+        self._needs_key = False
+        self._waiting.put_nowait(encoded)
+
+
+class _Peer:
+    """A viewer that takes the video of a topic."""
+
+    def __init__(self, topic: str, video: CameraVideo, tell: Callable[[Mapping[str, Any]], None]) -> None:
+        self.topic, self._video, self._tell = topic, video, tell
+        self.pc = RTCPeerConnection(RTCConfiguration(iceServers=[]))
+        self.track = _PacketTrack(lambda: video.ask_key(topic), self._on_sent)
+        self.rate: float | None = None
+        """Bits a second that its link carries, as it says."""
+        self._is_told = False
+        self.sender: RTCRtpSender = self.pc.addTrack(self.track)
+
+    async def answer(self, offer: str, own: str, remote: str) -> str:
+        """Raises OfferRefused."""
+        await self.pc.setRemoteDescription(RTCSessionDescription(_with_address(offer, remote), 'offer'))
+        (transceiver,) = self.pc.getTransceivers()
+        codecs = [codec for codec in RTCRtpSender.getCapabilities('video').codecs if codec.mimeType in ('video/VP8', 'video/rtx')]
+        transceiver.setCodecPreferences(codecs)
+        _gather_at(self.sender.transport.transport.iceGatherer._connection, own)
+        handle = self.sender._handle_rtcp_packet
+
+        async def read(packet: Any) -> None:
+            self._on_rtcp(packet)
+            await handle(packet)
+
+        self.sender._handle_rtcp_packet = read
+        self.pc.on('connectionstatechange', self._on_state)
+        await self.pc.setLocalDescription(await self.pc.createAnswer())
+        return str(self.pc.localDescription.sdp)
+
+    def _on_state(self) -> None:
+        if self.pc.connectionState in ('failed', 'closed'):
+            self._video.lost(self, 'the connection for video (UDP) was lost')
+
+    def _on_sent(self, encoded: _Encoded) -> None:
+        if not self._is_told:
+            self._is_told = True
+            self._tell({'rtp': self.sender._RTCRtpSender__rtp_timestamp, 'at': encoded.at_ms, 'topic': self.topic})
+
+    def _on_rtcp(self, packet: Any) -> None:
+        if not isinstance(packet, RtcpPsfbPacket):
+            return
+        if packet.fmt in (RTCP_PSFB_PLI, RTCP_PSFB_FIR):
+            self._video.ask_key(self.topic)
+        elif packet.fmt == RTCP_PSFB_APP:
+            with suppress(ValueError):
+                self.rate = float(unpack_remb_fci(packet.fci)[0])
+
+
+class CameraVideo:
+    """Encodes the topics that peers take, and sends them. Used by one event loop. New; close once.
+
+    ``changed`` is called when other topics are to be read than before.
+    """
+
+    def __init__(self, changed: Callable[[], None]) -> None:
+        self._changed = changed
+        self._loop = asyncio.get_running_loop()
+        self._encoders: dict[str, _VideoEncoder] = {}
+        self._rates: dict[str, tuple[int, float]] = {}
+        self._peers: dict[object, _Peer] = {}
+        self._ending: set[asyncio.Task[None]] = set()
+        for name in ('aioice', 'aiortc'):
+            logging.getLogger(name).setLevel(logging.WARNING)
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """Those that somebody takes."""
+        return frozenset(self._encoders)
+
+    def offer(self, item: LiveItem) -> None:
+        """A JPEG of one of the topics."""
+        if (encoder := self._encoders.get(item.topic)) is not None and item.head is not None:
+            encoder.offer(float(item.head['at']), item.body)
+
+    def ask_key(self, topic: str) -> None:
+        if (encoder := self._encoders.get(topic)) is not None:
+            encoder.ask_key()
+
+    async def take(self, who: object, said: Mapping[str, Any], addresses: tuple[str, str],
+                   tell: Callable[[Mapping[str, Any]], None]) -> None:  # fmt: skip
+        """A viewer asks for a topic: ``said`` has ``topic`` and ``offer`` (SDP). ``tell`` is given the answer, or the problem.
+
+        ``addresses``: at which of ours it reached us, and its own.
+        """
+        self.end(who)
+        try:
+            peer = self._new_peer(who, said.get('topic'), tell)
+            answer = await self._answered(who, peer, said.get('offer'), addresses)
+        except OfferRefused as error:
+            tell({'problem': str(error)})
+        else:
+            tell({'answer': answer})
+            self._loop.call_later(CONNECT_S, self._look_at, peer)
+
+    def _new_peer(self, who: object, topic: Any, tell: Callable[[Mapping[str, Any]], None]) -> _Peer:
+        if not isinstance(topic, str):
+            raise OfferRefused('a viewer takes a topic')
+        if len(self._peers) >= MOST_PEERS:
+            raise OfferRefused(f'{MOST_PEERS} viewers take video, which is the most there may be')
+        if topic not in self._encoders and len(self._encoders) >= MOST_ENCODED:
+            raise OfferRefused(f'{MOST_ENCODED} cameras are encoded, which is the most there may be')
+        peer = self._peers[who] = _Peer(topic, self, tell)
+        self._follow()
+        return peer
+
+    async def _answered(self, who: object, peer: _Peer, offer: Any, addresses: tuple[str, str]) -> str:
+        """Whatever goes wrong, the peer is ended. Raises OfferRefused."""
+        answer = None
+        try:
+            answer = await peer.answer(offer, *addresses)
+        except _BROKEN as error:
+            raise OfferRefused(f'the offer cannot be answered: {type(error).__name__}') from error
+        finally:
+            if answer is None and self._peers.get(who) is peer:
+                self.end(who)
+        return answer
+
+    def end(self, who: object) -> None:
+        """It takes no video any more."""
+        if (peer := self._peers.pop(who, None)) is not None:
+            self._follow()
+            task = self._loop.create_task(peer.pc.close())
+            self._ending.add(task)
+            task.add_done_callback(self._ending.discard)
+
+    def lost(self, peer: _Peer, problem: str) -> None:
+        for who, one in list(self._peers.items()):
+            if one is peer:
+                peer._tell({'problem': problem})
+                self.end(who)
+
+    def has(self, who: object) -> bool:
+        """Whether it takes video, and is connected."""
+        return (peer := self._peers.get(who)) is not None and peer.pc.connectionState == 'connected'
+
+    def tick(self) -> None:
+        """Once a second: the rate of each topic is what the slowest of its links carries."""
+        now_s = time.monotonic()
+        for topic, encoder in self._encoders.items():
+            told = [peer.rate for peer in self._peers.values() if peer.topic == topic and peer.rate is not None]
+            if not told:
+                continue
+            rate, since_s = self._rates.get(topic, (FIRST_RATE, -RAISE_EVERY_S))
+            wanted = int(min(max(min(told) * RATE_SHARE, LEAST_RATE), MOST_RATE))
+            if wanted < 0.9 * rate or (wanted > 1.25 * rate and now_s - since_s >= RAISE_EVERY_S):
+                self._rates[topic] = wanted, now_s
+                encoder.set_rate(wanted)
+
+    async def close(self) -> None:
+        for who in list(self._peers):
+            self.end(who)
+        if self._ending:
+            await asyncio.wait(self._ending, timeout=5.0)
+
+    def _look_at(self, peer: _Peer) -> None:
+        if peer.pc.connectionState != 'connected':
+            self.lost(peer, f'no connection for video (UDP) within {CONNECT_S:.0f} s')
+
+    def _follow(self) -> None:
+        """Encoders of the topics that are taken, and of no others."""
+        wanted = {peer.topic for peer in self._peers.values()}
+        for topic in self._encoders.keys() - wanted:
+            self._rates.pop(topic, None)
+            encoder = self._encoders.pop(topic)
+            self._loop.run_in_executor(None, encoder.close)
+        for topic in wanted - self._encoders.keys():
+            encoder = self._encoders[topic] = _VideoEncoder(topic, self._on_encoded)
+            encoder.worker.start()
+        self._changed()
+
+    def _on_encoded(self, topic: str, encoded: _Encoded) -> None:
+        """On the thread of the encoder."""
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._share, topic, encoded)
+
+    def _share(self, topic: str, encoded: _Encoded) -> None:
+        for peer in self._peers.values():
+            if peer.topic == topic:
+                peer.track.offer(encoded)
+
+
+def _with_address(offer: str, remote: str) -> str:
+    """The offer with candidates at the viewer's own address alone; browsers put names that few can look up in its place."""
+    lines = offer.replace('\r\n', '\n').strip().split('\n')
+    if [line[:8] for line in lines if line.startswith('m=')] != ['m=video ']:
+        raise OfferRefused('an offer has one part, which is video')
+    ports = [int(found[1]) for line in lines if (found := _CANDIDATE.match(line)) and 0 < int(found[1]) < 65_536]
+    lines = [line for line in lines if not line.startswith(('a=candidate', 'a=end-of-candidates', 'a=remote-candidates'))]
+    ports = ports[:_MOST_CANDIDATES] or [9]  # without any, the answering side would not wait for the other
+    lines += [f'a=candidate:{place} 1 udp 2122260223 {remote} {port} typ host' for place, port in enumerate(ports)]
+    return '\r\n'.join([*lines, 'a=end-of-candidates', ''])
+
+
+def _gather_at(connection: Any, address: str) -> None:
+    """Let an ICE connection (aioice) listen at this address alone, and not at all but the loopback's, as it would."""
+    gather: Callable[..., Awaitable[list[Any]]] = connection.get_component_candidates
+
+    async def at_address(component: int, addresses: list[str], timeout: int = 5) -> list[Any]:  # noqa: ARG001 - as aioice has it
+        found = await gather(component, [address], timeout)
+        for protocol in connection._protocols:
+            with suppress(OSError):
+                protocol.transport.get_extra_info('socket').setsockopt(socket.IPPROTO_IP, socket.IP_TOS, 34 << 2)
+        return found
+
+    connection.get_component_candidates = at_address

@@ -1,0 +1,235 @@
+"""The camera as video over WebRTC, to a real Chromium: from a server with frames of our own."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import simplejpeg
+from live.test_access import Page, serving
+
+from shadowhound_data_logger.live import server as module
+from shadowhound_data_logger.live.kinds import LiveItem
+from shadowhound_data_logger.options import COMPRESSED_IMAGE
+
+CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
+CAMERA = '/camera'
+LEVELS = 12
+OFFER = """v=0
+o=- 1 2 IN IP4 127.0.0.1
+s=-
+t=0 0
+m=video 9 UDP/TLS/RTP/SAVPF 96
+c=IN IP4 0.0.0.0
+a=candidate:1 1 udp 2113937151 44704baf-a062-4990-bc94-2b32b99782c0.local 48973 typ host generation 0
+a=candidate:2 1 udp 2113937151 203.0.113.9 50000 typ host generation 0
+a=candidate:3 1 tcp 1518280447 203.0.113.9 9 typ host tcptype active
+a=candidate:4 1 udp 1677729535 203.0.113.9 50001 typ srflx raddr 0.0.0.0 rport 0
+a=ice-ufrag:Ovmx
+a=ice-pwd:JBXCKCpMvrxWitDC1/BFTuxa
+a=fingerprint:sha-256 A3:8B:1D:B0:EA:06:0E:80:F8:28:E1:FA:90:B7:9B:75:92:33:B6:51:CB:69:98:21:16:74:7C:E8:C3:66:76:7C
+a=setup:actpass
+a=mid:0
+a=recvonly
+a=rtcp-mux
+a=rtpmap:96 VP8/90000
+"""
+
+
+def picture(number: int) -> bytes:
+    """320 x 240, of which the brightness tells which one it is."""
+    return bytes(simplejpeg.encode_jpeg(np.full((240, 320, 3), 20 + 18 * (number % LEVELS), np.uint8), 90))
+
+
+async def until(condition: Callable[[], Awaitable[Any]], what: str) -> Any:
+    async def looking() -> Any:
+        while not (found := await condition()):
+            await asyncio.sleep(0.05)
+        return found
+
+    try:
+        return await asyncio.wait_for(looking(), 90.0)
+    except asyncio.TimeoutError:
+        raise AssertionError(f'within 90 s: {what}') from None
+
+
+class Robot:
+    """A page with a camera of ten frames a second."""
+
+    def __init__(self, page: Page) -> None:
+        self.page, self.server = page, page.server
+        self.at: list[float] = []
+        """When each frame came, ms."""
+
+    async def publish(self) -> None:
+        while True:
+            self.at.append(round(asyncio.get_running_loop().time() * 1e3, 1))
+            self.server._on_items([LiveItem(CAMERA, 'camera', head={'at': self.at[-1]}, body=picture(len(self.at) - 1))])
+            await asyncio.sleep(0.1)
+
+
+@asynccontextmanager
+async def robot(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '127.0.0.1') -> AsyncIterator[Robot]:
+    async with serving(folder, monkeypatch, bind) as page:
+        page.server.no_video = ''
+        page.server._on_graph({CAMERA: COMPRESSED_IMAGE})
+        found = Robot(page)
+        task = asyncio.create_task(found.publish())
+        try:
+            yield found
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+@pytest.mark.long('a Chromium')
+@pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
+def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is encoded once for both; each frame has the time at which it came to the robot; JPEGs are not sent beside it.
+
+    When a viewer goes back to JPEG it gets those, and without viewers nothing is encoded.
+    """
+    api = pytest.importorskip('playwright.async_api')
+    pytest.importorskip('aiortc')
+    # What is on the canvas and when the page says that it came.
+    shown = """() => [document.querySelector('.camera canvas').getContext('2d').getImageData(160, 120, 1, 1).data[1],
+                      shadowhound.at().camera, shadowhound.video.frames]"""
+
+    async def run() -> None:
+        async with robot(tmp_path, monkeypatch) as found, api.async_playwright() as playwright:
+            browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox', '--disable-gpu'])
+            tabs = [await browser.new_page() for _ in range(2)]
+            for tab in tabs:
+                tab.set_default_timeout(90_000)
+                await tab.goto(found.page.origin)
+                await tab.select_option('[data-video]', 'video')
+            for tab in tabs:
+                await until(lambda tab=tab: tab.evaluate('shadowhound.video.frames > 10'), 'frames of video')
+            video = found.server._video
+            assert video is not None
+            assert len(video._peers) == 2
+            assert video.topics == {CAMERA}
+            (encoder,) = video._encoders.values()
+            assert encoder.encoded <= len(found.at)
+            assert all(CAMERA not in one.viewer.watched for one in found.server._viewers)
+            for tab in tabs:
+                told = [await tab.evaluate(shown) for _ in range(20)]
+                for level, at, _ in told:
+                    number = min(range(len(found.at)), key=lambda place: abs(found.at[place] - at))
+                    assert abs(found.at[number] - at) < 1, 'a time at which no frame came'
+                    assert abs(level - (20 + 18 * (number % LEVELS))) < 9, 'the time is that of another frame'
+            await tabs[0].select_option('[data-video]', 'jpeg')
+            await until(lambda: tabs[0].evaluate("document.querySelector('[data-video]').dataset.video === 'off'"), 'JPEG again')
+            before = await tabs[0].evaluate('shadowhound.count.camera')
+            await until(lambda: tabs[0].evaluate(f'shadowhound.count.camera > {before} + 5'), 'frames as JPEG')
+            await browser.close()
+
+            async def is_idle() -> bool:
+                return not video.topics
+
+            await until(is_idle, 'nothing is encoded')
+
+    asyncio.run(run())
+
+
+@pytest.mark.long('a Chromium')
+@pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
+def test_a_page_without_the_extra_shows_jpegs_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the extra is there and the negotiation fails."""
+    api = pytest.importorskip('playwright.async_api')
+
+    async def run() -> None:
+        async with robot(tmp_path, monkeypatch) as found, api.async_playwright() as playwright:
+            browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox', '--disable-gpu'])
+            tab = await browser.new_page()
+            tab.set_default_timeout(90_000)
+            found.server.no_video = module.NO_WEBRTC
+            await tab.goto(found.page.origin)
+            assert await tab.locator('[data-video]').get_attribute('title') == module.NO_WEBRTC
+            found.server.no_video = ''
+            await tab.reload()
+            await tab.locator('select[data-video]').wait_for()
+            found.server.no_video = module.NO_WEBRTC
+            await tab.select_option('[data-video]', 'video')
+            await until(lambda: tab.evaluate('shadowhound.video.problem.value'), 'a problem')
+            assert module.NO_WEBRTC in await tab.locator('[data-video]').get_attribute('title')
+            before = await tab.evaluate('shadowhound.count.camera')
+            await until(lambda: tab.evaluate(f'shadowhound.count.camera > {before} + 5'), 'frames as JPEG')
+            await browser.close()
+
+    asyncio.run(run())
+
+
+def test_an_offer_gives_ports_and_no_addresses() -> None:
+    """Whatever an offer names, packets go to the viewer's own address alone."""
+    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
+    found = [line for line in webrtc._with_address(OFFER, '192.0.2.7').split('\r\n') if 'candidate:' in line]
+    assert [line.split()[4:6] for line in found] == [['192.0.2.7', '48973'], ['192.0.2.7', '50000']]
+
+
+@pytest.mark.parametrize('offer', [
+    '', 'v=0', OFFER + OFFER, OFFER.replace('m=video', 'm=application'), OFFER.replace('VP8', 'XYZ'), 'm=video 9\n' + 'a=' * 5000,
+    OFFER.replace('a=ice-pwd:', 'a=nothing:'), OFFER.replace('a=fingerprint:', 'a=none:'), OFFER.replace('SAVPF 96', 'SAVPF x'),
+    'm=video \ud800', OFFER.replace('a=setup:actpass', 'a=setup:nobody'), 7, None, ['m=video 9'],
+])  # fmt: skip
+def test_an_offer_that_is_none_is_answered_with_the_problem(offer: Any) -> None:
+    """And leaves nothing behind."""
+    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
+
+    async def run() -> None:
+        video = webrtc.CameraVideo(lambda: None)
+        told: list[dict[str, Any]] = []
+        await video.take('viewer', {'topic': CAMERA, 'offer': offer}, ('127.0.0.1', '127.0.0.1'), told.append)
+        if told[0].get('answer') is None:
+            assert told[0]['problem']
+            assert not video.topics
+        await video.close()
+        assert not video.topics
+
+    asyncio.run(run())
+
+
+def test_no_more_peers_and_cameras_than_there_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever comes later is told so; whoever goes makes room."""
+    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
+    monkeypatch.setattr(webrtc, 'MOST_PEERS', 3)
+    addresses = '127.0.0.1', '127.0.0.1'
+
+    async def run() -> None:
+        video = webrtc.CameraVideo(lambda: None)
+        told: dict[str, dict[str, Any]] = {}
+
+        async def ask(who: str, topic: str) -> bool:
+            await video.take(who, {'topic': topic, 'offer': OFFER}, addresses, lambda what: told.__setitem__(who, dict(what)))
+            return 'answer' in told[who]
+
+        assert [await ask('a', '/1'), await ask('b', '/2'), await ask('c', '/3')] == [True, True, False]
+        assert 'cameras are encoded' in told['c']['problem']
+        assert await ask('c', '/2')
+        assert not await ask('d', '/1')
+        assert 'viewers take video' in told['d']['problem']
+        assert '127.0.0.1' in told['a']['answer']
+        video.end('a')
+        assert await ask('d', '/2')
+        await video.close()
+
+    asyncio.run(run())
+
+
+def test_frames_of_any_size_become_video() -> None:
+    """Odd sides, large ones, grey ones; what is no picture is left out."""
+    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
+    for height, width, shown in ((3, 5, (2, 4)), (240, 321, (240, 320)), (500, 4001, (188, 1500))):
+        frame = webrtc._frame(simplejpeg.encode_jpeg(np.zeros((height, width, 3), np.uint8)))
+        assert (frame.height, frame.width) == shown
+    grey = simplejpeg.encode_jpeg(np.zeros((8, 8, 1), np.uint8), colorspace='GRAY', colorsubsampling='Gray')
+    assert webrtc._frame(grey).width == 8
+    for broken in (b'', b'\xff\xd8\xff', simplejpeg.encode_jpeg(np.zeros((1, 1, 3), np.uint8))):
+        with pytest.raises(ValueError):
+            webrtc._frame(broken)
