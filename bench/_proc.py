@@ -35,6 +35,22 @@ def cpu_s(pid: int) -> float:
     return sum(stats[number].ticks for number in _tree(pid, stats)) * TICK_S
 
 
+def threads(pid: int) -> dict[str, float]:
+    """Seconds of CPU of the threads of a process by their names, as ``top -H`` shows these: of all with one name together.
+
+    The main thread, which has the name of the program, is ``main``.
+    """
+    used: dict[str, float] = {}
+    for entry in Path(f'/proc/{pid}/task').iterdir():
+        try:
+            name = 'main' if entry.name == str(pid) else (entry / 'comm').read_text(encoding='utf-8').strip()
+            nanoseconds = int((entry / 'schedstat').read_text(encoding='ascii').split()[0])
+        except OSError:  # it has ended since
+            continue
+        used[name] = used.get(name, 0.0) + nanoseconds / 1e9
+    return used
+
+
 def memory(pid: int) -> Memory:
     """What a process and its descendants have in memory now."""
     total = dict.fromkeys(Memory._fields, 0.0)
