@@ -1,7 +1,7 @@
 # Every target makes the environment first (see scripts/setup); with nothing to do that takes milliseconds.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-long test-matrix torture check format demo bench docs lock vendor tower tower-secrets clean
+.PHONY: help setup test test-long test-matrix torture check format demo bench docs lock vendor sbom audit tower tower-secrets clean
 
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
@@ -48,6 +48,12 @@ lock: setup ## write requirements/*.txt anew from requirements/*.in; LOCK_ARGS=-
 
 vendor: ## bundle what the live page needs of others (three, uPlot, preact) from npm
 	scripts/vendor
+
+sbom: setup ## bills of materials (CycloneDX) of the lock files and of what is vendored, into build/sbom
+	scripts/with-env python requirements/supply_chain.py sbom
+
+audit: setup ## known vulnerabilities of what the lock files pin; skipped where their database cannot be reached
+	scripts/with-env python requirements/supply_chain.py audit
 
 tower-secrets: ## credentials of a Tower, once; TOWER_ARGS="--host 192.168.1.10 --robot thor" is handed on
 	python3 tower/make_secrets.py $(TOWER_ARGS)

@@ -97,6 +97,7 @@ def test_every_dependency_has_its_reason(name: str) -> None:
     ('lock', 'sources'),
     [
         ('uv.txt', ['uv.in']),
+        ('audit.txt', ['audit.in']),
         ('runtime.txt', ['runtime.in']),
         ('robot.txt', ['runtime.in']),
         ('wheels.txt', ['runtime.in', 'ros.in', 'dev.in']),

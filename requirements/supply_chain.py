@@ -1,0 +1,145 @@
+#!/usr/bin/env python3
+"""Says what the package consists of, and what is known against it: ``make sbom`` and ``make audit``.
+
+    sbom    build/sbom/LOCK.cdx.json of each lock file that users install, and vendored.cdx.json of what is bundled here:
+            CycloneDX 1.6, with versions, package URLs and SHA-256 or SHA-512 of every file that may be installed
+    audit   known vulnerabilities of the pins; exit code 1 where there are some, 0 where the database cannot be reached
+
+The tools have an environment of their own, .cache/audit, from requirements/audit.txt.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import json
+import re
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+LOCKS: Final = ('robot', 'runtime')
+"""What robots and other machines install (docs/dependencies.md)."""
+TOOLS: Final = ROOT / '.cache' / 'audit'
+PAGE: Final = ROOT / 'requirements' / 'page' / 'package-lock.json'
+LICENSES: Final = ROOT / 'shadowhound_data_logger' / 'live' / 'page' / 'vendor' / 'LICENSES.txt'
+ANSWER_S: Final = 3.0
+AUDIT_S: Final = 60.0
+_BUNDLED: Final = re.compile(r'^(\S+) (\d\S*) \(([^)]+)\)$', re.MULTILINE)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('what', choices=('sbom', 'audit'))
+    what = parser.parse_args(arguments).what
+    return sbom(ROOT / 'build' / 'sbom') if what == 'sbom' else audit()
+
+
+def sbom(folder: Path) -> int:
+    """Write the bills of materials; the exit code."""
+    tools()
+    folder.mkdir(parents=True, exist_ok=True)
+    for lock in LOCKS:
+        target = folder / f'{lock}.cdx.json'
+        command = [str(TOOLS / 'bin' / 'cyclonedx-py'), 'requirements', str(ROOT / 'requirements' / f'{lock}.txt'),
+                   '--output-reproducible', '--output-format', 'JSON', '--output-file', str(target)]  # fmt: skip
+        subprocess.run(command, check=True)
+        print(target)
+    target = folder / 'vendored.cdx.json'
+    content = {'bomFormat': 'CycloneDX', 'specVersion': '1.6', 'version': 1, 'components': list(vendored())}
+    target.write_text(json.dumps(content, indent=2) + '\n', encoding='utf-8')
+    print(target)
+    return 0
+
+
+def vendored() -> Iterator[dict[str, Any]]:
+    """What others wrote and the repository holds: what is in the bundles of the live page."""
+    locked: Mapping[str, Any] = json.loads(PAGE.read_text(encoding='utf-8'))['packages']
+    for name, version, license_ in _BUNDLED.findall(LICENSES.read_text(encoding='utf-8')):
+        at = locked[f'node_modules/{name}']
+        if (at['version'], at['license']) != (version, license_):
+            raise SystemExit(f'{LICENSES} has {name} {version} ({license_}), {PAGE} has another: run `make vendor`')
+        algorithm, _, digest = at['integrity'].partition('-')
+        yield {
+            'type': 'library', 'bom-ref': f'{name}@{version}', 'name': name, 'version': version,
+            'purl': f'pkg:npm/{name.replace("@", "%40")}@{version}', 'licenses': [{'license': {'id': license_}}],
+            'hashes': [{'alg': algorithm.upper().replace('SHA', 'SHA-'), 'content': base64.b64decode(digest).hex()}],
+        }  # fmt: skip
+
+
+def audit() -> int:
+    """Print what is known of the pins; the exit code. A machine that does not reach the database says so in a line."""
+    locks = [ROOT / 'requirements' / f'{lock}.txt' for lock in LOCKS]
+    first = re.findall(r'^(\S+)==(\S+)', locks[0].read_text(encoding='utf-8'), re.MULTILINE)[0]
+    if not reachable(url := f'{database()}/{first[0]}/{first[1]}/json'):
+        print(f'audit: skipped, {url} does not say within {ANSWER_S:g} s what is known')
+        return 0
+    try:
+        tools()
+        lines, asked = judged([row for lock in locks for row in audited(lock)])
+    except (subprocess.SubprocessError, OSError, ValueError, LookupError) as error:
+        print(f'audit: skipped, pip-audit gives no answer: {str(error)[:200]}')
+        return 0
+    print('\n'.join(lines) or f'audit: nothing is known against {asked} packages')
+    return 1 if lines else 0
+
+
+def audited(lock: Path) -> list[dict[str, Any]]:
+    """pip-audit's row of each package."""
+    command = [str(TOOLS / 'bin' / 'pip-audit'), '--requirement', str(lock), '--require-hashes', '--disable-pip',
+               '--format', 'json', '--progress-spinner', 'off', '--timeout', f'{ANSWER_S:g}']  # fmt: skip
+    answer = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, timeout=AUDIT_S, check=False)
+    rows: list[dict[str, Any]] = json.loads(answer.stdout)['dependencies']
+    return rows
+
+
+def judged(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], int]:
+    """A line for each vulnerability, and of how many packages the database knew something."""
+    known = {row['name']: row for row in rows if 'skip_reason' not in row}
+    lines = {
+        f'{row["name"]} {row["version"]}: {one["id"]}, mended in {", ".join(one["fix_versions"]) or "no version"}'
+        for row in rows
+        for one in row.get('vulns', ())
+    }
+    return sorted(lines), len(known)
+
+
+def database() -> str:
+    """The URL below which each version of a package has what is known of it: of PyPI, as pip has it; empty without pip."""
+    try:
+        from pip._internal.models.index import PyPI  # noqa: PLC0415
+    except ImportError:
+        return ''
+    return str(PyPI.pypi_url)
+
+
+def reachable(url: str) -> bool:
+    """Whether it answers in time, with JSON: a proxy's page says nothing."""
+    try:
+        with urllib.request.urlopen(url, timeout=ANSWER_S) as answer:  # noqa: S310 - https, ours
+            return 'vulnerabilities' in json.load(answer)
+    except (OSError, ValueError):
+        return False
+
+
+def tools() -> None:
+    """Make the environment of the tools, or bring it up to date. Raises subprocess.CalledProcessError without a registry."""
+    wanted = (ROOT / 'requirements' / 'audit.txt').read_text(encoding='utf-8')
+    done = TOOLS / 'done'
+    if done.is_file() and done.read_text(encoding='utf-8') == wanted:
+        return
+    uv = str(ROOT / '.venv' / 'bin' / 'uv')
+    subprocess.run([uv, 'venv', '--quiet', '--clear', str(TOOLS)], check=True, timeout=AUDIT_S)
+    command = [uv, 'pip', 'install', '--quiet', '--python', str(TOOLS / 'bin' / 'python'), '--require-hashes',
+               '--requirement', str(ROOT / 'requirements' / 'audit.txt')]  # fmt: skip
+    subprocess.run(command, check=True, timeout=AUDIT_S)
+    done.write_text(wanted, encoding='utf-8')
+
+
+if __name__ == '__main__':
+    sys.exit(main())

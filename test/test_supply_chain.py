@@ -1,0 +1,55 @@
+"""Bills of materials and the audit of the pins: requirements/supply_chain.py."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def supply_chain(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(ROOT / 'requirements')
+    return importlib.import_module('supply_chain')
+
+
+def test_all_that_is_bundled_has_a_version_a_licence_and_a_hash(supply_chain: Any) -> None:
+    """Each package of package-lock.json that runs in the page, as npm hands it out."""
+    found = {each['name']: each for each in supply_chain.vendored()}
+    wanted = json.loads((ROOT / 'requirements/page/package.json').read_text())['dependencies']
+    assert set(wanted) <= set(found)
+    for each in found.values():
+        assert re.fullmatch(r'pkg:npm/(%40[a-z]+/)?[a-z-]+@[0-9.]+', each['purl'])
+        assert each['licenses'] == [{'license': {'id': each['licenses'][0]['license']['id']}}]
+        assert [(one['alg'], len(one['content'])) for one in each['hashes']] == [('SHA-512', 128)]
+
+
+def test_a_machine_without_the_database_skips_the_audit(
+    supply_chain: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With exit code 0 and a line that says so, and without making an environment for it."""
+    monkeypatch.setattr(supply_chain, 'database', lambda: 'http://127.0.0.1:9')
+    monkeypatch.setattr(supply_chain, 'tools', lambda: pytest.fail('it is not needed'))
+    assert supply_chain.audit() == 0
+    assert 'audit: skipped, http://127.0.0.1:9/aio' in capsys.readouterr().out
+
+
+def test_what_is_known_is_told_once(
+    supply_chain: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A package of both lock files is one finding; what the database does not know counts as not asked."""
+    rows = [
+        {'name': 'a', 'version': '1', 'vulns': [{'id': 'CVE-1', 'fix_versions': ['2']}]},
+        {'name': 'b', 'version': '1', 'vulns': []}, {'name': 'c', 'skip_reason': 'not found'},
+    ]  # fmt: skip
+    for name, answer in (('reachable', True), ('tools', None), ('audited', rows)):
+        monkeypatch.setattr(supply_chain, name, lambda *_, answer=answer: answer)
+    assert supply_chain.audit() == 1
+    assert capsys.readouterr().out == 'a 1: CVE-1, mended in 2\n'
+    assert supply_chain.judged(rows[1:]) == ([], 1)
