@@ -15,7 +15,7 @@ import numpy as np
 import simplejpeg
 
 from shadowhound_data_logger.encode.payload import Fact, Job, Payload
-from shadowhound_data_logger.encode.statistics import ALL, NONE, Statistic, of_number, of_whole
+from shadowhound_data_logger.encode.statistics import ALL, NONE, Statistic, of_number, of_whole, packed
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
 from shadowhound_data_logger.options import ARCHIVES, COMPRESSED_IMAGE, IMAGE
@@ -117,13 +117,13 @@ def _published(job: Job, sample: Sample, message: Any) -> Payload:
     else:
         text = f'neither JPEG nor PNG: format {message.format[:40]!r}, data begins with {body[:4].hex()}'
         raise Rejected('unsupported_encoding', text)
-    found = _statistics(job, body) if ext == 'jpg' else {}
+    found = _statistics(job, body) if ext == 'jpg' else b''
     return Payload(body, (sample,), ext, content_type, {'width': width, 'height': height, **facts}, found)
 
 
-def _statistics(job: Job, body: bytes) -> dict[str, Statistic]:
+def _statistics(job: Job, body: bytes) -> bytes:
     """Of a picture that is an object of its own."""
-    return of_jpeg(body) if job.sensor.statistics != (NONE,) and job.sensor.format not in ARCHIVES else {}
+    return packed(of_jpeg(body)) if job.sensor.statistics != (NONE,) and job.sensor.format not in ARCHIVES else b''
 
 
 def _depth(message: Any) -> tuple[Any, dict[str, Fact]]:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from shadowhound_data_logger.config import SensorSettings
-from shadowhound_data_logger.encode.statistics import Statistic
 from shadowhound_data_logger.encode.types import ENCAPSULATION_BYTES, MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Batch, Sample
@@ -36,8 +35,8 @@ class Payload:
     facts: Mapping[str, Fact] = field(default_factory=dict)
     """What is known of the content: lower-case names, numbers or printable ASCII. It becomes the object's S3 user metadata,
     or in an archive the JSON beside the file."""
-    statistics: Mapping[str, Statistic] = field(default_factory=dict)
-    """Of the numbers in it; empty where nobody looked."""
+    statistics: bytes = b''
+    """Of the numbers in it, as ``statistics.packed``; empty where nobody looked."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from shadowhound_data_logger.encode.payload import Fact, Job, Payload
-from shadowhound_data_logger.encode.statistics import ALL, MOST_FIELDS, NONE, Statistic, of_number, of_whole
+from shadowhound_data_logger.encode.statistics import ALL, MOST_FIELDS, NONE, Statistic, of_number, of_whole, packed
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
 from shadowhound_data_logger.options import ARCHIVES, POINT_CLOUD
@@ -67,7 +67,8 @@ def encode_cloud(job: Job, sample: Sample) -> Payload:
     body = b''.join((_header(cloud, fields, sample.stamp_ns), points.data))
     facts: dict[str, Fact] = {'points': cloud.width * cloud.height, 'is_dense': bool(cloud.is_dense)}
     is_asked = job.sensor.statistics != (NONE,) and job.sensor.format not in ARCHIVES
-    found = of_points(points.reshape(-1).view([(field.name, field.format('<')) for field in fields])) if is_asked else {}
+    layout = [(field.name, field.format('<')) for field in fields]
+    found = packed(of_points(points.reshape(-1).view(layout))) if is_asked else b''
     return Payload(body, (sample,), 'pcd', 'application/octet-stream', facts, found)
 
 

@@ -23,8 +23,9 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys.base import normalize_fieldname
 
 from shadowhound_data_logger.clock import iso
+from shadowhound_data_logger.encode.columns import BatchStatistics
 from shadowhound_data_logger.encode.payload import Job, Payload, Rejections
-from shadowhound_data_logger.encode.statistics import NONE, FieldStatistics
+from shadowhound_data_logger.encode.statistics import NONE, UNCOUNTED, FieldStatistics, covers, packed
 from shadowhound_data_logger.encode.types import PLACEHOLDER, MessageTypes, nested_type
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 ODOMETRY: Final = 'nav_msgs/msg/Odometry'
 NON_FINITE: Final = 'non_finite'
 _TAKEN: Final = frozenset({'stamp_ns', NON_FINITE})
+_TAKEN_ALONE: Final = _TAKEN | {'robot', 'sensor', 'topic', 'type', 'timestamp'}
 AT_ONCE: Final = 100
 """Records that are Python objects at a time: they take twenty times the bytes of the message, and ``orjson`` holds the GIL
 while it writes them."""
@@ -54,22 +56,21 @@ def encode_records(job: Job, rejections: Rejections) -> Payload | None:
     records = _records(job, _of_batch if batched else _alone, kept, rejections)
     parts: list[bytes] = []
     non_finite = 0
-    has_statistics = job.sensor.statistics != (NONE,)
-    found = FieldStatistics(job.sensor.statistics)
+    are_widened = False
     while some := list(islice(records, AT_ONCE)):
-        part, missing = _dump(some)
+        part, missing, is_widened = _dump(some)
+        are_widened |= is_widened
         parts.append(part[1:-1])
         non_finite += missing
-        if has_statistics:
-            found.add(orjson.loads(part))
     if not kept:
         return None
+    said = _statistics(job, kept, parts, batched=batched, is_widened=are_widened)
     body = b','.join(parts)
     if batched:
         body = b'%b,"samples":[%b]}' % (_head(job, kept)[:-1], body)
     if non_finite:
         body = b'%b,"non_finite":%d}' % (body[:-1], non_finite)
-    return Payload(body, tuple(kept), 'json', 'application/json', statistics=found.told() if has_statistics else {})
+    return Payload(body, tuple(kept), 'json', 'application/json', statistics=said)
 
 
 def _records(job: Job, record: ToRecord, kept: list[Sample], rejections: Rejections) -> Iterator[dict[str, Any]]:
@@ -90,7 +91,7 @@ def _alone(job: Job, sample: Sample, message: Any) -> dict[str, Any]:
     if special is not None:
         return special(sample, message)
     own = {**_origin(job), 'timestamp': iso(sample.stamp_ns), 'stamp_ns': sample.stamp_ns}
-    return {**own, **converter(job.types, job.batch.type, frozenset((*own, NON_FINITE)))(message)}
+    return {**own, **converter(job.types, job.batch.type, _TAKEN_ALONE)(message)}
 
 
 def _of_batch(job: Job, sample: Sample, message: Any) -> dict[str, Any]:
@@ -131,13 +132,50 @@ _RECORDS: Final[Mapping[str, Callable[[Sample, Any], dict[str, Any]]]] = {ODOMET
 """Types whose single record has a form of its own."""
 
 
-def _dump(records: list[dict[str, Any]]) -> tuple[bytes, int]:
-    """The records as a JSON list, and how many of their numbers are not finite and so became null."""
+_PLACES: Final[Mapping[str, Mapping[str, str]]] = {
+    ODOMETRY: {'pose.pose.position': 'position', 'pose.pose.orientation': 'orientation', 'twist.twist.linear': 'linear_velocity',
+               'twist.twist.angular': 'angular_velocity'},
+}  # fmt: skip
+"""Where the numbers of the message are in such a record."""
+
+
+def _statistics(job: Job, kept: Sequence[Sample], parts: Sequence[bytes], *, batched: bool, is_widened: bool) -> bytes:
+    """Of the numbers in the JSON: from the messages at once where they are of one layout, else by reading it again."""
+    if job.sensor.statistics == (NONE,):
+        return b''
+    told = None
+    if not is_widened:
+        told = _columns(job.types, job.batch.type, job.sensor.statistics, batched).told([sample.cdr for sample in kept])
+    if told is None:
+        found = FieldStatistics(job.sensor.statistics)
+        for part in parts:
+            found.add(orjson.loads(b'[%b]' % part))
+        told = packed(found.told())
+    return told
+
+
+@lru_cache(maxsize=1024)
+def _columns(types: MessageTypes, type_name: str, chosen: tuple[str, ...], batched: bool) -> BatchStatistics:
+    special = None if batched else _PLACES.get(type_name)
+    names = [name for name, _ in types.fields(type_name)]
+    free = {name: _free(name, _TAKEN if batched else _TAKEN_ALONE, names) for name in names}
+
+    def named(path: str) -> str | None:
+        if special is not None:
+            return next((new + path[len(old) :] for old, new in special.items() if covers(old, path)), None)
+        name, dot, rest = path.partition('.')
+        return None if free[name] in UNCOUNTED else f'{free[name]}{dot}{rest}'
+
+    return BatchStatistics(types, type_name, chosen, named)
+
+
+def _dump(records: list[dict[str, Any]]) -> tuple[bytes, int, bool]:
+    """The records as a JSON list, how many numbers are not finite and so became null, and whether the others are ``widened``."""
     body = orjson.dumps(records, option=orjson.OPT_SERIALIZE_NUMPY)
-    if _AWKWARD in body:
+    if is_awkward := _AWKWARD in body:
         body = orjson.dumps(widened(records), option=orjson.OPT_SERIALIZE_NUMPY)
     # A message has no nulls of its own, but text may contain the word.
-    return body, _nulls(orjson.loads(body)) if b'null' in body else 0
+    return body, _nulls(orjson.loads(body)) if b'null' in body else 0, is_awkward
 
 
 def _nulls(value: Any) -> int:

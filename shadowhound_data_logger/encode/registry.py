@@ -13,7 +13,6 @@ from shadowhound_data_logger.encode.image import encode_jpeg, encode_png
 from shadowhound_data_logger.encode.payload import Encoder, Fact, Job, Payload, Rejections, encode_cdr, one_message
 from shadowhound_data_logger.encode.pointcloud import encode_cloud
 from shadowhound_data_logger.encode.records import encode_records
-from shadowhound_data_logger.encode.statistics import packed
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import NameRefused, Rejected
 from shadowhound_data_logger.keys import KeyTemplate, dated
@@ -90,7 +89,7 @@ def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, 
         dedup=sensor.dedup,
         metadata={**{name: _text(fact) for name, fact in payload.facts.items()}, **metadata},
         key_pattern=pattern,
-        statistics=packed(payload.statistics),
+        statistics=payload.statistics,
     )
 
 

@@ -24,6 +24,8 @@ MOST_ELEMENTS: Final = 20
 MOST_DEPTH: Final = 8
 MOST_SAID: Final = 1 << 16
 """Bytes of the statistics of an object as they are kept."""
+MEAN_ERROR: Final = 2.0**-22
+"""A float32 and its shortest decimal are within 2^-24 of each other, and the mean is kept as a float32."""
 ALL: Final = ''
 NONE: Final = 'none'
 """Instead of names of fields: no statistics."""
@@ -33,7 +35,11 @@ UNCOUNTED: Final = frozenset({'stamp_ns', 'timestamp', 'header', 'non_finite'})
 
 @dataclass(frozen=True, slots=True)
 class Statistic:
-    """Of the finite numbers of a field in an object; None where it has none. Their mean is None where their sum has no double."""
+    """Of the finite numbers of a field in an object; None where it has none. Their mean is None where their sum has no double.
+
+    The mean need not be the nearest double: the greatest magnitude among ``min`` and ``max`` times ``MEAN_ERROR`` is as far as
+    it may be from that of the decimals in the JSON, which an encoder does not read again for it.
+    """
 
     first: float | None
     last: float | None
@@ -186,13 +192,40 @@ def of_number(value: float) -> Statistic:
 
 def packed(found: Mapping[str, Statistic]) -> bytes:
     """The statistics as JSON; empty where there are none, or too much of them."""
-    said = orjson.dumps({name: numbers_of(each) for name, each in found.items()}) if found else b''
+    if ALL not in found:
+        return b''
+    names = [name for name in found if name != ALL]
+    rows = [[getattr(found[name], each) for name in names] for each in _IN_PART]
+    part = {'fields': names, 'numbers': rows, **{each: [getattr(found[name], each) for name in names] for each in _COUNTS}}
+    return packed_parts(found[ALL].count, found[ALL].nan_count, [part] if names else [])
+
+
+def packed_parts(messages: int, left_out: int, parts: Sequence[Mapping[str, Any]]) -> bytes:
+    """The same of ``fields`` in parts, each with its ``numbers``, a row for each of first, last, mean, min and max.
+
+    One row stands for all of them, none for fields without finite numbers; ``count`` and ``nan_count`` are of each or of all.
+    """
+    said = orjson.dumps({'messages': messages, 'left_out': left_out, 'parts': parts}, option=orjson.OPT_SERIALIZE_NUMPY)
     return said if len(said) <= MOST_SAID else b''
 
 
 def unpacked_statistics(said: bytes) -> dict[str, Statistic]:
     """What was packed; empty where that is damaged."""
     try:
-        return {str(name): Statistic(*each) for name, each in orjson.loads(said).items()} if said else {}
-    except (ValueError, TypeError, AttributeError):
+        return dict(_unpacked(orjson.loads(said))) if said else {}
+    except (ValueError, TypeError, LookupError, AttributeError):
         return {}
+
+
+def _unpacked(told: Any) -> Iterator[tuple[str, Statistic]]:
+    yield ALL, of_whole(int(told['messages']), int(told['left_out']))
+    for part in told['parts']:
+        names, rows = part['fields'], part['numbers'] or [[None] * len(part['fields'])]
+        rows = rows * len(_IN_PART) if len(rows) == 1 else rows
+        counts = [part[each] if isinstance(part[each], list) else [part[each]] * len(names) for each in _COUNTS]
+        for name, *numbers, count, nan_count in zip(names, *rows, *counts, strict=True):
+            yield str(name), Statistic(**dict(zip(_IN_PART, numbers, strict=True)), count=count, nan_count=nan_count)
+
+
+_IN_PART: Final = ('first', 'last', 'mean', 'min', 'max')
+_COUNTS: Final = ('count', 'nan_count')

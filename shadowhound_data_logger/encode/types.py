@@ -34,7 +34,7 @@ PLACEHOLDER: Final = 'structure_needs_at_least_one_member'
 
 _TYPE_NAME = re.compile(r'[A-Za-z]\w*/msg/[A-Za-z]\w*', re.ASCII)
 _WHOLE: Final = {'int8': 'b', 'uint8': 'B', 'byte': 'B', 'int16': 'h', 'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q'}
-_SIZES: Final = {
+SIZES: Final = {
     **{name: struct.calcsize(code) for name, code in _WHOLE.items()}, 'uint64': 8, 'float32': 4, 'float64': 8, 'bool': 1,
     'char': 1,
 }  # fmt: skip
@@ -159,8 +159,8 @@ class MessageTypes:
 
     def _end(self, description: FieldDesc, place: int) -> int:
         """Where a field ends that begins at ``place`` or, aligned, after it, in bytes after the encapsulation (XCDR1)."""
-        if description[0] == Nodetype.BASE and description[1][0] in _SIZES:
-            size = _SIZES[description[1][0]]
+        if description[0] == Nodetype.BASE and description[1][0] in SIZES:
+            size = SIZES[description[1][0]]
             return place + -place % size + size
         if description[0] == Nodetype.ARRAY:
             of, count = description[1]

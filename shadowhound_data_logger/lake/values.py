@@ -32,6 +32,7 @@ from shadowhound_data_logger.encode.pointcloud import of_points
 from shadowhound_data_logger.encode.records import AT_ONCE
 from shadowhound_data_logger.encode.statistics import (
     ALL,
+    MEAN_ERROR,
     NUMBERS,
     FieldStatistics,
     Statistic,
@@ -65,6 +66,8 @@ _COMPARISON: Final = re.compile(
 _WORD: Final = re.compile(r'\s*(and\b|or\b|\(|\)|$)', re.ASCII | re.IGNORECASE)
 _IS_VALUE: Final = re.compile(rf'(?<![\w.]){_PATH}', re.ASCII)
 _TEXT: Final = re.compile(r"'[^']*'")
+_TINY: Final = 2.0**-140
+"""Beyond what separates the least float32 from its decimal."""
 _SIGNS: Final = {'=': '==', '<>': '!='}
 _JSON, _JPEG, _PCD = 'json', 'jpg', 'pcd'
 _KEY: Final = ('bucket', 'key', 't_start_ns')
@@ -241,31 +244,31 @@ def _candidates(source: Bucket, asked: Wanted, flags: Mapping[str, Any], express
                 findings: Findings) -> tuple[pa.Table, pa.Table, pa.Table]:  # fmt: skip
     """The objects that have to be judged, their statistics, and the times of all objects.
 
-    Where every object has statistics of all its fields, those that a first comparison rules out are left out, and most row groups
+    Where every object has statistics of all its fields, those that first comparisons rule out are left out, and most row groups
     are not even read. Keys and names make most of a part's bytes: they are read only where an object has to be told by them.
     """
     times = _catalogue(source, flags, _TIMES, findings)
-    lead = _lead(expression)
-    if lead is not None:
-        whole = _read_all(source, asked, findings, (ALL, ALL), _WHOLE)
-        is_plain = len(pc.unique(times['robot'])) == 1 and not pc.any(pc.greater(whole['nan_count'], 0)).as_py()
-        stamps, told = np.sort(_stamps(times)), np.sort(_stamps(whole))
-        if is_plain and np.array_equal(stamps, told) and (np.diff(stamps) > 0).all():
-            return *_led(source, asked, expression, lead, findings, times, whole), times
+    whole = _read_all(source, asked, findings, (ALL, ALL), _WHOLE)
+    is_plain = len(pc.unique(times['robot'])) == 1 and not pc.any(pc.greater(whole['nan_count'], 0)).as_py()
+    stamps, told = np.sort(_stamps(times)), np.sort(_stamps(whole))
+    if is_plain and np.array_equal(stamps, told) and (np.diff(stamps) > 0).all():
+        return *_led(source, asked, expression, findings, times, whole), times
     rows = _catalogue(source, flags, _OBJECT, findings).sort_by([('robot', 'ascending'), ('t_start_ns', 'ascending')])
     return rows, _statistics(source, asked, leaves(expression), findings), times
 
 
-def _led(source: Bucket, asked: Wanted, expression: Expression, lead: Comparison, findings: Findings, times: pa.Table,
+def _led(source: Bucket, asked: Wanted, expression: Expression, findings: Findings, times: pa.Table,
          whole: pa.Table) -> tuple[pa.Table, pa.Table]:  # fmt: skip
-    """The objects for which the first comparison may hold, each told from all others by its time, and their statistics."""
-    first = _statistics(source, asked, [lead], findings, _bounds_of(lead))
-    some, _ = _by_statistics(lead, {name: _numbers(first, name) for name in NUMBERS})
-    first = first.filter(pa.array(some))
-    chosen = _stamps(first)
-    others = [leaf for leaf in leaves(expression) if leaf != lead]
-    tables_of = [first, *([_only_at(_statistics(source, asked, others, findings), chosen)] if others else [])]
-    found = pa.concat_tables([table.select(_STATISTIC) for table in tables_of])
+    """The objects for which the first comparisons may hold, each told from all others by its time, and their statistics."""
+    leads = _leads(expression)
+    of_leads = []
+    for lead in dict.fromkeys(leads):
+        first = _statistics(source, asked, [lead], findings, _bounds_of(lead))
+        some, _ = _by_statistics(lead, {name: _numbers(first, name) for name in NUMBERS})
+        of_leads.append(first.filter(pa.array(some)))
+    chosen = np.unique(_stamps(pa.concat_tables(of_leads)))
+    others = [leaf for leaf in leaves(expression) if leaf not in leads]
+    found = pa.concat_tables([*of_leads, *([_only_at(_statistics(source, asked, others, findings), chosen)] if others else [])])
     keys = found.select(['bucket', 'key', 't_start_ns']).group_by(list(_KEY)).aggregate([])
     objects = _only_at(times, chosen).join(keys, keys='t_start_ns', join_type='inner')
     common = _only_at(whole, chosen).join(keys, keys='t_start_ns', join_type='inner')
@@ -275,17 +278,18 @@ def _led(source: Bucket, asked: Wanted, expression: Expression, lead: Comparison
     return objects.sort_by('t_start_ns').combine_chunks(), pa.concat_tables([found, wholes.cast(found.schema)]).combine_chunks()
 
 
-def _lead(expression: Expression) -> Comparison | None:
-    """A comparison that must hold for the expression to hold."""
+def _leads(expression: Expression) -> list[Comparison]:
+    """Comparisons of which at least one must hold for the expression to hold: as few as there are."""
     if isinstance(expression, Comparison):
-        return expression
-    return next((found for part in expression.parts if (found := _lead(part))), None) if expression.word == 'and' else None
+        return [expression]
+    found = [_leads(part) for part in expression.parts]
+    return min(found, key=len) if expression.word == 'and' else [lead for part in found for lead in part]
 
 
 def _bounds_of(leaf: Comparison) -> tuple[Bound, ...]:
     """What a statistic must be at least and at most where the comparison may hold."""
     name = leaf.function or {'>': 'max', '>=': 'max', '<': 'min', '<=': 'min'}.get(leaf.sign)
-    if name is None or leaf.sign in {'==', '!='} or name in {'count', 'nan_count'}:
+    if name is None or leaf.sign in {'==', '!='} or name in {'count', 'nan_count', 'mean'}:
         return ()
     low, high = (leaf.number, math.inf) if leaf.sign in {'>', '>='} else (-math.inf, leaf.number)
     return ((name, low, high),)
@@ -411,11 +415,16 @@ class _Told:
 
 
 def _by_statistics(leaf: Comparison, values: Mapping[str, NDArray[np.float64]]) -> tuple[Mask, Mask]:
-    """Whether it holds for some of the numbers, and for all: of a statistic itself both are one."""
-    if leaf.function:
+    """Whether it holds for some of the numbers, and for all; of a statistic both are one, but for a mean that is near."""
+    low, high, number = values['min'], values['max'], leaf.number
+    if leaf.function and leaf.function != 'mean':
         found: Mask = leaf.holds(values[leaf.function])
         return found, found
-    low, high, number = values['min'], values['max'], leaf.number
+    if leaf.function:
+        reach = MEAN_ERROR * np.maximum(np.abs(low), np.abs(high)) + _TINY
+        mean = values['mean']
+        is_open = np.isnan(mean) & (values['count'] > 0)  # the sum has no double, or not in that order
+        low, high = np.where(is_open, -np.inf, mean - reach), np.where(is_open, np.inf, mean + reach)
     if leaf.sign == '==':
         return (low <= number) & (number <= high), (low == number) & (number == high)
     if leaf.sign == '!=':
