@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import secrets
 import shlex
@@ -9,9 +10,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Coroutine, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -19,8 +22,11 @@ from domains import free_domain
 from e2e.cut_link import CutLink
 from e2e.processes import Node, Process, Processes, until
 
+from shadowhound_data_logger.live import server as server_module
+from shadowhound_data_logger.live.server import LiveServer, LiveSettings
+
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Browser, Page
 
 CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
 FLAGS = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox']
@@ -70,20 +76,31 @@ def watching(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watching]:
 
 
 @pytest.fixture(scope='module')
-def page(watching: Watching) -> Iterator[Page]:
+def browser() -> Iterator[Browser]:
+    """One for all of them."""
     api = pytest.importorskip('playwright.sync_api')
     with api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_page(viewport={'width': 1280, 'height': 800})
-        page.set_default_timeout(120_000)
-        page.wrong = []
-        page.asked = []
-        page.on('pageerror', lambda error: page.wrong.append(str(error)))
-        page.on('console', lambda message: page.wrong.append(message.text) if message.type == 'error' else None)
-        page.on('request', lambda request: page.asked.append(request.url))
-        page.goto(watching.url)
-        yield page
+        yield browser
         browser.close()
+
+
+def opened(browser: Browser, url: str) -> Page:
+    """A tab that remembers what it asked for (``asked``) and what went wrong in it (``wrong``)."""
+    page: Any = browser.new_page(viewport={'width': 1280, 'height': 800})
+    page.set_default_timeout(120_000)
+    page.wrong = []
+    page.asked = []
+    page.on('pageerror', lambda error: page.wrong.append(str(error)))
+    page.on('console', lambda message: page.wrong.append(message.text) if message.type == 'error' else None)
+    page.on('request', lambda request: page.asked.append(request.url))
+    page.goto(url)
+    return page
+
+
+@pytest.fixture(scope='module')
+def page(watching: Watching, browser: Browser) -> Page:
+    return opened(browser, watching.url)
 
 
 def holds(page: Page, script: str) -> None:
@@ -259,14 +276,37 @@ def test_back_in_time(page: Page, watching: Watching) -> None:
     page.locator('#data').wait_for()
 
 
-@pytest.mark.parametrize(('width', 'scheme'), [(1440, 'light'), (1440, 'dark'), (390, 'light')])
-def test_nothing_is_wider_than_the_screen(page: Page, tmp_path: Path, width: int, scheme: Any) -> None:
-    """On a laptop and on a phone, light and dark."""
+def wider(page: Page, width: int) -> list[Any]:
+    """What reaches beyond the right edge of a screen that is so wide, once the page is laid out for it."""
     page.set_viewport_size({'width': width, 'height': 850})
-    page.emulate_media(color_scheme=scheme)
-    holds(page, 'document.documentElement.scrollWidth <= innerWidth')
-    page.wait_for_timeout(500)
-    (tmp_path / f'{width}_{scheme}.png').write_bytes(page.screenshot(full_page=True, timeout=120_000))
+    holds(page, f'innerWidth === {width} && document.querySelector("main").clientWidth <= {width}')
+    page.evaluate('new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))')
+    script = """() => {
+        if (document.documentElement.scrollWidth <= innerWidth) return [];
+        const found = [], range = document.createRange();
+        const nodes = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT | NodeFilter.SHOW_ELEMENT);
+        for (let each = nodes.nextNode(); each; each = nodes.nextNode()) {
+            const element = each.nodeType === Node.TEXT_NODE ? each.parentElement : each;
+            if (element.closest(".scroll, .stage, .timeline-box")) continue;
+            range.selectNode(each);
+            const right = Math.max(...[...range.getClientRects()].map(box => box.right));
+            if (right > innerWidth) found.push([element.tagName, element.className, right, each.textContent.slice(0, 40)]);
+        }
+        return [document.documentElement.scrollWidth, ...found];
+    }"""
+    return list(page.evaluate(script))
+
+
+def fits(page: Page, width: int) -> None:
+    """Wait until nothing does."""
+    until(lambda: not wider(page, width), lambda: f'{width}: {wider(page, width)}')
+
+
+def test_nothing_is_wider_than_the_screen(page: Page) -> None:
+    """Of the page of the robot, as it is after all of this, on a laptop and on phones."""
+    for width in (1440, 390, 320):
+        fits(page, width)
+    page.set_viewport_size({'width': 1280, 'height': 800})
 
 
 def test_an_outage_of_ten_seconds(page: Page, watching: Watching) -> None:
@@ -289,11 +329,87 @@ def test_an_outage_of_ten_seconds(page: Page, watching: Watching) -> None:
             wrong_ms.append(abs(true_ms - age_ms))
         link.mend()
         count = counted(page, 'imu')
-        mended_s = time.monotonic()
         holds(page, f'shadowhound.count.imu > {count}')
-        assert time.monotonic() - mended_s < 20  # 2 s on a machine of its own: bench/live.py --browser
         assert page.evaluate('window.same')
-        assert sorted(wrong_ms)[len(wrong_ms) // 2] < 200
+        assert sorted(wrong_ms)[len(wrong_ms) // 2] < 2500  # ages that stand still would be off by 5 s; how exact: bench/live.py
     finally:
         page.goto('about:blank')
         link.close()
+
+
+HOSTILE = '<img src=x onerror="window.attacked = 1">'
+LONG = 'unbroken_' * 14
+NAMES = (HOSTILE, LONG)
+
+
+class Served:
+    """A live page in this process, on a thread of its own, until it is closed."""
+
+    def __init__(self, settings: LiveSettings) -> None:
+        self.loop = asyncio.new_event_loop()
+        self.thread = threading.Thread(target=self.loop.run_forever, name='served')
+        self.thread.start()
+        self.server = LiveServer(settings)
+        self.run(self.server.open())
+
+    def run(self, doing: Coroutine[Any, Any, Any]) -> None:
+        asyncio.run_coroutine_threadsafe(doing, self.loop).result(120)
+
+    def close(self) -> None:
+        self.run(self.server.close())
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self.thread.join()
+        self.loop.close()
+
+
+def told_of_names(now_ms: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Figures and gaps in which every text is hostile or long."""
+    counts = dict.fromkeys(('received', 'stored', 'skipped', 'missed', 'pending', 'lost'), 1_234_567_890)
+    topics = [
+        {'topic': f'/{name}', 'type': f'a/msg/{name}', 'sensor': name, 'missed_estimated': None, 'unavailable': name,
+         'rate_hz': 12345.6, 'age_s': 12345.6, 'publishers': 1, 'may_be_silent': False, **counts} for name in NAMES
+    ]  # fmt: skip
+    figures = {
+        'robot': 'thor', 'state': 'not_answering', 'age_s': 1.0, 'paused': False, 'mission': {'mission_id': LONG},
+        'queue': {'messages': 123_456_789, 'bytes': 10**12, 'max_messages': 10**9}, 'findings': list(NAMES), 'balanced': False,
+        'spool': {'pending': 10**9, 'bytes': 10**12, 'max_bytes': 10**13, 'free_bytes': 10**13, 'quarantined': 10**9},
+        'store': {'target': LONG, 'state': LONG, 'last_error': HOSTILE + LONG, 'mbps': 1.0, 'max_mbps': 4}, 'bag': {'name': LONG},
+        'objects': {'delivered': 10**12, 'pending': 10**9}, 'bytes': {'pending': 10**12}, 'topics': topics,
+    }  # fmt: skip
+    columns = ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade']
+    gaps = [
+        ['objects', f'/{name}', name, name, now_ms - 500_000, now_ms - 400_000, 10**9, 'exact'] for name in NAMES
+    ]  # fmt: skip
+    day_ms = {'from': now_ms - 3_600_000, 'to': now_ms, 'now': now_ms}
+    return figures, {**day_ms, 'columns': columns, 'gaps': gaps, 'known': [[f'/{name}', *day_ms.values()][:3] for name in NAMES]}
+
+
+def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names, reasons and answers that are code or have no space in them: nothing of them runs, and a phone shows them."""
+    monkeypatch.setattr(server_module, 'find_spec', lambda _: None)  # no ROS here
+    settings = LiveSettings(spool=tmp_path / 'spool', robot=LONG[:60], tokens=tmp_path / 'live', port=0)
+    served = Served(settings)
+    try:
+        figures, gaps = told_of_names(time.time() * 1e3)
+        monkeypatch.setattr(served.server, '_figures', SimpleNamespace(now=lambda **_: figures, gaps=lambda *_: gaps))
+        monkeypatch.setattr(served.server, '_ask', lambda *_: {'ok': True, 'message': HOSTILE + LONG})
+        graph = {f'/{name}/{place}': 'sensor_msgs/msg/Imu' for name in NAMES for place in (1, 2)}
+        served.loop.call_soon_threadsafe(served.server._on_graph, graph)
+        page = opened(browser, served.server.url)
+        page.evaluate('[...document.querySelectorAll("header button")].at(-1).click()')
+        page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
+        page.evaluate('document.querySelector("dialog button.primary").click()')
+        page.locator('[data-act=flush]').wait_for()
+        page.evaluate('document.querySelector("[data-act=flush]").click()')
+        holds(page, 'document.querySelectorAll(".answers li, rect.gap, .findings li").length >= 5')
+        page.evaluate('document.querySelector("rect.gap").dispatchEvent(new PointerEvent("pointerenter"))')
+        page.evaluate('document.querySelectorAll("details").forEach(each => { each.open = true; })')
+        page.locator('.chosen').wait_for()
+        for width in (1440, 1000, 390, 320):
+            fits(page, width)
+        assert HOSTILE in page.locator('body').inner_text()
+        assert page.evaluate('[window.attacked ?? null, document.querySelectorAll("img[src=x]").length]') == [None, 0]
+        assert page.wrong == []
+        page.close()
+    finally:
+        served.close()

@@ -268,11 +268,11 @@ function Head({ onSignIn }) {
     await fetch('/api/sign-out', { method: 'POST', headers: { 'X-CSRF-Token': session.value.csrf } });
     location.reload();
   };
-  return html`<header><a class="skip" href="#data">Skip to the data</a><img src="icon.svg" alt="" width="30" height="30" /><h1>${session.value?.robot ?? 'Live'}</h1>
+  return html`<header><a class="skip" href="#data">Skip to the data</a><img src="icon.svg" alt="" width="30" height="30" /><h1 title=${session.value?.robot}>${session.value?.robot ?? 'Live'}</h1>
     <span class=${`pill ${kind}`} role="status">${text}</span>
     ${!past.value && session.value.has_live && html`<nav aria-label="Parts of this page"><a href="#now">Now</a><a href="#data">The data</a><a href="#gaps">Gaps</a></nav>`}
     <span class="spacer"></span>${told && html`<${Age} kind="figures" />`}
-    ${session.value?.signed_in ? html`<button type="button" onClick=${signOut}>Sign out (${session.value.role})</button>` : html`<button type="button" onClick=${onSignIn}>Sign in</button>`}</header>`;
+    ${session.value?.signed_in ? html`<button type="button" onClick=${signOut}>Sign out<span class="role"> (${session.value.role})</span></button>` : html`<button type="button" onClick=${onSignIn}>Sign in</button>`}</header>`;
 }
 
 function App() {

@@ -54,7 +54,7 @@ export function Cards({ figures }) {
   const isFine = ['idle', 'shipping', 'not_draining'].includes(store?.state);
   return html`<div class="cards">
     <div class="panel card"><h3>Delivery</h3><p class="big"><${Mark} kind=${isFine ? 'good' : store?.state ? 'bad' : 'none'} why=${storeState} /> ${storeState}</p>
-      <dl><dt>to</dt><dd class="wrap">${store?.target || '–'}</dd><dt>sends</dt><dd>${store?.mbps ? `${store.mbps.toFixed(1)} Mbit/s` : 'nothing now'}${store?.max_mbps ? html` <small>of at most ${store.max_mbps}</small>` : ''}</dd>
+      <dl><dt>to</dt><dd>${store?.target || '–'}</dd><dt>sends</dt><dd>${store?.mbps ? `${store.mbps.toFixed(1)} Mbit/s` : 'nothing now'}${store?.max_mbps ? html` <small>of at most ${store.max_mbps}</small>` : ''}</dd>
       <dt>delivered</dt><dd><span data-field="delivered">${digits(objects?.delivered)}</span> objects</dd></dl>${store?.last_error && !isFine ? html`<p class="note bad">${store.last_error}</p>` : ''}</div>
     <div class="panel card"><h3>Waiting</h3><p class="big">${digits(waiting)} <small>objects</small></p>
       <dl><dt>size</dt><dd>${volume(bytes)}</dd><dt>there in</dt><dd>${waiting === 0 ? 'nothing waits' : pace !== null ? span(pace) : 'not at today’s pace'}</dd>
@@ -64,7 +64,7 @@ export function Cards({ figures }) {
       <dl><dt>of at most</dt><dd>${volume(spool?.max_bytes)}</dd><dt>disk has free</dt><dd>${volume(spool?.free_bytes)}</dd><dt>quarantined</dt><dd>${digits(spool?.quarantined)}</dd></dl></div>
     <div class="panel card"><h3>Queue</h3><p class="big">${digits(queue?.messages)} <small>messages</small></p>
       <${Bar} part=${queue?.messages ?? 0} whole=${queue?.max_messages} label="how full the queue is" />
-      <dl><dt>in memory</dt><dd>${volume(queue?.bytes)}</dd><dt>mission</dt><dd>${figures.mission?.mission_id || figures.mission?.active?.mission_id || 'none'}</dd><dt>bag</dt><dd class="wrap">${figures.bag?.name || figures.bag?.bag || figures.bag?.state || 'none'}</dd></dl></div>
+      <dl><dt>in memory</dt><dd>${volume(queue?.bytes)}</dd><dt>mission</dt><dd>${figures.mission?.mission_id || figures.mission?.active?.mission_id || 'none'}</dd><dt>bag</dt><dd>${figures.bag?.name || figures.bag?.bag || figures.bag?.state || 'none'}</dd></dl></div>
   </div>`;
 }
 

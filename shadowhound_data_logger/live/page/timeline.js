@@ -235,7 +235,7 @@ export function Timeline({ session }) {
     ${chosen && html`<p class="chosen" aria-live="polite"><i class=${`swatch hue-${hue(chosen.kind, chosen.cause)}`}></i><b>${chosen.topic}</b> ${digits(chosen.count)} messages
       ${chosen.kind}, ${CAUSES[chosen.cause] ?? chosen.cause.replaceAll('_', ' ')}: from ${clock(chosen.from)} for ${span((chosen.to - chosen.from) / 1000)}${chosen.grade === 'exact' ? '' : ' (estimated)'}</p>`}
     ${isPast && html`<${Commands} />`}
-    ${gaps.length > 0 && html`<details><summary>All ${gaps.length} gaps as a table</summary><div class="scroll"><table><thead><tr><th>Topic</th><th>From</th><th class="n">For</th>
+    ${gaps.length > 0 && html`<details><summary>All ${gaps.length} gaps as a table</summary><div class="scroll"><table class="gaps-table"><thead><tr><th>Topic</th><th>From</th><th class="n">For</th>
       <th class="n">Messages</th><th>What</th><th>Cause</th></tr></thead><tbody>${gaps.slice(-500).map((gap) => html`<tr><td>${gap.topic}</td><td>${clock(gap.from)}</td>
       <td class="n">${span((gap.to - gap.from) / 1000)}</td><td class="n">${digits(gap.count)}</td><td>${gap.kind}</td><td>${gap.cause.replaceAll('_', ' ')}</td></tr>`)}</tbody></table></div></details>`}
   </div>`;
