@@ -21,6 +21,7 @@ import secrets
 import shutil
 import signal
 import statistics
+import struct
 import subprocess
 import sys
 import tempfile
@@ -76,7 +77,10 @@ class Watcher:
                     if head['kind'] == 'video':
                         await video.told(head)
                     if 'at' in head and head['kind'] in KINDS:  # one machine, one monotonic clock
-                        self.late_ms.setdefault(head['kind'], []).append(time.monotonic() * 1e3 - head['at'])
+                        now_ms = time.monotonic() * 1e3
+                        first = 4 + int.from_bytes(whole[:4], 'little')
+                        times = struct.unpack_from(f'<{head["rows"]}d', whole, first) if 'rows' in head else (head['at'],)
+                        self.late_ms.setdefault(head['kind'], []).extend(now_ms - at_ms for at_ms in times)
                 if time.monotonic() - said_s > 1:
                     said_s = time.monotonic()
                     await ws.send_json({'ping': said_s})

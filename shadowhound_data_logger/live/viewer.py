@@ -17,9 +17,11 @@ from shadowhound_data_logger.live.kinds import FULL, HALF, SIZES, SMALLEST, Live
 
 CHUNK: Final = 12 << 10
 """Bytes of a frame, or a third of the window: on a slow link small items wait for less."""
-LEAST_WINDOW, MOST_WINDOW = 16 << 10, 64 << 10
-WINDOW_S: Final = 0.08
+LEAST_WINDOW, MOST_WINDOW = 12 << 10, 64 << 10
+WINDOW_S: Final = 0.04
 """What may be under way lasts so long on the link, within these bounds."""
+SMALL_ROOM: Final = 8 << 10
+"""Small items may exceed the window by so much: they do not wait for a large one to be acknowledged."""
 MOST_ROWS_WAITING: Final = 12
 """Items of a series, each of some 33 ms; older ones are left out."""
 SMALL_LANE: Final = 0
@@ -107,13 +109,15 @@ class Viewer:
 
     def next_frame(self) -> bytes | None:
         """What is sent now; None while nothing waits or may be sent."""
-        if self._sent - self._acked >= self.window:
+        under_way, window = self._sent - self._acked, self.window
+        if under_way >= window + SMALL_ROOM:
             return None
         for topic, rows in self._rows.items():
             if rows:
                 self._rows[topic] = self._rows.pop(topic)  # the others have their turn first
                 return self._count(bytes((SMALL_LANE, BEGIN | END, 0, 0)) + rows.popleft().packed)
-        return None if self.has_video and self._now() < self._bulk_s else self._bulk()
+        is_videos_turn = self.has_video and self._now() < self._bulk_s
+        return self._bulk() if under_way < window and not is_videos_turn else None
 
     def acknowledge(self, received: int) -> None:
         """The browser has received so many bytes, modulo 2^32. What it cannot have received is left out."""
@@ -122,8 +126,9 @@ class Viewer:
             self._acked = received
             while self._measured and self._measured[0][0] <= received:
                 _, before, since_s = self._measured.popleft()
-                rate = (received - before) / max(self._now() - since_s, 1e-4)
-                self.rate += 0.3 * (min(rate, 1e8) - self.rate)
+                # The mean of times, not of rates: one item that a buffer took at once says little about the link.
+                pace = max(self._now() - since_s, 1e-4) / (received - before)
+                self.rate = 1 / (0.7 / self.rate + 0.3 * max(pace, 1e-8))
             self.ready.set()
 
     def choose_sizes(self) -> None:
