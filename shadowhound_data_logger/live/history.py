@@ -12,10 +12,13 @@ import os
 import resource
 import shlex
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotYet
+from contextlib import closing, suppress
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
@@ -24,16 +27,29 @@ import numpy as np
 import simplejpeg
 
 from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.errors import BagDamaged, DataLoggerError, LakeError, Rejected
+from shadowhound_data_logger.errors import BagDamaged, DataLoggerError, LakeError, Rejected, SettingError
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem, clouds, frames, points_items, series, table_item
-from shadowhound_data_logger.live.past import PastContents, PastDay, PastObject, PastSource, SpoolPast, StorePast, dates_between
+from shadowhound_data_logger.live.past import (
+    FRESH_S,
+    PastContents,
+    PastDay,
+    PastObject,
+    PastSource,
+    SpoolPast,
+    StorePast,
+    dates_between,
+)
 from shadowhound_data_logger.mcap.index import McapIndex, read_index
 from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import Ranged
+from shadowhound_data_logger.options import UploadSettings
+from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.untrusted import check_pixels, visible
 
 MOST_SPAN_NS: Final = 50 * 3600 * SECOND
@@ -49,6 +65,8 @@ SERIES_NS: Final = 10 * SECOND
 PATH_NS: Final = 600 * SECOND
 AROUND_NS: Final = 5 * SECOND
 """Of a moment, on either side: what its commands ask for."""
+LABELS_S: Final = 1.0
+"""A timeline waits so long for the labels in the store."""
 IN_BAG_NS: Final = 3 * SECOND // 2
 """So much before a moment is read of a bag."""
 MOST_TEXT: Final = 160
@@ -73,6 +91,7 @@ class PastReader:
         self._types = MessageTypes(prefixes)
         self._pool = ThreadPoolExecutor(8, 'past')
         self._index = lru_cache(maxsize=16)(self._read_index)
+        self._labels = PastLabels(self._pool)
 
     def close(self) -> None:
         self._pool.shutdown()
@@ -91,7 +110,11 @@ class PastReader:
             return self.timeline(robot, int(asked['from']) * 1_000_000, int(asked['to']) * 1_000_000), b''
         if do == 'moment':
             return self.moment(robot, int(asked['at']) * 1_000_000)
-        raise ValueError('do is robots, days, timeline or moment')
+        if do == 'label':
+            if robot not in self._source.robots():
+                raise LabelRefused(f'there is no robot {robot!r} here')
+            return {'id': self._labels.add(robot, asked)}, b''
+        raise ValueError('do is robots, days, timeline, moment or label')
 
     # -- a time ----------------------------------------------------------------------------------------------------
 
@@ -109,13 +132,14 @@ class PastReader:
             [_text(topic), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1)]
             for topic, from_ns, to_ns in _runs(days, begin_ns, end_ns)
         ]  # fmt: skip
-        marks = sorted([*self._marks_of_missions(days), *self._marks_of_bags(days)], key=lambda mark: mark[2])
+        labels, lacking = self._labels.marks(robot)
+        marks = sorted([*self._marks_of_missions(days), *self._marks_of_bags(days), *labels], key=lambda mark: mark[2])
         inside = [mark for mark in marks if mark[3] >= begin_ns and mark[2] <= end_ns][:MOST_MARKS]
         found['marks'] = [
             [kind, _text(name), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1), _text(text)]
             for kind, name, from_ns, to_ns, text in inside
         ]  # fmt: skip
-        found['problem'] = _text(next((day.problem for day in days if day.problem), ''), 400)
+        found['problem'] = _text(next((day.problem for day in days if day.problem), lacking), 400)
         found['commands'] = commands(robot, begin_ns, end_ns, [mark[1] for mark in inside if mark[0] == 'bag'])
         return found
 
@@ -263,6 +287,70 @@ class PastReader:
         return source, read_index(source)
 
 
+class LabelRefused(DataLoggerError):
+    """What is no label."""
+
+    DEFAULT_REMEDY = 'a label is a text on one line, for a time that ends after it begins'
+
+
+class PastLabels:
+    """The labels that stand in the store, and new ones. They are read beside the rest: a store that is away delays nothing."""
+
+    def __init__(self, pool: ThreadPoolExecutor) -> None:
+        self._pool = pool
+        self._reading: dict[str, tuple[float, Future[list[_Mark]]]] = {}
+        self._known: dict[str, list[_Mark]] = {}
+
+    def marks(self, robot: str) -> tuple[list[_Mark], str]:
+        """As they were read last, and why they are not known or old."""
+        if find_spec('pyarrow') is None:
+            return [], ''
+        now_s = time.monotonic()
+        since_s, reading = self._reading.get(robot, (-FRESH_S, None))
+        if reading is None or (reading.done() and now_s - since_s > FRESH_S):
+            reading = self._pool.submit(_labels_of, robot)
+            self._reading[robot] = now_s, reading
+        try:
+            self._known[robot] = reading.result(LABELS_S)
+        except NotYet:
+            return self._known.get(robot, []), 'the labels in the store are still being read'
+        except (DataLoggerError, *_BROKEN) as error:
+            return self._known.get(robot, []), f'the labels in the store cannot be read: {error}'
+        return self._known[robot], ''
+
+    def add(self, robot: str, asked: Mapping[str, Any]) -> str:
+        """Its id. Raises LakeError, SettingError, StoreError."""
+        if find_spec('pyarrow') is None:
+            raise LakeError('labels need pyarrow', remedy='install the extra lake')
+        from shadowhound_data_logger.lake import labels  # noqa: PLC0415 - the extra lake
+
+        label, note, by = (str(asked[name]) for name in ('label', 'note', 'by'))
+        since_ns, until_ns = (int(asked[name]) * 1_000_000 for name in ('from', 'to'))
+        try:
+            one = labels.Label(robot=robot, label=label, since_ns=since_ns, until_ns=until_ns, note=note).checked()
+        except SettingError as error:
+            raise LabelRefused(str(error)) from error
+        with closing(open_store(store_settings(os.environ, home(os.environ)), UploadSettings())) as store:
+            labels.write(store, robot, [one], by=by)
+        self._reading.pop(robot, None)
+        return one.id
+
+
+def _labels_of(robot: str) -> list[_Mark]:
+    """Raises LakeError, StoreError, SettingError."""
+    from shadowhound_data_logger.lake import labels  # noqa: PLC0415 - the extra lake
+    from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
+    from shadowhound_data_logger.lake.findings import Findings  # noqa: PLC0415
+
+    found = labels.read(Bucket(store_settings(os.environ, home(os.environ)), BUCKET), robot, findings=Findings(lambda _: None))
+    return [
+        ('label', one.label, one.since_ns, one.until_ns, f'{one.note} by {one.by}' if one.note else f'by {one.by}')
+        for one in found if one.robot == robot
+    ]  # fmt: skip
+
+
+_Mark = tuple[str, str, int, int, str]
+"""Kind, name, begin and end in ns, what else there is to say."""
 _BROKEN: Final = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, MemoryError, OSError)
 """What comes of content that is not what its name says."""
 
@@ -385,7 +473,7 @@ def main() -> None:
                 history = PastReader(source, os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
             head, body = history.answer(json.loads(line))
         except DataLoggerError as error:
-            head = {'error': visible(str(error))[:1000]}
+            head = {'error': visible(str(error))[:1000], 'is_wrong': isinstance(error, LabelRefused)}
         except (*_BROKEN, LakeError, BagDamaged) as error:
             head = {'error': f'this cannot be read: {type(error).__name__}: {visible(str(error))[:300]}', 'is_wrong': True}
         told = json.dumps(head, separators=(',', ':')).encode()

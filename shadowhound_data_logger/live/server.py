@@ -164,7 +164,7 @@ class LiveServer:
         app.add_routes([
             web.get('/ws', self._watch), web.get('/api/session', self._session), web.post('/api/session', self._sign_in),
             web.post('/api/sign-out', self._sign_out), web.post('/api/act', self._act), web.get('/api/gaps', self._tell_gaps),
-            web.get('/api/doctor', self._tell_doctor),
+            web.get('/api/doctor', self._tell_doctor), web.post('/api/label', self._label),
             web.get('/api/past/{do:robots|days|timeline|moment}', self._tell_past), web.get('/{name:.*}', self._file),
         ])  # fmt: skip
         self._runner = web.AppRunner(app, access_log=None, handle_signals=False)
@@ -439,6 +439,25 @@ class LiveServer:
             answer = await self._loop.run_in_executor(self._pool, partial(self._ask, str(do), request.remote or '', given))
         return _json(answer)
 
+    async def _label(self, request: web.Request) -> web.StreamResponse:
+        """A label of a time, which an operator puts into the store."""
+        who = self._who(request)
+        if not who.may_act:
+            return _problem(403, 'only an operator may do that: sign in with the token of the operator')
+        if not self._access.is_csrf(who, request.headers.get('X-CSRF-Token', '')):
+            return _problem(403, 'the request does not come from this page')
+        asked = await _body(request)
+        robot, label, note = asked.get('robot'), asked.get('label'), asked.get('note', '')
+        times = [asked.get(name) for name in ('from', 'to')]
+        if not all(isinstance(each, str) for each in (robot, label, note)) or not is_name(str(robot)):
+            return _problem(400, 'a label has a robot, a label, a note, from and to')
+        if not all(type(each) is int and 0 <= each < 10**14 for each in times):
+            return _problem(400, 'from and to are times in UTC, in ms')
+        address = request.remote or ''
+        log.info('operator at %s labels %s', address, robot)
+        said = {'label': label, 'note': note, 'by': f'operator at {address}', 'from': times[0], 'to': times[1]}
+        return await self._of_past('label', str(robot), said)
+
     def _ask(self, do: str, address: str, given: Mapping[str, str]) -> dict[str, Any]:
         try:
             with closing(connect(self._settings.spool, self._settings.robot)) as connection:
@@ -481,9 +500,9 @@ class LiveServer:
             return _problem(400, f'{do} takes {" and ".join(("robot", *takes))}')
         return await self._of_past(do, robot, times)
 
-    async def _of_past(self, do: str, robot: str, times: Mapping[str, int | None]) -> web.StreamResponse:
+    async def _of_past(self, do: str, robot: str, more: Mapping[str, Any]) -> web.StreamResponse:
         try:
-            head, body = await self._history.ask({'do': do, 'robot': robot, **times})
+            head, body = await self._history.ask({'do': do, 'robot': robot, **more})
         except PastUnavailable as error:
             return _problem(503, str(error), {'Retry-After': '2'})
         if 'error' in head:

@@ -78,6 +78,8 @@ class Page:
 @asynccontextmanager
 async def serving(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '0.0.0.0') -> AsyncIterator[Page]:
     monkeypatch.setattr(module, 'find_spec', lambda _: None)  # no ROS here
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(folder))
+    monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     server = LiveServer(LiveSettings(spool=folder / 'spool', robot='thor', tokens=folder / 'live', bind=bind, port=0))
     await server.open()
     try:
@@ -90,6 +92,7 @@ async def serving(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '0.
 
 
 ACT = json.dumps({'do': 'flush'}).encode()
+LABEL = b'{"robot": "thor", "label": "x", "from": 5, "to": 5}'
 REBOUND = {'Host': 'evil.example:8765'}
 FOREIGN = {'Origin': 'http://evil.example'}
 TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
@@ -126,6 +129,14 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('POST', '/api/act', {'body': b'{' * 100}, (401, 403, 400)),
     ('POST', '/api/act', {'body': b' ' * (MOST_BODY + 1)}, (413, 413, 413)),
     ('POST', '/api/session', {'body': b' ' * (MOST_BODY + 1)}, (413, 413, 413)),
+    ('POST', '/api/label', {'body': LABEL}, (401, 403, 200)),
+    ('POST', '/api/label', {'body': LABEL, 'csrf': False}, (401, 403, 403)),
+    ('POST', '/api/label', {'body': LABEL, 'headers': FOREIGN}, (403, 403, 403)),
+    ('POST', '/api/label', {'body': LABEL.replace(b'thor', b'../x')}, (401, 403, 400)),
+    ('POST', '/api/label', {'body': LABEL.replace(b'"x"', b'["x"]')}, (401, 403, 400)),
+    ('POST', '/api/label', {'body': LABEL.replace(b'5', b'true')}, (401, 403, 400)),
+    ('POST', '/api/label', {'body': LABEL.replace(b'x', b'x' * MOST_BODY)}, (413, 413, 413)),
+    ('GET', '/api/label', {}, (401, 404, 404)),
     ('POST', '/api/sign-out', {'csrf': False}, (401, 403, 403)),
     ('DELETE', '/api/session', {}, (403, 403, 403)),
 )

@@ -7,6 +7,7 @@ import json
 import os
 import shlex
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -23,7 +24,10 @@ from spool.making import FakeClock, index_of, make, new_spool, put, settle
 from shadowhound_data_logger.bags.manifest import COMPLETE, EventOf, Manifest, MissionOf, SliceEntry, TriggerOf
 from shadowhound_data_logger.catalogue.schema import BUCKET, Row, row_of
 from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.live.history import PastReader, commands
+from shadowhound_data_logger.lake import labels
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.live import history as module
+from shadowhound_data_logger.live.history import LabelRefused, PastReader, commands
 from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
 from shadowhound_data_logger.live.past import PastSource, SpoolPast, StorePast
 from shadowhound_data_logger.mcap.slice_info import Channel
@@ -254,6 +258,42 @@ def test_a_hostile_store_is_answered_without_what_is_wrong(store: ObjectStore, o
     found, _ = history.answer({'do': 'timeline', 'robot': 'thor', 'from': noon, 'to': noon + 60_000})
     assert '\x1b' not in json.dumps([found, head], ensure_ascii=False)
     assert commands('thor', 0, SECOND, ['a; reboot', '$(reboot)', '../x']) == commands('thor', 0, SECOND, [])
+
+
+def test_labels_are_marks_and_an_operator_adds_them(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """Those in the store stand on the timeline, by whom; a new one is read back as ``label list`` reads it."""
+    patrol(store, tmp_path)
+    history = opened(StorePast())
+    noon = NOON_NS // 1_000_000
+    timeline = {'do': 'timeline', 'robot': 'thor', 'from': noon, 'to': noon + 60_000}
+    assert [mark for mark in history.answer(timeline)[0]['marks'] if mark[0] == 'label'] == []
+    given = {'do': 'label', 'robot': 'thor', 'note': HOSTILE, 'by': 'operator at ::1', 'from': noon + 1000, 'to': noon + 2500}
+    added, _ = history.answer({**given, 'label': 'stairs'})
+    (mark,) = [mark for mark in history.answer(timeline)[0]['marks'] if mark[0] == 'label']
+    assert mark[:4] == ['label', 'stairs', noon + 1000, noon + 2500]
+    assert mark[4].endswith('by operator at ::1')
+    assert '\x1b' not in mark[4]
+    (found,) = labels.read(Bucket(folder_store(tmp_path), BUCKET), 'thor')
+    assert (found.id, found.label, found.since_ns, found.by) == (added['id'], 'stairs', NOON_NS + SECOND, 'operator at ::1')
+    for wrong in ({'label': HOSTILE}, {'label': ' '}, {'label': 'x', 'to': noon}, {'label': 'x', 'robot': 'nobody'}):
+        with pytest.raises(LabelRefused):
+            history.answer({**given, **wrong})
+
+
+def test_a_store_that_is_away_delays_no_timeline(opened: Opened, store: ObjectStore, tmp_path: Path,
+                                                 monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """The rest is told, and that the labels are still being read."""
+    patrol(store, tmp_path)
+    answers = threading.Event()
+    monkeypatch.setattr(module, 'LABELS_S', 0.01)
+    monkeypatch.setattr(module, '_labels_of', lambda _: answers.wait(60) and [])
+    noon = NOON_NS // 1_000_000
+    try:
+        found, _ = opened(StorePast()).answer({'do': 'timeline', 'robot': 'thor', 'from': noon, 'to': noon + 60_000})
+    finally:
+        answers.set()
+    assert [kind for kind, *_ in found['marks']] == ['mission']
+    assert 'still being read' in found['problem']
 
 
 @pytest.mark.parametrize('question', [

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Coroutine, Iterator
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -21,12 +22,16 @@ import pytest
 from domains import free_domain
 from e2e.cut_link import CutLink
 from e2e.processes import Node, Process, Processes, until
+from lake.making import add, add_part, folder_store
+from live.test_history import jpeg, patrol, told
 
 from shadowhound_data_logger.live import server as server_module
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
+from shadowhound_data_logger.options import COMPRESSED_IMAGE, UploadSettings
+from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Locator, Page
 
 CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
 FLAGS = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox']
@@ -103,6 +108,11 @@ def page(watching: Watching, browser: Browser) -> Page:
     return opened(browser, watching.url)
 
 
+def press(button: Locator) -> None:
+    """Without waiting for frames, of which a software GL on a busy machine draws few."""
+    button.dispatch_event('click')
+
+
 def holds(page: Page, script: str) -> None:
     """Wait until it is so in the page, which lets nobody else evaluate text (``script-src 'self'``)."""
     until(lambda: page.evaluate(script), script)
@@ -130,15 +140,15 @@ def test_a_viewer_has_no_buttons_that_act(page: Page) -> None:
 def test_an_operator_acts(page: Page, watching: Watching) -> None:
     """The answer of the node is on the page, and in the node's log stands who asked; the token is in no address."""
     token = (watching.home / 'live' / 'operator.token').read_text().strip()
-    page.get_by_role('button', name='Sign in', exact=True).click()
+    press(page.get_by_role('button', name='Sign in', exact=True))
     page.locator('dialog input[name=token]').fill('not-the-token')
-    page.locator('dialog button.primary').click()
+    press(page.locator('dialog button.primary'))
     page.locator('dialog [role=alert]').wait_for()
     page.locator('dialog input[name=token]').fill(token)
-    page.locator('dialog button.primary').click()
+    press(page.locator('dialog button.primary'))
     for act, words in (('flush', 'spooled'), ('bag start', ''), ('bag stop', '')):
         before = page.locator('.answers li').count()
-        page.locator(f'[data-act="{act}"]').click()
+        press(page.locator(f'[data-act="{act}"]'))
         holds(page, f'document.querySelectorAll(".answers li").length > {before}')
         answer = page.locator('.answers li').first.inner_text()
         assert act in answer
@@ -181,7 +191,7 @@ def test_the_figures_are_those_of_the_ledger(page: Page, watching: Watching) -> 
     """Once the robot is silent: received, stored and missed of each topic, as ``ledger --json`` has them."""
     watching.sim.signal(signal.SIGINT)
     watching.sim.wait()
-    page.locator('[data-act="flush"]').click()
+    press(page.locator('[data-act="flush"]'))
 
     def shown() -> dict[str, dict[str, str]]:
         cells = page.locator('td[data-topic][data-field]').evaluate_all(
@@ -245,14 +255,14 @@ def test_back_in_time(page: Page, watching: Watching) -> None:
 
     The gap of the restart stands there too, and the commands that the page tells do what they say.
     """
-    page.get_by_role('button', name='Back in time').click()
+    press(page.get_by_role('button', name='Back in time'))
     holds(page, '(shadowhound.past?.count ?? 0) > 0')
     holds(page, "document.querySelectorAll('rect.recorded').length > 5")
     assert {'/imu', '/camera/compressed'} <= set(
         page.locator('rect.recorded').evaluate_all('all => all.map(one => one.dataset.topic)')
     )
     assert 'restart' in page.locator('rect.gap[data-topic="/imu"]').evaluate_all('all => all.map(one => one.dataset.cause)')
-    page.get_by_role('button', name='15 min').click()
+    press(page.get_by_role('button', name='15 min'))
     slider = "document.querySelector('svg[role=slider]')"
     holds(page, f'{slider}.ariaValueMax - {slider}.ariaValueMin < 1000000')
     spot = page.locator('rect.recorded[data-topic="/imu"]').first.bounding_box()
@@ -262,9 +272,9 @@ def test_back_in_time(page: Page, watching: Watching) -> None:
     holds(page, f'{kinds}.every(each => shadowhound.past.shown.some(([, kind]) => kind === each))')
     live = counted(page, 'imu')
     before = int(page.locator('[data-moment]').get_attribute('data-moment') or 0)
-    page.locator('[data-play]').click()
+    press(page.locator('[data-play]'))
     holds(page, f'shadowhound.past.at > {before + 1000}')
-    page.locator('[data-play]').click()
+    press(page.locator('[data-play]'))
     assert counted(page, 'imu') <= live + 3  # nobody watches the live topics meanwhile
     home = {**watching.processes.environ, 'SHADOWHOUND_HOME': str(watching.home)}
     query = shlex.split(page.locator('[data-command=query]').inner_text())
@@ -272,7 +282,7 @@ def test_back_in_time(page: Page, watching: Watching) -> None:
     command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', *query[1:], '--json']
     ran = subprocess.run(command, env=home, capture_output=True, text=True, check=True, timeout=120)
     assert {'camera', 'imu'} <= {row['sensor'] for row in json.loads(ran.stdout)}
-    page.get_by_role('button', name='Back to now').click()
+    press(page.get_by_role('button', name='Back to now'))
     page.locator('#data').wait_for()
 
 
@@ -396,11 +406,10 @@ def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: p
         graph = {f'/{name}/{place}': 'sensor_msgs/msg/Imu' for name in NAMES for place in (1, 2)}
         served.loop.call_soon_threadsafe(served.server._on_graph, graph)
         page = opened(browser, served.server.url)
-        page.evaluate('[...document.querySelectorAll("header button")].at(-1).click()')
+        press(page.get_by_role('button', name='Sign in', exact=True))
         page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
-        page.evaluate('document.querySelector("dialog button.primary").click()')
-        page.locator('[data-act=flush]').wait_for()
-        page.evaluate('document.querySelector("[data-act=flush]").click()')
+        press(page.locator('dialog button.primary'))
+        press(page.locator('[data-act=flush]'))
         holds(page, 'document.querySelectorAll(".answers li, rect.gap, .findings li").length >= 5')
         page.evaluate('document.querySelector("rect.gap").dispatchEvent(new PointerEvent("pointerenter"))')
         page.evaluate('document.querySelectorAll("details").forEach(each => { each.open = true; })')
@@ -408,6 +417,47 @@ def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: p
         for width in (1440, 1000, 390, 320):
             fits(page, width)
         assert HOSTILE in page.locator('body').inner_text()
+        assert page.evaluate('[window.attacked ?? null, document.querySelectorAll("img[src=x]").length]') == [None, 0]
+        assert page.wrong == []
+        page.close()
+    finally:
+        served.close()
+
+
+def test_the_page_of_a_store(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a robot: the last day, a moment of it, and labels that an operator adds to it; names in it are text."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
+    with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
+        patrol(store, tmp_path)
+        rows = [told(6, 'camera', f'/{name}', COMPRESSED_IMAGE, 'jpg', mission_id=name, mission_type=name) for name in NAMES]
+        for place, row in enumerate(rows):
+            row['key'] = f'thor/names/{place}.jpg'
+            add(store, tmp_path / 'tmp', row['key'], jpeg(9))
+        add_part(store, rows, 'names', tmp_path / 'tmp')
+    served = Served(LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True))
+    try:
+        page = opened(browser, served.server.url)
+        holds(page, "document.querySelectorAll('rect.recorded').length > 2 && shadowhound.past?.shown.length > 2")
+        press(page.get_by_role('button', name='Sign in', exact=True))
+        page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
+        press(page.locator('dialog button.primary'))
+        at_ms = int(page.locator('[data-moment]').get_attribute('data-moment') or 0)
+        press(page.get_by_role('button', name='From here'))
+        press(page.get_by_role('button', name='1 second back'))
+        holds(page, f"document.querySelector('[data-moment]').dataset.moment == {at_ms - 1000}")
+        page.locator('input[name=label]').fill(HOSTILE)
+        page.get_by_label('Note on the label').fill(HOSTILE)
+        press(page.locator('[data-act=label]'))
+        mark = page.locator('[data-mark=label]')
+        mark.wait_for(state='attached')
+        assert [mark.get_attribute(f'data-{name}') for name in ('name', 'from', 'to')] == [HOSTILE, str(at_ms - 1000), str(at_ms)]
+        assert set(NAMES) <= set(
+            page.locator('[data-mark=mission]').evaluate_all('marks => marks.map(mark => mark.dataset.name)')
+        )
+        for width in (1440, 390):
+            fits(page, width)
+        assert [url for url in page.asked if not url.startswith((served.server.url, 'blob:'))] == []
         assert page.evaluate('[window.attacked ?? null, document.querySelectorAll("img[src=x]").length]') == [None, 0]
         assert page.wrong == []
         page.close()

@@ -73,6 +73,36 @@ function Transport({ robot }) {
     <time class="moment" data-moment=${Math.round(at)}>${moment(at)}</time><span class="unit">UTC${past.value.mission ? ` · ${past.value.mission}` : ''}${busy.value ? ' · reading…' : ''}</span></div>`;
 }
 
+// An operator says what there is to see: of this moment, or of the time since "From here".
+function LabelForm({ session, robot }) {
+  const [label, setLabel] = useState('');
+  const [note, setNote] = useState('');
+  const [begin, setBegin] = useState(null);
+  const [said, setSaid] = useState(['', '']);
+  const at = Math.round(past.value.at);
+  const [from, to] = begin === null ? [at, at] : [Math.min(begin, at), Math.max(begin, at)];
+  const submit = async (event) => {
+    event.preventDefault();
+    try {
+      const answer = await fetch('/api/label', { method: 'POST', headers: { 'Content-Type': 'application/json', 'X-CSRF-Token': session.csrf }, body: JSON.stringify({ robot, label, note, from, to }) });
+      const content = await answer.json();
+      setSaid(answer.ok ? ['good', `labelled ${label}`] : ['bad', content.error]);
+      if (!answer.ok) return;
+      setLabel('');
+      setNote('');
+      setBegin(null);
+      look(robot, range.value.from, range.value.to);
+    } catch {
+      setSaid(['bad', 'it cannot be reached']);
+    }
+  };
+  return html`<form class="row label-form" onSubmit=${submit}><input aria-label="Label" name="label" placeholder="label, such as stairs" required maxlength="200" value=${label} onInput=${(event) => setLabel(event.target.value)} />
+    <input aria-label="Note on the label" placeholder="a note" maxlength="500" value=${note} onInput=${(event) => setNote(event.target.value)} />
+    <button type="button" aria-pressed=${begin !== null} onClick=${() => setBegin(begin === null ? at : null)}>From here</button>
+    <button class="primary" data-act="label">${begin === null ? 'Label this moment' : `Label ${span((to - from) / 1000)}`}</button>
+    ${said[1] && html`<span class=${`note ${said[0]}`} role="status">${said[1]}</span>`}</form>`;
+}
+
 export function Timeline({ session }) {
   const [minutes, setMinutes] = useState(60);
   const [today, setToday] = useState(null);
@@ -192,6 +222,7 @@ export function Timeline({ session }) {
       ${isPast ? session.has_live && html`<button type="button" class="primary" onClick=${leave}>Back to now</button>` : html`<button type="button" class="primary" onClick=${() => openRobot(session.robot)}>Back in time</button>`}
     </div>
     ${isPast && html`<${Transport} robot=${robot} />`}
+    ${isPast && session.role === 'operator' && html`<${LabelForm} session=${session} robot=${robot} />`}
     <div ref=${box} class="timeline-box">
       ${problem && html`<p class="note bad" role="alert">${problem}</p>`}
       ${isPast && found?.problem && html`<p class="note watch">${found.problem}</p>`}
@@ -228,7 +259,7 @@ export function Timeline({ session }) {
       ${isPast && html`<span><i class="swatch recorded"></i>recorded</span>`}
       <span><i class="swatch known"></i>nothing else is missing</span><span><i class="swatch unknown"></i>not known yet</span>
       ${[...seen.values()].map((each) => html`<span title=${CAUSES[each.cause] ?? ''}><i class=${`swatch hue-${hue(each.kind, each.cause)}`}></i>${each.kind}: ${each.cause.replaceAll('_', ' ')} <b>${digits(each.messages)}</b></span>`)}
-      ${['mission', 'bag', 'event'].filter((kind) => marks.some((mark) => mark.kind === kind)).map((kind) => html`<span><i class=${`swatch of-${kind}`}></i>${kind}</span>`)}
+      ${['mission', 'bag', 'event', 'label'].filter((kind) => marks.some((mark) => mark.kind === kind)).map((kind) => html`<span><i class=${`swatch of-${kind}`}></i>${kind}</span>`)}
       ${found && !gaps.length && topics.length > 0 && html`<span class="good">no gap is known in this time</span>`}
       ${!isPast && topics.length > 0 && html`<span class="unit">click on a time to see it again</span>`}
     </div>
