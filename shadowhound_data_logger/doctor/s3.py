@@ -1,7 +1,7 @@
 """The S3 server: what it is, whether it accepts our signature and our objects, and whether it keeps the two promises of a put.
 
 What it leaves behind: ``<robot>/_doctor/probe`` in each bucket that this machine writes to, 64 bytes that are always the
-same, because the robot's keys may delete nothing. On Tower a second object is written and deleted. On Tower and Spark
+same, because the robot's keys may delete nothing. On Tower some more are raced for and deleted. On Tower and Spark
 ``_requests/_doctor/inbox.json`` is raced for.
 """
 
@@ -181,6 +181,7 @@ def _use(requests: S3Requests, context: Context) -> Iterator[Result]:
     yield from s3_put.promises(requests, written[0], context.settings.robot, latency.data['latency_s'])
     if context.role is Role.TOWER:
         yield from _delete(requests, written[0], context.settings.robot)
+        yield from race_creates(requests, written[0], context.settings.robot)
         yield from race_mailboxes(requests)
 
 
@@ -234,6 +235,38 @@ def _delete(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:
             'versions or a retention rule keep it',
             f'aws --endpoint-url {requests.endpoint} s3api get-bucket-versioning --bucket {bucket}',
         )
+
+
+def race_creates(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:
+    """On Tower, whose keys may delete: whether of those who create one object at once one alone wins."""
+    names = [f'{robot}/_doctor/{uuid.uuid4().hex}' for _ in range(RACES)]
+    try:
+        winners = [_creators(requests, bucket, name) for name in names]
+        for name in names:
+            requests.delete(bucket, name)
+    except AccessDenied as problem:
+        yield of_error('s3.race', problem, "these are not Tower's own keys")
+        return
+    if winners == [1] * RACES:
+        yield ok('s3.race', f'of {RACERS} who create an object at once one wins')
+        return
+    yield warning(
+        's3.race',
+        f'of {RACERS} who created one object at once {winners} won',
+        'the server does not honour If-None-Match in one instant: of two who write one key, one is overwritten',
+        'give each robot a name of its own (SHADOWHOUND_ROBOT), and update the S3 server',
+    )
+
+
+def _creators(requests: S3Requests, bucket: str, name: str) -> int:
+    from shadowhound_data_logger.stores.s3_requests import Sent  # noqa: PLC0415 - botocore costs half a second
+
+    def create(racer: int) -> bool:
+        body = b'%d' % racer
+        return requests.put(s3_put.probe(bucket, name, body), body, s3_put.crc32(body), conditional=True) is Sent.CREATED
+
+    with ThreadPoolExecutor(RACERS) as pool:
+        return sum(pool.map(create, range(RACERS)))
 
 
 def _read(requests: S3Requests, context: Context) -> Iterator[Result]:

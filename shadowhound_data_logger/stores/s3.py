@@ -2,6 +2,8 @@
 
 Guarantees: a put is one PUT with ``If-None-Match: *``, a CRC32 that the server verifies and ``sha256`` as metadata, and whether
 the server honours the condition is proved before it is relied on: MinIO before 2024 and some others ignore it and overwrite.
+Servers have let two creates of one instant through (SeaweedFS 4.16): where another writer of the same keys was seen, each put
+looks afterwards whose content is there, so that the one that was overwritten knows.
 Of a large object it is a multipart upload (s3_multipart.py), which looks twice and sends the condition as well.
 """
 
@@ -56,7 +58,8 @@ class _Condition(Enum):
 class S3Store:
     """A store on an S3 server: a put never overwrites, and is confirmed only when its content has been verified.
 
-    ``_lock`` guards what was learnt of the server: ``_condition``, and which buckets it refused to create.
+    ``_lock`` guards what was learnt of the server: ``_condition``, and which buckets it refused to create. ``_has_rival`` is set
+    once, when somebody else's object was found under a key of ours.
     """
 
     def __init__(self, settings: StoreSettings, upload: UploadSettings) -> None:
@@ -64,6 +67,7 @@ class S3Store:
         self._multipart = Multipart(self._s3)
         self._lock = threading.Lock()
         self._condition = _Condition.UNPROVED
+        self._has_rival = False
         self._refused: dict[str, tuple[float, BucketMissing]] = {}
         self._created: dict[str, float] = {}
         self._creating = threading.Lock()  # held while a bucket is created, so that one thread does it
@@ -151,6 +155,7 @@ class S3Store:
         if held is not None:
             return self._judge(item, held)
         if self._multipart.put(item, lambda: self._look(item) is not None):
+            self._look_again(item)
             return Put.CREATED
         return self._judge(item, self._s3.head(item.bucket, item.key))
 
@@ -174,6 +179,7 @@ class S3Store:
             return self._judge(item, self._s3.head(item.bucket, item.key))
         if self._condition is _Condition.UNPROVED:
             self._prove(item, body, crc32)
+        self._look_again(item)
         return Put.CREATED
 
     def _look(self, item: SpooledObject) -> ObjectInfo | None:
@@ -183,6 +189,17 @@ class S3Store:
             if self._condition is _Condition.IGNORED:  # without a look it could overwrite
                 raise
             return None  # credentials that may write only: the server has to judge
+
+    def _look_again(self, item: SpooledObject) -> None:
+        """Whether it is still ours, where another put of the same instant may have replaced it. Raises ForeignObject if not."""
+        if self._condition is not _Condition.IGNORED and not self._has_rival:
+            return
+        try:
+            held = self._s3.head(item.bucket, item.key)
+        except AccessDenied:  # credentials that may write only
+            return
+        if held is None or held.sha256 != item.sha256:
+            self._judge(item, held)
 
     def _prove(self, item: SpooledObject, body: bytes | IO[bytes], crc32: str) -> None:
         """Put the very same content once more: a server that takes it would have taken other content as well."""
@@ -202,8 +219,8 @@ class S3Store:
             self._condition = condition
         if condition is _Condition.IGNORED and known is not condition:
             _log.warning(
-                'Tower at %s %s If-None-Match: each put looks first now, which is slower and does not see a second writer in '
-                'the same instant (update the S3 server: MinIO of 2024 or later, SeaweedFS)', self._s3.endpoint, how,
+                'Tower at %s %s If-None-Match: each put looks before and afterwards now, which is slower, and a second writer in '
+                'the same instant overwrites (update the S3 server: MinIO of 2024 or later, SeaweedFS)', self._s3.endpoint, how,
             )  # fmt: skip
 
     def _judge(self, item: SpooledObject, held: ObjectInfo | None) -> Put:
@@ -215,6 +232,7 @@ class S3Store:
             try:
                 return identical_or_foreign(item, held, lambda: self._sha256(item))
             except ForeignObject:
+                self._has_rival = True
                 if self._s3.head(item.bucket, item.key) == held:
                     raise
             raise StoreUnavailable(f'{what} is not described twice the same: an answer broke off', **where)

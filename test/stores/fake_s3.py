@@ -27,7 +27,11 @@ class FakeS3(ThreadingHTTPServer):
         self.without_buckets = without_buckets
         self.creations = 0
         """How often a bucket was to be created, which is denied where there are to be none."""
+        self.lock = threading.Lock()
+        """Makes a look and a put one step, where nobody is to win a race."""
         self.forbid_head = False
+        self.races: dict[str, threading.Barrier] = {}
+        """Key -> so many creates of it see that nothing is there, before any of them writes, and all write before any answers."""
         self.objects: dict[str, tuple[bytes, dict[str, str]]] = {}
         self.requests: list[str] = []
         """Methods, in order."""
@@ -51,16 +55,26 @@ class _Handler(BaseHTTPRequestHandler):
             self.server.creations += creation
             self._answer(*((403, error('AccessDenied')) if creation else (404, error('NoSuchBucket'))))
             return
-        if self.headers.get('If-None-Match'):
-            if self.server.condition == 'not implemented':
-                self._answer(501, error('NotImplemented', 'A header you provided implies functionality'))
-                return
-            if self.server.condition == 'honoured' and key in self.server.objects:
+        if self.headers.get('If-None-Match') and self.server.condition == 'not implemented':
+            self._answer(501, error('NotImplemented', 'A header you provided implies functionality'))
+            return
+        kept = {name: value for name, value in self.headers.items() if name.lower().startswith(('x-amz-meta-', 'content-type'))}
+        race = self.server.races.get(key) if key not in self.server.objects else None
+        if race is not None:
+            race.wait(60.0)
+        with self.server.lock:
+            is_refused = bool(self.headers.get('If-None-Match')) and self.server.condition == 'honoured'
+            if is_refused and key in self.server.objects and race is None:
                 self._answer(412, error('PreconditionFailed'))
                 return
-        kept = {name: value for name, value in self.headers.items() if name.lower().startswith(('x-amz-meta-', 'content-type'))}
-        self.server.objects[key] = (body, kept)
+            self.server.objects[key] = (body, kept)
+        if race is not None:
+            race.wait(60.0)
         self._answer(200, b'', etag(body))
+
+    def do_DELETE(self) -> None:
+        self.server.objects.pop(unquote(urlsplit(self.path).path), None)
+        self._answer(204, b'')
 
     def do_HEAD(self) -> None:
         if self.server.forbid_head:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import pytest
 from stores.asking import error_of
@@ -47,6 +49,29 @@ def test_a_proved_server_costs_one_request_a_put(opened: Callable[..., S3Store],
         for key in ('a', 'b', 'c'):
             store.put(spool(key, key.encode()))
         assert server.requests == ['HEAD', 'PUT', 'PUT', 'PUT', 'PUT']
+
+
+@pytest.mark.parametrize('condition', ['honoured', 'ignored'])
+def test_who_loses_a_race_knows(condition: str, opened: Callable[..., S3Store], spool: Spool, bucket: str) -> None:
+    """A server lets two creates of one instant through, with different content: the one whose content is there has created it.
+
+    The other finds a foreign object, as it does where it comes later. Each had met objects of the other before.
+    """
+    with served(FakeS3(condition=condition)) as server, ThreadPoolExecutor(2) as pool:
+        ours, theirs = opened(server.url), opened(server.url)
+        for number, (first, second) in enumerate(((ours, theirs), (theirs, ours))):
+            first.put(spool(f'{number}', b'first'))
+            error_of(ForeignObject, lambda: second.put(spool(f'{number}', b'other')))  # noqa: B023 - called at once
+        server.races[f'/{bucket}/raced'] = threading.Barrier(2)
+        contents = {b'ours': ours, b'theirs': theirs}
+        items = {content: spool('raced', content) for content in contents}
+        puts = {content: pool.submit(store.put, items[content]) for content, store in contents.items()}
+        wait(puts.values(), 60.0)
+        kept = server.objects[f'/{bucket}/raced'][0]
+        (lost,) = set(contents) - {kept}
+        assert puts[kept].result() is Put.CREATED
+        assert isinstance(puts[lost].exception(), ForeignObject)
+        assert items[lost].path.read_bytes() == lost
 
 
 def test_credentials_that_may_only_write(opened: Callable[..., S3Store], spool: Spool) -> None:
