@@ -26,12 +26,13 @@ from shadowhound_data_logger.cli.output import print_json
 from shadowhound_data_logger.spool.status import robots
 
 PORT = 8765
+RTSP_PORT = 8554
 
 
 @click.command(
     epilog=examples(
         'live', 'live --bind 0.0.0.0', 'live --bind 0.0.0.0 --tls tower.crt tower.key',
-        'live --robot thor --robot-url http://thor:8765/ --robot-token thor.token',
+        'live --rtsp 8554', 'live --robot thor --robot-url http://thor:8765/ --robot-token thor.token',
     )
 )  # fmt: skip
 @click.option('--bind', default='127.0.0.1', show_default=True, metavar='ADDRESS', help='Address to listen on.')
@@ -50,6 +51,8 @@ PORT = 8765
 )
 @click.option('--uploads-mbps', type=click.FloatRange(0.0, 10_000.0), default=4.0, show_default=True,
               help='Limit of uploads in Mbit/s while somebody watches over the network; 0: no limit.')  # fmt: skip
+@click.option('--rtsp', type=click.IntRange(0, 65535), is_flag=False, flag_value=RTSP_PORT, metavar='[PORT]',
+              help=f'Serve the cameras over RTSP too, at port {RTSP_PORT} or another; 0 takes a free one.')  # fmt: skip
 @click.option('--new-tokens', is_flag=True, help='Make new tokens first: everybody has to sign in again.')
 @click.option('--robot-url', metavar='URL', help="Of a store's page: relay the live view of this robot's own page.")
 @click.option('--robot-token', type=click.Path(path_type=Path, dir_okay=False), metavar='FILE',
@@ -58,8 +61,8 @@ PORT = 8765
 @spool_folder
 @as_json
 def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[str, ...],  # noqa: PLR0913 - one an option
-         uploads_mbps: float, new_tokens: bool, robot_url: str | None, robot_token: Path | None, robot: str | None,
-         spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
+         uploads_mbps: float, rtsp: int | None, new_tokens: bool, robot_url: str | None, robot_token: Path | None,
+         robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Serve a page that shows robot and data.
 
     It shows in a browser what the robot sees now, its data, what is missing, and what was recorded at any moment before. On a
@@ -69,7 +72,8 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
     pause) always need the operator's token. The tokens are files in SHADOWHOUND_HOME/live.
     """
     try:
-        from shadowhound_data_logger.live.access import make_tokens  # noqa: PLC0415 - loaded by this verb alone
+        from shadowhound_data_logger.live.access import RTSP_FILE, make_tokens  # noqa: PLC0415 - loaded by this verb alone
+        from shadowhound_data_logger.live.rtsp import USER  # noqa: PLC0415 - the same
         from shadowhound_data_logger.live.server import LiveServer, LiveSettings  # noqa: PLC0415 - aiohttp
     except ImportError as error:
         raise BadUsage(f'the live page needs aiohttp: {error}', 'install requirements/robot.txt') from error
@@ -79,6 +83,8 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
     store = the_store_settings()
     has_store = bool(store.endpoint_url) or store.directory.is_dir()
     is_of_store = spool is None and not folder.is_dir() and (has_store or robot_url is not None)
+    if rtsp is not None and is_of_store:
+        raise BadUsage('this is the page of a store, which has no cameras', 'give --rtsp to the page of the robot')
     if robot_url is not None:
         if not is_of_store:
             raise BadUsage(f'{folder} is a spool: this is the robot itself', 'leave out --robot-url')
@@ -87,7 +93,7 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
             raise BadUsage(f'--robot-url {robot_url[:100]!r} is not a URL such as http://thor.local:8765/')
     settings = LiveSettings(
         spool=folder, robot=robot or next(iter(robots(folder)), 'thor'), tokens=tokens, bind=bind, port=port, names=names,
-        certificate=tls or None, uploads_mbps=uploads_mbps, is_of_store=is_of_store,
+        certificate=tls or None, uploads_mbps=uploads_mbps, rtsp=rtsp, is_of_store=is_of_store,
         robot_url=robot_url or '', robot_token=robot_token,
     )  # fmt: skip
     logging.basicConfig(level=logging.INFO, format='%(message)s')
@@ -101,9 +107,11 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
             await server.open()
             if as_json:
                 print_json({'url': server.url, 'pid': os.getpid(), 'tokens': {role: str(path) for role, path in paths.items()},
-                            'problem': server.ros_problem})  # fmt: skip
+                            'rtsp': server.rtsp_url, 'problem': server.ros_problem})  # fmt: skip
             else:
                 click.echo(f"{server.url}\nthe operator's token is in {paths['operator']}, a viewer's in {paths['viewer']}")
+                if server.rtsp_url:
+                    click.echo(f'{server.rtsp_url}/TOPIC: user {USER}, password in {tokens / RTSP_FILE}')
                 if server.ros_problem:
                     click.echo(server.ros_problem, err=True)
             await stop.wait()

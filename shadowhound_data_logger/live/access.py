@@ -24,6 +24,7 @@ from shadowhound_data_logger.errors import DataLoggerError
 
 VIEWER, OPERATOR = 'viewer', 'operator'
 ROLES: Final = (OPERATOR, VIEWER)
+RTSP_FILE: Final = 'rtsp.password'
 COOKIE: Final = 'shadowhound_live'
 LASTS_S: Final = 12 * 3600
 """A sign-in."""
@@ -60,17 +61,26 @@ def make_tokens(folder: Path, *, anew: bool = False) -> dict[str, Path]:
     """The file with the token of each role, created where there is none. Raises TokenRefused."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     paths = {role: folder / f'{role}.token' for role in ROLES}
-    for path in paths.values():
-        if anew:
-            path.unlink(missing_ok=True)
-        try:
-            with os.fdopen(
-                os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), 'w', encoding='ascii'
-            ) as file:
-                file.write(f'{secrets.token_urlsafe(24)}\n')
-        except FileExistsError:
-            token_of(path)
+    for path in (*paths.values(), folder / RTSP_FILE) if anew else paths.values():
+        _make_token(path, anew=anew)
     return paths
+
+
+def rtsp_password(folder: Path) -> str:
+    """The password of RTSP, made where there is none; no token, because players keep it who knows where. Raises TokenRefused."""
+    path = folder / RTSP_FILE
+    _make_token(path)
+    return token_of(path)
+
+
+def _make_token(path: Path, *, anew: bool = False) -> None:
+    if anew:
+        path.unlink(missing_ok=True)
+    try:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), 'w', encoding='ascii') as file:
+            file.write(f'{secrets.token_urlsafe(24)}\n')
+    except FileExistsError:
+        token_of(path)
 
 
 def token_of(path: Path) -> str:

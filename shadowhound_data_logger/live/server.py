@@ -37,11 +37,13 @@ from shadowhound_data_logger.live.access import (
     is_loopback,
     is_same_origin,
     make_tokens,
+    rtsp_password,
 )
 from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures
 from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
 from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem
 from shadowhound_data_logger.live.relay import Relay
+from shadowhound_data_logger.live.rtsp import RtspServer
 from shadowhound_data_logger.live.viewer import Viewer
 from shadowhound_data_logger.spool.control import connect
 
@@ -107,6 +109,8 @@ class LiveSettings:
     """Of a store's page: where the robot's own page is, from which the live view is relayed; empty: there is none."""
     robot_token: Path | None = None
     """The file with the token of a viewer there."""
+    rtsp: int | None = None
+    """The port of RTSP; None: there is none."""
     uploads_mbps: float = 4.0
     """What uploads are left while somebody watches over the network; 0: all they want."""
 
@@ -143,6 +147,7 @@ class LiveServer:
         self._relay: Relay | None = None
         self._told_topics: LiveItem | None = None
         self._video: CameraVideo | None = None
+        self._rtsp: RtspServer | None = None
         self.no_video = '' if find_spec('aiortc') and find_spec('av') else NO_WEBRTC
         """Why cameras are sent as JPEG alone; empty where WebRTC is to be had."""
         self._pool = ThreadPoolExecutor(2, 'spool')
@@ -158,7 +163,7 @@ class LiveServer:
         """Why nothing but the data is shown; empty where topics are read."""
 
     async def open(self) -> None:
-        """Raises OSError where nobody can listen there, or the certificate cannot be read."""
+        """Raises OSError where nobody can listen there, or the certificate cannot be read; RtspUnavailable."""
         self._loop = asyncio.get_running_loop()
         app = web.Application(middlewares=[self._guard], client_max_size=MOST_BODY)
         app.add_routes([
@@ -176,6 +181,11 @@ class LiveServer:
         listener = _listener(self._settings.bind, self._settings.port)
         self.port = listener.getsockname()[1]
         await web.SockSite(self._runner, listener, ssl_context=secure).start()
+        if self._settings.rtsp is not None:
+            password = rtsp_password(self._settings.tokens)
+            self._rtsp = RtspServer(self._settings.bind, self._settings.rtsp, password, self._rewatch)
+            await self._rtsp.open()
+            self._rewatch()  # the topics of the graph are wanted even while nobody watches
         self._open_topics()
         self._ticker = asyncio.create_task(self._tick())
 
@@ -192,6 +202,8 @@ class LiveServer:
         await self._history.close()
         if self._video is not None:
             await self._video.close()
+        if self._rtsp is not None:
+            await self._rtsp.close()
         if self._relay is not None:
             await self._relay.close()
         if self._topics is not None:
@@ -199,10 +211,18 @@ class LiveServer:
         self._pool.shutdown()
 
     @property
+    def rtsp_url(self) -> str:
+        """To which the name of a camera's topic is appended; empty where RTSP is not served."""
+        return '' if self._rtsp is None else f'rtsp://{self._host}:{self._rtsp.port}'
+
+    @property
     def url(self) -> str:
+        return f'{self._scheme}://{self._host}:{self.port}/'
+
+    @property
+    def _host(self) -> str:
         bind = self._settings.bind
-        host = {'0.0.0.0': socket.gethostname(), '::': socket.gethostname()}.get(bind, f'[{bind}]' if ':' in bind else bind)  # noqa: S104 - compared
-        return f'{self._scheme}://{host}:{self.port}/'
+        return {'0.0.0.0': socket.gethostname(), '::': socket.gethostname()}.get(bind, f'[{bind}]' if ':' in bind else bind)  # noqa: S104 - compared
 
     @property
     def _scheme(self) -> str:
@@ -234,6 +254,8 @@ class LiveServer:
 
     def _on_graph(self, graph: Mapping[str, str]) -> None:
         self._graph = graph
+        if self._rtsp is not None:
+            self._rtsp.serve(topic for topic in graph if self._kind_of(topic) == 'camera')
         for one in self._viewers:
             self._offer_catalogue(one)
 
@@ -253,8 +275,11 @@ class LiveServer:
         self._offer_video(item)
 
     def _offer_video(self, item: LiveItem) -> None:
-        if self._video is not None and item.kind == 'camera' and item.size == FULL:
-            self._video.offer(item)
+        if item.kind != 'camera' or item.size != FULL:
+            return
+        for taker in (self._video, self._rtsp):
+            if taker is not None:
+                taker.offer(item)
 
     def _offer_catalogue(self, one: _Connected) -> None:
         if self._told_topics is not None:
@@ -269,10 +294,11 @@ class LiveServer:
         for one in self._viewers:
             for topic in one.viewer.watched:
                 wanted.setdefault(topic, set()).add(one.viewer.size(topic))
-        for topic in self._video.topics if self._video is not None else ():
-            wanted.setdefault(topic, set()).add(FULL)
+        for taker in (self._video, self._rtsp):
+            for topic in taker.topics if taker is not None else ():
+                wanted.setdefault(topic, set()).add(FULL)
         before = self._wanted
-        self._wanted = {topic: frozenset(sizes) for topic, sizes in wanted.items()} if self._viewers else None
+        self._wanted = {topic: frozenset(sizes) for topic, sizes in wanted.items()} if self._viewers or self._rtsp else None
         if self._wanted != before:
             for source in (self._topics, self._relay):
                 if source is not None:

@@ -76,11 +76,11 @@ class Page:
 
 
 @asynccontextmanager
-async def serving(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '0.0.0.0') -> AsyncIterator[Page]:
+async def serving(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '0.0.0.0', **settings: Any) -> AsyncIterator[Page]:
     monkeypatch.setattr(module, 'find_spec', lambda _: None)  # no ROS here
     monkeypatch.setenv('SHADOWHOUND_HOME', str(folder))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
-    server = LiveServer(LiveSettings(spool=folder / 'spool', robot='thor', tokens=folder / 'live', bind=bind, port=0))
+    server = LiveServer(LiveSettings(spool=folder / 'spool', robot='thor', tokens=folder / 'live', bind=bind, port=0, **settings))
     await server.open()
     try:
         page = Page(server, folder / 'live')

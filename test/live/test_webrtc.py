@@ -44,7 +44,9 @@ a=rtpmap:96 VP8/90000
 
 def picture(number: int) -> bytes:
     """320 x 240, of which the brightness tells which one it is."""
-    return bytes(simplejpeg.encode_jpeg(np.full((240, 320, 3), 20 + 18 * (number % LEVELS), np.uint8), 90))
+    return bytes(
+        simplejpeg.encode_jpeg(np.full((240, 320, 3), 20 + 18 * (number % LEVELS), np.uint8), 90, colorsubsampling='420')
+    )
 
 
 async def until(condition: Callable[[], Awaitable[Any]], what: str) -> Any:
@@ -75,8 +77,8 @@ class Robot:
 
 
 @asynccontextmanager
-async def robot(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '127.0.0.1') -> AsyncIterator[Robot]:
-    async with serving(folder, monkeypatch, bind) as page:
+async def robot(folder: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> AsyncIterator[Robot]:
+    async with serving(folder, monkeypatch, '127.0.0.1', **settings) as page:
         page.server.no_video = ''
         page.server._on_graph({CAMERA: COMPRESSED_IMAGE})
         found = Robot(page)

@@ -1,0 +1,179 @@
+"""The cameras over RTSP, for players and recorders: JPEGs as they came (RFC 2435), served by GStreamer in a process of its own.
+
+GStreamer's RTSP server comes from Debian or Ubuntu with bindings for the system's Python, so ``rtsp_process.py`` runs under that.
+RFC 2435 knows baseline JPEGs in YUV 4:2:0 or 4:2:2 whose sides are multiples of 8 pixels up to 2040; others are not sent, and the
+log says so. A topic is read while somebody plays it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import struct
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import simplejpeg
+
+from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.live.kinds import LiveItem
+
+log = logging.getLogger(__name__)
+
+PYTHON: Final = Path('/usr/bin/python3')
+"""Of the system: the one for which Debian and Ubuntu build GStreamer's bindings."""
+SCRIPT: Final = Path(__file__).with_name('rtsp_process.py')
+USER: Final = 'viewer'
+START_S: Final = 20.0
+AGAIN_S: Final = 5.0
+MOST_SIDE: Final = 2040
+MOST_WAITING: Final = 4 << 20
+"""Bytes for a process that does not read; frames beyond it are left out."""
+_BASELINE, _FRAMES = 0xC0, range(0xC0, 0xD0)
+_NO_FRAMES: Final = (0xC4, 0xC8, 0xCC)
+"""Markers among those of frames that begin tables (ITU T.81, table B.1)."""
+
+
+class RtspUnavailable(DataLoggerError):
+    """This machine serves no RTSP."""
+
+    DEFAULT_REMEDY = 'apt install python3-gi gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-base gstreamer1.0-plugins-good'
+
+
+class RtspServer:
+    """The process that serves, as long as this one. Used by one event loop. New; open once; close once.
+
+    ``changed`` is called when other topics are played than before.
+    """
+
+    def __init__(self, address: str, port: int, password: str, changed: Callable[[], None]) -> None:
+        self._given = {'address': address, 'port': port, 'user': USER, 'password': password}
+        self._changed = changed
+        self._process: asyncio.subprocess.Process | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._cameras: list[str] = []
+        self._refused: dict[str, str] = {}
+        self.topics: frozenset[str] = frozenset()
+        """Those that somebody plays."""
+        self.port = 0
+
+    async def open(self) -> None:
+        """Raises RtspUnavailable where GStreamer is missing, or nobody can listen there."""
+        await self._start()
+        self._task = asyncio.create_task(self._run())
+
+    async def close(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._task
+        await self._end()
+
+    def serve(self, cameras: Iterable[str]) -> None:
+        """Let these topics be played."""
+        if (wanted := sorted(cameras)) != self._cameras:
+            self._cameras = wanted
+            self._tell({'topics': wanted})
+
+    def offer(self, item: LiveItem) -> None:
+        """A JPEG of one of the topics."""
+        if item.topic not in self.topics:
+            return
+        if why := unsuited(item.body):
+            if self._refused.get(item.topic) != why:
+                log.warning('%s is not sent over RTSP: %s', item.topic, why)
+                self._refused[item.topic] = why
+            return
+        height, width, *_ = simplejpeg.decode_jpeg_header(item.body)
+        self._tell({'topic': item.topic, 'width': width, 'height': height}, item.body)
+
+    def _tell(self, head: dict[str, Any], body: bytes = b'') -> None:
+        if self._process is None or (stdin := self._process.stdin) is None or stdin.is_closing():
+            return
+        if not body or stdin.transport.get_write_buffer_size() < MOST_WAITING:
+            text = json.dumps(head).encode()
+            stdin.write(struct.pack('<II', len(text), len(body)) + text + body)
+
+    async def _start(self) -> None:
+        try:
+            self._process = await asyncio.create_subprocess_exec(
+                str(PYTHON), '-I', str(SCRIPT), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+            )
+        except OSError as error:
+            raise RtspUnavailable(f'{PYTHON} cannot be run: {error}') from error
+        self._tell(self._given)  # not on the command line, which everybody can read
+        try:
+            said = await asyncio.wait_for(self._said(), START_S)
+        except asyncio.TimeoutError:
+            said = {'error': f'it says nothing for {START_S:.0f} s'}
+        if 'port' not in said:
+            await self._end()
+            raise RtspUnavailable(f'RTSP is not served: {said.get("error", "the process ended")}', remedy=said.get('remedy', ''))
+        self.port = self._given['port'] = said['port']
+        self._tell({'topics': self._cameras})
+
+    async def _said(self) -> dict[str, Any]:
+        """The next line of the process; empty when it has ended."""
+        assert self._process is not None
+        assert self._process.stdout is not None
+        line = await self._process.stdout.readline()
+        return dict(json.loads(line)) if line else {}
+
+    async def _run(self) -> None:
+        """What is played; and the process again after it ended."""
+        while True:
+            while said := await self._said():
+                self._watch(said.get('watched', ()))
+            self._watch(())
+            log.warning('the process that serves RTSP has ended; it is started again')
+            while True:
+                await asyncio.sleep(AGAIN_S)
+                try:
+                    await self._end()
+                    await self._start()
+                    break
+                except RtspUnavailable as error:
+                    log.warning('%s', error)
+
+    def _watch(self, topics: Iterable[str]) -> None:
+        self.topics = frozenset(topics)
+        self._changed()
+
+    async def _end(self) -> None:
+        process, self._process = self._process, None
+        if process is None:
+            return
+        if process.stdin is not None:
+            process.stdin.close()  # it ends with its input
+        try:
+            await asyncio.wait_for(process.wait(), 5.0)
+        except asyncio.TimeoutError:
+            process.kill()
+            await process.wait()
+
+
+def unsuited(jpeg: bytes) -> str:
+    """Why RFC 2435 has no way to send this JPEG; empty where it has."""
+    try:
+        height, width, _, sampling = simplejpeg.decode_jpeg_header(jpeg)
+    except ValueError as error:
+        return f'it is no JPEG: {error}'
+    if width % 8 or height % 8 or max(width, height) > MOST_SIDE:
+        return f'{width} x {height} pixels; RFC 2435 has multiples of 8 up to {MOST_SIDE}'
+    if sampling not in ('420', '422'):
+        return f'its colours are sampled as {sampling}; RFC 2435 has 420 and 422'
+    return '' if _coding(jpeg) == _BASELINE else 'it is no baseline JPEG'
+
+
+def _coding(jpeg: bytes) -> int:
+    """The marker of the frame, which tells how it is coded; 0 where there is none."""
+    at = 2
+    while at + 4 <= len(jpeg) and jpeg[at] == 0xFF:
+        marker = jpeg[at + 1]
+        if marker in _FRAMES and marker not in _NO_FRAMES:
+            return marker
+        at += 2 + int.from_bytes(jpeg[at + 2 : at + 4], 'big')
+    return 0

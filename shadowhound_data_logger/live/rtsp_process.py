@@ -1,0 +1,139 @@
+"""Serves JPEGs from standard input over RTSP: a script for the system's Python, which has GStreamer's bindings (python3-gi).
+
+It imports nothing of this package. Each record of its input is two uint32 (little-endian) with the lengths of a head in JSON and
+of a body, and these. The first head has ``address``, ``port``, ``user`` and ``password``; later ones name ``topics`` that are
+served, or a ``topic`` with ``width`` and ``height`` of the JPEG in the body. What it says are lines of JSON: ``port``,
+``watched`` (topics that clients play), or ``error``. It ends with its input.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+import threading
+from typing import Any, BinaryIO
+
+PIPELINE = (
+    '( appsrc name=frames is-live=true format=time do-timestamp=true max-buffers=2 leaky-type=downstream'
+    ' ! rtpjpegpay name=pay0 pt=26 )'
+)
+MOST_SESSIONS = 16
+ROLE = 'viewer'
+
+
+def say(**what: Any) -> None:
+    """A line for the process that feeds this one."""
+    sys.stdout.write(json.dumps(what) + '\n')
+    sys.stdout.flush()
+
+
+def read(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
+    """The next record; None at the end."""
+    lengths = stream.read(8)
+    if len(lengths) < 8:
+        return None
+    head, body = struct.unpack('<II', lengths)
+    text, frame = stream.read(head), stream.read(body)
+    return (json.loads(text), frame) if len(text) + len(frame) == head + body else None
+
+
+class Cameras:
+    """The server and its pipelines: one a topic, shared by all who play it. The lock guards the sources."""
+
+    def __init__(self, rtsp: Any, gst: Any, digest: Any, given: dict[str, Any]) -> None:
+        self._rtsp, self._gst = rtsp, gst
+        self._lock = threading.Lock()
+        self._sources: dict[str, Any] = {}
+        self._caps: dict[str, tuple[int, int]] = {}
+        self._mounted: set[str] = set()
+        self.server = rtsp.RTSPServer()
+        self.server.set_address(given['address'])
+        self.server.set_service(str(given['port']))
+        self.server.get_session_pool().set_max_sessions(MOST_SESSIONS)
+        auth, token = rtsp.RTSPAuth(), rtsp.RTSPToken()
+        token.set_string('media.factory.role', ROLE)
+        auth.set_supported_methods(digest)
+        auth.add_digest(given['user'], given['password'], token)
+        self.server.set_auth(auth)
+
+    def mount(self, topics: list[str]) -> None:
+        """Serve these; others that were served before stay."""
+        for topic in topics:
+            if topic in self._mounted:
+                continue
+            self._mounted.add(topic)
+            factory = self._rtsp.RTSPMediaFactory()
+            factory.set_launch(PIPELINE)
+            factory.set_shared(True)
+            permissions = self._rtsp.RTSPPermissions()
+            for right in ('media.factory.access', 'media.factory.construct'):
+                permissions.add_permission_for_role(ROLE, right, True)
+            factory.set_permissions(permissions)
+            factory.connect('media-configure', self._begin, topic)
+            self.server.get_mount_points().add_factory(topic, factory)
+
+    def push(self, topic: str, width: int, height: int, jpeg: bytes) -> None:
+        with self._lock:
+            source = self._sources.get(topic)
+            if source is None:
+                return
+            if self._caps.get(topic) != (width, height):
+                self._caps[topic] = width, height
+                source.set_property('caps', self._gst.Caps.from_string(f'image/jpeg,width={width},height={height},framerate=0/1'))
+            source.emit('push-buffer', self._gst.Buffer.new_wrapped(jpeg))
+
+    def _begin(self, _: Any, media: Any, topic: str) -> None:
+        with self._lock:
+            self._sources[topic] = media.get_element().get_by_name('frames')
+            self._caps.pop(topic, None)
+            media.connect('unprepared', self._end, topic)
+            say(watched=sorted(self._sources))
+
+    def _end(self, _: Any, topic: str) -> None:
+        with self._lock:
+            self._sources.pop(topic, None)
+            say(watched=sorted(self._sources))
+
+
+def main() -> None:
+    """Until the input ends."""
+    first = read(sys.stdin.buffer)
+    if first is None:
+        return
+    try:
+        import gi  # noqa: PLC0415 - the system's Python has it, or not
+
+        for name in ('Gst', 'GstRtsp', 'GstRtspServer'):
+            gi.require_version(name, '1.0')
+        from gi.repository import GLib, Gst, GstRtsp, GstRtspServer  # noqa: PLC0415
+    except (ImportError, ValueError) as error:
+        say(error=f'the system has no RTSP server: {error}')
+        return
+    Gst.init(None)
+    lacks = [name for name in ('appsrc', 'rtpjpegpay') if Gst.ElementFactory.find(name) is None]
+    if lacks:
+        say(error=f'GStreamer has no {" and no ".join(lacks)}')
+        return
+    cameras = Cameras(GstRtspServer, Gst, GstRtsp.RTSPAuthMethod.DIGEST, first[0])
+    if not cameras.server.attach(None):
+        say(error=f'nobody can listen at {first[0]["address"]} port {first[0]["port"]}', remedy='name a free port: --rtsp PORT')
+        return
+    loop = GLib.MainLoop()
+
+    def follow() -> None:
+        while (record := read(sys.stdin.buffer)) is not None:
+            head, jpeg = record
+            if 'topics' in head:
+                GLib.idle_add(cameras.mount, head['topics'])
+            else:
+                cameras.push(head['topic'], head['width'], head['height'], jpeg)
+        GLib.idle_add(loop.quit)
+
+    say(port=cameras.server.get_bound_port())
+    threading.Thread(target=follow, daemon=True).start()
+    loop.run()
+
+
+if __name__ == '__main__':
+    main()
