@@ -38,9 +38,9 @@ POLICIES = 'lerobot/policies'
 ADMIN = ('Admin', 'Read', 'Write', 'List', 'Tagging')
 NAME = re.compile(r'[a-z0-9][a-z0-9_-]{0,62}')
 """A robot's name leads its keys, and is part of a pattern here: no wildcard may be in it."""
-OWN_USERS = ('tower', 'mlflow', 'spark')
-NO_LOGIN = 'mlflow'
-"""The server's own user of S3, which is none of MLflow's."""
+OWN_USERS = ('tower', 'mlflow', 'spark', 'prune')
+NO_LOGIN = ('mlflow', 'prune')
+"""Users of S3 alone: MLflow's own server, and who deletes by `shadowhound-data lake prune`."""
 SIGNING_KEYS = (
     'WEED_JWT_SIGNING_KEY', 'WEED_JWT_SIGNING_READ_KEY', 'WEED_JWT_FILER_SIGNING_KEY', 'WEED_JWT_FILER_SIGNING_READ_KEY',
 )  # fmt: skip
@@ -63,6 +63,10 @@ def actions(user: str) -> list[str]:
         return list(ADMIN)
     if user == 'mlflow':
         return [f'{action}:mlflow' for action in ('Read', 'Write', 'List', 'Tagging')]
+    if user == 'prune':
+        return [f'{action}:{bucket}' for bucket in ('sensor-data', 'trajectories', 'lerobot') for action in ('Read', 'List')] + [
+            f'Write:{bucket}' for bucket in ROBOT_BUCKETS
+        ]
     if user == 'spark':
         return [
             *(f'{action}:{bucket}' for bucket in READ_BUCKETS for action in ('Read', 'List')),
@@ -127,7 +131,7 @@ def logins(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
     """Who may log in to MLflow, as its server checks it (shadowhound_data_logger/sim/mlflow_access.py)."""
     digests = {
         user: [hashlib.sha256(key['password'].encode()).hexdigest() for key in keys]
-        for user, keys in users.items() if user != NO_LOGIN
+        for user, keys in users.items() if user not in NO_LOGIN
     }  # fmt: skip
     return json.dumps(digests, indent=1) + '\n'
 
@@ -143,7 +147,7 @@ def environment(user: str, key: Mapping[str, str], settings: Mapping[str, str]) 
         'AWS_DEFAULT_REGION': 'us-east-1', 'MLFLOW_TRACKING_URI': f'{server}:{MLFLOW_PORT + offset}',
         'MLFLOW_S3_ENDPOINT_URL': store,
     }  # fmt: skip
-    if user != NO_LOGIN:
+    if user not in NO_LOGIN:
         values |= {'MLFLOW_TRACKING_USERNAME': user, 'MLFLOW_TRACKING_PASSWORD': key['password']}
     if user not in OWN_USERS:
         values['SHADOWHOUND_ROBOT'] = user
@@ -154,7 +158,7 @@ def credentials(user: str, key: Mapping[str, str]) -> str:
     """A shared-credentials file, which a running program reads again, and MLflow's clients as well: its environment it cannot."""
     keys = f'[default]\naws_access_key_id = {key["accessKey"]}\naws_secret_access_key = {key["secretKey"]}\n'
     login = f'[mlflow]\nmlflow_tracking_username = {user}\nmlflow_tracking_password = {key["password"]}\n'
-    return keys + (login if user != NO_LOGIN else '')
+    return keys + (login if user not in NO_LOGIN else '')
 
 
 def has_certificate(folder: Path) -> bool:
@@ -221,6 +225,8 @@ def make(folder: Path, host: str | None, robots: Sequence[str], rotate: Sequence
     for name in robots:
         if not NAME.fullmatch(name):
             raise Refused(f'{name!r} is no name for a robot: lower-case letters, digits, "-" and "_"')
+        if name in OWN_USERS:
+            raise Refused(f'{name!r} is no name for a robot: a user of the Tower itself is called so')
     for name in dict.fromkeys((*OWN_USERS, *robots)):
         users.setdefault(name, [new_key()])
     for key in (key for keys in users.values() for key in keys):  # of before MLflow had passwords

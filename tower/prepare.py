@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -24,7 +25,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
 ROBOT_BUCKETS = ('sensor-data', 'trajectories')
-OWN_USERS = ('tower', 'mlflow', 'spark')
+OWN_USERS = ('tower', 'mlflow', 'spark', 'prune')
 ACCOUNT = '000000000000'
 """Of every user of a SeaweedFS server, in a policy's ARN."""
 OLD_VERSION_DAYS = 30
@@ -47,15 +48,31 @@ def policy(bucket: str, robots: Sequence[str]) -> str:
     })  # fmt: skip
 
 
-def rules(bucket: str) -> dict[str, Any]:
-    """Parts of uploads that were never finished go, and so do versions that were replaced long ago."""
+def rules(bucket: str, robots: Sequence[str] = (), expiry: Sequence[tuple[str, int]] = ()) -> dict[str, Any]:
+    """Parts of uploads that were never finished go, and so do versions that were replaced or deleted long ago.
+
+    ``expiry`` has sensors, and after how many days the server itself deletes their objects.
+    """
     everything = {'Filter': {'Prefix': ''}, 'Status': 'Enabled'}
     found = [
         {'ID': 'unfinished-uploads', 'AbortIncompleteMultipartUpload': {'DaysAfterInitiation': UNFINISHED_DAYS}, **everything}
     ]
     if bucket in ROBOT_BUCKETS:
         found += [{'ID': 'old-versions', 'NoncurrentVersionExpiration': {'NoncurrentDays': OLD_VERSION_DAYS}, **everything}]
+        found += [
+            {'ID': f'expire-{robot}-{sensor}', 'Filter': {'Prefix': f'{robot}/{sensor}/'}, 'Status': 'Enabled',
+             'Expiration': {'Days': days}}
+            for robot in robots for sensor, days in expiry
+        ]  # fmt: skip
     return {'Rules': found}
+
+
+def expiry_of(text: str) -> tuple[str, int]:
+    """The sensor and the days of ``camera=90``. Raises ArgumentTypeError."""
+    sensor, _, days = text.partition('=')
+    if not re.fullmatch(r'[A-Za-z0-9][A-Za-z0-9_-]*', sensor) or not re.fullmatch(r'[1-9][0-9]{0,4}', days):
+        raise argparse.ArgumentTypeError(f'{text!r} is not SENSOR=DAYS, such as camera=90')
+    return sensor, int(days)
 
 
 def make_mailbox(s3: Any, robot: str) -> None:
@@ -94,14 +111,15 @@ def wait(s3: Any, seconds: float) -> None:
             return
 
 
-def prepare(s3: Any, robots: Sequence[str]) -> list[str]:
+def prepare(s3: Any, robots: Sequence[str], expiry: Sequence[tuple[str, int]] = ()) -> list[str]:
     """Make it so; returns a sentence for each thing that the server does not do. Raises ClientError when there are no buckets."""
     missing: list[str] = []
     present = {bucket['Name'] for bucket in s3.list_buckets()['Buckets']}
     for bucket in BUCKETS:
         if bucket not in present:
             s3.create_bucket(Bucket=bucket)
-        steps = {'lifecycle rules': partial(s3.put_bucket_lifecycle_configuration, LifecycleConfiguration=rules(bucket))}
+        lifecycle = rules(bucket, robots, expiry)
+        steps = {'lifecycle rules': partial(s3.put_bucket_lifecycle_configuration, LifecycleConfiguration=lifecycle)}
         if bucket in ROBOT_BUCKETS:
             steps['versions'] = partial(s3.put_bucket_versioning, VersioningConfiguration={'Status': 'Enabled'})
             steps['a policy against deleting'] = partial(s3.put_bucket_policy, Policy=policy(bucket, robots))
@@ -122,6 +140,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         '--robot', action='append', default=[], metavar='NAME', help='a robot that must not delete (default: thor)'
     )
     parser.add_argument('--users', type=Path, metavar='FILE', help='take the robots from users.json of make_secrets.py')
+    parser.add_argument(
+        '--expire',
+        action='append',
+        default=[],
+        type=expiry_of,
+        metavar='SENSOR=DAYS',
+        help='let the server itself delete the objects of a sensor that are so old, whatever refers to them',
+    )
     parser.add_argument('--wait', type=float, default=60.0, metavar='S', help='how long to wait for the server')
     options = parser.parse_args(arguments)
     if not os.environ.get('AWS_ENDPOINT_URL'):
@@ -131,7 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         robots = options.robot or (robots_of(options.users) if options.users else ['thor'])
         s3 = connect()
         wait(s3, options.wait)
-        missing = prepare(s3, robots)
+        missing = prepare(s3, robots, options.expire)
     except (OSError, ValueError) as error:
         print(f'prepare: {options.users}: {error}', file=sys.stderr)
         return 2

@@ -74,10 +74,16 @@ class TableSchema:
     """Columns without nulls."""
     about: Mapping[str, str]
     """The key-value metadata of each part."""
+    is_apart: bool = False
+    """Whether the parts lie beside the robots' own folders: a robot's credentials may not write them."""
 
     def prefix(self, robot: str) -> str:
         """What the keys of a robot's parts begin with."""
-        return f'{robot}/{self.folder}/'
+        return f'{self.folder}/{robot}/' if self.is_apart else f'{robot}/{self.folder}/'
+
+    def robot_of(self, key: str) -> str:
+        """Whose part this is."""
+        return ''.join(key.split('/')[1:2]) if self.is_apart else key.partition('/')[0]
 
     def part_key(self, robot: str, date: str, name: str) -> str:
         """The key of a part with rows of one date (``YYYY-MM-DD``); ``name`` makes it unique."""
@@ -95,6 +101,34 @@ KEPT: Final = TableSchema(
 ``robot``: on the robot's disk. ``lost``: it was evicted there, or refused; ``reason`` says why. A row of the same object in the
 catalogue, which says that the store has it, supersedes both, and ``lost`` supersedes ``robot``, whatever comes first. Readers of
 the catalogue that know nothing of this table see only what the store has.
+"""
+FORGOTTEN: Final = TableSchema(
+    '_forgotten',
+    {
+        'robot': STRING,
+        'sensor': STRING,
+        'topic': STRING,
+        'bucket': STRING,
+        'key': STRING,
+        'bytes': INT64,
+        't_start': TIME,
+        't_start_ns': INT64,
+        't_end_ns': INT64,
+        'count': INT64,
+        'rule': STRING,
+        'forgotten': TIME,
+        'forgotten_ns': INT64,
+        'format_version': INT32,
+    },
+    ('bucket', 'key', 'bytes', 't_start_ns', 'forgotten_ns', 'format_version'),
+    {'shadowhound.forgotten': '1'},
+    is_apart=True,
+)
+"""What ``lake prune`` deleted from the store on purpose: of each object the columns of its row in the catalogue, ``forgotten``
+when, and by which ``rule``.
+
+The row in the catalogue stays; one here, under the same date, supersedes it. It is there before the object is deleted: a robot
+that could write one could have an object deleted.
 """
 GAPS_FOLDER: Final = '_gaps'
 """Of the gap journal's parts."""

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.datasets.export import Exported
     from shadowhound_data_logger.datasets.features import ExportOptions
     from shadowhound_data_logger.datasets.imports import Demonstration
+    from shadowhound_data_logger.datasets.transfer import DatasetPlace
     from shadowhound_data_logger.datasets.verify import Proved, Seen
 
 SCHEME: Final = 's3://'
@@ -249,7 +250,8 @@ def export_verify(*, place: str, is_all: bool, is_read: bool, as_json: bool) -> 
         if stored is not None:
             folder = Path(temporary)
             fetch_dataset(stored, folder, store, bar.say)
-        found = library.verify(folder, store, frames=None if is_all else library.FRAMES, is_read=is_read, say=bar.say)
+        found = library.verify(folder, store, frames=None if is_all else library.FRAMES, is_read=is_read, forgotten=_forgotten,
+                               say=bar.say)  # fmt: skip
     if as_json:
         print_json(asdict(found))
     else:
@@ -341,27 +343,49 @@ def export_where(*, key: str, places: tuple[str, ...], as_json: bool) -> ExitCod
         print_json(told)
         return ExitCode.FINE
     lines = []
+    if (date := _date_of(key)) is not None:
+        lines.append(plain(f'It was deleted from the store on {date} (lake prune).'))
     for each in told:
         lines.append(plain(f'{each["where"]}: {number(each["frames"])} frames of {", ".join(each["missions"])}'))
         lines += [plain(f'  trained on it: run {run}') for run in each['runs']]
-    print_lines(*lines or [plain(f'No data set has values of {key}.')])
+    print_lines(*lines, *([] if told else [plain(f'No data set has values of {key}.')]))
     return ExitCode.FINE
+
+
+def _date_of(key: str) -> str | None:
+    """On which date an object was deleted on purpose; named as ``KEY`` or ``BUCKET/KEY``."""
+    return next((date for (bucket, name), date in _forgotten().items() if key in {name, f'{bucket}/{name}'}), None)
+
+
+def _forgotten() -> Mapping[tuple[str, str], str]:
+    """(bucket, key) -> the date on which it was deleted from the store on purpose."""
+    from shadowhound_data_logger.lake.forgotten import dates_of_deletion, forgotten  # noqa: PLC0415
+    from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+    return dates_of_deletion(forgotten(default_source(the_store_settings()), None, quietly()))
+
+
+def all_datasets() -> tuple[list[Path], list[DatasetPlace]]:
+    """Those that this machine exported, and those in the store, in the bucket ``lerobot``. Raises StoreError."""
+    from shadowhound_data_logger.datasets.export import known_folders  # noqa: PLC0415
+    from shadowhound_data_logger.datasets.transfer import datasets_in  # noqa: PLC0415
+
+    copies = the_home() / COPIES
+    with closing(open_reader(the_store_settings())) as store:
+        stored = list(datasets_in(store))
+    return [each for each in known_folders(the_home()) if copies not in each.parents], stored
 
 
 def _seen(key: str, places: tuple[str, ...]) -> Iterator[Seen]:
     from shadowhound_data_logger.datasets import verify as library  # noqa: PLC0415
-    from shadowhound_data_logger.datasets.export import known_folders  # noqa: PLC0415
-    from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in  # noqa: PLC0415
+    from shadowhound_data_logger.datasets.transfer import DatasetPlace  # noqa: PLC0415
     from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
 
     settings = the_store_settings()
     folders = [Path(each) for each in places if not each.startswith(SCHEME)]
     stored = [DatasetPlace.of(each) for each in places if each.startswith(SCHEME)]
     if not places:
-        copies = the_home() / COPIES
-        folders = [each for each in known_folders(the_home()) if copies not in each.parents]
-        with closing(open_reader(settings)) as store:
-            stored = list(datasets_in(store))
+        folders, stored = all_datasets()
     for folder in folders:
         if (seen := library.seen_in_folder(folder, key)) is not None:
             yield seen
@@ -385,16 +409,14 @@ def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> Exit
     with _exporting():
         from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415
         from shadowhound_data_logger.datasets.lerobot import Lerobot  # noqa: PLC0415
-        from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in, fetch_dataset, upload  # noqa: PLC0415
+        from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset, upload  # noqa: PLC0415
 
         stored = [DatasetPlace.of(each) for each in places if each.startswith(SCHEME)]
     folders = [Path(each) for each in places if not each.startswith(SCHEME)]
     dropped: dict[str, str] = {}
     with progress('looking for it') as bar, the_store() as store:
         if not places:
-            copies = the_home() / COPIES
-            folders = [each for each in library.known_folders(the_home()) if copies not in each.parents]
-            stored = list(datasets_in(store))
+            folders, stored = all_datasets()
         for folder in folders:
             if mission in Lerobot(folder).mission_ids or (folder / library.DROPPING).is_file():
                 dropped[str(folder)] = library.drop(folder, mission)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from datetime import timedelta
@@ -28,6 +29,7 @@ from shadowhound_data_logger.cli.common import (
     the_store,
     the_store_settings,
 )
+from shadowhound_data_logger.cli.export import all_datasets
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 from shadowhound_data_logger.clock import SECOND, SystemClock, utc
@@ -37,6 +39,7 @@ from shadowhound_data_logger.times import moment
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.gaps import Coverage
+    from shadowhound_data_logger.lake.prune import PrunePlan
     from shadowhound_data_logger.lake.verify import Rows
 
 THREADS: Final = 16
@@ -124,6 +127,120 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
     if any(day.denied for day in found):
         click.echo('These credentials may not delete: the files only take up space.')
     return tell_left_out(left_out)
+
+
+@lake.command(
+    'prune',
+    epilog=examples(
+        'lake prune --keep "camera 90d, lidar 14d, events forever" --dry-run',
+        'lake prune --keep "camera 90d, lidar 14d, bags 30d" --max-bytes 2TB',
+    ),
+)
+@click.option('--keep', 'rules', required=True, metavar='RULES', help='Sensors, and for how long to keep each: "camera 90d, ..."')
+@click.option('--max-bytes', 'most', metavar='SIZE',
+              help='Where more is left, such as 2TB, also delete the oldest days of these sensors.')  # fmt: skip
+@_robot
+@click.option('--dry-run', is_flag=True, help='Only say what would be deleted.')
+@click.option('--force', is_flag=True, help='Also delete what data sets, labels and open requests refer to.')
+@click.option('--yes', is_flag=True, help='Do not ask.')
+@as_json
+def lake_prune(
+    *, rules: str, most: str | None, robot: str | None, dry_run: bool, force: bool, yes: bool, as_json: bool
+) -> ExitCode:
+    """Delete old objects from the store.
+
+    By sensor and age; `bags`, `events` and `missions` are sensors here, too, and go as a whole. What no rule names stays, and so
+    does what a data set, a label or an open request (`pull`) refers to. The catalogue keeps the rows, as forgotten.
+
+    It asks before it deletes all of a sensor or, with --force, what something refers to; without a terminal it then does nothing.
+    Exit code 1 when it did nothing for that reason, or when more is left than --max-bytes.
+    """
+    with asking():
+        now_ns = SystemClock.of_this_machine().wall_ns()
+        from shadowhound_data_logger.lake import prune as library  # noqa: PLC0415
+        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+        keep = library.keep_rules(rules, now_ns)
+        how: dict[str, Any] = {'robot': robot, 'most_bytes': None if most is None else library.size_of(most), 'is_forced': force}
+    source, left_out = default_source(the_store_settings()), quietly()
+    with progress('looking at what there is') as bar:
+        made = library.plan(source, keep, exported=_exported(bar.say), findings=left_out, tell=bar.say, **how)
+    if not as_json:
+        print_page(*_planned(made, dry_run=dry_run))
+    if dry_run or not made.going:
+        if as_json:
+            print_json(_prune_told(made))
+        return exit_code(finding=made.over_bytes or tell_left_out(left_out))
+    if (reasons := list(_reasons(made))) and not yes:
+        for reason in reasons:
+            click.echo(reason, err=True)
+        if not (sys.stdin.isatty() and click.confirm('Delete it?', err=True)):
+            click.echo('Nothing is deleted. --yes deletes it without asking.', err=True)
+            return ExitCode.FINDING
+        made = library.plan(source, keep, exported=_exported(), findings=quietly(), **how)  # it may be labelled meanwhile
+    with the_store(THREADS) as target, progress() as bar:
+        done = library.apply(source, target, made, now_ns=now_ns, findings=left_out, tell=bar.say)
+    if as_json:
+        print_json({**_prune_told(made), 'deleted': done.objects, 'deleted_bytes': done.bytes, 'mended': done.mended})
+    else:
+        click.echo(f'{number(done.objects)} objects ({volume(done.bytes)}) are deleted.')
+        if done.mended:
+            click.echo(f'So are {number(done.mended)} that an earlier run did not come to.')
+    return exit_code(finding=made.over_bytes or tell_left_out(left_out))
+
+
+def _exported(say: Callable[[str], None] = lambda _: None) -> dict[tuple[str, str], str]:
+    """(bucket, key) -> a data set that has values of it."""
+    from shadowhound_data_logger.datasets import verify  # noqa: PLC0415
+    from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
+
+    found: dict[tuple[str, str], str] = {}
+    folders, stored = all_datasets()
+    for folder in folders:
+        say(str(folder))
+        found |= dict.fromkeys(verify.sources_in_folder(folder), str(folder))
+    for place in stored:
+        say(str(place))
+        found |= dict.fromkeys(verify.sources_in_store(Bucket(the_store_settings(), place.bucket), place), str(place))
+    return found
+
+
+def _prune_told(made: PrunePlan) -> dict[str, Any]:
+    sensors = [{'sensor': each.sensor, 'rule': each.rule, 'objects': each.objects, 'bytes': each.bytes, 'going': each.going,
+                'going_bytes': each.going_bytes, 'protected': dict(each.protected), 'referrers': sorted(each.referrers)}
+               for each in made.sensors.values()]  # fmt: skip
+    return {'sensors': sensors, 'going': made.going, 'going_bytes': made.going_bytes, 'over_bytes': made.over_bytes}
+
+
+def _planned(made: PrunePlan, *, dry_run: bool) -> Iterator[RenderableType]:
+    table = plain_table('', ('sensor', 'keep', 'objects', 'size', 'to delete', 'size', 'protected', 'by'),
+                        ('sensor', 'keep', 'by'))  # fmt: skip
+    table.title = None
+    for each in sorted(made.sensors.values(), key=lambda each: each.sensor):
+        by = ', '.join(sorted(each.referrers)[:3]) + (', ...' if len(each.referrers) > 3 else '')
+        keep = each.rule.removeprefix(each.sensor).strip() or 'no rule'
+        table.add_row(plain(each.sensor), plain(keep), number(each.objects), volume(each.bytes), number(each.going),
+                      volume(each.going_bytes), number(sum(each.protected.values())), plain(by))  # fmt: skip
+    yield table
+    for each in made.sensors.values():
+        if not each.objects:
+            yield plain(f'There are no objects of {each.sensor}.', 'yellow')
+    will = 'would be' if dry_run else 'will be'
+    yield plain(f'{number(made.going)} objects ({volume(made.going_bytes)}) {will} deleted.' if made.going
+                else 'There is nothing to delete.')  # fmt: skip
+    if made.over_bytes:
+        yield plain(f'{volume(made.over_bytes)} more than --max-bytes stays: no rule lets it go.', 'yellow')
+
+
+def _reasons(made: PrunePlan) -> Iterator[str]:
+    """Why to ask first, with what would go."""
+    for each in made.sensors.values():
+        if each.is_all:
+            yield f'This deletes all {number(each.objects)} objects of {each.sensor} ({volume(each.bytes)}).'
+        if made.is_forced and each.protected:
+            kinds = ', '.join(f'{number(count)} by a {why}' for why, count in each.protected.items())
+            by = ', '.join(sorted(each.referrers))
+            yield f'This deletes objects of {each.sensor} that are referred to: {kinds}. By: {by}.'
 
 
 @lake.command('reindex', epilog=examples('lake reindex --robot thor'))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from shadowhound_data_logger.datasets.episodes import EPISODE
+from shadowhound_data_logger.datasets.episodes import EPISODE, SOURCES
 from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, OURS, SOURCE_TABLE, EpisodeRow, Lerobot
 from shadowhound_data_logger.datasets.series import pictures_of
 from shadowhound_data_logger.datasets.transfer import DatasetPlace
@@ -54,8 +54,11 @@ class Proved:
 
 
 def verify(folder: Path, store: ObjectStore, *, frames: int | None = FRAMES, is_read: bool = False,
+           forgotten: Callable[[], Mapping[tuple[str, str], str]] = dict,
            say: Callable[[str], None] = lambda _: None) -> Proved:  # fmt: skip
     """``frames`` is how many of each camera and episode are compared, None for all; ``is_read`` reads every source again.
+
+    ``forgotten`` is asked where sources are gone: (bucket, key) -> the date on which `lake prune` deleted it.
 
     Raises LakeError for what is no data set of ours, StoreError.
     """
@@ -70,7 +73,7 @@ def verify(folder: Path, store: ObjectStore, *, frames: int | None = FRAMES, is_
         found.wrong.append(f'{SOURCE_TABLE} cannot be read: {error}')
         return found
     say('sources')
-    _sources(table, store, found, is_read=is_read)
+    _sources(table, store, found, forgotten, is_read=is_read)
     for row in made.rows:
         say(f'episode {row["episode_index"] + 1} of {len(made.rows)}')
         mine = table.filter(pc.equal(table[EPISODE], row[f'{OURS}mission_id']))
@@ -97,7 +100,9 @@ def _files(made: Lerobot, found: Proved) -> None:
         found.files += 1
 
 
-def _sources(table: pa.Table, store: ObjectStore, found: Proved, *, is_read: bool) -> None:
+def _sources(table: pa.Table, store: ObjectStore, found: Proved, forgotten: Callable[[], Mapping[tuple[str, str], str]], *,
+             is_read: bool) -> None:  # fmt: skip
+    gone: list[tuple[str, str]] = []
     rows = table.group_by(['bucket', 'key', 'sha256']).aggregate([]).sort_by('key').to_pylist()
 
     def wrong(row: dict[str, str]) -> str:
@@ -105,7 +110,8 @@ def _sources(table: pa.Table, store: ObjectStore, found: Proved, *, is_read: boo
         try:
             held = store.head(row['bucket'], row['key'])
             if held is None:
-                return f'the source {name} is gone'
+                gone.append((row['bucket'], row['key']))
+                return ''
             sha256 = held.sha256
             if is_read and row['sha256']:
                 sha256 = _sha256_of(store, row['bucket'], row['key'])
@@ -115,6 +121,10 @@ def _sources(table: pa.Table, store: ObjectStore, found: Proved, *, is_read: boo
 
     with ThreadPoolExecutor(THREADS, 'export-verify') as pool:
         found.wrong += [said for said in pool.map(wrong, rows) if said]
+    dates = forgotten() if gone else {}
+    for bucket, key in sorted(gone):
+        said = f'was deleted on {dates[bucket, key]} (lake prune)' if (bucket, key) in dates else 'is gone'
+        found.wrong.append(f'the source {bucket}/{key} {said}')
     found.sources = len(rows)
 
 
@@ -209,3 +219,27 @@ def _seen(where: str, table: pa.Table, told: Any, key: str) -> Seen | None:
     frames = len(mine.group_by([EPISODE, 'frame']).aggregate([]))
     digests = tuple(each['digest'] for each in told['digests'] if {*missions} & {*each['missions']})
     return Seen(where, missions, frames, digests)
+
+
+def sources_in_folder(folder: Path) -> set[tuple[str, str]]:
+    """(bucket, key) of all objects that a data set has values of, or an export to it has begun to read. Raises LakeError."""
+    found: set[tuple[str, str]] = set()
+    try:
+        for path in (folder / SOURCE_TABLE, *folder.glob(f'.shadowhound/*/{SOURCES}')):
+            found |= _named(pq.read_table(path))
+    except (OSError, ValueError, pa.ArrowException, LookupError) as error:
+        raise LakeError(f'the data set {folder} cannot be read: {error}', remedy='mend it, or move it away') from error
+    return found
+
+
+def sources_in_store(source: Bucket, place: DatasetPlace) -> set[tuple[str, str]]:
+    """The same, of a data set in a store. Raises StoreError, LakeError."""
+    try:
+        return _named(pq.read_table(io.BytesIO(source.get(place.prefix + SOURCE_TABLE, MOST_TABLE_BYTES))))
+    except (ObjectRefused, ValueError, pa.ArrowException, LookupError) as error:
+        raise LakeError(f'the data set {place} cannot be read: {error}', remedy='mend it, or delete it') from error
+
+
+def _named(table: pa.Table) -> set[tuple[str, str]]:
+    named = table.group_by(['bucket', 'key']).aggregate([])
+    return set(zip(named['bucket'].to_pylist(), named['key'].to_pylist(), strict=True))

@@ -157,6 +157,21 @@ def listed(store: ObjectStore, source: Bucket, robot: str) -> list[PullState]:
     return found
 
 
+def unanswered(source: Bucket, robot: str) -> list[PullRequest]:
+    """The requests in the mailbox of a robot that have no last answer yet. Raises StoreError, LakeError."""
+    try:
+        entries = decode_inbox(source.get(inbox_key(robot), MOST_INBOX_BYTES))
+    except ObjectRefused as error:
+        if error.data.get('reason') == 'missing':
+            return []
+        raise
+    except RequestRefused as error:
+        raise LakeError(
+            f'the mailbox of {robot}: {error}', remedy='somebody damaged it: put an empty one in its place'
+        ) from error
+    return _requests(robot, _unanswered(source, robot, entries))
+
+
 def newest_answer(source: Bucket, robot: str, request: str) -> dict[str, Any] | None:
     """The newest answer to a request; None before the first one. What is none is left out. Raises StoreError."""
     numbers = []

@@ -29,6 +29,7 @@ from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.forgotten import forgotten
 from shadowhound_data_logger.lake.gaps import newest, watermarks
 from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.scan import Catalogue
@@ -41,6 +42,7 @@ from daft import DataFrame, Expression, col, lit  # isort: skip
 
 _MISSIONS: Final = re.compile(r'\bmissions\b', re.IGNORECASE)
 _LABELS: Final = re.compile(r'\blabels\b', re.IGNORECASE)
+_FORGOTTEN: Final = re.compile(r'\bforgotten\b', re.IGNORECASE)
 _GAPS: Final = re.compile(r'\b(gaps|watermarks)\b', re.IGNORECASE)
 _OF_OBJECTS: Final = ('near', 'mission_type', 'success', 'where', 'label')
 """Flags that gaps know nothing of."""
@@ -117,6 +119,8 @@ def sql(query: str, source: Bucket | None = None, *, findings: Findings | None =
         views['missions'] = _missions(chosen, asked)
     if _LABELS.search(query):
         views['labels'] = _labels(chosen, asked)
+    if _FORGOTTEN.search(query):
+        views['forgotten'] = _forgotten(chosen, asked)
     if _GAPS.search(query):
         views.update(_gaps(chosen, asked))
     with answering():
@@ -229,6 +233,22 @@ def _labels(lake: _Asked, asked: Wanted) -> DataFrame:
     rows = [asdict(each) for each in found if each.until_ns >= since_ns and each.since_ns < until_ns]
     names = [name for name in LABELS.columns if name not in _UNSEEN_OF_LABELS]
     return daft.from_arrow(pa.Table.from_pylist(rows, schema=narrow(names, LABELS)))
+
+
+def _forgotten(lake: _Asked, asked: Wanted) -> DataFrame:
+    """What was deleted on purpose, by its own time."""
+    if refused := [name for name in (*_OF_OBJECTS, 'mission') if getattr(asked, name) is not None]:
+        raise LakeError(f'forgotten cannot be selected by {" ".join(refused)}',
+                        remedy='select by robot, sensor, topic, since or until')  # fmt: skip
+    rows = forgotten(lake.source, asked.robot, lake.findings)
+    for name in ('sensor', 'topic'):
+        if (value := getattr(asked, name)) is not None:
+            rows = rows.filter(pc.equal(rows[name], value))
+    if asked.since_ns is not None:
+        rows = rows.filter(pc.greater_equal(rows['t_start_ns'], asked.since_ns))
+    if asked.until_ns is not None:
+        rows = rows.filter(pc.less(rows['t_start_ns'], asked.until_ns))
+    return daft.from_arrow(rows.select([name for name in rows.column_names if name != 'format_version']))
 
 
 def _gaps(lake: _Asked, asked: Wanted) -> dict[str, DataFrame]:

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 from shadowhound_data_logger.catalogue.gaps import GAPS, STATEMENT_KINDS
 from shadowhound_data_logger.catalogue.labels import LABEL_KINDS, LABELS
 from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
-from shadowhound_data_logger.catalogue.schema import KEPT, OBJECTS, TableSchema
+from shadowhound_data_logger.catalogue.schema import FORGOTTEN, KEPT, OBJECTS, TableSchema
 from shadowhound_data_logger.catalogue.statistics import STATISTICS
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.keys import is_name
@@ -64,6 +64,7 @@ _PAGE: Final = re.compile(
 _OWNER: Final = {
     OBJECTS.folder: 'key',
     KEPT.folder: 'key',
+    FORGOTTEN.folder: 'key',
     STATISTICS.folder: 'key',
     GAPS.folder: 'robot',
     LABELS.folder: 'robot',
@@ -71,7 +72,7 @@ _OWNER: Final = {
 """The column that says whose a row is, by the table's folder."""
 _COUNTS: Final = ('bytes', 'revision', 'merged', 'received', 'skipped', 'nan_count')
 _SPANS: Final = (('from_ns', 'to_ns'), ('since_ns', 'until_ns'))
-_TIMES: Final = ('t_start', 't_end', 't_from', 't_to', 'made')
+_TIMES: Final = ('t_start', 't_end', 't_from', 't_to', 'made', 'forgotten')
 _YEARS_US: Final = (-62_135_596_800_000_000, 253_402_300_799_999_999)
 """1 to 9999, those of a date."""
 UNREADABLE: Final = (pa.ArrowException, OSError, MemoryError, ValueError, LookupError, TypeError, OverflowError)
@@ -87,9 +88,9 @@ def tables(source: Bucket, entries: Sequence[ObjectInfo], columns: Sequence[str]
     schema = narrow(_needed(columns, of), of)
     rows = _Rows(schema, findings, of=of)
     for entry, body in _bodies(source, entries):
-        if rows.robot != _robot(entry.key) or rows.nbytes > BATCH_BYTES:
+        if rows.robot != of.robot_of(entry.key) or rows.nbytes > BATCH_BYTES:
             yield from rows.taken(columns)
-            rows = _Rows(schema, findings, _robot(entry.key), of)
+            rows = _Rows(schema, findings, of.robot_of(entry.key), of)
         for table, size in _contents(source, entry, body, schema, findings, wanted, of):
             rows.add(entry.key, table, size)
             if rows.nbytes > BATCH_BYTES:
@@ -104,7 +105,7 @@ def whole(source: Bucket, entries: Sequence[ObjectInfo], findings: Findings,
     schema = narrow(arrow_schema(of).names, of)
     for entry, body in _bodies(source, entries):
         found = Findings(lambda _: None)
-        rows = _Rows(schema, found, _robot(entry.key), of)
+        rows = _Rows(schema, found, of.robot_of(entry.key), of)
         for table, size in _contents(source, entry, body, schema, found, None, of):
             rows.add(entry.key, table, size)
         made = list(rows.taken(schema.names))
@@ -137,10 +138,6 @@ def footer(source: Bucket, entry: ObjectInfo) -> Mapping[bytes, bytes]:
 def _needed(columns: Sequence[str], of: TableSchema) -> list[str]:
     """In the order of the schema; what tells whose a row is, is always looked at."""
     return [name for name in arrow_schema(of).names if name in columns or name == _OWNER[of.folder]]
-
-
-def _robot(key: str) -> str:
-    return key.partition('/')[0]
 
 
 def _bodies(source: Bucket, entries: Sequence[ObjectInfo]) -> Iterator[tuple[ObjectInfo, bytes | ObjectRefused | None]]:

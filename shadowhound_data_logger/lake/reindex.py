@@ -15,7 +15,7 @@ from typing import Any, Final
 import pyarrow.compute as pc
 
 from shadowhound_data_logger.catalogue import parts
-from shadowhound_data_logger.catalogue.schema import BUCKET, Row, is_row, row_of
+from shadowhound_data_logger.catalogue.schema import BUCKET, FORGOTTEN, OBJECTS, Row, TableSchema, is_row, row_of
 from shadowhound_data_logger.catalogue.statistics import STATISTICS, statistic_rows
 from shadowhound_data_logger.encode.statistics import ALL
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
@@ -45,7 +45,7 @@ class Reindexed:
     added: int = 0
     parts: int = 0
     gone: int = 0
-    """Rows whose objects are not there any more; they stay."""
+    """Rows whose objects are not there any more, beside those that were forgotten; they stay."""
 
 
 def reindex(
@@ -58,7 +58,8 @@ def reindex(
     """
     check_name(robot, 'the robot name')
     found = Reindexed()
-    known = _known(source, robot, Findings() if findings is None else findings)
+    findings = Findings() if findings is None else findings
+    known = _keys(source, robot, findings)
     for bucket in buckets:
         place = Bucket(source.settings, bucket)
         entries = (entry for entry in place.list(f'{robot}/') if is_row(bucket, entry.key))
@@ -74,7 +75,8 @@ def reindex(
                 found.parts += 1
             found.added += len(rows)
             tell(found)
-    found.gone = sum(bucket in buckets for bucket, _ in known)
+    forgotten = _keys(source, robot, findings, FORGOTTEN) if known else set()
+    found.gone = sum(pair[0] in buckets and pair not in forgotten for pair in known)
     return found
 
 
@@ -120,9 +122,9 @@ def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Call
     return found
 
 
-def _known(source: Bucket, robot: str, findings: Findings) -> set[tuple[str, str]]:
-    entries = [entry for day in folders(source, Wanted(robot=robot), findings) for entry in day.entries]
-    found = tables(source, entries, KEY, findings)
+def _keys(source: Bucket, robot: str, findings: Findings, of: TableSchema = OBJECTS) -> set[tuple[str, str]]:
+    entries = [entry for day in folders(source, Wanted(robot=robot), findings, of) for entry in day.entries]
+    found = tables(source, entries, KEY, findings, of=of)
     return {pair for rows in found for pair in zip(*(rows[name].to_pylist() for name in KEY), strict=True)}
 
 

@@ -22,6 +22,7 @@ from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.forgotten import forgotten_entries, forgotten_names, without
 from shadowhound_data_logger.lake.live_files import Day, days, robots
 from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, arrow_schema
 from shadowhound_data_logger.lake.select import Wanted
@@ -65,10 +66,11 @@ class Catalogue(DataSource):
     async def get_tasks(self, pushdowns: Pushdowns) -> AsyncIterator[DataSourceTask]:
         columns = _columns(pushdowns)
         found = await _apart(lambda: folders(self._source, self._wanted, self._findings))
-        for day in found:
-            if day.is_backfilled:
-                yield self._parts(day.entries, columns, once=True)
-        for _, whole in groupby((day for day in found if not day.is_backfilled), lambda day: day.robot):
+        gone = await _apart(lambda: forgotten_entries(self._source, found, self._findings))
+        apart = [day for day in found if day.is_backfilled or (day.robot, day.date) in gone]
+        for day in apart:
+            yield self._parts(day.entries, columns, once=day.is_backfilled, gone=gone.get((day.robot, day.date), ()))
+        for _, whole in groupby((day for day in found if day not in apart), lambda day: day.robot):
             plain = [entry for day in whole for entry in day.entries]
             small = [entry for entry in plain if entry.size <= SMALL_BYTES]
             for start in range(0, len(small), PARTS_AT_A_TIME):
@@ -77,22 +79,24 @@ class Catalogue(DataSource):
                 if entry.size > SMALL_BYTES:
                     yield self._parts([entry], columns)
 
-    def _parts(self, entries: Sequence[ObjectInfo], columns: Sequence[str], *, once: bool = False) -> _Parts:
-        return _Parts(self._source, entries, columns, self._wanted, self._findings, once=once)
+    def _parts(self, entries: Sequence[ObjectInfo], columns: Sequence[str], *, once: bool = False,
+               gone: Sequence[ObjectInfo] = ()) -> _Parts:  # fmt: skip
+        return _Parts(self._source, entries, columns, self._wanted, self._findings, once=once, gone=gone)
 
 
 class _Parts(DataSourceTask):
     """Parts that are read together, from the store to batches of the columns that are needed."""
 
     def __init__(self, source: Bucket, entries: Sequence[ObjectInfo], columns: Sequence[str], wanted: Wanted,
-                 findings: Findings, *, once: bool) -> None:  # fmt: skip
-        """``once``: of rows with the same key and time one is kept."""
+                 findings: Findings, *, once: bool, gone: Sequence[ObjectInfo]) -> None:  # fmt: skip
+        """``once``: of rows with the same key and time one is kept. ``gone``: parts that name what was forgotten of them."""
         self._source = source
         self._entries = tuple(entries)
         self._columns = tuple(columns)
         self._wanted = wanted
         self._findings = findings
         self._once = once
+        self._gone = tuple(gone)
 
     @property
     def schema(self) -> daft.Schema:
@@ -109,10 +113,15 @@ class _Parts(DataSourceTask):
 
     def _tables(self) -> Generator[pa.Table, None, None]:
         wide = (*self._columns, *(name for name in ROW if name not in self._columns)) if self._once else self._columns
+        if self._gone:
+            wide = (*wide, *(name for name in KEY if name not in wide))
         if self._wanted.chosen:
             wide = (*wide, *(name for name in _TIMES if name not in wide))
         found = (_within(table, self._wanted)
                  for table in reading.tables(self._source, self._entries, wide, self._findings, self._wanted))  # fmt: skip
+        if self._gone:
+            names = forgotten_names(self._source, self._gone, self._findings)
+            found = (without(table, names) for table in found)
         if self._once:
             yield unrepeated(pa.concat_tables([reading.narrow(wide).empty_table(), *found])).select(self._columns)
         else:

@@ -322,16 +322,20 @@ class StorePast:
         import pyarrow.compute as pc  # noqa: PLC0415
 
         from shadowhound_data_logger.lake.findings import Findings  # noqa: PLC0415
+        from shadowhound_data_logger.lake.forgotten import forgotten_entries, forgotten_names, without  # noqa: PLC0415
         from shadowhound_data_logger.lake.live_files import days  # noqa: PLC0415
         from shadowhound_data_logger.lake.reading import narrow, tables  # noqa: PLC0415
 
         findings = Findings(lambda _: None)
         with ThreadPoolExecutor(4, 'past') as pool:
-            entries = [entry for day in days(self._source, [robot], [date], pool, findings) for entry in day.entries]
+            found = days(self._source, [robot], [date], pool, findings)
+        entries = [entry for day in found for entry in day.entries]
+        gone = forgotten_entries(self._source, found, findings)
+        names = forgotten_names(self._source, gone.get((robot, date), ()), findings)
         read: list[Any] = []
         rows = 0
         for table in tables(self._source, entries, _COLUMNS, findings):
-            read.append(table.slice(0, MOST_ROWS - rows))
+            read.append(without(table, names).slice(0, MOST_ROWS - rows))
             rows += len(read[-1])
             if rows >= MOST_ROWS:
                 break

@@ -12,6 +12,7 @@ from lake.making import NOON_NS, fill, folder_store
 from PIL import Image
 
 from shadowhound_data_logger.catalogue.gaps import GAP, statement
+from shadowhound_data_logger.cli.label import label
 from shadowhound_data_logger.cli.lake import lake
 
 
@@ -56,6 +57,38 @@ def test_reindex_says_what_it_found(home: Path) -> None:
     again = run(home, 'reindex', '--robot', 'thor')
     assert '0 were not in the catalogue' in again.output
     assert '192 rows name objects that are gone' in again.output
+
+
+def ended(home: Path, *arguments: str) -> Result:
+    """With what the verb itself returned."""
+    env = {'SHADOWHOUND_HOME': str(home), 'COLUMNS': '150', 'AWS_ENDPOINT_URL': ''}
+    return CliRunner().invoke(lake, arguments, env=env, standalone_mode=False)
+
+
+def test_prune_says_what_goes_and_asks_before_all_of_a_sensor_does(home: Path) -> None:
+    """Without a terminal it then does nothing; a dry run never does; what is referred to is named before it is forced."""
+    rules = ('prune', '--keep', 'camera 2026-10-29, odom forever, lidar 1d')
+    dry = ended(home, *rules, '--dry-run')
+    assert dry.return_value == 0
+    assert '48 objects' in dry.output
+    assert 'There are no objects of lidar' in dry.output
+    everything = ('prune', '--keep', 'camera 1d')
+    asked = ended(home, *everything)
+    assert asked.return_value == 1
+    assert 'all 96 objects of camera' in asked.output
+    assert 'Nothing is deleted' in asked.output
+    assert json.loads(ended(home, *everything, '--dry-run', '--json').output)['going'] == 96
+    env = {'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': ''}
+    assert CliRunner().invoke(label, ['add', 'keep', '--robot', 'thor', '--since', '2026-10-28T12:00', '--until',
+                                      '2026-10-28T12:00:20'], env=env).exit_code == 0  # fmt: skip
+    forced = ended(home, *rules, '--force')
+    assert forced.return_value == 1
+    assert 'referred to: 2 by a label. By: label keep.' in forced.output
+    assert '46 objects' in ended(home, *rules).output
+    assert 'There is nothing to delete' in ended(home, *rules).output
+    assert json.loads(ended(home, *rules, '--force', '--yes', '--json').output)['deleted'] == 2
+    assert (run(home, 'prune', '--keep', 'camera').exit_code, run(home, *rules, '--max-bytes', 'much').exit_code) == (2, 2)
+    assert ended(home, *rules, '--max-bytes', '1', '--dry-run').return_value == 1
 
 
 def test_bad_usage(home: Path) -> None:

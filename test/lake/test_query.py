@@ -94,18 +94,18 @@ def test_only_the_asked_days_are_asked_for(world: tuple[StoreSettings, list[sche
     assert source.asked == []
     frame.collect()
     assert {verb for verb, _ in source.asked} == {'folders', 'list', 'get'}
-    assert [key for verb, key in source.asked if verb == 'folders'] == ['']
+    assert [key for verb, key in source.asked if verb == 'folders'] == ['', '_forgotten/thor/']
     assert {key for verb, key in source.asked if verb == 'list'} == {'thor/_catalog/date=2026-10-28/'}
     assert all(key.startswith('thor/_catalog/date=2026-10-28/') for verb, key in source.asked if verb == 'get')
     assert len({key for verb, key in source.asked if verb == 'get'}) == 24
 
 
 def test_a_robot_that_is_named_is_not_looked_for(world: tuple[StoreSettings, list[schema.Row]]) -> None:
-    """One listing of one folder, then its parts."""
+    """One listing of one folder, and whether anything was forgotten; then its parts."""
     source = watched(world[0])
     lake.objects(source, robot='thor', **DAY).collect()
     assert [verb for verb, _ in source.asked].count('list') == 1
-    assert 'folders' not in {verb for verb, _ in source.asked}
+    assert [key for verb, key in source.asked if verb == 'folders'] == ['_forgotten/thor/']
 
 
 def test_sql_over_the_views(world: tuple[StoreSettings, list[schema.Row]]) -> None:

@@ -36,7 +36,7 @@ def offset() -> int:
 @pytest.fixture(scope='session')
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tower]:
     """SeaweedFS with the users of make_secrets.py, prepared by prepare.py."""
-    users = {name: make_secrets.actions(name) for name in ('mlflow', 'spark', 'thor', 'tachi')}
+    users = {name: make_secrets.actions(name) for name in ('mlflow', 'spark', 'prune', 'thor', 'tachi')}
     with Tower(tmp_path_factory.mktemp('tower'), users=users) as tower:
         with pytest.MonkeyPatch.context() as patch:
             for name, value in tower.environment().items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from argparse import ArgumentTypeError
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -11,15 +12,18 @@ from typing import Any
 
 import pytest
 from botocore.exceptions import ClientError
+from lake.making import add, add_part, row
 from tower_scripts import make_secrets, prepare
 
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.doctor.model import Severity
 from shadowhound_data_logger.doctor.s3 import RACED, race_mailboxes
 from shadowhound_data_logger.doctor.s3_put import single_requests
-from shadowhound_data_logger.errors import AccessDenied, ForeignObject
-from shadowhound_data_logger.lake import pull
+from shadowhound_data_logger.errors import AccessDenied, ForeignObject, LakeError
+from shadowhound_data_logger.lake import prune, pull
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.mailbox import KeptFilter, decode_inbox, inbox_key
 from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.sim.tower import Tower
@@ -145,6 +149,52 @@ def test_policies_are_read_by_robots_and_nothing_else_there(as_user: Connect) ->
     assert _is_denied(thor.copy_object, Bucket='lerobot', Key='policies/copy', CopySource=f'lerobot/{key}')
     for prefix in ('', 'policies/'):
         assert _is_denied(thor.list_objects_v2, Bucket='lerobot', Prefix=prefix)
+
+
+def test_old_data_is_deleted_by_one_user_alone(server: Tower, as_user: Connect, tmp_path: Path) -> None:
+    """`lake prune` with the keys of a robot, and with those of Spark, deletes nothing and writes no row; with its own it does."""
+    at_ns = 1_790_000_000 * SECOND
+    rows = [row('camera', at_ns + number * SECOND) for number in range(3)]
+    with closing(S3Store(server.store_settings('thor'), UploadSettings())) as robot:
+        robot.open()
+        for each in rows:
+            add(robot, tmp_path, each['key'], b'one')
+        add_part(robot, rows, 'part', tmp_path)
+    assert _is_denied(as_user('thor').put_object, Bucket='sensor-data', Key='_forgotten/thor/x', Body=b'one')
+    source = Bucket(server.store_settings('spark'), 'sensor-data')
+    rules, findings = prune.keep_rules('camera 1d', at_ns + 9 * 86_400 * SECOND), Findings()
+    made = prune.plan(source, rules, robot='thor', exported={}, findings=findings)
+    assert made.going == 3
+    how = {'now_ns': at_ns, 'findings': findings}
+    for user in ('thor', 'spark', 'prune'):
+        with closing(S3Store(server.store_settings(user), UploadSettings())) as store:
+            store.open()
+            if user == 'prune':
+                assert prune.apply(Bucket(server.store_settings(user), 'sensor-data'), store, made, **how).objects == 3
+            else:
+                with pytest.raises(LakeError, match='may not prune'):
+                    prune.apply(source, store, made, **how)
+                assert len(source.list('thor/camera/20260921/')) == 3
+                assert source.list('_forgotten/') == []
+    assert source.list('thor/camera/20260921/') == []
+    assert len(source.list('_forgotten/thor/')) == 2
+    assert _is_denied(as_user('prune').put_object, Bucket='lerobot', Key='x', Body=b'one')
+    assert _is_denied(as_user('prune').get_object, Bucket='mlflow', Key='x')
+
+
+def test_the_server_can_delete_by_age(as_user: Connect) -> None:
+    """As lifecycle rules of each robot's folder of a sensor; what is no such rule is refused."""
+    tower = as_user('tower')
+    before = tower.get_bucket_lifecycle_configuration(Bucket='sensor-data')['Rules']
+    assert prepare.prepare(tower, ['thor', 'tachi'], [prepare.expiry_of('camera=90')]) == []
+    found = {rule['ID']: rule for rule in tower.get_bucket_lifecycle_configuration(Bucket='sensor-data')['Rules']}
+    assert found['expire-thor-camera']['Expiration']['Days'] == 90
+    assert found['expire-tachi-camera']['Filter']['Prefix'] == 'tachi/camera/'
+    prepare.prepare(tower, ['thor', 'tachi'])
+    assert tower.get_bucket_lifecycle_configuration(Bucket='sensor-data')['Rules'] == before
+    for text in ('camera', 'camera=0', 'camera=x', '../x=1', '_ledger=1'):
+        with pytest.raises(ArgumentTypeError):
+            prepare.expiry_of(text)
 
 
 def test_mlflow_has_its_bucket_alone(as_user: Connect) -> None:

@@ -1,0 +1,524 @@
+"""``lake prune``: deletes objects that rules name, and leaves a row of each that says so.
+
+In this order: a part with the rows of what goes (``catalogue/schema.py``, ``FORGOTTEN``), statements of the gap journal, the
+objects, and a mark beside the part that says that they are deleted. So a run may be killed at any moment, and two may run at
+once: a row may say for a while that an object is gone that is still there, which the next run mends, but never the reverse.
+
+What a rule does not name stays, and so does what a data set, a label or an open request of a robot's mailbox refers to. A bag,
+and what a mission stored, goes as a whole or not at all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from bisect import bisect_left
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from itertools import groupby
+from typing import Final, NamedTuple
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.catalogue import gaps as journal
+from shadowhound_data_logger.catalogue import parts
+from shadowhound_data_logger.catalogue.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, Row
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.errors import AccessDenied, BagDamaged, LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.lake import labels, pull
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.forgotten import forgotten_entries, forgotten_names, without
+from shadowhound_data_logger.lake.gaps import HOUR_NS, OBJECTS
+from shadowhound_data_logger.lake.live_files import Day, robots
+from shadowhound_data_logger.lake.reading import narrow, tables
+from shadowhound_data_logger.lake.scan import KEY, folders
+from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.mailbox import KeptFilter
+from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.retry import steadily
+from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.times import moment
+from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES
+
+FOREVER: Final = 'forever'
+BAGS, EVENTS = 'bags', 'events'
+"""What recordings are called in a rule: those of events apart, as their manifest tells them."""
+BAG_SENSORS: Final = frozenset({'bag', 'rosbags'})
+MISSIONS: Final = 'missions'
+EXPORT, LABEL, REQUEST, UNTOLD = 'data set', 'label', 'request', 'no manifest'
+"""Why something stays that a rule names."""
+MOST_ROWS: Final = 10_000
+"""Of a part."""
+MOST_NAMES: Final = 20
+"""Of what refers to objects of a sensor, in an answer."""
+DELETED: Final = '.deleted'
+"""Follows the key of a part whose objects are deleted."""
+KIND, CAUSE = 'forgotten', 'retention'
+"""Of the gaps."""
+RULES: Final = "a text such as 'camera 90d, lidar 14d, events forever': a sensor and for how long to keep it, as often as needed"
+DAY_NS: Final = 24 * HOUR_NS
+_RULE: Final = re.compile(r'([A-Za-z0-9][\w-]*)\s+(\S+)', re.ASCII)
+_DATE: Final = re.compile(r'(?<!\d)20\d{6}(?!\d)', re.ASCII)
+_SIZE: Final = re.compile(r'(\d{1,15}(?:\.\d{1,9})?)\s*([kMGTP]?)(i?)B?', re.ASCII)
+_COLUMNS: Final = ('robot', 'sensor', 'topic', 'bucket', 'key', 'bytes', 't_start', 't_start_ns', 't_end_ns', 'count',
+                   'mission_id', 'run_id', 'mission_type', 'x', 'y')  # fmt: skip
+
+
+class RetentionRule(NamedTuple):
+    """For how long the objects of a sensor stay."""
+
+    sensor: str
+    text: str
+    since_ns: int | None
+    """Those that ended before it go; None: never."""
+
+
+def keep_rules(text: str, now_ns: int) -> tuple[RetentionRule, ...]:
+    """Raises SettingError for what are no rules."""
+    found: dict[str, RetentionRule] = {}
+    for part in text.split(','):
+        match = _RULE.fullmatch(part.strip())
+        if match is None:
+            raise SettingError('--keep', text, RULES)
+        sensor = BAGS if match[1] in BAG_SENSORS else match[1]
+        if sensor in found:
+            raise SettingError('--keep', text, f'one rule for each sensor, and there are two for {sensor}')
+        since_ns = None if match[2] == FOREVER else moment('--keep', match[2], now_ns)
+        if since_ns is not None and since_ns > now_ns:
+            raise SettingError('--keep', text, f'a time that has passed, which {match[2]} has not')
+        found[sensor] = RetentionRule(sensor, f'{sensor} {match[2]}', since_ns)
+    return tuple(found.values())
+
+
+def size_of(text: str) -> int:
+    """Bytes of ``2TB``, ``500 GB`` or ``1TiB``. Raises SettingError."""
+    match = _SIZE.fullmatch(text.strip())
+    if match is None:
+        raise SettingError('--max-bytes', text, 'a size such as 500GB, 2TB or 2TiB')
+    return int(float(match[1]) * (1024 if match[3] else 1000) ** ' kMGTP'.index(match[2] or ' '))
+
+
+@dataclass(slots=True)
+class PrunedSensor:
+    """What the store has of a sensor, and what of it goes."""
+
+    sensor: str
+    rule: str = ''
+    objects: int = 0
+    bytes: int = 0
+    going: int = 0
+    going_bytes: int = 0
+    protected: Counter[str] = field(default_factory=Counter)
+    """Why -> how many objects stay that the rules would let go."""
+    referrers: set[str] = field(default_factory=set)
+    """Which data sets, labels and requests refer to those, the first of them."""
+
+    @property
+    def is_all(self) -> bool:
+        """Whether nothing of it would be left."""
+        return 0 < self.objects == self.going
+
+
+class Protection:
+    """What must stay, whatever the rules say: objects and times by what refers to them."""
+
+    def __init__(self, exported: Mapping[tuple[str, str], str] | None = None, labelled: Iterable[labels.Label] = (),
+                 requests: Mapping[str, Sequence[tuple[str, KeptFilter]]] | None = None) -> None:  # fmt: skip
+        self._exported = exported or {}
+        self._requests = requests or {}
+        self._keys: dict[tuple[str, str], str] = {}
+        self._spans: defaultdict[str, list[tuple[int, int, str]]] = defaultdict(list)
+        for each in labelled:
+            if each.key is not None:
+                self._keys[each.bucket or BUCKET, each.key] = each.label
+            else:
+                self._spans[each.robot].append((each.since_ns, each.until_ns, each.label))
+        self._latest: dict[str, list[int]] = {}
+        for robot, spans in self._spans.items():
+            spans.sort()
+            latest = 0
+            self._latest[robot] = [latest := max(latest, until_ns) for _, until_ns, _ in spans]
+
+    def why(self, row: Row) -> tuple[str, str] | None:
+        """Why an object stays, and what refers to it; None where nothing does."""
+        name = row['bucket'], row['key']
+        if (data_set := self._exported.get(name)) is not None:
+            return EXPORT, data_set
+        if (label := self._keys.get(name) or self._label_of(row)) is not None:
+            return LABEL, label
+        metadata = {word: row[word] for word in (words.MISSION_ID, words.RUN_ID, words.MISSION_TYPE) if row[word] is not None}
+        if row['x'] is not None and row['y'] is not None:
+            metadata[words.POSE] = f'{row["x"]} {row["y"]} 0 odom'
+        begin_ns, end_ns = row['t_start_ns'], _end_ns(row)
+        for request, want in self._requests.get(row['robot'], ()):
+            if want.takes(row['key'], row['sensor'] or '', row['topic'], begin_ns, end_ns, metadata):
+                return REQUEST, request
+        return None
+
+    def _label_of(self, row: Row) -> str | None:
+        """Of a time into which the object reaches."""
+        spans, latest = self._spans.get(row['robot'], []), self._latest.get(row['robot'], [])
+        first = bisect_left(latest, row['t_start_ns'])
+        end_ns = _end_ns(row)
+        for since_ns, until_ns, label in spans[first:]:
+            if since_ns > end_ns:
+                return None
+            if until_ns >= row['t_start_ns']:
+                return label
+        return None
+
+
+@dataclass(slots=True)
+class PrunePlan:
+    """What a prune would do; ``apply`` does it."""
+
+    rules: tuple[RetentionRule, ...]
+    robots: tuple[str, ...]
+    sensors: dict[str, PrunedSensor]
+    is_forced: bool
+    protection: Protection = field(repr=False)
+    cut_ns: int = 0
+    """Because of the size, what ended before goes as well, of sensors that a rule does not keep forever."""
+    over_bytes: int = 0
+    """So much is left beyond the size that was asked for."""
+    groups: dict[str, _Group] = field(repr=False, default_factory=dict)
+
+    @property
+    def going(self) -> int:
+        return sum(each.going for each in self.sensors.values())
+
+    @property
+    def going_bytes(self) -> int:
+        return sum(each.going_bytes for each in self.sensors.values())
+
+    def since_ns(self, sensor: str) -> int | None:
+        """What of a sensor ended before goes; None where nothing does."""
+        found = next((rule.since_ns for rule in self.rules if rule.sensor == sensor), None)
+        return None if found is None else max(found, self.cut_ns)
+
+
+@dataclass(slots=True)
+class Pruned:
+    """What a prune did."""
+
+    objects: int = 0
+    bytes: int = 0
+    mended: int = 0
+    """Objects that an earlier run had a row for and that it may not have deleted."""
+
+
+def protection(source: Bucket, named: Sequence[str], exported: Mapping[tuple[str, str], str]) -> Protection:
+    """What the store says of these robots, with (bucket, key) -> data set of what was exported.
+
+    Raises LakeError where a label or a mailbox cannot be read: what it refers to is not known then. Raises StoreError.
+    """
+    left_out = Findings(lambda _: None)
+    found = [one for name in named for one in labels.read(source, name, findings=left_out)]
+    for one in left_out:
+        raise LakeError(f'the labels cannot be read: {one}', remedy='move the part away: nothing is deleted until they can')
+    requests = {name: [(each.id, each.want) for each in pull.unanswered(source, name)] for name in named}
+    return Protection(exported, found, requests)
+
+
+@dataclass(slots=True)
+class _Group:
+    """Objects that go together: those of a bag, or of a mission."""
+
+    sensor: str
+    robot: str
+    prefix: str
+    begin_ns: int
+    end_ns: int
+    objects: int = 0
+    bytes: int = 0
+    why: tuple[str, str] | None = None
+    manifest: Manifest | None = None
+
+
+def plan(source: Bucket, rules: Sequence[RetentionRule], *, robot: str | None = None, exported: Mapping[tuple[str, str], str],  # noqa: PLR0913
+         most_bytes: int | None = None, is_forced: bool = False, findings: Findings,
+         tell: Callable[[str], None] = lambda _: None) -> PrunePlan:  # fmt: skip
+    """What goes by these rules and, where that leaves more than ``most_bytes``, the oldest days of what they name beside.
+
+    Raises LakeError, StoreError.
+    """
+    named = tuple([robot] if robot else robots(source))
+    made = PrunePlan(tuple(rules), named, {}, is_forced, protection(source, named, exported))
+    for rule in rules:
+        made.sensors[rule.sensor] = PrunedSensor(rule.sensor, rule.text)
+    counts = _Counts(made)
+    for rows in _by_day(source, named, findings, tell):
+        for row in rows:
+            counts.total += row['size']
+            if row['group'] is None:
+                counts.add(row['name'], row['objects'], row['size'], row['end_ns'], lambda row=row: made.protection.why(row))  # type: ignore[misc]
+            else:
+                _grouped(made, row)
+    for group in made.groups.values():
+        if group.sensor == BAGS:
+            _tell_events_apart(source, group)
+        counts.add(group.sensor, group.objects, group.bytes, group.end_ns, lambda group=group: group.why)  # type: ignore[misc]
+    if most_bytes is not None:
+        counts.cut(most_bytes)
+    return made
+
+
+class _Counts:
+    """Adds up what of each sensor there is, and what of it goes."""
+
+    def __init__(self, made: PrunePlan) -> None:
+        self._made = made
+        self._younger: defaultdict[int, dict[str, list[int]]] = defaultdict(dict)
+        self.total = 0
+        """Bytes of all objects."""
+
+    def add(self, sensor: str, objects: int, size: int, end_ns: int, ask_why: Callable[[], tuple[str, str] | None]) -> None:
+        one = self._made.sensors.setdefault(sensor, PrunedSensor(sensor))
+        one.objects += objects
+        one.bytes += size
+        since_ns = self._made.since_ns(sensor)
+        if since_ns is None:
+            return
+        why = ask_why()
+        is_free = why is None or self._made.is_forced
+        if end_ns < since_ns and why is not None:
+            one.protected[why[0]] += objects
+            if len(one.referrers) < MOST_NAMES:
+                one.referrers.add(f'{why[0]} {why[1]}')
+        if end_ns < since_ns and is_free:
+            one.going += objects
+            one.going_bytes += size
+        elif is_free:
+            day = self._younger[end_ns // DAY_NS].setdefault(sensor, [0, 0])
+            day[0] += objects
+            day[1] += size
+
+    def cut(self, most_bytes: int) -> None:
+        """Let the oldest days go as well, until so much is left."""
+        left = self.total - self._made.going_bytes
+        for day in sorted(self._younger):
+            if left <= most_bytes:
+                break
+            self._made.cut_ns = (day + 1) * DAY_NS
+            for sensor, (objects, size) in self._younger[day].items():
+                self._made.sensors[sensor].going += objects
+                self._made.sensors[sensor].going_bytes += size
+                left -= size
+        self._made.over_bytes = max(0, left - most_bytes)
+
+
+def apply(source: Bucket, store: ObjectStore, made: PrunePlan, *, now_ns: int, findings: Findings,
+          tell: Callable[[str], None] = lambda _: None) -> Pruned:  # fmt: skip
+    """Do what was planned, after what an earlier run left undone. Raises LakeError, StoreError: a later run goes on."""
+    done = Pruned()
+    try:
+        for robot in made.robots:
+            done.mended += _settle(source, store, robot, findings, tell)
+            for rows in _by_day(source, [robot], findings, tell):
+                going = [row for row in rows if _goes(made, row)]
+                _state_bags(store, made, going)
+                for _, date, numbered in parts.by_folder(enumerate(going)):
+                    some = [_forgotten_row(made, row, now_ns) for _, row in numbered]
+                    for start in range(0, len(some), MOST_ROWS):
+                        part = some[start : start + MOST_ROWS]
+                        name = f'{date.replace("-", "")}_{_digest(part)}'
+                        put_part(store, FORGOTTEN.part_key(robot, date, name), robot, parts.encode(part, FORGOTTEN), len(part))
+                done.objects += sum(row['objects'] for row in going)
+                done.bytes += sum(row['size'] for row in going)
+            _settle(source, store, robot, findings, tell)
+    except AccessDenied as error:
+        raise LakeError(f'these credentials may not prune: {error.what}',
+                        remedy='use those of the user `prune` (docs/tower.md)') from error  # fmt: skip
+    return done
+
+
+def _goes(made: PrunePlan, row: Row) -> bool:
+    group = None if row['group'] is None else made.groups.get(row['group'])
+    if row['group'] is not None and group is None:
+        return False  # it came after the plan was made
+    sensor, end_ns = (row['name'], row['end_ns']) if group is None else (group.sensor, max(group.end_ns, row['end_ns']))
+    since_ns = made.since_ns(sensor)
+    if since_ns is None or end_ns >= since_ns:
+        return False
+    why = made.protection.why(row) if group is None else group.why
+    return why is None or made.is_forced
+
+
+def _by_day(source: Bucket, named: Sequence[str], findings: Findings, tell: Callable[[str], None]) -> Iterator[list[Row]]:
+    """The rows of what the store has, the newest day of a robot first; no object twice in a day.
+
+    Each with ``name`` (what a rule calls its sensor), ``group``, ``end_ns``, and how many ``objects`` of which ``size`` it adds.
+    An object that a later row names as its content (a repeat) is as old as that row.
+    """
+    for robot in named:
+        found = sorted(folders(source, Wanted(robot=robot), findings), key=lambda day: day.date, reverse=True)
+        gone = forgotten_entries(source, found, findings)
+        later: dict[tuple[str, str], int] = {}
+        for day in found:
+            tell(f'{robot} {day.date}')
+            yield list(_rows_of(source, day, gone.get((robot, day.date), ()), later, findings))
+
+
+def _rows_of(source: Bucket, day: Day, gone: Sequence[ObjectInfo], later: dict[tuple[str, str], int],
+             findings: Findings) -> Iterator[Row]:  # fmt: skip
+    found = pa.concat_tables([narrow(_COLUMNS).empty_table(), *tables(source, day.entries, _COLUMNS, findings)])
+    found = without(found, forgotten_names(source, gone, findings))
+    found = found.filter(pc.and_(pc.is_valid(found['t_start']), pc.is_valid(found['t_start_ns'])))
+    compact_date = day.date.replace('-', '')
+    newest: dict[tuple[str, str], Row] = {}
+    for row in found.sort_by('t_start_ns').to_pylist():
+        name = row['bucket'], row['key']
+        row['end_ns'] = max(_end_ns(row), _key_ns(row['key']))
+        if name in newest:
+            newest[name]['end_ns'] = max(newest[name]['end_ns'], row['end_ns'])
+        else:
+            newest[name] = row
+    for name, row in newest.items():
+        row['name'], row['group'] = _group_of(row)
+        row['objects'], row['size'] = 1, row['bytes']
+        if name in later:  # it was counted with the later row
+            row['objects'] = row['size'] = 0
+            row['end_ns'] = max(row['end_ns'], later[name])
+        if compact_date not in row['key']:
+            later[name] = row['end_ns']
+        yield row
+
+
+def _group_of(row: Row) -> tuple[str, str | None]:
+    sensor = row['sensor'] or ''
+    place = row['key'].split('/')
+    if sensor in BAG_SENSORS:
+        return BAGS, f'{row["bucket"]}/{"/".join(place[:3])}/' if len(place) > 3 else None
+    if sensor == MISSIONS:
+        return MISSIONS, f'{row["bucket"]}/{"/".join(place[:3])}/' if len(place) > 3 else None
+    return sensor, None
+
+
+def _grouped(made: PrunePlan, row: Row) -> None:
+    group = made.groups.get(row['group'])
+    if group is None:
+        group = _Group(row['name'], row['robot'], row['group'].partition('/')[2], row['t_start_ns'], row['end_ns'])
+        made.groups[row['group']] = group
+    group.begin_ns, group.end_ns = min(group.begin_ns, row['t_start_ns']), max(group.end_ns, row['end_ns'])
+    group.objects += row['objects']
+    group.bytes += row['size']
+    group.why = group.why or made.protection.why(row)
+
+
+def _tell_events_apart(source: Bucket, group: _Group) -> None:
+    """By the manifest. Of a bag without one nobody knows whether an event made it, or whether it still grows: it stays."""
+    try:
+        body = source.get(f'{group.prefix}manifest.json', MOST_DOCUMENT_BYTES)
+        group.manifest = Manifest.from_json(body)
+    except (ObjectRefused, BagDamaged):
+        group.why = group.why or (UNTOLD, group.prefix)
+        return
+    group.sensor = BAGS if group.manifest.event is None else EVENTS
+
+
+def _end_ns(row: Row) -> int:
+    start_ns: int = row['t_start_ns']
+    return max(start_ns, row['t_end_ns'] or start_ns)
+
+
+def _key_ns(key: str) -> int:
+    """The latest date in a key, 0 where it has none: a robot may write a row with an older one, but not another key."""
+    found = 0
+    for date in _DATE.findall(key):
+        with suppress(ValueError):
+            day = datetime.strptime(date, '%Y%m%d').replace(tzinfo=timezone.utc)
+            found = max(found, round(day.timestamp()) * SECOND)
+    return found
+
+
+def _forgotten_row(made: PrunePlan, row: Row, now_ns: int) -> Row:
+    of = row['name'] if row['group'] is None else made.groups[row['group']].sensor
+    rule = next(rule.text for rule in made.rules if rule.sensor == of)
+    told = {name: row[name] for name in FORGOTTEN.columns if name in row}
+    return {**told, 't_start': row['t_start_ns'] // 1000, 'rule': rule, 'forgotten': now_ns // 1000, 'forgotten_ns': now_ns,
+            'format_version': FORMAT_VERSION}  # fmt: skip
+
+
+def _digest(rows: Iterable[Row]) -> str:
+    names = sorted(f'{row["bucket"]}/{row["key"]}' for row in rows)
+    return hashlib.sha256('\n'.join(names).encode()).hexdigest()[:16]
+
+
+# -- what was begun ------------------------------------------------------------------------------------------------------------
+
+
+def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, tell: Callable[[str], None]) -> int:
+    """Delete what has a row and is not marked as deleted yet; how many objects that were."""
+    listed = source.list(FORGOTTEN.prefix(robot))
+    marks = {entry.key for entry in listed if entry.key.endswith(DELETED)}
+    entries = [entry for entry in listed if entry.key.endswith('.parquet')]
+    pending = [entry for entry in entries if entry.key + DELETED not in marks]
+    for _, of_date in groupby(pending, _folder):
+        folder = _folder(next(of_date))
+        _state(store, robot, source, [entry for entry in entries if _folder(entry) == folder], findings)
+    done = 0
+    with ThreadPoolExecutor(THREADS, 'prune') as pool:
+        for entry in pending:
+            keys = {pair for rows in tables(source, [entry], KEY, findings, of=FORGOTTEN)
+                    for pair in zip(*(rows[name].to_pylist() for name in KEY), strict=True)}  # fmt: skip
+            tell(f'{robot}: deleting {len(keys):,} objects')
+            for _ in pool.map(lambda pair: steadily(lambda: store.delete(*pair)), sorted(keys)):
+                done += 1
+            put_part(store, entry.key + DELETED, robot, b'{}\n', len(keys))
+    return done
+
+
+def _folder(entry: ObjectInfo) -> str:
+    return entry.key.rpartition('/')[0]
+
+
+def _state(store: ObjectStore, robot: str, source: Bucket, entries: Sequence[ObjectInfo], findings: Findings) -> None:
+    """Statements of the gap journal about all of a date that is forgotten, one for each topic and hour; the last one counts."""
+    hours: defaultdict[tuple[str, int], dict[tuple[str, str], Row]] = defaultdict(dict)
+    for rows in tables(source, entries, tuple(FORGOTTEN.columns), findings, of=FORGOTTEN):
+        for row in rows.to_pylist():
+            if row['topic'] is not None:
+                hours[row['topic'], row['t_start_ns'] // HOUR_NS][row['bucket'], row['key']] = row
+    found = []
+    for (topic, hour), of_hour in sorted(hours.items()):
+        rows_of = list(of_hour.values())
+        first, last = min(row['t_start_ns'] for row in rows_of), max(_end_ns(row) for row in rows_of)
+        period_ns = (max(row['t_start_ns'] for row in rows_of) - first) // (len(rows_of) - 1) if len(rows_of) > 1 else SECOND
+        counts = [row['count'] for row in rows_of]
+        found.append(journal.statement(
+            robot, journal.GAP, journal.name_of(KIND, OBJECTS, topic, hour), len(rows_of), sink=OBJECTS, topic=topic, kind=KIND,
+            cause=CAUSE, from_ns=first, to_ns=max(last + 1, min(last + period_ns, (hour + 1) * HOUR_NS)),
+            count=None if None in counts else sum(counts), grade='exact',
+        ))  # fmt: skip
+    _put_statements(store, robot, found)
+
+
+def _state_bags(store: ObjectStore, made: PrunePlan, going: Iterable[Row]) -> None:
+    """Of each bag that goes, one statement for each topic: what was in it only its manifest tells, which goes as well."""
+    for name in sorted({row['group'] for row in going if row['group'] is not None}):
+        group = made.groups[name]
+        if group.manifest is None:
+            continue
+        _put_statements(store, group.robot, [
+            journal.statement(
+                group.robot, journal.GAP, journal.name_of(KIND, group.sensor, one.topic, name), 1, sink=group.sensor,
+                topic=one.topic, kind=KIND, cause=CAUSE, from_ns=group.begin_ns, to_ns=group.end_ns + 1, count=one.messages,
+                grade='exact',
+            ) for one in group.manifest.topics if one.messages
+        ])  # fmt: skip
+
+
+def _put_statements(store: ObjectStore, robot: str, found: Sequence[journal.Statement]) -> None:
+    for date, rows in groupby(sorted(found, key=journal.date_of), journal.date_of):
+        part = list(rows)
+        said = '\n'.join(f'{row["id"]} {row["revision"]}' for row in part)
+        name = f'{date.replace("-", "")}_{KIND}_{hashlib.sha256(said.encode()).hexdigest()[:16]}'
+        put_part(store, journal.GAPS.part_key(robot, date, name), robot, parts.encode(part, journal.GAPS), len(part))

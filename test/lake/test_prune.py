@@ -1,0 +1,386 @@
+"""Pruning deletes what rules name and nothing else, says so of each object, and may die anywhere."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import threading
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lake.making import DAY_NS, MINUTE_NS, NOON_NS, add, add_part, content, folder_store, row
+
+from shadowhound_data_logger import lake
+from shadowhound_data_logger.bags.manifest import EventOf, Manifest, RecordedTopic
+from shadowhound_data_logger.catalogue import schema
+from shadowhound_data_logger.catalogue.gaps import complete
+from shadowhound_data_logger.catalogue.parts import encode
+from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import AccessDenied, LakeError, SettingError
+from shadowhound_data_logger.lake import compact as compaction
+from shadowhound_data_logger.lake import gaps, labels, prune, pull, verify
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.forgotten import dates_of_deletion, forgotten
+from shadowhound_data_logger.lake.reindex import reindex
+from shadowhound_data_logger.mailbox import KeptFilter
+from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.ship.audit import audit
+from shadowhound_data_logger.stores import open_store
+
+NOW_NS = NOON_NS + 10 * DAY_NS
+RULES = 'camera 5d, bags 5d, events forever'
+AGES = range(10)
+"""Days before now of which there are rows."""
+
+
+class Dead(Exception):
+    """The process died here."""
+
+
+class MortalStore:
+    """A store of a process that dies at the nth thing that it does."""
+
+    def __init__(self, inner: Any, life: int) -> None:
+        self._inner, self._life, self._lock = inner, life, threading.Lock()
+
+    def _live(self) -> None:
+        with self._lock:
+            if self._life == 0:
+                raise Dead
+            self._life -= 1
+
+    def put(self, item: Any) -> Any:
+        self._live()
+        return self._inner.put(item)
+
+    def delete(self, bucket: str, key: str) -> None:
+        self._live()
+        self._inner.delete(bucket, key)
+
+
+def _source(settings: StoreSettings) -> Bucket:
+    return Bucket(settings, schema.BUCKET)
+
+
+def _fill(settings: StoreSettings, folder: Path) -> None:
+    """Three objects of two sensors a day, with their content, at noon."""
+    with closing(open_store(settings, UploadSettings())) as store:
+        for age in AGES:
+            rows = [row(sensor, NOW_NS - age * DAY_NS + second * SECOND) for second in range(3) for sensor in ('camera', 'odom')]
+            for each in rows:
+                add(store, folder, each['key'], content(each['sensor'], each['t_start_ns']))
+            add_part(store, rows, f'day{age}', folder)
+
+
+def _add_bag(settings: StoreSettings, folder: Path, name: str, begin_ns: int, *, is_event: bool = False,
+             has_manifest: bool = True) -> list[str]:  # fmt: skip
+    """A bag of two slices, a day apart."""
+    event = EventOf('fall', 1.0, 1.0, 1.0, ()) if is_event else None
+    manifest = Manifest(name, 'thor', None, 'complete', (), (RecordedTopic('/imu', 'sensor_msgs/msg/Imu', 7),), (), event)
+    prefix = f'thor/rosbags/{name}/'
+    bodies = {f'{prefix}{name}_0.mcap': (b'zero', begin_ns), f'{prefix}{name}_1.mcap': (b'one', begin_ns + DAY_NS)}
+    if has_manifest:
+        bodies[f'{prefix}manifest.json'] = manifest.to_json(), begin_ns
+    with closing(open_store(settings, UploadSettings())) as store:
+        for number, (key, (body, at_ns)) in enumerate(bodies.items()):
+            said = {'robot': 'thor', 'sensor': 'bag', 't_start_ns': str(at_ns), 't_end_ns': str(at_ns + SECOND)}
+            add(store, folder, key, body, said)
+            add_part(store, [schema.row_of(schema.BUCKET, key, len(body), '', said)], f'{name}{number}', folder)
+    return sorted(bodies)
+
+
+def _plan(settings: StoreSettings, rules: str = RULES, **how: Any) -> prune.PrunePlan:
+    found = {'exported': {}, 'findings': Findings(), **how}
+    return prune.plan(_source(settings), prune.keep_rules(rules, NOW_NS), **found)
+
+
+def _run(settings: StoreSettings, rules: str = RULES, store: Any = None, **how: Any) -> prune.Pruned:
+    made = _plan(settings, rules, **how)
+    with closing(open_store(settings, UploadSettings())) as own:
+        return prune.apply(_source(settings), store or own, made, now_ns=NOW_NS, findings=Findings())
+
+
+def _stored(settings: StoreSettings, *sensors: str) -> list[str]:
+    """What the store has, without the catalogue."""
+    found = [entry.key for entry in _source(settings).list('thor/') if schema.is_row(schema.BUCKET, entry.key)]
+    return sorted(key for key in found if not sensors or key.split('/')[1] in sensors)
+
+
+def _answer(settings: StoreSettings) -> list[str]:
+    return sorted(lake.objects(_source(settings)).select('key').to_pydict()['key'])
+
+
+def _check(settings: StoreSettings) -> None:
+    """The catalogue names what the store has, and of what it does not name there is a row that says when it went."""
+    source, left_out = _source(settings), Findings()
+    assert _answer(settings) == _stored(settings)
+    rows = verify.rows(source, left_out)
+    with closing(open_store(settings, UploadSettings())) as store, verify.Unfinished(rows, settings.directory / 'v', '') as left:
+        found = audit(left, store)
+    assert (found.counts, len(left_out)) == ({}, 0)
+
+
+@pytest.fixture(scope='module')
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('filled')
+    _fill(folder_store(folder), folder / 'tmp')
+    return folder
+
+
+@pytest.fixture
+def settings(filled: Path, tmp_path: Path) -> StoreSettings:
+    shutil.copytree(filled / 'store', tmp_path / 'store')
+    return folder_store(tmp_path)
+
+
+def test_what_a_rule_names_goes_and_nothing_else(settings: StoreSettings) -> None:
+    """By sensor and age. The catalogue names the rest, the rows of what went say when, and a second run finds nothing."""
+    before = _stored(settings)
+    done = _run(settings)
+    old = [key for key in before if '/camera/' in key and key.split('/')[2] < '20261102']
+    assert len(old) == 12
+    assert (done.objects, _stored(settings)) == (12, sorted({*before} - {*old}))
+    _check(settings)
+    rows = forgotten(_source(settings), None, Findings())
+    assert sorted(rows['key'].to_pylist()) == old
+    assert {*rows['rule'].to_pylist()} == {'camera 5d'}
+    assert {*dates_of_deletion(rows).values()} == {f'{utc(NOW_NS):%Y-%m-%d}'}
+    assert _run(settings) == prune.Pruned()
+    asked = "SELECT count(*) AS n, sum(count) AS messages FROM forgotten WHERE sensor = 'camera'"
+    assert lake.sql(asked, _source(settings)).to_pydict() == {'n': [12], 'messages': [12]}
+    with closing(open_store(settings, UploadSettings())) as store:
+        assert reindex(_source(settings), store, 'thor').gone == 0
+
+
+def test_the_gap_journal_says_what_was_deleted(settings: StoreSettings, tmp_path: Path) -> None:
+    """Of each hour one gap with its messages, which a later prune of more of that hour replaces."""
+    began_ns = NOW_NS - 9 * DAY_NS
+    with closing(open_store(settings, UploadSettings())) as store:
+        said = complete('thor', 'j', 1, sink='objects', topic='/camera/compressed', session=1, from_ns=began_ns,
+                        to_ns=NOW_NS, grade='exact', received=60, skipped=0)  # fmt: skip
+        body = encode([said], gaps.GAPS)
+        add(store, tmp_path / 'tmp', gaps.GAPS.part_key('thor', f'{utc(NOW_NS):%Y-%m-%d}', 'mark'), body, {'robot': 'thor'})
+    first = row('camera', began_ns)
+    _run(settings, exported={(first['bucket'], first['key']): 'a set'})
+    known = gaps.known('thor', '/camera/compressed', began_ns, NOW_NS, source=_source(settings))
+    assert [(gap.kind, gap.cause, gap.count) for gap in known.gaps] == [('forgotten', 'retention', 2)] + [
+        ('forgotten', 'retention', 3)] * 3  # fmt: skip
+    assert not known.between(began_ns + DAY_NS, began_ns + DAY_NS + 2 * SECOND).is_whole
+    assert known.between(NOW_NS - DAY_NS, NOW_NS).is_whole
+    _run(settings)
+    known = gaps.known('thor', '/camera/compressed', began_ns, NOW_NS, source=_source(settings))
+    assert [gap.count for gap in known.gaps] == [3] * 4
+
+
+def test_what_something_refers_to_stays(settings: StoreSettings) -> None:
+    """A data set, a label of a time or of an object, and a request that is open, each counted and named; force overrides."""
+    source = _source(settings)
+    exported, labelled, asked = (row('camera', NOW_NS - age * DAY_NS) for age in (9, 8, 7))
+    at_ns = NOW_NS - 6 * DAY_NS
+    with closing(open_store(settings, UploadSettings())) as store:
+        of_object = labels.Label(robot='thor', label='door', since_ns=0, until_ns=0, bucket=schema.BUCKET, key=labelled['key'])
+        of_time = labels.Label(robot='thor', label='stairs', since_ns=at_ns - SECOND, until_ns=at_ns + SECOND)
+        labels.write(store, 'thor', [of_object, of_time], by='me')
+        request = pull.ask(store, source, 'thor', KeptFilter(keys=frozenset({asked['key']})), by='me')
+    how: dict[str, Any] = {'exported': {(exported['bucket'], exported['key']): 'patrols'}}
+    made = _plan(settings, **how)
+    camera = made.sensors['camera']
+    assert (camera.objects, camera.going, dict(camera.protected)) == (30, 7, {'data set': 1, 'label': 3, 'request': 1})
+    assert camera.referrers == {'data set patrols', 'label door', 'label stairs', f'request {request.id}'}
+    assert _run(settings, **how).objects == 7
+    left = _stored(settings, 'camera')
+    assert {exported['key'], labelled['key'], asked['key']} <= {*left}
+    assert len(left) == 23
+    _check(settings)
+    assert _run(settings, **how, is_forced=True).objects == 5
+    assert len(_stored(settings, 'camera')) == 18
+    _check(settings)
+
+
+def test_a_label_that_cannot_be_read_stops_it(settings: StoreSettings, tmp_path: Path) -> None:
+    """Nobody knows then what it refers to."""
+    with closing(open_store(settings, UploadSettings())) as store:
+        add(store, tmp_path / 'tmp', 'thor/_labels/date=2026-11-01/thor_x.parquet', b'no parquet')
+    with pytest.raises(LakeError, match='labels'):
+        _plan(settings)
+
+
+def test_a_bag_goes_as_a_whole_or_not_at_all(settings: StoreSettings, tmp_path: Path) -> None:
+    """When its last slice is old. An event's has a rule of its own, and of one without a manifest nobody knows whose it is."""
+    tmp = tmp_path / 'tmp'
+    old = _add_bag(settings, tmp, 'old', NOW_NS - 8 * DAY_NS)
+    young = _add_bag(settings, tmp, 'young', NOW_NS - 5 * DAY_NS - MINUTE_NS)
+    event = _add_bag(settings, tmp, 'event', NOW_NS - 8 * DAY_NS, is_event=True)
+    torn = _add_bag(settings, tmp, 'torn', NOW_NS - 8 * DAY_NS, has_manifest=False)
+    made = _plan(settings, 'bags 5d')
+    bags = made.sensors['bags']
+    assert (bags.going, dict(bags.protected), made.sensors['events'].objects) == (3, {'no manifest': 2}, 3)
+    _run(settings, 'bags 5d')
+    assert _stored(settings, 'rosbags') == sorted([*young, *event, *torn])
+    _check(settings)
+    known = gaps.known('thor', '/imu', NOW_NS - 9 * DAY_NS, NOW_NS, sink='bags', source=_source(settings))
+    assert [(gap.kind, gap.count) for gap in known.gaps] == [('forgotten', 7)]
+    _run(settings, 'bags forever, events 5d')
+    assert _stored(settings, 'rosbags') == sorted([*young, *torn])
+    assert old
+    _check(settings)
+
+
+def test_a_repeat_keeps_what_holds_its_content(settings: StoreSettings, tmp_path: Path) -> None:
+    """An object that a younger row names as its content is as young as that row."""
+    held = row('camera', NOW_NS - 9 * DAY_NS)
+    at_ns = NOW_NS - DAY_NS
+    again = {**row('camera', at_ns + 30 * SECOND), 'key': held['key']}
+    with closing(open_store(settings, UploadSettings())) as store:
+        add_part(store, [again], 'again', tmp_path / 'tmp')
+    _run(settings)
+    assert held['key'] in _stored(settings)
+    assert len(_stored(settings, 'camera')) == 19
+    assert len(forgotten(_source(settings), None, Findings())) == 11
+
+
+def test_a_robot_cannot_have_a_young_object_deleted(settings: StoreSettings, tmp_path: Path) -> None:
+    """By a row with an older time, or by what looks like a part of what is forgotten: it may write below its own name alone."""
+    young = row('camera', NOW_NS)
+    old_ns = NOW_NS - 9 * DAY_NS
+    forged = {**row('camera', old_ns + MINUTE_NS), 'key': young['key']}
+    said = {**dict.fromkeys(schema.FORGOTTEN.columns), **{name: young[name] for name in ('bucket', 'key', 'bytes', 't_start_ns')},
+            'forgotten_ns': NOW_NS, 'format_version': 1}  # fmt: skip
+    with closing(open_store(settings, UploadSettings())) as store:
+        add_part(store, [forged], 'forged', tmp_path / 'tmp')
+        body = encode([said], schema.FORGOTTEN)
+        add(store, tmp_path / 'tmp', f'thor/_forgotten/date={utc(NOW_NS):%Y-%m-%d}/thor_x.parquet', body, {'robot': 'thor'})
+    assert _run(settings).objects == 12
+    assert young['key'] in _stored(settings)
+    assert young['key'] in _answer(settings)
+
+
+def test_by_size_the_oldest_days_go(settings: StoreSettings) -> None:
+    """Of what a rule names with an age alone; what cannot be reached is told."""
+    per_day = sum(len(content(sensor, NOW_NS)) for sensor in ('camera', 'odom')) * 3
+    camera = len(content('camera', NOW_NS)) * 3
+    total = per_day * len(AGES)
+    made = _plan(settings, 'camera 30d, odom forever', most_bytes=total - 2 * camera + 1)
+    assert (made.going, made.over_bytes) == (6, 0)
+    made = _plan(settings, 'camera 30d, odom forever', most_bytes=0)
+    assert (made.going, made.sensors['camera'].is_all, made.over_bytes) == (30, True, total - 10 * camera)
+    _run(settings, 'camera 30d, odom forever', most_bytes=total - 2 * camera)
+    assert len(_stored(settings, 'camera')) == 24
+    assert len(_stored(settings, 'odom')) == 30
+    _check(settings)
+
+
+def test_it_may_die_anywhere(tmp_path: Path) -> None:
+    """After each single thing that it does, whatever the catalogue names is there; the next run ends it, once for each object."""
+    for life in range(100):
+        settings = folder_store(tmp_path / str(life))
+        with closing(open_store(settings, UploadSettings())) as store:
+            rows = [row('camera', NOW_NS - age * DAY_NS) for age in (9, 8, 1)]
+            for each in rows:
+                add(store, tmp_path / 'tmp', each['key'], content('camera', each['t_start_ns']))
+                add_part(store, [each], f'{each["t_start_ns"]}', tmp_path / 'tmp')
+            is_dead = False
+            try:
+                _run(settings, store=MortalStore(store, life))
+            except Dead:
+                is_dead = True
+            names = _source(settings)
+            gone = {*forgotten(names, None, Findings())['key'].to_pylist()}
+            assert {each['key'] for each in rows} - gone <= {*_stored(settings)}
+            _run(settings)
+        assert _stored(settings) == [rows[2]['key']]
+        assert len(forgotten(names, None, Findings())) == 2
+        found = gaps.newest(names)
+        assert sum(found['count'].to_pylist()) == 2
+        if not is_dead:
+            break
+    else:
+        pytest.fail('it never came to its end')
+    assert life > 6
+    _check(settings)
+
+
+def test_two_at_once_delete_once(settings: StoreSettings) -> None:
+    """Both find the same; each object has one row that counts, and its messages are counted once."""
+    with closing(open_store(settings, UploadSettings())) as store:
+        plans = [_plan(settings), _plan(settings, 'camera 7d')]
+        failed: list[BaseException] = []
+
+        def run(made: prune.PrunePlan) -> None:
+            try:
+                prune.apply(_source(settings), store, made, now_ns=NOW_NS, findings=Findings())
+            except BaseException as error:  # noqa: BLE001 - told by the test
+                failed.append(error)
+
+        threads = [threading.Thread(target=run, args=(made,)) for made in plans]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert failed == []
+    _run(settings)
+    assert len(_stored(settings, 'camera')) == 18
+    assert len(forgotten(_source(settings), None, Findings())) == 12
+    assert sum(gaps.newest(_source(settings))['count'].to_pylist()) == 12
+    _check(settings)
+
+
+def test_compaction_changes_nothing_of_it(settings: StoreSettings) -> None:
+    """Whether days are merged before, between or after."""
+    with closing(open_store(settings, UploadSettings())) as store:
+        made = _plan(settings)
+        list(compaction.compact(_source(settings), store, before=f'{utc(NOW_NS):%Y-%m-%d}', grace=None))
+        prune.apply(_source(settings), store, made, now_ns=NOW_NS, findings=Findings())
+        _check(settings)
+        list(compaction.compact(_source(settings), store, before='2027-01-01', grace=None))
+    _check(settings)
+    assert len(_answer(settings)) == 48
+
+
+def test_without_the_right_to_delete_it_says_whose_it_takes(settings: StoreSettings) -> None:
+    """And with that right the next run deletes what is written down."""
+
+    class Denying(MortalStore):
+        def delete(self, bucket: str, key: str) -> None:
+            raise AccessDenied('no', bucket=bucket)
+
+    with closing(open_store(settings, UploadSettings())) as store, pytest.raises(LakeError, match='may not prune') as denied:
+        _run(settings, store=Denying(store, 1000))
+    assert 'prune' in denied.value.remedy
+    assert _run(settings).mended == 12
+    _check(settings)
+
+
+@pytest.mark.parametrize('text', ['', 'camera', 'camera 90', 'camera 90d lidar 14d', 'camera 1d, camera 2d', '_ledger 1d',
+                                  'bag 1d, bags 2d', 'camera 2999-01-01', 'camera/ 1d', 'camera 90d,'])  # fmt: skip
+def test_rules_that_are_none_are_refused(text: str) -> None:
+    """With the setting and what is allowed."""
+    with pytest.raises(SettingError, match='--keep'):
+        prune.keep_rules(text, NOW_NS)
+
+
+def test_sizes_are_read() -> None:
+    """In decimal and binary units."""
+    assert [prune.size_of(text) for text in ('2TB', '500 GB', '1TiB', '1.5kB', '7')] == [2 * 10**12, 5 * 10**11, 1 << 40, 1500, 7]
+    with pytest.raises(SettingError, match='--max-bytes'):
+        prune.size_of('much')
+
+
+def test_any_label_protects_what_it_reaches_into() -> None:
+    """As looking at each span does."""
+    rng = random.Random(7)
+    for _ in range(300):
+        spans = [(begin, begin + rng.randrange(30)) for begin in (rng.randrange(100) for _ in range(rng.randrange(8)))]
+        shield = prune.Protection(labelled=[_span(*span) for span in spans])
+        begin = rng.randrange(130)
+        end = begin + rng.randrange(20)
+        each = {**row('camera', begin), 't_end_ns': end}
+        assert (shield.why(each) is not None) == any(since <= end and until >= begin for since, until in spans)
+
+
+def _span(since_ns: int, until_ns: int) -> labels.Label:
+    return labels.Label(robot='thor', label='x', since_ns=since_ns, until_ns=until_ns)
