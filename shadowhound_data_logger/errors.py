@@ -147,6 +147,12 @@ class LakeError(DataLoggerError):
     DEFAULT_REMEDY = 'shadowhound-data query --help has examples; lake status describes the catalogue'
 
 
+class SinkUnavailable(LakeError):
+    """A server that is sent the catalogue gives no answer, or asks to wait."""
+
+    DEFAULT_REMEDY = 'run it again: it goes on where it stopped'
+
+
 class PolicyError(DataLoggerError):
     """A policy cannot be packed, published, activated or rolled back."""
 

@@ -28,6 +28,7 @@ from shadowhound_data_logger.cli.policy import policy
 from shadowhound_data_logger.cli.pull import pull
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.cli.search import lake_index, search
+from shadowhound_data_logger.cli.sink import lake_sink
 from shadowhound_data_logger.cli.spool import spool
 from shadowhound_data_logger.cli.status import status
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
@@ -82,6 +83,7 @@ def cli() -> None:
 for _verb in (verb for section in SECTIONS.values() for verb in section):
     cli.add_command(_verb)
 lake.add_command(lake_index)
+lake.add_command(lake_sink)
 
 
 def main() -> None:

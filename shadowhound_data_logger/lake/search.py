@@ -96,11 +96,11 @@ def update(path: Path, source: Bucket, findings: Findings | None = None) -> Inde
             for start in range(0, len(new), AT_A_TIME):
                 some = new[start : start + AT_A_TIME]
                 with ThreadPoolExecutor(THREADS, 'lake-index') as pool:
-                    told = list(pool.map(lambda run, of=robot: _summary(source, of, run, findings), some))
+                    told = list(pool.map(lambda run, of=robot: summary(source, of, run, findings), some))
                 with db:
-                    for run, summary in zip(some, told, strict=True):
-                        if summary is not None:
-                            add(db, of_mission(robot, run, summary))
+                    for run, said in zip(some, told, strict=True):
+                        if said is not None:
+                            add(db, of_mission(robot, run, said))
                             added += 1
                 waiting += told.count(None)
         with db:
@@ -271,8 +271,8 @@ def _moment(value: Any, otherwise: int | None) -> int | None:
         return otherwise
 
 
-def _summary(source: Bucket, robot: str, run_id: str, findings: Findings) -> Mapping[str, Any] | None:
-    """None where there is none yet. One that is none is left out, and looked at again the next time."""
+def summary(source: Bucket, robot: str, run_id: str, findings: Findings) -> Mapping[str, Any] | None:
+    """Of a mission, None where there is none yet. One that is none is left out, and looked at again the next time."""
     key = f'{robot}/missions/{run_id}/summary.json'
     try:
         told = from_json(source.get(key, MOST_SUMMARY_BYTES), MOST_SUMMARY_BYTES)

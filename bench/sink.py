@@ -1,0 +1,108 @@
+"""``lake sink`` of a million rows to a stand-in for OpenSearch in memory: how long it takes, and how much memory.
+
+Run it as ``python bench/sink.py [--days 30] [--folder F] [--json]``: 30 days are 720 parts of an hour in a folder store, a
+million rows, made as ``bench/lake.py`` makes them. The memory is that of the process that sends, a few times a second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+from _proc import memory as process_memory
+from _report import Bar, Report, main, progress
+from lake import rows
+from osmem_server import OsmemServer
+
+from shadowhound_data_logger.catalogue import parts, schema
+from shadowhound_data_logger.clock import utc
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.lake.bucket import put_part
+from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.stores import open_store
+
+HOURS: Final = 24
+LIMIT_S: Final = 300.0
+FLAT: Final = 1.25
+"""The highest memory of the second half, of the highest of the first."""
+LOOK_S: Final = 0.2
+PROGRAM: Final = 'from shadowhound_data_logger.cli.main import main; main()'
+
+
+def fill(folder: Path, days: int) -> int:
+    """The parts of these days in a folder store; how many rows they have."""
+    count = 0
+    with closing(open_store(StoreSettings(directory=folder / 'store'), UploadSettings())) as store:
+        for hour in range(days * HOURS):
+            made = [row for minute in range(hour * 60, hour * 60 + 60) for row in rows(minute)]
+            stamp = utc(made[0]['t_start_ns'])
+            key = schema.OBJECTS.part_key('thor', f'{stamp:%Y-%m-%d}', f'{stamp:%Y%m%dT%H}0000_b007')
+            put_part(store, key, 'thor', parts.encode(made), len(made))
+            count += len(made)
+            if hour % HOURS == HOURS - 1:
+                progress(f'{hour + 1:,} parts, {count:,} rows')
+    return count
+
+
+def run(url: str, folder: Path) -> tuple[float, list[float], dict[str, Any]]:
+    """Seconds, its own memory (MB) meanwhile, and what it said."""
+    environ = {'SHADOWHOUND_HOME': str(folder), 'PATH': '/usr/bin:/bin'}
+    began = time.perf_counter()
+    with subprocess.Popen(
+        [sys.executable, '-c', PROGRAM, 'lake', 'sink', url, '--json'], env=environ, stdout=subprocess.PIPE
+    ) as child:
+        memory: list[float] = []
+        done = threading.Event()
+
+        def look() -> None:
+            while not done.wait(LOOK_S):
+                memory.append(process_memory(child.pid).anon)
+
+        watcher = threading.Thread(target=look, name='memory')
+        watcher.start()
+        assert child.stdout is not None
+        said = child.stdout.read()
+        took = time.perf_counter() - began
+        done.set()
+        watcher.join()
+    return took, memory, json.loads(said)
+
+
+def measure(options: argparse.Namespace) -> Report:
+    """Once all, then again what is there already."""
+    shutil.rmtree(options.folder / 'sink_home', ignore_errors=True)
+    home = options.folder / 'sink_home'
+    home.mkdir(parents=True)
+    count = fill(home, options.days)
+    with OsmemServer.start() as server, server.clone() as clone:
+        took, memory, said = run(clone.url, home)
+        again_s, _, again = run(clone.url, home)
+    half = len(memory) // 2
+    growth = max(memory[half:]) / max(memory[:half])
+    figures = {
+        'rows': count, 'added': said['added'], 'seconds': took, 'rows_per_s': count / took, 'again_s': again_s,
+        'again_added': again['added'], 'memory_mb': max(memory), 'memory_growth': growth,
+    }  # fmt: skip
+    limit_s = LIMIT_S * count / 1_000_000
+    wrong = abs(said['added'] - count) + again['added']
+    return Report((
+        Bar('all rows sent', f'at most {limit_s:.0f}', took, 's', took <= limit_s),
+        Bar('memory of the second half, of the first', f'at most {FLAT}', growth, 'times', growth <= FLAT),
+        Bar('documents missing, or sent as new again', '0', wrong, 'documents', wrong == 0),
+    ), figures)  # fmt: skip
+
+
+def _more(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--days', type=int, default=30)
+
+
+if __name__ == '__main__':
+    main(__doc__ or '', measure, seconds=0.0, more=_more)

@@ -1,0 +1,71 @@
+"""``shadowhound-data lake sink``: the catalogue and what lies beside it into Elasticsearch or OpenSearch."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+
+import click
+
+from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, robot_name, the_home, the_store_settings
+from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, progress
+from shadowhound_data_logger.cli.question import asking, quietly, tell_left_out
+
+SHOWN: Final = 10
+
+
+@click.command('sink', epilog=examples(
+    'lake sink http://127.0.0.1:9200', 'lake sink https://elastic.lan:9200 --index robots --follow'
+))  # fmt: skip
+@click.argument('url')
+@click.option('--index', default='robots', show_default=True, metavar='NAME',
+              help='Indexes are NAME-objects, NAME-gaps, NAME-missions, NAME-events, NAME-labels.')  # fmt: skip
+@click.option('--robot', metavar='NAME', callback=robot_name, help='Only of this robot.')
+@click.option('--ca', type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar='FILE',
+              help="Certificate of the authority that signed the server's.")  # fmt: skip
+@click.option('--follow', is_flag=True, help='Go on until Ctrl-C, and send what is new.')
+@click.option('--every', type=click.FloatRange(1.0), default=60.0, show_default=True, metavar='S',
+              help='With --follow: seconds between two looks.')  # fmt: skip
+@as_json
+def lake_sink(*, url: str, index: str, robot: str | None, ca: Path | None, follow: bool, every: float, as_json: bool) -> ExitCode:
+    """Send the catalogue to Elasticsearch or OpenSearch.
+
+    The rows of the catalogue, gaps, missions, their events, and labels. What the server has is noted in
+    $SHADOWHOUND_HOME/sink, so a run that was interrupted resumes there, and nothing is there twice. ELASTIC_API_KEY, or
+    ELASTIC_USERNAME and ELASTIC_PASSWORD, name who sends.
+
+    Exit code 1 when the server refused documents, or something was left out.
+    """
+    with asking():
+        from shadowhound_data_logger.lake import sink as library  # noqa: PLC0415
+        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+
+    source, left_out, total = default_source(the_store_settings()), quietly(), library.SinkTally()
+    with (
+        closing(library.SearchServer(url, library.authorization(os.environ), ca)) as server,
+        library.opened(server, index, the_home()) as position,
+        progress(f'sending to {index}') as bar,
+    ):
+        sink = library.Sink(
+            source, server, index, position, left_out, tries=float('inf') if follow else library.TRIES, tell=bar.say
+        )
+        total += sink.send(robot)
+        while follow:
+            bar.say(f'{number(total.added)} sent; waiting for more')
+            time.sleep(every)
+            total += sink.send(robot)
+    if as_json:
+        print_json({'url': server.url, 'index': index, 'position': str(position.path), **asdict(total)})
+    else:
+        print_lines(f'{counted(total.added, "document")} sent, {number(total.present)} were there.')
+        for one in total.restarted:
+            print_lines(f'{one} is not the index of the last run: all was sent again.')
+        for reason, count in total.refused.most_common(SHOWN):
+            print_lines(plain(f'{number(count)} refused: {reason}'))
+        if total.refused:
+            print_lines(f'Which they are is in {position.path}, table refused.')
+    return tell_left_out(left_out) or exit_code(finding=total.refused)

@@ -1,0 +1,590 @@
+"""The catalogue, the gap journal, missions, their events and the labels as documents of Elasticsearch or OpenSearch.
+
+Requests are plain HTTP, because the clients of either refuse the servers of the other: ``PUT _index_template``, ``PUT INDEX`` and
+``POST _bulk``, which both have alike.
+https://www.elastic.co/docs/api/doc/elasticsearch/operation/operation-bulk
+https://docs.opensearch.org/latest/api-reference/document-apis/bulk/
+
+What a document says gives its ``_id``, so the same is there once however often it is sent. A row of the catalogue never changes
+and is only created; statements of the gap journal and labels are replaced by newer ones (external versions) in any order.
+What the server took is noted in a file, part by part, after the server has said so: a run that is killed goes on there, and what
+it sends twice is there already.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+import random
+import re
+import sqlite3
+import ssl
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+
+import pyarrow as pa
+import urllib3
+
+from shadowhound_data_logger.catalogue.gaps import GAPS, WITHDRAWN
+from shadowhound_data_logger.catalogue.labels import LABELS, REMOVED
+from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.errors import LakeError, SettingError, SinkUnavailable
+from shadowhound_data_logger.lake import search
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.live_files import days, folder_of, name_of, robots
+from shadowhound_data_logger.lake.reading import tables
+from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.retry import backoff
+from shadowhound_data_logger.untrusted import from_json, visible
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+WHICH: Final = 'is it an Elasticsearch or an OpenSearch?'
+BULK_BYTES: Final = 4 << 20
+"""Of one request: both servers advise 5 to 15 MB at most."""
+BULK_DOCUMENTS: Final = 4_000
+PARTS_AT_A_TIME: Final = 180
+"""Noted together: what a kill sends again, at most."""
+TRIES: Final = 8
+"""Of a request, without ``--follow``: about a minute."""
+CAP_S: Final = 30.0
+ANSWER_S: Final = 60.0
+MOST_ANSWER_BYTES: Final = 64 << 20
+MOST_REASON: Final = 200
+_NAME: Final = re.compile(r'[a-z0-9][a-z0-9_.-]{0,99}', re.ASCII)
+_RETRIED: Final = (429, 502, 503, 504)
+_GOOD: Final = range(200, 300)
+CONFLICT: Final = 409
+TOO_LARGE: Final = 413
+_rng: Final = random.Random()
+_Answer = TypeVar('_Answer')
+_KEYWORD: Final = {'type': 'keyword', 'ignore_above': 8191}
+_DATE: Final = {'type': 'date_nanos'}
+_WORDS: Final = {'type': 'text', 'fields': {'keyword': {'type': 'keyword', 'ignore_above': 256}}}
+_OF_TYPE: Final = (
+    (_KEYWORD, 'robot sensor topic type bucket key sha256 mission_id run_id mission_type pose_frame clock content_type policy'),
+    (_KEYWORD, 'what id sink publisher kind cause grade label by result'),
+    (_DATE, 'time t_start t_end t_from t_to since until made started ended'),
+    ({'type': 'long'}, 'bytes t_start_ns t_end_ns count clock_offset_ns revision session from_ns to_ns merged received skipped'),
+    ({'type': 'long'}, 'since_ns until_ns made_ns'),
+    ({'type': 'double'}, 'x y yaw battery_pct width height distance_m duration_s battery_consumed_pct'),
+    (_WORDS, 'command title text note'),
+    ({'type': 'boolean'}, 'success'),
+)  # fmt: skip
+_FIELDS: Final = {name: mapping for mapping, names in _OF_TYPE for name in names.split()}
+"""Field -> its mapping. ``x y`` are metres in the odometry's frame, and no place on the Earth."""
+_SUMMARY: Final = ('mission_type', 'result', 'success', 'distance_m', 'duration_s', 'battery_consumed_pct', 'policy')
+ROWS, GAP_ROWS, MISSIONS, EVENTS, LABEL_ROWS = 'objects', 'gaps', 'missions', 'events', 'labels'
+INDEXES: Final = (ROWS, GAP_ROWS, MISSIONS, EVENTS, LABEL_ROWS)
+"""Each is an index of its own, ``NAME-objects`` and so on."""
+
+
+class SinkDocument(NamedTuple):
+    """What is sent of one thing."""
+
+    kind: str
+    """One of ``INDEXES``."""
+    id: str
+    fields: Mapping[str, Any]
+    version: int | None = None
+    """None: it is only created. Else it replaces what has a lower one."""
+
+
+@dataclass(slots=True)
+class SinkTally:
+    """What became of the documents of a run."""
+
+    added: int = 0
+    """Created, or replaced by what is newer."""
+    present: int = 0
+    """There already, as they are or newer."""
+    refused: Counter[str] = field(default_factory=Counter)
+    """By the server's reason; which they are is in the file of the position."""
+    restarted: list[str] = field(default_factory=list)
+    """Indexes that are not those of the run before: all was sent again."""
+
+    def __iadd__(self, other: SinkTally) -> Self:
+        self.added += other.added
+        self.present += other.present
+        self.refused.update(other.refused)
+        self.restarted += other.restarted
+        return self
+
+
+# -- the server ----------------------------------------------------------------------------------------------------------------
+
+
+class SearchServer:
+    """Asks one Elasticsearch (7.8 or later) or OpenSearch. Its repr shows no secret.
+
+    ``authorization`` is the value of that header, see ``authorization``. Raises SettingError for a URL that is none of ours,
+    SinkUnavailable without an answer or where the server asks to wait, LakeError for an answer that says no.
+    """
+
+    def __init__(self, url: str, authorization: str = '', ca: Path | None = None) -> None:
+        try:
+            parsed = urllib3.util.parse_url(url)
+        except urllib3.exceptions.LocationParseError as error:
+            raise SettingError('URL', url[:200], 'http://HOST:9200 or https://HOST:9200') from error
+        if parsed.auth:
+            raise SettingError(
+                'URL',
+                'with a password',
+                'a URL without one: ELASTIC_USERNAME and ELASTIC_PASSWORD, or ELASTIC_API_KEY, name them',
+            )
+        if parsed.scheme not in {'http', 'https'} or not parsed.host or parsed.query or parsed.fragment:
+            raise SettingError('URL', url[:200], 'http://HOST:9200 or https://HOST:9200')
+        self.url = f'{parsed.scheme}://{parsed.netloc}{(parsed.path or "").rstrip("/")}'
+        trust = ssl.create_default_context(cafile=None if ca is None else str(ca)) if parsed.scheme == 'https' else None
+        self._pool = urllib3.PoolManager(1, maxsize=1, retries=False, timeout=urllib3.Timeout(5.0, ANSWER_S), ssl_context=trust)
+        self._headers = {'User-Agent': 'shadowhound-data', **({'Authorization': authorization} if authorization else {})}
+
+    def close(self) -> None:
+        self._pool.clear()
+
+    def ask(self, method: str, path: str, body: bytes | None = None, kind: str = 'application/json',
+            allowed: Sequence[int] = ()) -> tuple[int, Any]:  # fmt: skip
+        """The status and the JSON of an answer; other statuses than 2xx and those allowed are errors."""
+        try:
+            answer = self._pool.request(method, f'{self.url}/{path}', body=body, redirect=False, preload_content=False,
+                                        headers={**self._headers, 'Content-Type': kind})  # fmt: skip
+            try:
+                content = answer.read(MOST_ANSWER_BYTES + 1, decode_content=False)
+                if len(content) > MOST_ANSWER_BYTES:
+                    raise LakeError(
+                        f'{self.url} answers with more than {MOST_ANSWER_BYTES:,} bytes', remedy='is it the right server?'
+                    )
+                answer.read()  # the rest: a body that broke off is an error here
+            finally:
+                answer.close()
+        except urllib3.exceptions.HTTPError as error:
+            raise SinkUnavailable(f'{self.url} gives no answer: {_cause(error)}') from error
+        if answer.status in _RETRIED:
+            raise SinkUnavailable(f'{self.url} asks to wait ({answer.status})')
+        try:
+            told = from_json(content, MOST_ANSWER_BYTES) if content else {}
+        except ValueError as error:
+            raise LakeError(f'{self.url} does not answer in JSON ({answer.status})', remedy=WHICH) from error
+        if answer.status not in _GOOD and answer.status not in allowed:
+            remedies = {
+                401: 'set ELASTIC_API_KEY, or ELASTIC_USERNAME and ELASTIC_PASSWORD',
+                403: 'this user may not do that: see docs/elastic.md',
+            }
+            raise LakeError(f'{self.url} refuses {method} /{path} ({answer.status}): {_reason(told)}',
+                            remedy=remedies.get(answer.status, 'see docs/elastic.md'), status=answer.status)  # fmt: skip
+        return answer.status, told
+
+    def prepare(self, name: str) -> dict[str, str]:
+        """Put the template, make the indexes that are not there yet; returns the UUID of each."""
+        _, told = self.ask('GET', '')
+        version = told.get('version') if isinstance(told, dict) else None
+        if not isinstance(version, dict) or 'number' not in version:
+            raise LakeError(f'{self.url} is neither an Elasticsearch nor an OpenSearch', remedy='does the URL lead to one?')
+        self.ask(
+            'PUT', f'_index_template/{name}', _dump(template(name, is_opensearch=version.get('distribution') == 'opensearch'))
+        )
+        for index in INDEXES:
+            self.ask(
+                'PUT', f'{name}-{index}', b'{}', allowed=(400,)
+            )  # 400: it is there; what else it may be, the next request tells
+        names = ','.join(f'{name}-{index}' for index in INDEXES)
+        _, told = self.ask('GET', f'{names}/_settings')
+        try:
+            return {index: str(told[f'{name}-{index}']['settings']['index']['uuid']) for index in INDEXES}
+        except (KeyError, TypeError) as error:
+            raise LakeError(
+                f'{self.url} does not tell the UUIDs of {name}-*', remedy='may this user read their settings?'
+            ) from error
+
+    def bulk(self, documents: Sequence[bytes]) -> list[tuple[int, str]]:
+        """Send documents as ``encoded`` makes them; the status of each, and why it is so."""
+        _, told = self.ask('POST', '_bulk', b''.join(documents), 'application/x-ndjson')
+        try:
+            items = [next(iter(item.values())) for item in told['items']]
+            found = [(int(item['status']), _reason(item)) for item in items]
+        except (KeyError, TypeError, AttributeError, ValueError, StopIteration) as error:
+            raise LakeError(f'{self.url} does not answer _bulk as documented', remedy=WHICH) from error
+        if len(found) != len(documents):
+            raise LakeError(
+                f'{self.url} answers for {len(found)} of {len(documents)} documents', remedy='is there a proxy before it?'
+            )
+        return found
+
+
+def authorization(environ: Mapping[str, str]) -> str:
+    """The header that ``ELASTIC_API_KEY``, else ``ELASTIC_USERNAME`` and ``ELASTIC_PASSWORD`` ask for. Raises SettingError."""
+    key, user = environ.get('ELASTIC_API_KEY', ''), environ.get('ELASTIC_USERNAME', '')
+    found = f'ApiKey {key}' if key else ''
+    if user and not key:
+        found = 'Basic ' + base64.b64encode(f'{user}:{environ.get("ELASTIC_PASSWORD", "")}'.encode()).decode()
+    if not found.isascii() or not found.isprintable():
+        raise SettingError('ELASTIC_API_KEY', '...', 'letters, digits and signs, without a line break')
+    return found
+
+
+def template(name: str, *, is_opensearch: bool) -> dict[str, Any]:
+    """The index template: types of the fields; a field that is not in it is kept, and cannot be searched."""
+    position = {'position': {'type': 'xy_point' if is_opensearch else 'point'}}
+    return {
+        'index_patterns': [f'{name}-{index}' for index in INDEXES],
+        'priority': 200,
+        'template': {'mappings': {'dynamic': False, 'properties': {**_FIELDS, **position}}},
+        '_meta': {'by': 'shadowhound-data lake sink', 'version': 1},
+    }
+
+
+def _cause(error: BaseException) -> str:
+    reason = getattr(error, 'reason', None)
+    return visible(str(reason if isinstance(reason, BaseException) else error))[:MOST_REASON]
+
+
+def _reason(told: object) -> str:
+    """Why, in one line; '' where all is well."""
+    error = told.get('error') if isinstance(told, dict) else None
+    if isinstance(error, dict):
+        error = ': '.join(str(error[word]) for word in ('type', 'reason') if word in error)
+    return visible(str(error))[:MOST_REASON] if error else ''
+
+
+# -- documents -----------------------------------------------------------------------------------------------------------------
+
+
+def of_object(row: Mapping[str, Any]) -> SinkDocument:
+    """Of a row of the catalogue; its ``_id`` is the SHA-256 of bucket, key and ``t_start_ns``, each on a line."""
+    said = f'{row["bucket"]}\n{row["key"]}\n{row["t_start_ns"]}'
+    found = {name: value for name, value in row.items() if name not in {'format_version', 't_start', 't_end'}}
+    if row['t_start'] is not None:
+        found |= {'time': _iso(row['t_start_ns']), 't_start': _iso(row['t_start_ns']), 't_end': _iso(row['t_end_ns'])}
+    if row['x'] is not None and row['y'] is not None:
+        found['position'] = {'x': row['x'], 'y': row['y']}
+    return SinkDocument(ROWS, hashlib.sha256(said.encode(errors='replace')).hexdigest(), found)
+
+
+def of_statement(row: Mapping[str, Any]) -> SinkDocument:
+    """Of a row of the gap journal: the newest statement about each thing stays, ``what`` says what it is."""
+    found = {name: value for name, value in row.items() if name not in {'format_version', 't_from', 't_to'}}
+    for stamp, name in (('from_ns', 't_from'), ('to_ns', 't_to')):
+        found[name] = None if row[name] is None else _iso(row[stamp])
+    found['time'] = found['t_from'] or found['t_to']
+    return SinkDocument(
+        GAP_ROWS, _digest(row['robot'], row['id']), found, 2 * max(row['revision'], 0) + (row['what'] != WITHDRAWN)
+    )
+
+
+def of_label(row: Mapping[str, Any]) -> SinkDocument:
+    """Of a row of a layer of labels: the newest stays, ``what`` says whether it adds or removes."""
+    found = {name: value for name, value in row.items() if name not in {'format_version', 'made'}}
+    found |= {
+        'time': _iso(row['since_ns']),
+        'since': _iso(row['since_ns']),
+        'until': _iso(row['until_ns']),
+        'made': _iso(row['made_ns']),
+    }
+    return SinkDocument(
+        LABEL_ROWS, _digest(row['robot'], row['id']), found, 2 * max(row['made_ns'], 0) + (row['what'] == REMOVED)
+    )
+
+
+def of_mission(robot: str, run_id: str, told: Mapping[str, Any]) -> Iterator[SinkDocument]:
+    """A mission, its events and its errors, of its ``summary.json``."""
+    for number, each in enumerate(search.of_mission(robot, run_id, told)):
+        found: dict[str, Any] = {
+            'robot': robot, 'run_id': run_id, 'mission_id': each.mission_id, 'mission_type': each.mission_type,
+            'success': each.success, 'time': None if each.since_ns is None else _iso(each.since_ns), 'text': each.text,
+        }  # fmt: skip
+        if each.kind == search.MISSION:
+            scalars = {name: told[name] for name in _SUMMARY if isinstance(told.get(name), (str, int, float))}
+            found |= scalars | {
+                'command': each.title, 'bucket': each.bucket, 'key': each.key, 'started': found['time'],
+                'ended': None if each.until_ns is None else _iso(each.until_ns),
+            }  # fmt: skip
+            yield SinkDocument(MISSIONS, _digest(robot, run_id), found)
+        else:
+            yield SinkDocument(EVENTS, _digest(robot, run_id, number), {**found, 'kind': each.kind, 'title': each.title})
+
+
+def encoded(name: str, document: SinkDocument) -> bytes:
+    """Two lines of a bulk request; a number that JSON does not have is null."""
+    action: dict[str, Any] = {'_index': f'{name}-{document.kind}', '_id': document.id}
+    if document.version is None:
+        return _dump({'create': action}) + b'\n' + _dump(document.fields) + b'\n'
+    action |= {'version': document.version, 'version_type': 'external'}
+    return _dump({'index': action}) + b'\n' + _dump(document.fields) + b'\n'
+
+
+def _dump(value: Any) -> bytes:
+    try:
+        return json.dumps(value, allow_nan=False, separators=(',', ':')).encode('ascii')
+    except ValueError:
+        return json.dumps(_finite(value), allow_nan=False, separators=(',', ':')).encode('ascii')
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _finite(inner) for name, inner in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _digest(*parts: object) -> str:
+    return hashlib.sha256('\n'.join(map(str, parts)).encode(errors='replace')).hexdigest()
+
+
+def _iso(stamp_ns: int | None) -> str | None:
+    """With all nanoseconds: both servers read up to the year 2262, as int64 does."""
+    if stamp_ns is None:
+        return None
+    seconds, rest = divmod(stamp_ns, SECOND)
+    return f'{time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))}.{rest:09}Z'
+
+
+# -- where it is ---------------------------------------------------------------------------------------------------------------
+
+_SCHEMA: Final = """
+CREATE TABLE indexes (name TEXT PRIMARY KEY, uuid TEXT NOT NULL);
+CREATE TABLE taken (name TEXT, folder TEXT, part TEXT, PRIMARY KEY (name, folder, part)) WITHOUT ROWID;
+CREATE TABLE refused (name TEXT, id TEXT, status INTEGER, reason TEXT, PRIMARY KEY (name, id)) WITHOUT ROWID;
+PRAGMA user_version = 1;
+"""
+
+
+class Position:
+    """What one server has taken, in a SQLite file: parts of each folder by name, missions by run, and what was refused."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._db = sqlite3.connect(path, timeout=30.0)
+            path.chmod(0o600)
+            if not self._db.execute("SELECT count(*) FROM sqlite_master WHERE type = 'table'").fetchone()[0]:
+                self._db.executescript(_SCHEMA)
+            elif self._db.execute('PRAGMA user_version').fetchone() != (1,):
+                raise sqlite3.DatabaseError('it is of another version')
+        except sqlite3.Error as error:
+            raise LakeError(
+                f'{path} is not the position of a sink: {error}', remedy='remove it: all is sent again, nothing is there twice'
+            ) from error
+
+    def close(self) -> None:
+        self._db.close()
+
+    def is_same(self, name: str, uuid: str) -> bool:
+        """Whether an index is that of before, or nothing was known of one; notes which it is."""
+        known = self._db.execute('SELECT uuid FROM indexes WHERE name = ?', (name,)).fetchone()
+        with self._db:
+            self._db.execute('INSERT OR REPLACE INTO indexes VALUES (?,?)', (name, uuid))
+        return known in {None, (uuid,)}
+
+    def forget(self, name: str) -> None:
+        """An index has nothing, whatever it took before."""
+        with self._db:
+            self._db.execute('DELETE FROM taken WHERE name = ?', (name,))
+            self._db.execute('DELETE FROM refused WHERE name = ?', (name,))
+
+    def taken(self, name: str, folder: str) -> set[str]:
+        return {part for (part,) in self._db.execute('SELECT part FROM taken WHERE name = ? AND folder = ?', (name, folder))}
+
+    def take(self, name: str, parts: Iterable[tuple[str, str]], refused: Iterable[tuple[str, int, str]]) -> None:
+        """Note (folder, part) that the server has, and (id, status, reason) of what it refused; durable on return."""
+        with self._db:
+            self._db.executemany('INSERT OR IGNORE INTO taken VALUES (?,?,?)', ((name, *each) for each in parts))
+            self._db.executemany('INSERT OR REPLACE INTO refused VALUES (?,?,?,?)', ((name, *each) for each in refused))
+
+    def refused(self) -> list[tuple[str, str, int, str]]:
+        """Index, id, status and reason of each document that the server refused."""
+        return list(self._db.execute('SELECT name, id, status, reason FROM refused ORDER BY name, id'))
+
+
+def position_path(home: Path, url: str, name: str) -> Path:
+    """Of one name on one server, in the home of who sends."""
+    return home / 'sink' / f'{hashlib.sha256(f"{url} {name}".encode()).hexdigest()[:16]}.db'
+
+
+@contextmanager
+def opened(server: SearchServer, name: str, home: Path) -> Iterator[Position]:
+    """The position, for one process at a time. Raises SettingError, LakeError."""
+    if not _NAME.fullmatch(name):
+        raise SettingError('--index', name[:100], 'small letters, digits, "-", "_" and ".", beginning with a letter or digit')
+    path = position_path(home, server.url, name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with flock(path.with_suffix('.lock'), wait=False) as had:
+        if not had:
+            raise LakeError(f'another process sends to {name} at {server.url}', remedy='wait for it, or stop it')
+        with closing(Position(path)) as position:
+            yield position
+
+
+# -- sending -------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Sink:
+    """Sends what a server does not have yet, under one name, some megabytes at a time, until each document is taken or refused.
+
+    A request is tried ``tries`` times, where the server gives no answer or asks to wait.
+    """
+
+    source: Bucket
+    server: SearchServer
+    name: str
+    position: Position
+    findings: Findings
+    tries: float = TRIES
+    tell: Callable[[str], object] = lambda _: None
+    pause: Callable[[float], object] = time.sleep
+    _sent: SinkTally = field(default_factory=SinkTally)
+    _refused: list[tuple[str, int, str]] = field(default_factory=list)
+
+    def send(self, robot: str | None = None) -> SinkTally:
+        """Of one robot, or of all. Raises StoreError, SinkUnavailable, LakeError; what was taken until then is noted."""
+        self._sent = SinkTally()
+        for kind, uuid in self._patiently(lambda: self.server.prepare(self.name)).items():
+            if not self.position.is_same(kind, uuid):
+                self._sent.restarted.append(f'{self.name}-{kind}')
+                self.position.forget(MISSIONS if kind == EVENTS else kind)
+        named = [robot] if robot else robots(self.source)
+        for kind, table, make in ((ROWS, OBJECTS, of_object), (GAP_ROWS, GAPS, of_statement), (LABEL_ROWS, LABELS, of_label)):
+            self._send_parts(named, kind, table, make)
+        for each in named:
+            self._send_missions(each)
+        return self._sent
+
+    def _send_parts(self, named: Sequence[str], kind: str, of: TableSchema,
+                    make: Callable[[Mapping[str, Any]], SinkDocument]) -> None:  # fmt: skip
+        for parts in _new(self.source, named, of, self.position, kind, self.findings):
+            for rows in tables(self.source, [part.entry for part in parts], tuple(of.columns), self.findings, of=of):
+                self._send(map(make, _rows(rows)))
+            left_out = {one.key for one in self.findings}
+            whole = (part for part in parts if part.entry.key not in left_out)
+            self._take(kind, ((part.folder, name) for part in whole for name in part.names))
+
+    def _send_missions(self, robot: str) -> None:
+        folder = f'{robot}/missions/'
+        known = self.position.taken(MISSIONS, folder)
+        new = [run for run in self.source.folders(folder) if run not in known]
+        for start in range(0, len(new), PARTS_AT_A_TIME):
+            some = new[start : start + PARTS_AT_A_TIME]
+            with ThreadPoolExecutor(THREADS, 'lake-sink') as pool:
+                told = list(pool.map(lambda run: search.summary(self.source, robot, run, self.findings), some))
+            ended = [(run, said) for run, said in zip(some, told, strict=True) if said is not None]
+            self._send(document for run, said in ended for document in of_mission(robot, run, said))
+            self._take(MISSIONS, ((folder, run) for run, _ in ended))
+
+    def _take(self, kind: str, parts: Iterable[tuple[str, str]]) -> None:
+        self.position.take(kind, parts, self._refused)
+        self._refused = []
+
+    def _send(self, documents: Iterable[SinkDocument]) -> None:
+        batch: list[tuple[str, bytes]] = []
+        size = 0
+        for document in documents:
+            body = encoded(self.name, document)
+            if batch and (size + len(body) > BULK_BYTES or len(batch) >= BULK_DOCUMENTS):
+                self._send_batch(batch)
+                batch, size = [], 0
+            batch.append((document.id, body))
+            size += len(body)
+        self._send_batch(batch)
+
+    def _send_batch(self, batch: Sequence[tuple[str, bytes]]) -> None:
+        """Raises SinkUnavailable where the server took nothing in so many tries."""
+        failures = 0
+        while batch:
+            some = batch
+            found = self._patiently(lambda: self._bulk(some))  # noqa: B023 - called at once
+            if found is None:
+                self._send_batch(batch[: len(batch) // 2])
+                batch = batch[len(batch) // 2 :]
+                continue
+            left = self._settled(batch, found)
+            failures = 0 if len(left) < len(batch) else failures + 1
+            if failures >= self.tries:
+                raise SinkUnavailable(f'{self.server.url} takes no documents: {found[0][1]}')
+            if left:
+                self.pause(backoff(failures + 1, CAP_S, _rng))
+            batch = left
+            self.tell(f'{self.name}: {self._sent.added:,} sent, {self._sent.present:,} were there')
+
+    def _bulk(self, batch: Sequence[tuple[str, bytes]]) -> list[tuple[int, str]] | None:
+        """What became of each; None where it is too much at a time."""
+        try:
+            return self.server.bulk([body for _, body in batch])
+        except LakeError as error:
+            if error.data.get('status') != TOO_LARGE:
+                raise
+            return None if len(batch) > 1 else [(TOO_LARGE, 'the server takes no document of this size')]
+
+    def _settled(self, batch: Sequence[tuple[str, bytes]], found: Sequence[tuple[int, str]]) -> list[tuple[str, bytes]]:
+        """Count; returns those that the server asks to send later."""
+        left = []
+        for each, (status, reason) in zip(batch, found, strict=True):
+            if status in _RETRIED:
+                left.append(each)
+            elif status == CONFLICT:
+                self._sent.present += 1
+            elif status in _GOOD:
+                self._sent.added += 1
+            else:
+                self._sent.refused[reason or str(status)] += 1
+                self._refused.append((each[0], status, reason))
+        return left
+
+    def _patiently(self, ask: Callable[[], _Answer]) -> _Answer:
+        """The answer, after so many tries. Raises what the last one raised."""
+        failures = 0
+        while True:
+            try:
+                return ask()
+            except SinkUnavailable as error:
+                failures += 1
+                if failures >= self.tries:
+                    raise
+                self.tell(f'{error.what}; trying again')
+                self.pause(backoff(failures, CAP_S, _rng))
+
+
+class _Part(NamedTuple):
+    """A file with rows that the server does not have yet, or not all of them."""
+
+    entry: ObjectInfo
+    folder: str
+    names: frozenset[str]
+    """Of the robot's own parts that are in it."""
+
+
+def _new(source: Bucket, named: Sequence[str], of: TableSchema, position: Position, index: str,
+         findings: Findings) -> Iterator[list[_Part]]:  # fmt: skip
+    """A compacted part whose sources were all sent has nothing new."""
+    with ThreadPoolExecutor(THREADS, 'lake-sink') as pool:
+        found = days(source, named, None, pool, findings, of=of)
+    parts: list[_Part] = []
+    for day in found:
+        folder = folder_of(day.robot, day.date, of)
+        known = position.taken(index, folder)
+        for entry in day.entries:
+            names = day.sources.get(entry.key, frozenset({name_of(entry.key)}))
+            if not names <= known:
+                parts.append(_Part(entry, folder, names))
+        if len(parts) >= PARTS_AT_A_TIME:
+            yield parts
+            parts = []
+    if parts:
+        yield parts
+
+
+def _rows(table: pa.Table) -> Iterator[dict[str, Any]]:
+    """Times as microseconds: which there are is all that is asked."""
+    columns = [column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column for column in table.columns]
+    for values in zip(*(column.to_pylist() for column in columns), strict=True):
+        yield dict(zip(table.column_names, values, strict=True))

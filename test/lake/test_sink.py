@@ -1,0 +1,435 @@
+"""A search server has each row, gap, mission, event and label once, whatever happens on the way. It is an in-memory stand-in."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from datetime import timedelta
+from http.client import HTTPConnection
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lake import gap_parts
+from lake.making import NOON_NS, add, fill, folder_store
+
+from shadowhound_data_logger.catalogue.gaps import WITHDRAWN
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import LakeError, SettingError, SinkUnavailable
+from shadowhound_data_logger.lake import compact, labels, sink
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.stores import open_store
+
+osmem_server = pytest.importorskip('osmem_server')
+
+SUMMARY = {
+    'mission_id': 'm1', 'mission_type': 'patrol', 'mission_command': 'open the door', 'success': False, 'start_ns': NOON_NS,
+    'end_ns': NOON_NS + 60 * SECOND, 'distance_m': 12.5, 'errors': [{'error': 'slipped'}],
+    'events': [{'time': '2026-10-28T12:00:05Z', 'name': 'door', 'force_n': 3}],
+}  # fmt: skip
+LABEL = labels.Label(robot='thor', label='stairs', since_ns=NOON_NS, until_ns=NOON_NS + SECOND)
+COUNTS = {'objects': 96, 'gaps': 3, 'missions': 3, 'events': 2, 'labels': 1}
+"""What is in the lake below."""
+
+
+@pytest.fixture(scope='module')
+def cluster() -> Iterator[Any]:
+    with osmem_server.OsmemServer.start() as server:
+        yield server
+    for pipe in (server.process.stdin, server.process.stdout, server.process.stderr):
+        if pipe is not None:
+            pipe.close()
+
+
+@pytest.fixture
+def url(cluster: Any) -> Iterator[str]:
+    """An empty server of its own."""
+    with cluster.clone() as clone:
+        yield clone.url
+
+
+@pytest.fixture(scope='module')
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with rows of an hour, a gap, one that was withdrawn, a watermark, three missions and a label."""
+    folder = tmp_path_factory.mktemp('sink')
+    made = folder_store(folder)
+    fill(made, folder, days=(0,), hours=(11,))
+    with closing(open_store(made, UploadSettings())) as store:
+        add(store, folder, 'thor/missions/run3/summary.json', json.dumps(SUMMARY).encode())
+        labels.write(store, 'thor', [LABEL], by='ann')
+    gap_parts.tell(made, folder, gap_parts.lost('a', 1, 2), gap_parts.lost('b', 3, 4, what=WITHDRAWN), gap_parts.mark(60))
+    return folder / 'store'
+
+
+@pytest.fixture
+def settings(filled: Path, tmp_path: Path) -> StoreSettings:
+    """A copy of it."""
+    shutil.copytree(filled, tmp_path / 'store')
+    return folder_store(tmp_path)
+
+
+def ask(url: str, path: str, method: str = 'GET') -> Any:
+    with closing(HTTPConnection(url.removeprefix('http://'), timeout=60)) as server:
+        server.request(method, f'/{path}')
+        return json.loads(server.getresponse().read())
+
+
+def counts(url: str) -> dict[str, int]:
+    ask(url, 'robots-*/_refresh', 'POST')
+    return {kind: ask(url, f'robots-{kind}/_count')['count'] for kind in sink.INDEXES}
+
+
+def send(url: str, settings: StoreSettings, home: Path, *, tries: float = 3, findings: Findings | None = None,
+         server: type[sink.SearchServer] = sink.SearchServer) -> sink.SinkTally:  # fmt: skip
+    """A run as ``lake sink`` makes it, without its pauses."""
+    found = Findings(lambda _: None) if findings is None else findings
+    with closing(server(url)) as opened, sink.opened(opened, 'robots', home) as position:
+        return sink.Sink(Bucket(settings, 'sensor-data'), opened, 'robots', position, found, tries, pause=lambda _: None).send()
+
+
+def test_all_is_there_once(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """And a second run, or one whose position is lost, adds nothing."""
+    first = send(url, settings, tmp_path)
+    assert (first.added, first.present, first.refused) == (sum(COUNTS.values()), 0, Counter())
+    assert counts(url) == COUNTS
+    again = send(url, settings, tmp_path)
+    assert (again.added, again.present, again.restarted) == (0, 0, [])
+    sink.position_path(tmp_path, url, 'robots').unlink()
+    lost = send(url, settings, tmp_path)
+    assert (lost.added, lost.present) == (0, sum(COUNTS.values()))
+    assert counts(url) == COUNTS
+    assert oct(sink.position_path(tmp_path, url, 'robots').stat().st_mode)[-3:] == '600'
+
+
+def test_what_a_document_has(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """Times to the nanosecond, places in metres, and a mission, its event and its error found by their words."""
+    send(url, settings, tmp_path)
+    ask(url, 'robots-*/_refresh', 'POST')
+    (mission,) = ask(url, 'robots-missions/_search?q=command:door')['hits']['hits']
+    assert mission['_source']['started'] == '2026-10-28T12:00:00.000000000Z'
+    assert (mission['_source']['success'], mission['_source']['distance_m']) == (False, 12.5)
+    kinds = [hit['_source']['kind'] for hit in ask(url, 'robots-events/_search')['hits']['hits']]
+    assert sorted(kinds) == ['error', 'event']
+    row = ask(url, 'robots-objects/_search?size=1')['hits']['hits'][0]['_source']
+    assert row['position'] == {'x': row['x'], 'y': row['y']}
+    assert sink.of_object({**row, 't_start': 1}).fields['time'] == row['time']
+    known = sink.template('robots', is_opensearch=True)['template']['mappings']['properties']
+    for kind in sink.INDEXES:
+        for hit in ask(url, f'robots-{kind}/_search?size=100')['hits']['hits']:
+            assert set(hit['_source']) <= set(known), kind
+
+
+def test_the_newest_statement_stays(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """Of a gap and of a label, in whatever order they are sent."""
+    send(url, settings, tmp_path)
+    gap_parts.tell(settings, tmp_path, gap_parts.lost('a', 1, 2, revision=3, what=WITHDRAWN), name='c')
+    gap_parts.tell(settings, tmp_path, gap_parts.lost('a', 1, 2, revision=2, count=9), name='b')
+    with closing(open_store(settings, UploadSettings())) as store:
+        labels.write(store, 'thor', [LABEL], by='ann', is_removal=True)
+    newer = send(url, settings, tmp_path)
+    assert newer.added >= 2
+    ask(url, 'robots-*/_refresh', 'POST')
+    said = Counter(hit['_source']['what'] for hit in ask(url, 'robots-gaps/_search')['hits']['hits'])
+    assert said == {'withdrawn': 2, 'complete': 1}
+    (label,) = ask(url, 'robots-labels/_search')['hits']['hits']
+    assert (label['_source']['what'], label['_source']['label']) == ('removed', 'stairs')
+
+
+def test_compaction_sends_nothing_again(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """As long as the parts of which a compacted one was made are there, their names say what it holds."""
+    send(url, settings, tmp_path)
+    with closing(open_store(settings, UploadSettings())) as store:
+        assert list(compact.compact(Bucket(settings, 'sensor-data'), store, grace=timedelta(hours=1)))
+    assert (send(url, settings, tmp_path).added, counts(url)['missions']) == (0, 3)
+
+
+def test_an_index_that_was_deleted_is_filled_again(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """The position is of an index, by its UUID; the others are left as they are."""
+    send(url, settings, tmp_path)
+    whole = counts(url)
+    for kind in ('objects', 'events'):
+        ask(url, f'robots-{kind}', 'DELETE')
+    again = send(url, settings, tmp_path)
+    assert again.restarted == ['robots-objects', 'robots-events']
+    assert counts(url) == whole
+    assert again.added == whole['objects'] + whole['events']
+
+
+class Death(BaseException):
+    """The process is gone."""
+
+
+def test_it_may_die_anywhere(url: str, settings: StoreSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before or after any request, again and again: in the end each document is there, and once."""
+    monkeypatch.setattr(sink, 'BULK_DOCUMENTS', 7)
+    monkeypatch.setattr(sink, 'PARTS_AT_A_TIME', 2)
+    requests = [0]
+
+    class Dying(sink.SearchServer):
+        def ask(self, *given: Any, **more: Any) -> Any:
+            requests[0] += 1
+            if requests[0] % 25 == 0:
+                raise Death
+            answer = super().ask(*given, **more)
+            if requests[0] % 33 == 0:
+                raise Death
+            return answer
+
+    sent = Counter[str]()
+    for _ in range(200):
+        try:
+            send(url, settings, tmp_path, server=Dying)
+            sent['whole'] += 1
+            break
+        except Death:
+            sent['died'] += 1
+    assert sent['whole'] == 1
+    assert sent['died'] >= 2
+    monkeypatch.undo()
+    fresh = tmp_path / 'other'
+    fresh.mkdir()
+    assert send(url, settings, fresh).added == 0
+    assert counts(url) == COUNTS
+
+
+Answer = Callable[[int, bytes], 'tuple[int, bytes] | None']
+
+
+@contextmanager
+def between(url: str, answer: Answer) -> Iterator[tuple[str, list[Any]]]:
+    """A server before another one: ``answer`` gets the number and body of each bulk request; None hands it on."""
+    seen: list[Any] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def _serve(self) -> None:
+            body = self.rfile.read(int(self.headers.get('Content-Length', 0)))
+            own = None
+            if self.path == '/_bulk':
+                seen.append((dict(self.headers), body))
+                own = answer(len(seen), body)
+            if own is None:
+                own = self._asked(body)
+            status, content = own
+            self.send_response(status)
+            self.send_header('Content-Length', str(len(content) + (status == 299)))
+            self.end_headers()
+            self.wfile.write(content)
+            self.close_connection = True
+
+        def _asked(self, body: bytes) -> tuple[int, bytes]:
+            with closing(HTTPConnection(url.removeprefix('http://'), timeout=60)) as inner:
+                inner.request(self.command, self.path, body or None, {'Content-Type': self.headers['Content-Type']})
+                answer = inner.getresponse()
+                return answer.status, answer.read()
+
+        do_GET = do_PUT = do_POST = _serve  # noqa: N815 - as the library calls them
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(('127.0.0.1', 0), Handler)
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,), name='between')
+    thread.start()
+    try:
+        yield f'http://127.0.0.1:{server.server_port}', seen
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    'fault', [(429, b'{}'), (503, b'busy'), (299, b'{"items": [')], ids=['too many requests', 'unavailable', 'breaks off']
+)
+def test_what_passes_is_tried_again(url: str, settings: StoreSettings, tmp_path: Path, fault: tuple[int, bytes]) -> None:
+    """Half of all requests fail, and nothing is lost or there twice."""
+    with between(url, lambda number, _: fault if number % 2 else None) as (proxy, _):
+        assert send(proxy, settings, tmp_path).refused == Counter()
+    assert send(url, settings, tmp_path).added == 0
+
+
+def test_a_server_that_stays_away(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """Is told, with what to do; what it took before is noted."""
+    with between(url, lambda number, _: (429, b'{}') if number > 1 else None) as (proxy, _):
+        with pytest.raises(SinkUnavailable, match='asks to wait'):
+            send(proxy, settings, tmp_path)
+        assert SinkUnavailable.DEFAULT_REMEDY.startswith('run it again')
+
+
+def test_single_documents(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """One that has to wait is sent again alone; one that is refused is counted by reason and listed, and the others go on."""
+    sizes: list[int] = []
+
+    def answer(number: int, body: bytes) -> tuple[int, bytes] | None:
+        sizes.append(body.count(b'\n') // 2)
+        if number > 2:
+            return None
+        items: list[dict[str, Any]] = [{'create': {'status': 201}} for _ in range(sizes[-1])]
+        items[0]['create'] = {'status': 429, 'error': {'type': 'es_rejected_execution_exception', 'reason': 'full'}}
+        if number == 2:
+            items[0]['create'] = {'status': 400, 'error': {'type': 'mapper_parsing_exception', 'reason': 'a\nbad\x1b[31m date'}}
+        return 200, json.dumps({'errors': True, 'items': items}).encode()
+
+    with between(url, answer) as (proxy, seen):
+        found = send(proxy, settings, tmp_path)
+        assert sizes[1] == 1
+        assert list(found.refused.values()) == [1]
+        (reason,) = found.refused
+        assert reason.startswith('mapper_parsing_exception: a')
+        assert '\x1b' not in reason
+        with closing(sink.Position(sink.position_path(tmp_path, proxy, 'robots'))) as position:
+            listed = position.refused()
+    assert [(each[0], each[2]) for each in listed] == [('objects', 400)]
+    for headers, body in seen:
+        documented(headers, body)
+
+
+def documented(headers: dict[str, str], body: bytes) -> None:
+    """A bulk request as both servers describe it: action and document in turn, a line each, the last one ended as well."""
+    assert headers['Content-Type'] == 'application/x-ndjson'
+    assert body.endswith(b'\n')
+    lines = body.decode('ascii').splitlines()
+    assert len(lines) % 2 == 0
+    for action, document in zip(lines[::2], lines[1::2], strict=True):
+        ((verb, target),) = json.loads(action).items()
+        assert verb in {'create', 'index'}
+        assert set(target) <= {'_index', '_id', 'version', 'version_type'}
+        assert len(target['_id']) <= 512
+        assert isinstance(json.loads(document, parse_constant=pytest.fail), dict)
+
+
+def test_a_request_that_is_too_large_is_halved(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """Down to one document, which is then refused."""
+    with between(url, lambda _, body: (413, b'{}') if body.count(b'\n') > 4 else None) as (proxy, _):
+        assert send(proxy, settings, tmp_path).refused == Counter()
+    assert send(url, settings, tmp_path).added == 0
+    with between(url, lambda _, body: (413, b'{}') if b'thor/camera' in body else None) as (proxy, _):
+        fresh = tmp_path / 'other'
+        fresh.mkdir()
+        assert list(send(proxy, settings, fresh).refused) == ['the server takes no document of this size']
+
+
+@pytest.mark.parametrize('answer', [b'<html>', b'{"items": []}', b'{"items": [1]}'])
+def test_an_answer_that_is_none(url: str, settings: StoreSettings, tmp_path: Path, answer: bytes) -> None:
+    """Nothing counts as sent."""
+    with between(url, lambda *_: (200, answer)) as (proxy, _), pytest.raises(LakeError):
+        send(proxy, settings, tmp_path)
+    assert send(url, settings, tmp_path).present == 0
+
+
+def test_a_part_that_is_none_is_told_each_time(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """And keeps nothing else back."""
+    with closing(open_store(settings, UploadSettings())) as store:
+        add(store, tmp_path, 'thor/_catalog/date=2026-10-28/thor_x.parquet', b'PAR1 it is not')
+    for _ in range(2):
+        found = Findings(lambda _: None)
+        send(url, settings, tmp_path, findings=found)
+        assert [one.key for one in found] == ['thor/_catalog/date=2026-10-28/thor_x.parquet']
+
+
+def test_who_sends(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """Is in a header alone, never in a URL or a repr; a redirect to somebody else is not followed."""
+    with pytest.raises(SettingError, match='URL') as refused:
+        sink.SearchServer('http://me:secret@127.0.0.1:9200')
+    assert 'secret' not in str(refused.value)
+    said = sink.authorization({'ELASTIC_USERNAME': 'me', 'ELASTIC_PASSWORD': 'secret'})
+    server = sink.SearchServer(url, said)
+    assert 'secret' not in repr(server)
+    assert said not in repr(server)
+    server.close()
+    assert sink.authorization({'ELASTIC_API_KEY': 'abc'}) == 'ApiKey abc'
+    assert sink.authorization({}) == ''
+    with pytest.raises(SettingError):
+        sink.authorization({'ELASTIC_API_KEY': 'a\r\nHost: evil'})
+    for wrong in ('ftp://h:9200', '127.0.0.1:9200', 'http://', 'http://h/?a=1'):
+        with pytest.raises(SettingError):
+            sink.SearchServer(wrong)
+    with between(url, lambda *_: (302, b'{}')) as (proxy, seen), pytest.raises(LakeError, match='302'):
+        send(proxy, settings, tmp_path)
+    assert len(seen) == 1
+
+
+def test_two_at_a_time(url: str, tmp_path: Path) -> None:
+    """The second one is told to wait; a name that is no index is refused."""
+    with closing(sink.SearchServer(url)) as server, sink.opened(server, 'robots', tmp_path):
+        with pytest.raises(LakeError, match='another process'), sink.opened(server, 'robots', tmp_path):
+            pass
+        with pytest.raises(SettingError), sink.opened(server, 'Robots/../x', tmp_path):
+            pass
+
+
+FOLDER = Path(__file__).parents[2] / 'docs' / 'elastic'
+
+
+def fields(value: Any) -> Iterator[str]:
+    """All that saved objects name as a field of a document."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            if name in {'field', 'timeFieldName'}:
+                yield inner
+            elif name == 'columns':
+                yield from inner
+            elif name in {'visState', 'panelsJSON', 'searchSourceJSON'}:
+                yield from fields(json.loads(inner))
+            else:
+                yield from fields(inner)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from fields(inner)
+
+
+@pytest.mark.parametrize('kind', sink.INDEXES)
+def test_dashboards(kind: str) -> None:
+    """As far as parsing tells: each reference leads to an object of the file, each field is one that documents have."""
+    objects = [json.loads(line) for line in (FOLDER / f'{kind}.ndjson').read_text().splitlines()]
+    there = {(each['type'], each['id']) for each in objects}
+    assert {(one['type'], one['id']) for each in objects for one in each['references']} <= there
+    assert ('dashboard', f'robots-{kind}') in there
+    known = sink.template('robots', is_opensearch=False)['template']['mappings']['properties']
+    assert {name for each in objects for name in fields(each)} <= set(known)
+
+
+@pytest.mark.long('processes that are killed')
+def test_a_process_that_is_killed_goes_on(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """The command, killed at its first, second, ... request; then it ends, and everything is there once."""
+    assert settings.directory is not None
+    home = tmp_path / 'home'
+    home.mkdir()
+    settings.directory.rename(home / 'store')
+    environ = {name: value for name, value in os.environ.items() if not name.startswith('AWS_')}
+    environ |= {'SHADOWHOUND_HOME': str(home), 'PYTHONPATH': str(Path(__file__).parents[2])}
+    running: list[subprocess.Popen[bytes]] = []
+
+    def answer(number: int, _: bytes) -> None:
+        if number in {1, 2, 4, 6}:
+            running[-1].kill()
+
+    with between(url, answer) as (proxy, seen):
+        command = [sys.executable, '-c', RUN, 'lake', 'sink', proxy, '--json']
+        for _ in range(10):
+            running.append(subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL))
+            said, _ = running[-1].communicate(timeout=120)
+            if running[-1].returncode == 0:
+                break
+        assert len(running) >= 3
+        assert json.loads(said)['refused'] == {}
+        for headers, body in seen:
+            documented(headers, body)
+    moved = StoreSettings(directory=home / 'store')
+    again = send(url, moved, tmp_path)
+    assert (again.added, again.present) == (0, sum(counts(url).values()))
+
+
+RUN = 'from shadowhound_data_logger.cli.main import main; main()'
