@@ -35,7 +35,7 @@ import urllib3
 
 from shadowhound_data_logger.catalogue.gaps import GAPS, WITHDRAWN
 from shadowhound_data_logger.catalogue.labels import LABELS, REMOVED
-from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
+from shadowhound_data_logger.catalogue.schema import FORGOTTEN, OBJECTS, TableSchema
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.errors import LakeError, SettingError, SinkUnavailable
@@ -75,8 +75,8 @@ _DATE: Final = {'type': 'date_nanos'}
 _WORDS: Final = {'type': 'text', 'fields': {'keyword': {'type': 'keyword', 'ignore_above': 256}}}
 _OF_TYPE: Final = (
     (_KEYWORD, 'robot sensor topic type bucket key sha256 mission_id run_id mission_type pose_frame clock content_type policy'),
-    (_KEYWORD, 'what id sink publisher kind cause grade label by result'),
-    (_DATE, 'time t_start t_end t_from t_to since until made started ended'),
+    (_KEYWORD, 'what id sink publisher kind cause grade label by result rule'),
+    (_DATE, 'time t_start t_end t_from t_to since until made started ended forgotten'),
     ({'type': 'long'}, 'bytes t_start_ns t_end_ns count clock_offset_ns revision session from_ns to_ns merged received skipped'),
     ({'type': 'long'}, 'since_ns until_ns made_ns'),
     ({'type': 'double'}, 'x y yaw battery_pct width height distance_m duration_s battery_consumed_pct'),
@@ -89,6 +89,8 @@ _SUMMARY: Final = ('mission_type', 'result', 'success', 'distance_m', 'duration_
 ROWS, GAP_ROWS, MISSIONS, EVENTS, LABEL_ROWS = 'objects', 'gaps', 'missions', 'events', 'labels'
 INDEXES: Final = (ROWS, GAP_ROWS, MISSIONS, EVENTS, LABEL_ROWS)
 """Each is an index of its own, ``NAME-objects`` and so on."""
+FORGOTTEN_ROWS: Final = 'forgotten'
+"""What is said later of documents of ``objects``."""
 
 
 class SinkDocument(NamedTuple):
@@ -100,6 +102,8 @@ class SinkDocument(NamedTuple):
     fields: Mapping[str, Any]
     version: int | None = None
     """None: it is only created. Else it replaces what has a lower one."""
+    is_update: bool = False
+    """Whether these fields are added to a document that is there."""
 
 
 @dataclass(slots=True)
@@ -272,6 +276,13 @@ def of_object(row: Mapping[str, Any]) -> SinkDocument:
     return SinkDocument(ROWS, hashlib.sha256(said.encode(errors='replace')).hexdigest(), found)
 
 
+def of_forgotten(row: Mapping[str, Any]) -> SinkDocument:
+    """Of an object that ``lake prune`` deleted: its document stays, and says when and by which rule."""
+    document = of_object({**row, 'x': None, 'y': None})
+    fields = {name: value for name, value in document.fields.items() if name not in {'x', 'y', 'forgotten_ns'}}
+    return document._replace(fields={**fields, 'forgotten': _iso(row['forgotten_ns'])}, is_update=True)
+
+
 def of_statement(row: Mapping[str, Any]) -> SinkDocument:
     """Of a row of the gap journal: the newest statement about each thing stays, ``what`` says what it is."""
     found = {name: value for name, value in row.items() if name not in {'format_version', 't_from', 't_to'}}
@@ -318,6 +329,8 @@ def of_mission(robot: str, run_id: str, told: Mapping[str, Any]) -> Iterator[Sin
 def encoded(name: str, document: SinkDocument) -> bytes:
     """Two lines of a bulk request; a number that JSON does not have is null."""
     action: dict[str, Any] = {'_index': f'{name}-{document.kind}', '_id': document.id}
+    if document.is_update:
+        return _dump({'update': action}) + b'\n' + _dump({'doc': document.fields, 'doc_as_upsert': True}) + b'\n'
     if document.version is None:
         return _dump({'create': action}) + b'\n' + _dump(document.fields) + b'\n'
     action |= {'version': document.version, 'version_type': 'external'}
@@ -428,6 +441,14 @@ def opened(server: SearchServer, name: str, home: Path) -> Iterator[Position]:
 # -- sending -------------------------------------------------------------------------------------------------------------------
 
 
+_TABLES: Final[Sequence[tuple[str, TableSchema, Callable[[Mapping[str, Any]], SinkDocument]]]] = (
+    (ROWS, OBJECTS, of_object),
+    (FORGOTTEN_ROWS, FORGOTTEN, of_forgotten),
+    (GAP_ROWS, GAPS, of_statement),
+    (LABEL_ROWS, LABELS, of_label),
+)
+
+
 @dataclass(slots=True)
 class Sink:
     """Sends what a server does not have yet, under one name, some megabytes at a time, until each document is taken or refused.
@@ -453,8 +474,10 @@ class Sink:
             if not self.position.is_same(kind, uuid):
                 self._sent.restarted.append(f'{self.name}-{kind}')
                 self.position.forget(MISSIONS if kind == EVENTS else kind)
+                if kind == ROWS:
+                    self.position.forget(FORGOTTEN_ROWS)
         named = [robot] if robot else robots(self.source)
-        for kind, table, make in ((ROWS, OBJECTS, of_object), (GAP_ROWS, GAPS, of_statement), (LABEL_ROWS, LABELS, of_label)):
+        for kind, table, make in _TABLES:
             self._send_parts(named, kind, table, make)
         for each in named:
             self._send_missions(each)

@@ -19,8 +19,9 @@ from typing import Any
 
 import pytest
 from lake import gap_parts
-from lake.making import NOON_NS, add, fill, folder_store
+from lake.making import NOON_NS, add, fill, folder_store, minutes
 
+from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.catalogue.gaps import WITHDRAWN
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
@@ -166,6 +167,29 @@ def test_an_index_that_was_deleted_is_filled_again(url: str, settings: StoreSett
     assert again.added == whole['objects'] + whole['events']
 
 
+def test_what_was_pruned_says_so(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """Its document keeps all that it said, in whatever run it is told, and once."""
+    with closing(open_store(settings, UploadSettings())) as store:
+        row = fill_row()
+        told = {name: row[name] for name in schema.FORGOTTEN.columns if name in row}
+        told |= {'rule': 'camera 90d', 'forgotten': NOON_NS // 1000, 'forgotten_ns': NOON_NS}
+        key = schema.FORGOTTEN.part_key('thor', schema.date_of(row), 'x')
+        add(store, tmp_path, key, parts.encode([told], schema.FORGOTTEN))
+    send(url, settings, tmp_path)
+    assert send(url, settings, tmp_path).added == 0
+    assert counts(url) == COUNTS
+    (hit,) = ask(url, 'robots-objects/_search?q=rule:camera*')['hits']['hits']
+    said = hit['_source']
+    assert (said['key'], said['forgotten']) == (row['key'], '2026-10-28T12:00:00.000000000Z')
+    assert (said['sha256'], said['position']['x']) == (row['sha256'], row['x'])
+
+
+def fill_row() -> schema.Row:
+    """One of the lake's, a frame."""
+    _, rows = next(minutes(days=(0,), hours=(11,)))
+    return rows[0]
+
+
 class Death(BaseException):
     """The process is gone."""
 
@@ -304,7 +328,7 @@ def documented(headers: dict[str, str], body: bytes) -> None:
     assert len(lines) % 2 == 0
     for action, document in zip(lines[::2], lines[1::2], strict=True):
         ((verb, target),) = json.loads(action).items()
-        assert verb in {'create', 'index'}
+        assert verb in {'create', 'index', 'update'}
         assert set(target) <= {'_index', '_id', 'version', 'version_type'}
         assert len(target['_id']) <= 512
         assert isinstance(json.loads(document, parse_constant=pytest.fail), dict)
