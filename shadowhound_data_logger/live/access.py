@@ -150,6 +150,21 @@ class Access:
         if who.nonce:
             self._ended[who.nonce] = now + LASTS_S
 
+    def ticket(self, who: SignIn, address: str) -> str:
+        """What lets a program at this address watch, and nothing else, for as long as a sign-in lasts: it may stand in a URL."""
+        text = f'{who.role}.{int(self._now()) + LASTS_S}.{who.nonce}'
+        return f'{text}.{self._sign(who.role, f"ticket.{text}.{address}")}'
+
+    def of_ticket(self, ticket: str, address: str) -> str | None:
+        """The nonce of the sign-in that asked for this ticket; None for one that is worth nothing."""
+        parts = ticket.split('.')
+        if len(parts) != 4 or parts[0] not in ROLES or not parts[1].isdecimal() or len(parts[1]) >= 12:
+            return None
+        role, until, nonce, signature = parts
+        expected = self._sign(role, f'ticket.{role}.{until}.{nonce}.{address}')
+        is_signed = hmac.compare_digest(signature.encode(), expected.encode())
+        return nonce if is_signed and int(until) > self._now() and nonce not in self._ended else None
+
     def is_csrf(self, who: SignIn, given: str) -> bool:
         """Whether a request that acts comes from the page itself."""
         return bool(who.csrf) and hmac.compare_digest(who.csrf.encode(), given.encode())

@@ -8,6 +8,7 @@ import json
 import logging
 import mimetypes
 import os
+import secrets
 import socket
 import ssl
 import sys
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, Any, Final
 from aiohttp import WSMsgType, web
 
 from shadowhound_data_logger.clock import SECOND, SystemClock
+from shadowhound_data_logger.encode.definitions import describe
 from shadowhound_data_logger.errors import DataLoggerError, NodeUnavailable
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.live.access import (
@@ -40,8 +42,9 @@ from shadowhound_data_logger.live.access import (
     rtsp_password,
 )
 from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures
+from shadowhound_data_logger.live.foxglove import PROTOCOLS, FoxgloveClient
 from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
-from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem
+from shadowhound_data_logger.live.kinds import FULL, KINDS, RAW, LiveItem
 from shadowhound_data_logger.live.relay import Relay
 from shadowhound_data_logger.live.rtsp import RtspServer
 from shadowhound_data_logger.live.viewer import Viewer
@@ -55,6 +58,8 @@ log = logging.getLogger(__name__)
 
 PAGE: Final = Path(__file__).parent / 'page'
 MOST_VIEWERS: Final = 16
+MOST_FOXGLOVES: Final = 8
+"""Clients that speak Foxglove's protocol."""
 MOST_BODY: Final = 4096
 """Bytes of a request."""
 MOST_MESSAGE: Final = 16 << 10
@@ -131,6 +136,16 @@ class _Connected:
     """For video."""
 
 
+@dataclass(eq=False)
+class _Foxglove:
+    """A client that speaks Foxglove's protocol, by whose sign-in it is here, and from where."""
+
+    client: FoxgloveClient
+    nonce: str
+    address: str
+    tasks: list[asyncio.Task[None]] = field(default_factory=list)
+
+
 class LiveServer:
     """Serves the page until it is closed. New; open once; close once; all on one event loop."""
 
@@ -141,6 +156,8 @@ class LiveServer:
         self._figures = SpoolFigures(settings.spool, settings.robot, SystemClock.of_this_machine())
         self._files = dict(_static(PAGE))
         self._viewers: set[_Connected] = set()
+        self._foxgloves: set[_Foxglove] = set()
+        self._session_id = secrets.token_hex(8)
         self._wanted: dict[str, frozenset[int]] | None = None
         self._graph: Mapping[str, str] = {}
         self._topics: Topics | None = None
@@ -170,6 +187,7 @@ class LiveServer:
             web.get('/ws', self._watch), web.get('/api/session', self._session), web.post('/api/session', self._sign_in),
             web.post('/api/sign-out', self._sign_out), web.post('/api/act', self._act), web.get('/api/gaps', self._tell_gaps),
             web.get('/api/doctor', self._tell_doctor), web.post('/api/label', self._label),
+            web.get('/foxglove', self._foxglove), web.get('/api/foxglove', self._tell_foxglove),
             web.get('/api/past/{do:robots|days|timeline|moment}', self._tell_past), web.get('/{name:.*}', self._file),
         ])  # fmt: skip
         self._runner = web.AppRunner(app, access_log=None, handle_signals=False)
@@ -194,8 +212,8 @@ class LiveServer:
             self._ticker.cancel()
             with suppress(asyncio.CancelledError):
                 await self._ticker
-        for one in list(self._viewers):
-            for task in one.tasks:
+        for tasks in [one.tasks for one in self._viewers] + [one.tasks for one in self._foxgloves]:
+            for task in tasks:
                 task.cancel()
         if self._runner is not None:
             await self._runner.cleanup()
@@ -258,9 +276,16 @@ class LiveServer:
             self._rtsp.serve(topic for topic in graph if self._kind_of(topic) == 'camera')
         for one in self._viewers:
             self._offer_catalogue(one)
+        for foxglove in self._foxgloves:
+            foxglove.client.publish(graph)
+        self._rewatch()
 
     def _on_items(self, items: list[LiveItem]) -> None:
         for item in items:
+            if item.size == RAW:
+                for foxglove in self._foxgloves:
+                    foxglove.client.offer(item)
+                continue
             for one in self._viewers:
                 if item.topic in one.viewer.watched and one.viewer.size(item.topic) == item.size:
                     one.viewer.offer(item)
@@ -297,8 +322,15 @@ class LiveServer:
         for taker in (self._video, self._rtsp):
             for topic in taker.topics if taker is not None else ():
                 wanted.setdefault(topic, set()).add(FULL)
+        for foxglove in self._foxgloves:
+            for topic in foxglove.client.watched:
+                wanted.setdefault(topic, set()).add(RAW)
         before = self._wanted
-        self._wanted = {topic: frozenset(sizes) for topic, sizes in wanted.items()} if self._viewers or self._rtsp else None
+        self._wanted = (
+            {topic: frozenset(sizes) for topic, sizes in wanted.items()}
+            if self._viewers or self._foxgloves or self._rtsp
+            else None
+        )
         if self._wanted != before:
             for source in (self._topics, self._relay):
                 if source is not None:
@@ -325,13 +357,9 @@ class LiveServer:
                     one.viewer.choose_sizes()
                     self._suggest_video(one, began_s)
                 self._rewatch()
-                if (
-                    self._settings.uploads_mbps
-                    and began_s >= lease_s
-                    and any(not is_loopback(one.address) for one in self._viewers)
-                ):
-                    lease_s = began_s + LEASE_EVERY_S
-                    self._loop.run_in_executor(self._pool, self._lease)
+            if self._settings.uploads_mbps and began_s >= lease_s and self._is_watched_from_afar:
+                lease_s = began_s + LEASE_EVERY_S
+                self._loop.run_in_executor(self._pool, self._lease)
             rounds += 1
             await asyncio.sleep(max(0.05, began_s + FIGURES_S - time.monotonic()))
 
@@ -356,6 +384,11 @@ class LiveServer:
         item = LiveItem('', 'figures', head={'at': round(time.monotonic() * 1e3, 1), 'figures': figures})
         for one in self._viewers:
             one.viewer.offer(item)
+
+    @property
+    def _is_watched_from_afar(self) -> bool:
+        addresses = [one.address for one in self._viewers] + [one.address for one in self._foxgloves]
+        return not self._settings.is_of_store and any(not is_loopback(address) for address in addresses)
 
     def _lease(self) -> None:
         """Uploads yield for some seconds; a node that does not run uploads nothing."""
@@ -438,10 +471,10 @@ class LiveServer:
         if not self._access.is_csrf(who, request.headers.get('X-CSRF-Token', '')):
             return _problem(403, 'the request does not come from this page')
         self._access.sign_out(who)
-        for one in list(self._viewers):
-            if one.who.nonce == who.nonce:
-                for task in one.tasks:
-                    task.cancel()
+        of_it = [one.tasks for one in self._viewers if one.who.nonce == who.nonce]
+        for tasks in of_it + [one.tasks for one in self._foxgloves if one.nonce == who.nonce]:
+            for task in tasks:
+                task.cancel()
         response = _json({})
         response.del_cookie(COOKIE)
         return response
@@ -569,15 +602,69 @@ class LiveServer:
                 one.asks.cancel()
             if self._video is not None:
                 self._video.end(one)
-            for task in one.tasks:
-                task.cancel()
-            for task in one.tasks:
-                with suppress(asyncio.CancelledError, ConnectionError, RuntimeError, asyncio.TimeoutError):
-                    await task
-            self._rewatch()
-            if request.transport is not None and not ws.closed:
-                request.transport.abort()  # one that reads nothing would not read a farewell either
+            await self._leave(request, ws, one.tasks)
         return ws
+
+    async def _leave(self, request: web.Request, ws: web.WebSocketResponse, tasks: list[asyncio.Task[None]]) -> None:
+        """A connection has ended; it is in no set any more."""
+        for task in tasks:
+            task.cancel()
+        for task in tasks:
+            with suppress(asyncio.CancelledError, ConnectionError, RuntimeError, asyncio.TimeoutError):
+                await task
+        self._rewatch()
+        if request.transport is not None and not ws.closed:
+            request.transport.abort()  # one that reads nothing would not read a farewell either
+
+    async def _tell_foxglove(self, request: web.Request) -> web.StreamResponse:
+        """The address for a Foxglove at the same machine as this viewer."""
+        if self._settings.is_of_store:
+            return _problem(404, "Foxglove gets topics from the robot's own page")
+        return _json({'path': f'/foxglove?ticket={self._access.ticket(self._who(request), request.remote or "")}'})
+
+    async def _foxglove(self, request: web.Request) -> web.StreamResponse:
+        """A client that speaks Foxglove's protocol. Its ticket, which no foreign page knows, stands for sign-in and origin."""
+        address = request.remote or ''
+        nonce = self._access.of_ticket(request.query.get('ticket', ''), address)
+        if nonce is None:
+            return _problem(401, 'this address has ended, or is not for this machine: ask the page for another')
+        if len(self._foxgloves) >= MOST_FOXGLOVES:
+            return _problem(429, f'{MOST_FOXGLOVES} clients are here, which is the most there may be', {'Retry-After': '10'})
+        ws = web.WebSocketResponse(
+            protocols=PROTOCOLS, max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0, heartbeat=SILENT_S
+        )
+        one = _Foxglove(FoxgloveClient(self._settings.robot, self._session_id), nonce, address)
+        self._foxgloves.add(one)
+        try:
+            await ws.prepare(request)
+            _quicken(request)
+            self._rewatch()
+            await self._loop.run_in_executor(self._pool, _describe_all, frozenset(self._graph.values()))
+            one.client.publish(self._graph)
+            one.tasks = [asyncio.create_task(self._send_foxglove(ws, one.client)),
+                         asyncio.create_task(self._hear_foxglove(ws, one.client))]  # fmt: skip
+            await asyncio.wait(one.tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            self._foxgloves.discard(one)
+            await self._leave(request, ws, one.tasks)
+        return ws
+
+    async def _send_foxglove(self, ws: web.WebSocketResponse, client: FoxgloveClient) -> None:
+        while True:
+            message = client.next()
+            if message is None:
+                client.ready.clear()
+                await client.ready.wait()
+            elif isinstance(message, str):
+                await ws.send_str(message)
+            else:
+                await ws.send_bytes(message)
+
+    async def _hear_foxglove(self, ws: web.WebSocketResponse, client: FoxgloveClient) -> None:
+        async for message in ws:
+            if message.type == WSMsgType.TEXT:
+                client.take(_parsed(message.data))
+                self._rewatch()
 
     async def _send(self, ws: web.WebSocketResponse, viewer: Viewer) -> None:
         while True:
@@ -633,6 +720,12 @@ class LiveServer:
             tell({'problem': self.no_video})
         else:
             await self._video.take(one, said, (one.at, one.address), tell)
+
+
+def _describe_all(types: frozenset[str]) -> None:
+    """Reads files, of which the definitions are remembered."""
+    for name in types:
+        describe(name)
 
 
 def _parsed(text: str) -> dict[str, Any]:

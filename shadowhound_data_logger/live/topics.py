@@ -20,7 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.keys import printable
-from shadowhound_data_logger.live.kinds import KINDS, Kind, LiveItem, clouds, frames, series
+from shadowhound_data_logger.live.kinds import KINDS, RAW, Kind, LiveItem, clouds, frames, series
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
@@ -36,6 +36,8 @@ MOST_TOPICS: Final = 500
 """Of the graph that are told; whoever publishes more is not shown all of it."""
 _Wanted = Mapping[str, frozenset[int]]
 """Topic -> the sizes in which it is watched."""
+_RAW_ALONE: Final = Kind('raw', 100.0, is_bulk=False)
+"""Of types that the page does not show."""
 
 
 class _Watched:
@@ -135,12 +137,16 @@ class Topics:
 
     def _follow(self, wanted: _Wanted) -> None:
         assert self._node is not None
-        for topic in [topic for topic, one in self._watched.items() if topic not in wanted or self._graph.get(topic) != one.type]:
+        for topic in [
+            topic
+            for topic, one in self._watched.items()
+            if not _is_watched(one.kind, wanted.get(topic)) or self._graph.get(topic) != one.type
+        ]:
             self._watched.pop(topic).reader.close()
         for topic in wanted.keys() - self._watched.keys():
             type_name = self._graph.get(topic, '')
-            kind = KINDS.get(type_name)
-            if kind is None or self._refused.get(topic) == type_name:
+            kind = KINDS.get(type_name, _RAW_ALONE)
+            if not type_name or not _is_watched(kind, wanted[topic]) or self._refused.get(topic) == type_name:
                 continue
             try:
                 self._watched[topic] = _Watched(self._node, topic, type_name, kind)
@@ -150,11 +156,15 @@ class Topics:
 
     def _drain(self, wanted: _Wanted, now_s: float) -> None:
         for topic, one in self._watched.items():
-            taken = one.due(one.reader.drain(), now_s)
-            if not taken:
+            came = one.reader.drain()
+            sizes = wanted.get(topic, frozenset())
+            if RAW in sizes and came:
+                self._came([_raw(topic, message) for message in came])
+            taken = one.due(came, now_s)
+            if not taken or not sizes - {RAW} or one.kind is _RAW_ALONE:
                 continue
             try:
-                if items := self._items(topic, one, taken, sorted(wanted.get(topic, ()))):
+                if items := self._items(topic, one, taken, sorted(sizes - {RAW})):
                     self._came(items)
             except Rejected as error:
                 self.rejected[topic] = self.rejected.get(topic, 0) + 1
@@ -171,3 +181,11 @@ class Topics:
         if one.kind.name == 'cloud':
             return list(clouds(topic, self._types, at_ms, cdr, sizes))
         return list(frames(topic, one.type, self._types, at_ms, cdr, sizes))
+
+
+def _is_watched(kind: Kind, sizes: frozenset[int] | None) -> bool:
+    return bool(sizes) and (kind is not _RAW_ALONE or RAW in (sizes or ()))
+
+
+def _raw(topic: str, message: Taken) -> LiveItem:
+    return LiveItem(topic, 'raw', RAW, {'at_ns': message.received_ns or time.time_ns()}, message.cdr)
