@@ -102,6 +102,10 @@ def _missions(command: _Command) -> _Command:
 @click.option('--allow-gaps', is_flag=True, help='Also take such missions, and those of which it is not known what is missing.')
 @click.option('--validation', type=click.FloatRange(0.0, 0.9), default=0.0, show_default=True, metavar='SHARE',
               help='Share of the missions that are marked as validation.')  # fmt: skip
+@click.option(
+    '--validation-label', default='', metavar='NAME', help='Mark missions with this label in a frame as validation, too.'
+)
+@click.option('--labels', is_flag=True, help='Add a column with the labels of each frame, and a table with what they say.')
 @click.option('--arm', default='', metavar='NAME', help='Also export an arm, whose topics are below /NAME.')
 @click.option('--clock', type=click.Path(path_type=Path), metavar='FILE',
               help='Events that both robot and arm timed, in addition to those recorded: CSV with robot_ns,arm_ns.')  # fmt: skip
@@ -173,6 +177,7 @@ def _options(how: Mapping[str, Any]) -> ExportOptions:
         codec=how['codec'], is_lossless=how['lossless'], resample=_pairs('--resample', how['resample'], str),
         max_age_s=_pairs('--max-age', how['max_age'], float), max_gap_s=how['max_gap'], max_stale=how['max_stale'],
         allow_gaps=how['allow_gaps'], validation=how['validation'],
+        labels=how['labels'], validation_label=how['validation_label'],
         arm=how['arm'], clock_pairs=pairs,
     )  # fmt: skip
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 SHOWN: Final = 30
 """Rows of a table unless --limit says more."""
-COLUMNS: Final = ('t_start', 'sensor', 'key', 'bytes', 'x', 'y', 'battery_pct', 'mission_type')
+COLUMNS: Final = ('t_start', 'sensor', 'key', 'bytes', 'x', 'y', 'battery_pct', 'mission_type', 'labels')
 """Of a table of objects; the other formats have all."""
 MOST_POSES: Final = 20_000
 MOST_TIMES: Final = 100
@@ -61,13 +61,15 @@ _OBJECTS: Final = {'bucket', 'key'}
 @click.option('--join', 'join_s', type=click.FloatRange(0.0), default=1.0, show_default=True, metavar='S',
               help='Times at most so far apart are one.')  # fmt: skip
 @click.option('--pad', 'pad_s', type=click.FloatRange(0.0), default=0.0, metavar='S', help='So much before and after each time.')
+@click.option('--labels', 'with_labels', is_flag=True, help='Add a column with the labels of each object.')
 @as_json
 @click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')
 @click.option(
     '--map', 'ground', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw where the objects were recorded.'
 )
-def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str, as_json: bool,  # noqa: PLR0913 - one an option
-          scan: bool, join_s: float, pad_s: float, sheet: Path | None, ground: Path | None) -> ExitCode:  # fmt: skip
+def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str,  # noqa: PLR0913 - one an option
+          as_json: bool, with_labels: bool, scan: bool, join_s: float, pad_s: float, sheet: Path | None,
+          ground: Path | None) -> ExitCode:  # fmt: skip
     """Search what is stored, by flags or SQL.
 
     An object must match all flags; times are UTC.
@@ -80,11 +82,11 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
     Exit code 1 when files of the catalogue are damaged: they are left out, and named on standard error.
     """
     with asking():
+        from shadowhound_data_logger.lake import labels, values  # noqa: PLC0415
         from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
-        from shadowhound_data_logger.lake import values  # noqa: PLC0415
 
         if values.is_about_values(flags.get('where', '')):
-            if sql or sheet or ground or order or limit or kind not in {'table', 'json'}:
+            if sql or sheet or ground or order or limit or with_labels or kind not in {'table', 'json'}:
                 raise BadUsage('a condition on values answers with times, as a table or JSON',
                                'write them to a file with --json, and ask again with --ranges FILE')  # fmt: skip
             left_out = quietly()
@@ -93,12 +95,16 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
                                   pad_s=pad_s, findings=left_out, **others)  # fmt: skip
             _print_times(flags['where'], found, is_json=as_json or kind == 'json')
             return tell_left_out(left_out)
+        if sql and with_labels:
+            raise BadUsage('--labels adds a column to objects, not to SQL', 'SQL has a view of its own: SELECT * FROM labels')
         source, left_out = lake.default_source(the_store_settings()), quietly()
         ask = functools.partial(lake.sql, sql) if sql else lake.objects
         frame = ask(source, findings=left_out, **flags)
         with lake.answering():
             frame = _ordered(frame, order or ('t_start_ns' if not sql else None))
             found = (frame.limit(limit) if limit else frame).to_arrow()
+        if with_labels:
+            found = labels.with_column(found, labels.read(source, flags.get('robot'), findings=left_out))
     if (sheet or ground or kind == 'keys') and not _OBJECTS.issubset(found.column_names):
         raise BadUsage('keys and pictures need the columns bucket and key', 'SELECT bucket, key FROM objects ...')
     with asking():
@@ -193,6 +199,8 @@ def _cell(name: str, value: Any) -> str:
         return '-'
     if isinstance(value, datetime):
         return f'{value:%Y-%m-%d %H:%M:%S}'
+    if isinstance(value, list):
+        return ', '.join(map(str, value)) or '-'
     if isinstance(value, float):
         return f'{value:.2f}' if name in {'x', 'y', 'yaw'} else f'{value:g}'
     return number(value) if isinstance(value, int) and not isinstance(value, bool) else str(value)

@@ -10,7 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING, Any, Final
@@ -19,10 +19,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from shadowhound_data_logger.catalogue import labels as catalogue_labels
 from shadowhound_data_logger.catalogue.gaps import GAPS as STATEMENTS
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.datasets.clocks import ClockOffset
-from shadowhound_data_logger.datasets.features import ARM_ACTION, ARM_TOPICS, LINEAR, ExportOptions
+from shadowhound_data_logger.datasets.features import ARM_ACTION, ARM_TOPICS, LABEL_FEATURE, LINEAR, ExportOptions
 from shadowhound_data_logger.datasets.plan import ArmPlan, EpisodePlan, StreamPlan
 from shadowhound_data_logger.datasets.series import Recordings, Series
 from shadowhound_data_logger.datasets.ticks import (
@@ -40,16 +41,16 @@ from shadowhound_data_logger.datasets.ticks import (
 from shadowhound_data_logger.datasets.video import VideoWriter
 from shadowhound_data_logger.disk import replacing
 from shadowhound_data_logger.errors import BagDamaged, LakeError, ObjectRefused, Rejected
-from shadowhound_data_logger.lake import decode
+from shadowhound_data_logger.lake import decode, labels
 from shadowhound_data_logger.lake.prefetch import Place
-from shadowhound_data_logger.lake.reading import arrow_schema
+from shadowhound_data_logger.lake.reading import arrow_schema, narrow
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-ROWS, SOURCES, GAPS, TOLD = 'rows.parquet', 'sources.parquet', 'gaps.parquet', 'episode.json'
+ROWS, SOURCES, GAPS, LABELS, TOLD = 'rows.parquet', 'sources.parquet', 'gaps.parquet', 'labels.parquet', 'episode.json'
 """Files of an episode's folder; beside them ``<camera>.mp4``."""
 BATCH: Final = 128
 """Rows with pictures that are written at a time."""
@@ -64,6 +65,8 @@ SOURCE_SCHEMA: Final = pa.schema([
 """One row a frame and message that it was made from: ``held_s`` is how much older than the tick it was."""
 GAP_SCHEMA: Final = arrow_schema(STATEMENTS).insert(0, pa.field(EPISODE, pa.string(), nullable=False))
 """The statements of the gap journal that were believed (catalogue/gaps.py)."""
+LABEL_SCHEMA: Final = narrow(labels.FIELDS, catalogue_labels.LABELS).insert(0, GAP_SCHEMA.field(EPISODE))
+"""The labels that stood, with their boxes (catalogue/labels.py)."""
 PICTURE: Final = pa.struct([('bytes', pa.binary()), ('path', pa.string())])
 
 
@@ -124,6 +127,8 @@ def _built(
     streams = [_sampled(each, one, ticks, fps, options) for each, one in zip(plan.streams, series, strict=True)]
     causes = [_causes(each, ticks, plan.arm) for each in streams]
     told = _told(plan, streams, causes, ticks, fps)
+    labelled = _labels(plan, streams, ticks)
+    told |= {'labels': sorted(set().union(*labelled))} if options.labels or options.validation_label else {}
     if (why := _refusal(told, options)) and not options.allow_gaps:
         return {**told, 'refused': why}
     pictures = [each for each in streams if each.plan.part is None]
@@ -131,11 +136,28 @@ def _built(
     for each in pictures:
         histogram, size = _write_pictures(each, fps, options, folder)
         told['histograms'][each.plan.name], told['sizes'][each.plan.name] = histogram, size
-    _write_rows(streams, causes, ticks, fps, options, folder)
+    _write_rows(streams, causes, ticks, fps, options, folder, labelled)
     _write_sources(plan, streams, ticks, folder / SOURCES)
     gaps = plan.gaps.add_column(0, EPISODE, pa.array([plan.mission.mission_id] * len(plan.gaps), pa.string()))
     pq.write_table(gaps.cast(GAP_SCHEMA), folder / GAPS, compression='zstd')
+    if options.labels:
+        rows = [{EPISODE: plan.mission.mission_id, **asdict(each)} for each in plan.labels]
+        pq.write_table(pa.Table.from_pylist(rows, schema=LABEL_SCHEMA), folder / LABELS, compression='zstd')
     return told
+
+
+def _labels(plan: EpisodePlan, streams: Sequence[_Stream], ticks: NDArray[np.int64]) -> list[set[str]]:
+    """Of each frame: those of its time, and of the objects that its pictures come from."""
+    found: list[set[str]] = [set() for _ in ticks]
+    for each in (each for each in streams if each.plan.part is None and plan.labels):
+        files = [each.series.files[int(each.series.file[message])] for message in each.sampled.message]
+        rows = pa.table({
+            'robot': [plan.mission.robot] * len(ticks), 'bucket': [file.bucket for file in files],
+            'key': [file.key for file in files], 't_start_ns': ticks, 't_end_ns': ticks,
+        })  # fmt: skip
+        for frame, names in zip(found, labels.column(rows, plan.labels), strict=True):
+            frame.update(names)
+    return found
 
 
 def _check_clock(arm: ArmPlan, fps: int) -> None:
@@ -324,7 +346,7 @@ def vectors(values: NDArray[Any], kind: pa.DataType) -> pa.Array:
 
 
 def _write_rows(streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]], ticks: NDArray[np.int64], fps: int,
-                options: ExportOptions, folder: Path) -> None:  # fmt: skip
+                options: ExportOptions, folder: Path, labelled: Sequence[set[str]]) -> None:  # fmt: skip
     count = len(ticks)
     state = np.hstack([each.values for each in streams if each.plan.name.startswith('state.')]).astype(np.float32)
     action = np.hstack([each.values for each in _of_action(streams)]).astype(np.float32)
@@ -338,6 +360,7 @@ def _write_rows(streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]],
         'shadowhound.stale': vectors(np.column_stack([each.sampled.stale for each in streams]).astype(np.float32), pa.float32()),
         'shadowhound.age_s': vectors(np.column_stack([each.sampled.age_s for each in streams]), pa.float32()),
         'shadowhound.cause': pa.array(told, pa.string()),
+        **({LABEL_FEATURE: pa.array([json.dumps(sorted(each)) for each in labelled], pa.string())} if options.labels else {}),
         'shadowhound.stamp_ns': pa.array(ticks, pa.int64()),
         'timestamp': pa.array((np.arange(count) / fps).astype(np.float32)),
         'frame_index': pa.array(np.arange(count), pa.int64()),

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from shutil import rmtree
@@ -259,11 +259,12 @@ def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store
 
 def _key_of(plan: EpisodePlan, settings: Mapping[str, Any], options: ExportOptions) -> str:
     """What is left of an earlier run is used where it was made in the same way of the same objects and gaps."""
-    told = [settings, options.max_stale, options.allow_gaps, sorted(plan.topics.items()), plan.missing, _where(plan),
+    told = [settings, options.validation_label, options.max_stale, options.allow_gaps, sorted(plan.topics.items()), plan.missing,
+            _where(plan),
             [(name, sorted(track.key.to_pylist())) for name, track in sorted(_tracks_of(plan).items())],
             plan.arm and (plan.arm.why, plan.arm.clock and plan.arm.clock.told())]  # fmt: skip
     whole = hashlib.sha256(json.dumps(told, default=str).encode())
-    for column in plan.gaps.to_pydict().items():
+    for column in (*plan.gaps.to_pydict().items(), *map(asdict, plan.labels)):
         whole.update(json.dumps(column, default=str).encode())
     return whole.hexdigest()[:16]
 
@@ -282,7 +283,8 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
         if 'refused' in told:
             result.refused[mission] = told['refused']
             continue
-        split = split_of(mission, options.validation)
+        is_chosen = options.validation_label in told.get('labels', ())
+        split = VALIDATION if is_chosen else split_of(mission, options.validation)
         try:
             recorded(plan)
             made.add(told, work, options, split)

@@ -61,6 +61,8 @@ ARM_STATE: Final = StatePart('arm', ARM_JOINTS, ('position',), (), ('rad',))
 ARM_COMMAND: Final = StatePart('arm', ARM_COMMANDS, ('position',), (), ('rad',))
 ARM_ACTION: Final = 'action.arm'
 """The stream of the arm's part of the action."""
+LABEL_FEATURE: Final = 'shadowhound.labels'
+"""The column with the labels of a frame, a JSON list."""
 HOLD, LINEAR = 'hold', 'linear'
 AV1, H264 = 'av1', 'h264'
 
@@ -86,6 +88,10 @@ class ExportOptions:
     validation: float = 0.0
     arm: str = ''
     """The namespace of an arm's topics, and the robot by which it is recorded where it has a machine of its own."""
+    labels: bool = False
+    """Whether frames have a column with their labels."""
+    validation_label: str = ''
+    """Episodes with this label in a frame are marked as validation."""
     clock_pairs: tuple[tuple[int, int], ...] = ()
     """(ns of the robot, ns of the arm) of events of which both told the time, beside those that were recorded."""
 
@@ -110,6 +116,7 @@ class ExportOptions:
             'state': list(self.state), 'cameras': list(self.cameras), 'codec': self.codec, 'lossless': self.is_lossless,
             'resample': dict(sorted((self.resample or {}).items())), 'max_age_s': dict(sorted((self.max_age_s or {}).items())),
             'max_gap_s': self.max_gap_s, **({'arm': self.arm} if self.arm else {}),
+            **({'labels': True} if self.labels else {}),
         }  # fmt: skip
 
 

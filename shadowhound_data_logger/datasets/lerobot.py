@@ -18,7 +18,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shadowhound_data_logger.datasets.episodes import EPISODE, GAP_SCHEMA, GAPS, PICTURE, ROWS, SOURCE_SCHEMA, SOURCES
+from shadowhound_data_logger.datasets.episodes import (
+    EPISODE,
+    GAP_SCHEMA,
+    GAPS,
+    LABEL_SCHEMA,
+    LABELS,
+    PICTURE,
+    ROWS,
+    SOURCE_SCHEMA,
+    SOURCES,
+)
 from shadowhound_data_logger.datasets.features import (
     ARM_ACTION,
     ARM_COMMANDS,
@@ -26,6 +36,7 @@ from shadowhound_data_logger.datasets.features import (
     COMMAND,
     DERIVED,
     JOINT_STATE,
+    LABEL_FEATURE,
     STATE_PARTS,
     ExportOptions,
     StatePart,
@@ -34,7 +45,7 @@ from shadowhound_data_logger.datasets.video import feature_info, video_frames
 from shadowhound_data_logger.disk import fingerprint, replacing, sync
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
-from shadowhound_data_logger.lake.training import DIGEST_FILES, INFO, digest_of
+from shadowhound_data_logger.lake.training import DIGEST_FILES, INFO, LABEL_TABLE, digest_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -157,6 +168,7 @@ class Lerobot:
         row |= {f'stats/{key}/{name}': value for key, each in stats.items() for name, value in each.items()}
         row |= {f'meta/episodes/{name}': value for name, value in place.items()}
         row |= _ours(told, split)
+        row |= {f'{OURS}labels': json.dumps(told['labels'])} if options.labels else {}
         self._write_row(row)
 
     def _write_row(self, row: EpisodeRow) -> None:
@@ -182,6 +194,8 @@ class Lerobot:
         _put_json(self.folder / STATS, self._stats())
         self._write_parts(self.folder / SOURCE_TABLE, SOURCES, made, SOURCE_SCHEMA)
         self._write_parts(self.folder / GAP_TABLE, GAPS, made, GAP_SCHEMA)
+        if LABEL_FEATURE in self.info['features']:
+            self._write_parts(self.folder / LABEL_TABLE, LABELS, made, LABEL_SCHEMA)
         _put_json(self.folder / REPORT, dict(report))
         info = _dump(self.info)
         digest = digest_of(self.folder, info)
@@ -217,8 +231,8 @@ class Lerobot:
                 before[table[EPISODE][0].as_py()] = table
         with replacing(path, is_synced=True) as out, pq.ParquetWriter(out, schema, compression='zstd') as writer:
             for mission in self.mission_ids:
-                table = before[mission] if mission in before else pq.read_table(made[mission] / name)
-                if len(table):
+                table = pq.read_table(made[mission] / name) if mission not in before and mission in made else before.get(mission)
+                if table is not None and len(table):
                     writer.write_table(table.select(schema.names).cast(schema), row_group_size=max(len(table), 1))
 
     def _note_digest(self, digest: str) -> None:
@@ -247,7 +261,7 @@ class Lerobot:
         """The files that belong to it, but for ``info.json`` and the list of them."""
         for row in self.rows:
             yield from self._files_of(row)
-        optional = ('meta/report.png',)
+        optional = ('meta/report.png', LABEL_TABLE)
         yield from (self.folder / name for name in (STATS, TASKS, SOURCE_TABLE, GAP_TABLE, REPORT, DIGESTS))
         yield from (self.folder / name for name in optional if (self.folder / name).is_file())
 
@@ -319,6 +333,7 @@ def features_of(told: Mapping[str, Any], options: ExportOptions) -> dict[str, An
     features['shadowhound.stale'] = _vector(list(streams), about='1 where the newest message is older than it may be')
     features['shadowhound.age_s'] = _vector(list(streams), about='seconds since the newest message')
     features['shadowhound.cause'] = {'dtype': 'string', 'shape': [1], 'names': None}
+    features |= {LABEL_FEATURE: {'dtype': 'string', 'shape': [1], 'names': None}} if options.labels else {}
     features['shadowhound.stamp_ns'] = {'dtype': 'int64', 'shape': [1], 'names': None}
     features |= {name: {'dtype': kind, 'shape': [1], 'names': None} for name, kind in _COUNTERS.items()}
     return features

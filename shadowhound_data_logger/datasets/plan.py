@@ -34,10 +34,11 @@ from shadowhound_data_logger.datasets.features import (
 )
 from shadowhound_data_logger.datasets.series import RecordedSensor, Recordings, bags_of
 from shadowhound_data_logger.errors import LakeError
-from shadowhound_data_logger.lake import query
+from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import OBJECTS, Known, newest, of_rows, thinned_times, watermarks
+from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track
@@ -132,6 +133,8 @@ class EpisodePlan:
     arm: ArmPlan | None = None
     detections: tuple[Track, ...] = ()
     """Of topics with detections of objects."""
+    labels: tuple[Label, ...] = ()
+    """Those of its time, where they were asked for."""
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -191,8 +194,11 @@ def planned(source: Bucket, store: ObjectStore, missions: Sequence[ChosenMission
     for robot in sorted({mission.robot for mission in missions}):
         ours = [mission for mission in missions if mission.robot == robot]
         stated = newest(source, robot=robot, since_ns=min(mission.begin_ns for mission in ours) - BEFORE_NS, findings=findings)
+        labelled = labels.read(source, robot, findings=findings) if options.labels or options.validation_label else []
         for mission in ours:
-            yield _planned(source, store, mission, options, action=action, stated=stated, work=work, findings=findings)
+            made = _planned(source, store, mission, options, action=action, stated=stated, work=work, findings=findings)
+            first, last = made.span_ns
+            yield replace(made, labels=tuple(each for each in labelled if each.since_ns <= last and each.until_ns >= first))
 
 
 def settled_action(plans: Sequence[EpisodePlan], action: str) -> str:

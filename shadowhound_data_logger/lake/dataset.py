@@ -68,6 +68,7 @@ class MissionDataset:
             raise SettingError('sensor', flags['sensor'], 'anchor="camera" instead')
         self.aligned = {name: _way(name, how, causal=causal) for name, how in (align or {}).items()}
         self._place, asked = selecting.place(source)
+        self._lake = asked
         self.left_out = Findings()
         """What of the catalogue is not in it, since it is not part of one; a child that was forked or spawned has none of it."""
         if pull:
@@ -125,6 +126,18 @@ class MissionDataset:
                 found += [track.pose_at(int(number), int(stamp_ns), POSE_GAP_NS)[None]
                           for number in chosen for stamp_ns in track.stamps_ns(int(number))]  # fmt: skip
         return np.concatenate([np.empty((0, 3)), *found])
+
+    def labels(self) -> list[list[str]]:
+        """The labels of each sample that stand now: those of its time and of its object.
+
+        A folder of ``shadowhound-data fetch`` has none. Raises StoreError.
+        """
+        from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no Daft
+
+        tracks = zip(self._selection.anchors, self._chosen, strict=True)
+        return selecting.labels_of(
+            self._lake, [(track, int(number)) for track, chosen in tracks for number in chosen], self.left_out
+        )
 
     def stream(self, *, shuffle: bool = False, seed: int = 0, rank: int = 0, ranks: int = 1) -> MissionStream:
         """The same samples one after another, read ahead; a DataLoader takes it for an IterableDataset.

@@ -90,7 +90,8 @@ class Label:
         return replace(self, id=hashlib.blake2b('\0'.join(map(str, said)).encode(), digest_size=8).hexdigest())
 
 
-_FIELDS: Final = tuple(each.name for each in fields(Label))
+FIELDS: Final = tuple(each.name for each in fields(Label))
+"""The columns of a label."""
 
 
 def write(store: ObjectStore, robot: str, found: Sequence[Label], *, by: str, is_removal: bool = False) -> str:
@@ -101,7 +102,7 @@ def write(store: ObjectStore, robot: str, found: Sequence[Label], *, by: str, is
     rows: list[Row] = []
     for each in found:
         one = each.checked()
-        said = {name: getattr(one, name) for name in _FIELDS}
+        said = {name: getattr(one, name) for name in FIELDS}
         rows.append({**said, 'what': REMOVED if is_removal else LABEL, 'by': by, 'made_ns': made_ns, 'made': made_ns // 1000,
                      'format_version': 1})  # fmt: skip
     body = parts.encode(rows, LABELS)
@@ -126,7 +127,7 @@ def read(source: Bucket, robot: str | None = None, *, label: str | None = None, 
             if name not in newest or (row['made_ns'], row['what']) > (newest[name]['made_ns'], newest[name]['what']):
                 newest[name] = row
     standing = (row for row in newest.values() if row['what'] == LABEL and label in {None, row['label']})
-    labels = (Label(**{name: row[name] for name in _FIELDS if row[name] is not None}) for row in standing)
+    labels = (Label(**{name: row[name] for name in FIELDS if row[name] is not None}) for row in standing)
     return sorted(labels, key=lambda each: (each.robot, each.since_ns, each.label, each.id))
 
 
@@ -142,7 +143,10 @@ def spans(found: Iterable[Label]) -> tuple[list[TimeSpan], list[tuple[str, str]]
 
 
 def column(rows: pa.Table, found: Sequence[Label]) -> list[list[str]]:
-    """For each row of the catalogue the labels of its object: those of its key, and of times into which it reaches."""
+    """For each row of the catalogue the labels of its object: those of its key, and of times into which it reaches.
+
+    The columns that it needs are ``robot bucket key t_start_ns t_end_ns``.
+    """
     of_keys: dict[tuple[str, str], set[str]] = {}
     said: list[set[str]] = [set() for _ in range(len(rows))]
     first = pc.fill_null(rows['t_start_ns'], -1).to_numpy()
@@ -162,6 +166,11 @@ def column(rows: pa.Table, found: Sequence[Label]) -> list[list[str]]:
     return [sorted(each) for each in said]
 
 
+def with_column(rows: pa.Table, found: Sequence[Label]) -> pa.Table:
+    """The rows with a column ``labels``."""
+    return rows.append_column('labels', pa.array(column(rows, found), pa.list_(pa.string())))
+
+
 # -- files of labels -----------------------------------------------------------------------------------------------------------
 
 
@@ -172,19 +181,24 @@ def from_csv(body: bytes, robot: str, now_ns: int) -> list[Label]:
     """
     try:
         check_size(len(body), MOST_DOCUMENT_BYTES)
-        reader = csv.DictReader(io.StringIO(body.decode('utf-8-sig')), strict=True)
+        reader = csv.DictReader(io.StringIO(body.decode('utf-8-sig')), strict=True, restkey='')
         _check_columns(reader.fieldnames or ())
-        return [_of_csv({name: value or '' for name, value in row.items() if name}, robot, now_ns) for row in reader]
+        return [_of_csv({name: value or '' for name, value in row.items()}, robot, now_ns) for row in reader]
     except (ValueError, csv.Error, TypeError) as error:
         raise LakeError(f'it is not a CSV of labels: {error}') from error
 
 
 def _check_columns(names: Iterable[str]) -> None:
-    if 'label' not in names or set(names) - _CSV:
-        raise ValueError(f'its first line has to name the columns: label, and any of {" ".join(sorted(_CSV - {"label"}))}')
+    names = [*names]
+    if 'label' not in names or set(names) - _CSV or len(set(names)) != len(names):
+        raise ValueError(
+            f'its first line has to name the columns, each once: label, and any of {" ".join(sorted(_CSV - {"label"}))}'
+        )
 
 
 def _of_csv(row: Mapping[str, str], robot: str, now_ns: int) -> Label:
+    if '' in row:
+        raise ValueError(f'the label {row["label"]!r} has more cells than there are columns')
     key = row.get('key') or None
     if key is None and not (row.get('since') and row.get('until')):
         raise ValueError(f'the label {row["label"]!r} has neither since and until nor a key')
@@ -210,7 +224,7 @@ def from_coco(body: bytes, robot: str) -> list[Label]:
             key = keys[one['image_id']]
             found.append(Label(robot=robot or key.partition('/')[0], label=names[one['category_id']], since_ns=0, until_ns=0,
                                bucket=BUCKET, key=key, x=x, y=y, width=width, height=height))  # fmt: skip
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
         raise LakeError(
             f'it is not a COCO file of boxes: {" ".join(str(error).split())[:200] or type(error).__name__}'
         ) from error

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from shadowhound_data_logger.catalogue.schema import SENSOR
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.errors import LakeError, SettingError
-from shadowhound_data_logger.lake import query  # first: it turns Daft's telemetry off
+from shadowhound_data_logger.lake import labels, query  # first: it turns Daft's telemetry off
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES
 from shadowhound_data_logger.lake.findings import Findings
@@ -55,6 +55,18 @@ def pull(
     if isinstance(source, (str, Path)):
         raise SettingError('pull', True, 'a store as the source: robots are asked through one')
     bring(lake, flags, sensors=sensors, say=log.info, findings=findings)
+
+
+def labels_of(lake: Bucket, objects: Sequence[tuple[Track, int]], findings: Findings) -> list[list[str]]:
+    """Of each message in these objects of tracks. Raises StoreError."""
+    names: dict[str, list[Any]] = {name: [] for name in ('robot', 'bucket', 'key', 't_start_ns')}
+    for track, number in objects:
+        stamps = [int(stamp) for stamp in track.stamps_ns(number)]
+        names['t_start_ns'] += stamps
+        for name, value in (('robot', track.robot), ('bucket', track.bucket[number].as_py()), ('key', track.key[number].as_py())):
+            names[name] += [value] * len(stamps)
+    found = [label for robot in sorted(set(names['robot'])) for label in labels.read(lake, robot, findings=findings)]
+    return labels.column(pa.table({**names, 't_end_ns': names['t_start_ns']}), found)
 
 
 def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], size: tuple[int, int] | None,

@@ -1,7 +1,8 @@
 """What a model was trained on: the digest of a data set, and the mark of it in a run of MLflow.
 
 A digest stands for everything in a data set of ``shadowhound-data export``: ``info.json`` says how it was made, the table of
-sources has the SHA-256 of every object that a value came from, and that of gaps what was known to be missing.
+sources has the SHA-256 of every object that a value came from, and that of gaps what was known to be missing. In a data set with
+labels it also stands for those that were there when its episodes were made.
 """
 
 from __future__ import annotations
@@ -20,14 +21,19 @@ from shadowhound_data_logger.missions.tracking import MlflowTracking
 
 INFO: Final = 'meta/info.json'
 DIGEST_FILES: Final = (INFO, 'meta/shadowhound_sources.parquet', 'meta/shadowhound_gaps.parquet')
+LABEL_TABLE: Final = 'meta/shadowhound_labels.parquet'
+"""Only of data sets with labels; part of their digest."""
 DIGEST_TAG: Final = 'shadowhound_dataset_digest'
 NAME_TAG: Final = 'shadowhound_dataset'
 
 
 def digest_of(folder: Path, info: bytes | None = None) -> str:
-    """SHA-256 (hex) over ``DIGEST_FILES``; ``info`` stands for ``info.json`` while that is not written yet. Raises LakeError."""
+    """SHA-256 (hex) over ``DIGEST_FILES`` and the table of labels. Raises LakeError.
+
+    ``info`` stands for ``info.json`` while that is not written yet.
+    """
     whole = hashlib.sha256()
-    for name in DIGEST_FILES:
+    for name in (*DIGEST_FILES, *((LABEL_TABLE,) if (folder / LABEL_TABLE).is_file() else ())):
         try:
             body = info if info is not None and name == INFO else (folder / name).read_bytes()
         except OSError as error:

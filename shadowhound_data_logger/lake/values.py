@@ -58,6 +58,10 @@ JOIN_S: Final = 1.0
 """What is no further apart is one range."""
 OPENED_AT_A_TIME: Final = 64
 MOST_LEAVES: Final = 32
+MOST_TEXT: Final = 10_000
+"""Of a condition."""
+MOST_SHOWN: Final = 200
+"""Of one that is refused."""
 _PATH: Final = r'[A-Za-z_][\w-]*(?:\.(?:\w+|\*))+'
 _COMPARISON: Final = re.compile(
     rf'\s*(?:(?P<function>{"|".join(NUMBERS)})\s*\(\s*(?P<inner>{_PATH})\s*\)|(?P<plain>{_PATH}))'
@@ -155,13 +159,18 @@ def is_about_values(text: str) -> bool:
 
 def parse(text: str) -> Expression:
     """Raises SettingError."""
+    if len(text) > MOST_TEXT:
+        raise SettingError('where', f'{text[:80]}...', f'at most {MOST_TEXT:,} letters')
     found, at = _any(text, 0, 0)
     if text[at:].strip():
-        raise SettingError('where', text, ALLOWED)
-    sensors = {each.sensor for each in leaves(found)}
+        raise SettingError('where', text[:MOST_SHOWN], ALLOWED)
+    asked = leaves(found)
+    if len(asked) > MOST_LEAVES:
+        raise SettingError('where', text[:MOST_SHOWN], f'at most {MOST_LEAVES} comparisons')
+    sensors = {each.sensor for each in asked}
     if len(sensors) > 1:
-        raise SettingError('where', text, f'one sensor at a time, not {" and ".join(sorted(sensors))}: write the ranges of one '
-                                          'with --json to a file, and ask for the other with --ranges')  # fmt: skip
+        raise SettingError('where', text[:MOST_SHOWN], f'one sensor at a time, not {" and ".join(sorted(sensors))}: write the '
+                           'ranges of one with --json to a file, and ask for the other with --ranges')  # fmt: skip
     return found
 
 
@@ -194,11 +203,11 @@ def _one(text: str, at: int, depth: int) -> tuple[Expression, int]:
         return Comparison(found['function'] or '', sensor, name, sign, float(found['number'])), found.end()
     bracket = _WORD.match(text, at)
     if bracket is None or bracket[1] != '(' or depth >= MOST_LEAVES:
-        raise SettingError('where', text, ALLOWED)
+        raise SettingError('where', text[:MOST_SHOWN], ALLOWED)
     inner, at = _any(text, bracket.end(), depth + 1)
     close = _WORD.match(text, at)
     if close is None or close[1] != ')':
-        raise SettingError('where', text, ALLOWED)
+        raise SettingError('where', text[:MOST_SHOWN], ALLOWED)
     return inner, close.end()
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,12 @@ from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in,
 from shadowhound_data_logger.datasets.verify import seen_in_folder, seen_in_store, verify
 from shadowhound_data_logger.datasets.video import VideoWriter, video_frames
 from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.labels import Label
+from shadowhound_data_logger.lake.training import LABEL_TABLE, digest_of
+from shadowhound_data_logger.options import UploadSettings
+from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 PATROLS = {'mission_type': 'patrol'}
@@ -190,6 +197,40 @@ def test_a_share_of_the_missions_is_for_validation() -> None:
     assert 70 < len(held) < 130
     assert {*held} < {name for name in names if split_of(name, 0.5) == 'validation'}
     assert [name for name in names if split_of(name, 0.0) == 'validation'] == []
+
+
+def test_labels_are_a_column_and_choose_validation(tmp_path: Path) -> None:
+    """Of each frame those of its time and of its picture, as they stood; who said so is in a table, and the digest covers it."""
+    place = House(tmp_path)
+    mission = place.record(Mission('one', seconds=2, sensors=('camera', 'odom')))
+    place.record(Mission('two', begin_s=50, seconds=2, sensors=('camera', 'odom')))
+    stairs = Label(robot='thor', label='stairs; "up"', since_ns=mission.begin_ns + SECOND, until_ns=mission.begin_ns + 2 * SECOND)
+    picture = query.objects(place.source, sensor='camera', mission='two').sort('t_start_ns').to_pylist()[-1]
+    box = Label(robot='thor', label='person', since_ns=picture['t_start_ns'], until_ns=picture['t_end_ns'], bucket='sensor-data',
+                key=picture['key'], x=1, y=2, width=3, height=4)  # fmt: skip
+    with closing(open_store(place.settings, UploadSettings())) as store:
+        labels.write(store, 'thor', [stairs, box, replace(box, label='gone')], by='ann')
+        labels.write(store, 'thor', [replace(box, label='gone')], by='ben', is_removal=True)
+    options = ExportOptions(labels=True, validation_label='person', allow_gaps=True)
+    first = export(tmp_path / 'set', place.source, {'label': 'stairs; "up"', 'mission_type': 'patrol'}, options)
+    assert [each['mission_id'] for each in first.added] == ['one']
+    export(tmp_path / 'set', place.source, PATROLS, options)
+    made = Lerobot(tmp_path / 'set')
+    assert [row[f'{OURS}split'] for row in made.rows] == ['train', 'validation']
+    assert [row[f'{OURS}labels'] for row in made.rows] == [json.dumps(['stairs; "up"']), json.dumps(['person'])]
+    for row, label in zip(made.rows, (stairs, box), strict=True):
+        table = pq.read_table(made.path(DATA, row, 'data'))
+        for stamp, text in zip(table['shadowhound.stamp_ns'].to_pylist(), table['shadowhound.labels'].to_pylist(), strict=True):
+            if label.key is None:
+                assert json.loads(text) == ([label.label] if label.since_ns <= stamp <= label.until_ns else [])
+        assert label.label in {name for text in table['shadowhound.labels'].to_pylist() for name in json.loads(text)}
+    told = pq.read_table(made.folder / LABEL_TABLE).to_pylist()
+    assert [(each['episode_mission'], each['label'], each['by'], each['width']) for each in told] == [
+        ('one', 'stairs; "up"', 'ann', None), ('two', 'person', 'ann', 3.0),
+    ]  # fmt: skip
+    before = digest_of(made.folder)
+    (made.folder / LABEL_TABLE).write_bytes(b'another')
+    assert digest_of(made.folder) != before
 
 
 def test_frames_in_the_video_are_the_rows(exported: Exported) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import LakeError, NameRefused, SettingError
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.dataset import MissionDataset
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.stores import open_store
@@ -80,6 +82,17 @@ def test_labels_choose_objects(lake: Bucket) -> None:
     rows = query.objects(lake, sensor='camera', since='2026-10-28T11:55', until='2026-10-28T12:01').sort('t_start_ns').to_arrow()
     column = labels.column(rows, labels.read(lake))
     assert [each for each in column if each] == [['person'], ['stairs'], ['stairs']]
+    assert labels.with_column(rows.slice(0, 0), [STAIRS])['labels'].to_pylist() == []
+
+
+def test_samples_have_labels(lake: Bucket) -> None:
+    """Those that stand when they are asked for, also in a data set that was pickled."""
+    said(lake, STAIRS)
+    dataset = MissionDataset(lake, since='2026-10-28T11:59:50', until='2026-10-28T12:01')
+    found = [(stamp - NOON_NS) // SECOND for stamp, names in zip(dataset.stamps_ns, dataset.labels(), strict=True) if names]
+    assert found == [0, 15]
+    said(lake, STAIRS, is_removal=True)
+    assert not any(pickle.loads(pickle.dumps(dataset)).labels())  # noqa: S301 - our own
 
 
 def test_files_of_labels() -> None:
@@ -99,10 +112,13 @@ def test_files_of_labels() -> None:
         b'label,colour\nx,red\n',
         b'\xff',
         b'label,key,x\nm,thor/a,b\n',
+        b'label,label,key\nm,n,thor/a\n',
+        b'label,key\nm,thor/a,b\n',
     ):
         with pytest.raises(LakeError, match='CSV'):
             labels.from_csv(wrong, 'thor', NOON_NS)
-    for wrong in (b'{}', b'{"images": 1}', b'[]', json.dumps({**coco, 'annotations': [{'image_id': 2}]}).encode()):
+    for wrong in (b'{}', b'{"images": 1}', b'[]', json.dumps({**coco, 'annotations': [{'image_id': 2}]}).encode(),
+                  json.dumps(coco).replace('[1, 2,', f'[{10**400}, 2,').encode()):  # fmt: skip
         with pytest.raises(LakeError, match='COCO'):
             labels.from_coco(wrong, 'thor')
 
