@@ -16,9 +16,9 @@ from bisect import bisect_left
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
+from functools import lru_cache
 from itertools import groupby
 from typing import Final, NamedTuple
 
@@ -37,7 +37,7 @@ from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.forgotten import forgotten_entries, forgotten_names, without
 from shadowhound_data_logger.lake.gaps import HOUR_NS, OBJECTS
-from shadowhound_data_logger.lake.live_files import Day, robots
+from shadowhound_data_logger.lake.live_files import Day, name_of, robots
 from shadowhound_data_logger.lake.reading import narrow, tables
 from shadowhound_data_logger.lake.scan import KEY, folders
 from shadowhound_data_logger.lake.select import Wanted
@@ -59,6 +59,8 @@ MOST_ROWS: Final = 10_000
 """Of a part."""
 MOST_NAMES: Final = 20
 """Of what refers to objects of a sensor, in an answer."""
+REPEATS: Final = '_repeats'
+"""In the names of parts whose rows name the objects of other parts: only those are deleted by."""
 DELETED: Final = '.deleted'
 """Follows the key of a part whose objects are deleted."""
 KIND, CAUSE = 'forgotten', 'retention'
@@ -163,6 +165,10 @@ class Protection:
                 return REQUEST, request
         return None
 
+    def any_of(self, row: Row) -> tuple[str, str] | None:
+        """The same of an object with its repeats."""
+        return next((found for each in (row, *row['repeats']) if (found := self.why(each)) is not None), None)
+
     def _label_of(self, row: Row) -> str | None:
         """Of a time into which the object reaches."""
         spans, latest = self._spans.get(row['robot'], []), self._latest.get(row['robot'], [])
@@ -198,6 +204,10 @@ class PrunePlan:
     @property
     def going_bytes(self) -> int:
         return sum(each.going_bytes for each in self.sensors.values())
+
+    def lets_go(self, why: tuple[str, str] | None) -> bool:
+        """Whether an object goes if the rules say so, and this protects it."""
+        return why is None or (self.is_forced and why[0] != UNTOLD)
 
     def since_ns(self, sensor: str) -> int | None:
         """What of a sensor ended before goes; None where nothing does."""
@@ -257,14 +267,16 @@ def plan(source: Bucket, rules: Sequence[RetentionRule], *, robot: str | None = 
     counts = _Counts(made)
     for rows in _by_day(source, named, findings, tell):
         for row in rows:
-            counts.total += row['size']
+            counts.total += row['bytes']
             if row['group'] is None:
-                counts.add(row['name'], row['objects'], row['size'], row['end_ns'], lambda row=row: made.protection.why(row))  # type: ignore[misc]
+                counts.add(row['name'], 1, row['bytes'], row['end_ns'], lambda row=row: made.protection.any_of(row))  # type: ignore[misc]
             else:
                 _grouped(made, row)
+    if not {BAGS, EVENTS}.isdisjoint(made.sensors):
+        with ThreadPoolExecutor(THREADS, 'prune') as pool:
+            for _ in pool.map(lambda group: _tell_events_apart(source, group), made.groups.values()):
+                pass
     for group in made.groups.values():
-        if group.sensor == BAGS:
-            _tell_events_apart(source, group)
         counts.add(group.sensor, group.objects, group.bytes, group.end_ns, lambda group=group: group.why)  # type: ignore[misc]
     if most_bytes is not None:
         counts.cut(most_bytes)
@@ -288,7 +300,7 @@ class _Counts:
         if since_ns is None:
             return
         why = ask_why()
-        is_free = why is None or self._made.is_forced
+        is_free = self._made.lets_go(why)
         if end_ns < since_ns and why is not None:
             one.protected[why[0]] += objects
             if len(one.referrers) < MOST_NAMES:
@@ -325,19 +337,24 @@ def apply(source: Bucket, store: ObjectStore, made: PrunePlan, *, now_ns: int, f
             for rows in _by_day(source, [robot], findings, tell):
                 going = [row for row in rows if _goes(made, row)]
                 _state_bags(store, made, going)
-                for _, date, numbered in parts.by_folder(enumerate(going)):
-                    some = [_forgotten_row(made, row, now_ns) for _, row in numbered]
-                    for start in range(0, len(some), MOST_ROWS):
-                        part = some[start : start + MOST_ROWS]
-                        name = f'{date.replace("-", "")}_{_digest(part)}'
-                        put_part(store, FORGOTTEN.part_key(robot, date, name), robot, parts.encode(part, FORGOTTEN), len(part))
-                done.objects += sum(row['objects'] for row in going)
-                done.bytes += sum(row['size'] for row in going)
+                _put_rows(store, made, robot, [each for row in going for each in row['repeats']], now_ns, REPEATS)
+                _put_rows(store, made, robot, going, now_ns)
+                done.objects += len(going)
+                done.bytes += sum(row['bytes'] for row in going)
             _settle(source, store, robot, findings, tell)
     except AccessDenied as error:
         raise LakeError(f'these credentials may not prune: {error.what}',
                         remedy='use those of the user `prune` (docs/tower.md)') from error  # fmt: skip
     return done
+
+
+def _put_rows(store: ObjectStore, made: PrunePlan, robot: str, rows: Iterable[Row], now_ns: int, mark: str = '') -> None:
+    for _, date, numbered in parts.by_folder(enumerate(rows)):
+        some = [_forgotten_row(made, row, now_ns) for _, row in numbered]
+        for start in range(0, len(some), MOST_ROWS):
+            part = some[start : start + MOST_ROWS]
+            key = FORGOTTEN.part_key(robot, date, f'{date.replace("-", "")}{mark}_{_digest(part)}')
+            put_part(store, key, robot, parts.encode(part, FORGOTTEN), len(part))
 
 
 def _goes(made: PrunePlan, row: Row) -> bool:
@@ -348,47 +365,49 @@ def _goes(made: PrunePlan, row: Row) -> bool:
     since_ns = made.since_ns(sensor)
     if since_ns is None or end_ns >= since_ns:
         return False
-    why = made.protection.why(row) if group is None else group.why
-    return why is None or made.is_forced
+    return made.lets_go(made.protection.any_of(row) if group is None else group.why)
 
 
 def _by_day(source: Bucket, named: Sequence[str], findings: Findings, tell: Callable[[str], None]) -> Iterator[list[Row]]:
-    """The rows of what the store has, the newest day of a robot first; no object twice in a day.
+    """The rows of what the store has, the newest day of a robot first; no object twice.
 
-    Each with ``name`` (what a rule calls its sensor), ``group``, ``end_ns``, and how many ``objects`` of which ``size`` it adds.
-    An object that a later row names as its content (a repeat) is as old as that row.
+    Each with ``name`` (what a rule calls its sensor), ``group``, ``end_ns``, and as ``repeats`` the other rows that name it as
+    their content: it is as old as the youngest of them.
     """
     for robot in named:
         found = sorted(folders(source, Wanted(robot=robot), findings), key=lambda day: day.date, reverse=True)
         gone = forgotten_entries(source, found, findings)
-        later: dict[tuple[str, str], int] = {}
+        later: defaultdict[tuple[str, str], list[Row]] = defaultdict(list)
         for day in found:
             tell(f'{robot} {day.date}')
             yield list(_rows_of(source, day, gone.get((robot, day.date), ()), later, findings))
 
 
-def _rows_of(source: Bucket, day: Day, gone: Sequence[ObjectInfo], later: dict[tuple[str, str], int],
+def _rows_of(source: Bucket, day: Day, gone: Sequence[ObjectInfo], later: defaultdict[tuple[str, str], list[Row]],
              findings: Findings) -> Iterator[Row]:  # fmt: skip
+    """``later`` has the rows of younger days whose key has another date than theirs, and gets those of this one.
+
+    Such a row is a repeat of what is older, or somebody's invention: by itself it lets nothing go.
+    """
     found = pa.concat_tables([narrow(_COLUMNS).empty_table(), *tables(source, day.entries, _COLUMNS, findings)])
     found = without(found, forgotten_names(source, gone, findings))
     found = found.filter(pc.and_(pc.is_valid(found['t_start']), pc.is_valid(found['t_start_ns'])))
-    compact_date = day.date.replace('-', '')
-    newest: dict[tuple[str, str], Row] = {}
+    date = day.date.replace('-', '')
+    own: dict[tuple[str, str], Row] = {}
     for row in found.sort_by('t_start_ns').to_pylist():
-        name = row['bucket'], row['key']
-        row['end_ns'] = max(_end_ns(row), _key_ns(row['key']))
-        if name in newest:
-            newest[name]['end_ns'] = max(newest[name]['end_ns'], row['end_ns'])
-        else:
-            newest[name] = row
-    for name, row in newest.items():
+        object_name = row['bucket'], row['key']
+        row['robot'] = day.robot
         row['name'], row['group'] = _group_of(row)
-        row['objects'], row['size'] = 1, row['bytes']
-        if name in later:  # it was counted with the later row
-            row['objects'] = row['size'] = 0
-            row['end_ns'] = max(row['end_ns'], later[name])
-        if compact_date not in row['key']:
-            later[name] = row['end_ns']
+        if row['group'] is None and date not in row['key']:
+            later[object_name].append(row)
+        elif object_name in own:
+            own[object_name]['repeats'].append(row)
+        else:
+            row['repeats'] = []
+            own[object_name] = row
+    for object_name, row in own.items():
+        row['repeats'] += later.pop(object_name, ())
+        row['end_ns'] = max(_key_ns(row['key']), *map(_end_ns, (row, *row['repeats'])))
         yield row
 
 
@@ -408,18 +427,20 @@ def _grouped(made: PrunePlan, row: Row) -> None:
         group = _Group(row['name'], row['robot'], row['group'].partition('/')[2], row['t_start_ns'], row['end_ns'])
         made.groups[row['group']] = group
     group.begin_ns, group.end_ns = min(group.begin_ns, row['t_start_ns']), max(group.end_ns, row['end_ns'])
-    group.objects += row['objects']
-    group.bytes += row['size']
-    group.why = group.why or made.protection.why(row)
+    group.objects += 1
+    group.bytes += row['bytes']
+    group.why = group.why or made.protection.any_of(row)
 
 
 def _tell_events_apart(source: Bucket, group: _Group) -> None:
     """By the manifest. Of a bag without one nobody knows whether an event made it, or whether it still grows: it stays."""
+    if group.sensor != BAGS:
+        return
     try:
         body = source.get(f'{group.prefix}manifest.json', MOST_DOCUMENT_BYTES)
         group.manifest = Manifest.from_json(body)
     except (ObjectRefused, BagDamaged):
-        group.why = group.why or (UNTOLD, group.prefix)
+        group.why = UNTOLD, group.prefix
         return
     group.sensor = BAGS if group.manifest.event is None else EVENTS
 
@@ -431,12 +452,16 @@ def _end_ns(row: Row) -> int:
 
 def _key_ns(key: str) -> int:
     """The latest date in a key, 0 where it has none: a robot may write a row with an older one, but not another key."""
-    found = 0
-    for date in _DATE.findall(key):
-        with suppress(ValueError):
-            day = datetime.strptime(date, '%Y%m%d').replace(tzinfo=timezone.utc)
-            found = max(found, round(day.timestamp()) * SECOND)
-    return found
+    return max((_begin_ns(date) for date in _DATE.findall(key)), default=0)
+
+
+@lru_cache(maxsize=4096)
+def _begin_ns(date: str) -> int:
+    try:
+        day = datetime.strptime(date, '%Y%m%d').replace(tzinfo=timezone.utc)
+    except ValueError:
+        return 0
+    return round(day.timestamp()) * SECOND
 
 
 def _forgotten_row(made: PrunePlan, row: Row, now_ns: int) -> Row:
@@ -467,8 +492,9 @@ def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, 
     done = 0
     with ThreadPoolExecutor(THREADS, 'prune') as pool:
         for entry in pending:
-            keys = {pair for rows in tables(source, [entry], KEY, findings, of=FORGOTTEN)
-                    for pair in zip(*(rows[name].to_pylist() for name in KEY), strict=True)}  # fmt: skip
+            keys: set[tuple[str, str]] = set()
+            for rows in tables(source, [entry], KEY, findings, of=FORGOTTEN) if f'{REPEATS}_' not in name_of(entry.key) else ():
+                keys.update(zip(*(rows[name].to_pylist() for name in KEY), strict=True))
             tell(f'{robot}: deleting {len(keys):,} objects')
             for _ in pool.map(lambda pair: steadily(lambda: store.delete(*pair)), sorted(keys)):
                 done += 1
@@ -482,11 +508,11 @@ def _folder(entry: ObjectInfo) -> str:
 
 def _state(store: ObjectStore, robot: str, source: Bucket, entries: Sequence[ObjectInfo], findings: Findings) -> None:
     """Statements of the gap journal about all of a date that is forgotten, one for each topic and hour; the last one counts."""
-    hours: defaultdict[tuple[str, int], dict[tuple[str, str], Row]] = defaultdict(dict)
+    hours: defaultdict[tuple[str, int], dict[tuple[str, str, int], Row]] = defaultdict(dict)
     for rows in tables(source, entries, tuple(FORGOTTEN.columns), findings, of=FORGOTTEN):
         for row in rows.to_pylist():
             if row['topic'] is not None:
-                hours[row['topic'], row['t_start_ns'] // HOUR_NS][row['bucket'], row['key']] = row
+                hours[row['topic'], row['t_start_ns'] // HOUR_NS][row['bucket'], row['key'], row['t_start_ns']] = row
     found = []
     for (topic, hour), of_hour in sorted(hours.items()):
         rows_of = list(of_hour.values())

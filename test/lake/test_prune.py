@@ -219,7 +219,7 @@ def test_a_bag_goes_as_a_whole_or_not_at_all(settings: StoreSettings, tmp_path: 
     made = _plan(settings, 'bags 5d')
     bags = made.sensors['bags']
     assert (bags.going, dict(bags.protected), made.sensors['events'].objects) == (3, {'no manifest': 2}, 3)
-    _run(settings, 'bags 5d')
+    _run(settings, 'bags 5d', is_forced=True)
     assert _stored(settings, 'rosbags') == sorted([*young, *event, *torn])
     _check(settings)
     known = gaps.known('thor', '/imu', NOW_NS - 9 * DAY_NS, NOW_NS, sink='bags', source=_source(settings))
@@ -230,17 +230,39 @@ def test_a_bag_goes_as_a_whole_or_not_at_all(settings: StoreSettings, tmp_path: 
     _check(settings)
 
 
+def _repeat(settings: StoreSettings, folder: Path, of: schema.Row, at_ns: int) -> schema.Row:
+    again = {**row('camera', at_ns), 'key': of['key']}
+    with closing(open_store(settings, UploadSettings())) as store:
+        add_part(store, [again], f'again{at_ns}', folder)
+    return again
+
+
 def test_a_repeat_keeps_what_holds_its_content(settings: StoreSettings, tmp_path: Path) -> None:
     """An object that a younger row names as its content is as young as that row."""
     held = row('camera', NOW_NS - 9 * DAY_NS)
-    at_ns = NOW_NS - DAY_NS
-    again = {**row('camera', at_ns + 30 * SECOND), 'key': held['key']}
-    with closing(open_store(settings, UploadSettings())) as store:
-        add_part(store, [again], 'again', tmp_path / 'tmp')
+    _repeat(settings, tmp_path / 'tmp', held, NOW_NS - DAY_NS + 30 * SECOND)
     _run(settings)
     assert held['key'] in _stored(settings)
     assert len(_stored(settings, 'camera')) == 19
     assert len(forgotten(_source(settings), None, Findings())) == 11
+
+
+@pytest.mark.parametrize('later_s', [600, 2 * 86_400 + 600])
+def test_a_label_of_a_repeat_protects_its_content(settings: StoreSettings, tmp_path: Path, later_s: int) -> None:
+    """On the same day and on another one; without it content and repeat go together, and the repeat's messages are counted."""
+    held = row('camera', NOW_NS - 9 * DAY_NS)
+    again = _repeat(settings, tmp_path / 'tmp', held, held['t_start_ns'] + later_s * SECOND)
+    at_ns = again['t_start_ns']
+    of_time = labels.Label(robot='thor', label='cat', since_ns=at_ns - SECOND, until_ns=at_ns + SECOND)
+    with closing(open_store(settings, UploadSettings())) as store:
+        labels.write(store, 'thor', [of_time], by='me')
+        assert _run(settings).objects == 11
+        assert held['key'] in _stored(settings)
+        labels.write(store, 'thor', [of_time], by='me', is_removal=True)
+    assert _run(settings).objects == 1
+    assert len(_stored(settings, 'camera')) == 18
+    _check(settings)
+    assert sum(gaps.newest(_source(settings))['count'].to_pylist()) == 13
 
 
 def test_a_robot_cannot_have_a_young_object_deleted(settings: StoreSettings, tmp_path: Path) -> None:
