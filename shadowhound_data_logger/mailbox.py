@@ -202,7 +202,7 @@ def read_entry(robot: str, entry: Any) -> PullRequest | PullCancel:
         raise RequestRefused('not_ours', 'it is not an object')
     fields = _CANCELLING if 'cancel' in entry else _ASKING
     if set(entry) != fields:
-        unlike = sorted(map(str, set(entry) ^ fields))
+        unlike = sorted(str(name)[:32] for name in set(entry) ^ fields)
         raise RequestRefused('fields', f'it has to have exactly the fields {" ".join(sorted(fields))}; wrong: {unlike[:3]}')
     by, made_ns = entry['by'], entry['made_ns']
     if not (isinstance(by, str) and is_name(by)):

@@ -131,17 +131,15 @@ def _is_finding(answer: Mapping[str, Any]) -> bool:
 
 
 def _list(found: Sequence[Any], *, is_json: bool) -> ExitCode:
+    from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415
+
     if is_json:
         print_json([asdict(one) for one in found])
         return ExitCode.FINE
     table = plain_table('', ('request', 'by', 'priority', 'state', 'objects', 'delivered'), {'request', 'by', 'state'})
     table.title = None
     for one in found:
-        answer = one.answer or {}
-        sent = (
-            answer.get('outcomes', {}).get('delivered', {}).get('objects', 0) if isinstance(answer.get('outcomes'), dict) else 0
-        )
-        cells = (one.id, one.by, one.priority, one.state, answer.get('objects', '-'), sent if answer else '-')
+        cells = (one.id, one.by, one.priority, one.state, *(lake.how_many(one.answer) if one.answer else ('-', '-')))
         table.add_row(*(plain(str(cell)) for cell in cells))
     print_page(*([table] if found else ['Nothing is asked for.']))
     return ExitCode.FINE

@@ -61,6 +61,8 @@ PAUSE_S: Final = 0.2
 """The longest pause between two tries; it doubles ten times."""
 MOST_OF_ONE: Final = 128
 """Open requests of one requester: others need room in the mailbox, too."""
+ANSWERS_TRIED: Final = 8
+"""Of what is no answer, the newest ones first."""
 MOST_ANSWER_BYTES: Final = 1 << 20
 LOOK_S: Final = 2.0
 LOOKS: Final = 90
@@ -133,7 +135,7 @@ def ask(store: ObjectStore, source: Bucket, robot: str, want: KeptFilter, *, by:
                 return None
         if sum(asked.by == by for asked in _requests(robot, left)) >= MOST_OF_ONE:
             raise LakeError(f'{by} has {MOST_OF_ONE} requests open', remedy='wait until some are answered, or cancel one')
-        return [*(entry for entry in left if request.id not in {entry.get('id'), entry.get('cancel')}), request.to_json()]
+        return [*(entry for entry in left if _id_of(entry) != request.id), request.to_json()]
 
     _change(store, robot, add)
     return request
@@ -141,9 +143,15 @@ def ask(store: ObjectStore, source: Bucket, robot: str, want: KeptFilter, *, by:
 
 def cancel(store: ObjectStore, source: Bucket, robot: str, request: str, *, by: str) -> None:
     """Take a request back. Raises StoreError, LakeError."""
-    said = PullCancel(id=request, by=by, made_ns=time.time_ns()).to_json()
-    _checked(robot, said)
-    _change(store, robot, lambda entries: [*_unanswered(source, robot, entries), said])
+
+    def add(entries: list[Any]) -> list[Any]:
+        left = _unanswered(source, robot, entries)
+        made_ns = max((asked.made_ns + 1 for asked in _requests(robot, left) if asked.id == request), default=0)
+        said = PullCancel(id=request, by=by, made_ns=max(time.time_ns(), made_ns)).to_json()
+        _checked(robot, said)
+        return [*left, said]
+
+    _change(store, robot, add)
 
 
 def listed(store: ObjectStore, source: Bucket, robot: str) -> list[PullState]:
@@ -179,7 +187,7 @@ def newest_answer(source: Bucket, robot: str, request: str) -> dict[str, Any] | 
         name = entry.key.rpartition('/')[2].removesuffix('.json')
         if name.isascii() and name.isdigit() and len(name) < 10:
             numbers.append(int(name))
-    for number in sorted(numbers, reverse=True):
+    for number in sorted(numbers, reverse=True)[:ANSWERS_TRIED]:
         try:
             answer = from_json(source.get(f'{answers_prefix(robot, request)}{number}.json', MOST_ANSWER_BYTES), MOST_ANSWER_BYTES)
         except (ObjectRefused, ValueError):
@@ -251,9 +259,17 @@ def _await(source: Bucket, request: PullRequest, say: Callable[[str], None], fin
 def _how_far(answer: Mapping[str, Any] | None) -> str:
     if answer is None:
         return 'asked'
+    objects, sent = how_many(answer)
+    return f'{answer["state"]}, {sent} of {objects} objects'
+
+
+def how_many(answer: Mapping[str, Any]) -> tuple[int, int]:
+    """Objects that a request found, and how many of them the store has, as an answer says; 0 for what says no number."""
     outcomes = answer.get('outcomes')
-    sent = outcomes.get('delivered') if isinstance(outcomes, dict) else None
-    return f'{answer["state"]}, {sent.get("objects") if isinstance(sent, dict) else 0} of {answer.get("objects")} objects'
+    delivered = outcomes.get('delivered') if isinstance(outcomes, dict) else None
+    said = answer.get('objects'), delivered.get('objects') if isinstance(delivered, dict) else 0
+    objects, sent = (count if type(count) is int else 0 for count in said)
+    return objects, sent
 
 
 def _is_last(answer: dict[str, Any], made_ns: int) -> bool:
@@ -292,7 +308,13 @@ def _unanswered(source: Bucket, robot: str, entries: Sequence[Any]) -> list[Any]
         if not (answer is not None and _is_last(answer, request.made_ns))
         and request.expires_ns + _DAY_NS > now_ns
     }  # fmt: skip
-    return [entry for entry in entries if isinstance(entry, dict) and entry.get('id', entry.get('cancel')) in waiting]
+    return [entry for entry in entries if isinstance(entry, dict) and _id_of(entry) in waiting]
+
+
+def _id_of(entry: Mapping[str, Any]) -> str:
+    """What an entry asks for or takes back; it may be anything."""
+    found = entry.get('id', entry.get('cancel'))
+    return found if isinstance(found, str) else ''
 
 
 def _read(store: ObjectStore, robot: str) -> tuple[list[Any], str]:

@@ -179,6 +179,9 @@ class RequestServer:
         if now_s >= self._tidy_at_s:
             self._tidy_at_s = now_s + TIDY_S
             self._spool.forget_requests(now_ns - REMEMBER_NS)
+            asking, known = {row.requester for row in rows}, {row.id for row in self._spool.requests()}
+            self._served = {name: served for name, served in self._served.items() if name in asking}
+            self._answering = {name: number for name, number in self._answering.items() if name in known}
             while self._spool.evict_old():
                 pass
         return is_busy
@@ -207,7 +210,7 @@ class RequestServer:
             self._refuse(error.reason, str(error))
             return True
         known = {row.id: row for row in self._spool.requests()}
-        new, cancels = [], []
+        new, cancels = dict[str, PullRequest](), []
         for entry in entries:
             try:
                 read = read_entry(self._robot, entry)
@@ -217,21 +220,20 @@ class RequestServer:
             row = known.get(read.id)
             if isinstance(read, PullCancel):
                 cancels.append(read)
-            elif row is None or (not row.is_open and row.told == row.state and read.made_ns > row.made_ns):
-                new.append(read)
-        new = _in_turn(new)
+            elif row is None or (not row.is_open and row.told == row.state and read.made_ns != row.made_ns):
+                new.setdefault(read.id, read)
         if (beyond := len(known) + len(new) - MOST_REQUESTS) > 0:
             self._spool.forget_requests(self._clock.wall_ns(), beyond)
             known = {row.id: row for row in self._spool.requests()}
-            if len(new) > (room := max(0, MOST_REQUESTS - len(known))):
-                self._refuse('too_many', 'too many requests are open')
-                new = new[:room]
-        known |= {row.id: row for row in self._accept(new[:AT_A_TIME], known)}
+        room = max(0, MOST_REQUESTS - len(known))
+        if len(new) > room:
+            self._refuse('too_many', 'too many requests are open')
+        known |= {row.id: row for row in self._accept(_in_turn(list(new.values()))[: min(AT_A_TIME, room)], known)}
         for cancel in cancels:
             row = known.get(cancel.id)
             if row is not None and row.is_open and cancel.made_ns > row.made_ns:
                 self._spool.close_request(cancel.id, CANCELLED)
-        return len(new) <= AT_A_TIME
+        return len(new) <= min(AT_A_TIME, room)
 
     def _accept(self, new: Sequence[PullRequest], known: Mapping[str, RequestRow]) -> Iterator[RequestRow]:
         """Each is a row with what it chose; what is kept is looked through once. Raises StoreError."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.kept import KeptCut
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.cli.pull import _sentence
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
 from shadowhound_data_logger.errors import LakeError, SettingError
@@ -25,11 +27,12 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.dataset import MissionDataset
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.mailbox import KeptFilter
+from shadowhound_data_logger.mailbox import KeptFilter, PullRequest
 from shadowhound_data_logger.model import Outcome, State
 from shadowhound_data_logger.ship.requests import RequestServer
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.directory import DirectoryStore
+from shadowhound_data_logger.untrusted import visible
 
 NOON = '2025-10-18T12:00:00Z'
 
@@ -227,3 +230,33 @@ def test_a_pull_that_a_robot_does_not_finish_is_said(field: Field, monkeypatch: 
     monkeypatch.setattr(lake.time, 'time_ns', lambda: field.clock.now_ns)
     with pytest.raises(LakeError, match='expired, 0 of 1 objects'):
         lake.bring(field.source, {'since': NOON})
+
+
+def test_a_hostile_mailbox_and_hostile_answers_are_read(field: Field) -> None:
+    """By one who asks: what is none of ours is left out of the mailbox, and no number or text in an answer ends a verb."""
+    field.records(1, 2)
+    prefix = '_requests/thor/inbox.json'
+    lake.make(field.store, 'thor')
+    found = field.store.changed('sensor-data', prefix, '', 1 << 20)
+    assert found
+    far = time.time_ns() + 300 * 24 * 3600 * SECOND
+    ours = PullRequest(robot='thor', by='x', made_ns=far, expires_ns=far + SECOND, want=KeptFilter(sensor='camera')).to_json()
+    junk = [7, None, {'id': ['x']}, {'id': {}, 'cancel': []}, {'cancel': 1e308}, ours]
+    body = json.dumps({'format': 1, 'entries': junk}).encode()
+    assert field.store.replace('sensor-data', prefix, body, found[1])
+    assert [one['by'] for one in run('pull', '--list')] == ['x']
+    said = run('pull', '--sensor', 'camera')
+    assert [one['id'] for one in run('pull', '--list')] == [said['id']] == [ours['id']]
+    for number, answer in enumerate((
+        {'state': 'sending', 'objects': '\x1b[2J', 'outcomes': {'delivered': [1]}, 'number': {}},
+        {'state': 'done\x07', 'objects': 10**30, 'outcomes': {'x': 1}, 'bags': {}, 'made_ns': 'x'},
+        {'state': 'sending', 'outcomes': [], 'bags': [['x']], 'why': {'a': 1}, 'time': []},
+    ), 50):  # fmt: skip
+        place = field.settings.directory / 'sensor-data' / 'thor' / '_answers' / said['id'] / f'{number}.json'
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text(json.dumps({'id': said['id'], **answer}))
+        done = CliRunner().invoke(cli, ['pull', '--list'], standalone_mode=False)
+        assert done.exception is None
+        assert '\x1b' not in done.output
+        assert '\x07' not in done.output
+        assert '\x1b' not in visible(_sentence({'time': None, **answer}))

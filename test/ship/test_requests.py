@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import KeepSettings
 from shadowhound_data_logger.mailbox import KeptFilter, PullCancel, PullRequest, encode_inbox
 from shadowhound_data_logger.ship.requests import WINDOW
-from shadowhound_data_logger.spool.request_table import RequestTable
+from shadowhound_data_logger.spool.request_table import RequestRow, RequestTable
 
 
 @pytest.fixture
@@ -193,7 +194,11 @@ def test_a_hostile_mailbox_is_refused(desk: Desk) -> None:
     bad: list[tuple[str, Any]] = [
         ('not_ours', 7), ('fields', {**good, 'more': 1}), ('fields', {'cancel': good['id']}), ('id', {**good, 'id': 'f' * 32}),
         ('id', {**good, 'id': '../../x'}), ('name', {**good, 'by': '../x'}), ('time', {**good, 'made_ns': 1 << 62}),
-        ('time', {**good, 'expires_ns': 1e30}), ('priority', {**good, 'priority': True}), ('robot', {**good, 'robot': 'tachi'}),
+        ('time', {**good, 'expires_ns': 1e30}), ('time', {**good, 'made_ns': float('nan')}),
+        ('near', {**good, 'want': {'near': [1e308, -1e308, 1e308]}}), ('near', {**good, 'want': {'near': [10**400, 0, 1]}}),
+        ('time', {**good, 'want': {'until_ns': -(1 << 70)}}), ('priority', {**good, 'priority': '0'}),
+        ('id', {**good, 'id': ['x']}), ('fields', {'x' * 100_000: 1, '\x1b[2J': 2}), ('priority', {**good, 'priority': True}),
+        ('robot', {**good, 'robot': 'tachi'}),
         ('fields', {**good, 'want': {'sql': '1'}}), ('fields', {**good, 'want': {}}),
         ('keys', {**good, 'want': {'keys': ['[a-z]']}}),
         ('keys', {**good, 'want': {'keys': ['a*'] * 17}}), ('near', {**good, 'want': {'near': [float('nan'), 0, 1]}}),
@@ -202,8 +207,8 @@ def test_a_hostile_mailbox_is_refused(desk: Desk) -> None:
     for _, entry in bad:
         desk.write(json.dumps({'format': 1, 'entries': [entry]}).encode())
         desk.step()
-    for body in (b'{', b'[]', b'{"format":2,"entries":[]}', b'[' * 100_000, b' ' * 300_000,
-                 json.dumps({'format': 1, 'entries': [good] * 257}).encode()):  # fmt: skip
+    for body in (b'{', b'[]', b'{"format":2,"entries":[]}', b'[' * 100_000, b'{"a":' * 40_000 + b'1' + b'}' * 40_000,
+                 b' ' * 300_000, json.dumps({'format': 1, 'entries': [good] * 257}).encode()):  # fmt: skip
         desk.write(body)
         desk.step()
     assert desk.released == []
@@ -212,7 +217,7 @@ def test_a_hostile_mailbox_is_refused(desk: Desk) -> None:
     assert {reason: found.pop(reason) for reason in set(expected)} == {
         reason: expected.count(reason) + (2 if reason == 'not_ours' else 0) for reason in set(expected)
     }
-    assert found == {'not_json': 2, 'too_large': 1, 'too_many': 1}
+    assert found == {'not_json': 3, 'too_large': 1, 'too_many': 1}
     desk.write(json.dumps({'format': 1, 'entries': [{}, good]}).encode())
     desk.step()
     assert len(desk.released) == 1
@@ -282,3 +287,45 @@ def test_a_request_expires_in_the_middle_of_a_slice_of_many(desk: Desk) -> None:
     desk.finish()
     assert desk.answers(request)[-1]['state'] == 'done'
     assert {row['state'] for row in rows(desk.root) if row['sensor'] == 'camera'} == {'delivered'}
+
+
+def test_a_mailbox_that_changes_at_each_look_asks_once(desk: Desk) -> None:
+    """Whatever changes in an entry but what it asks for, and however often it is there; others are served meanwhile."""
+    desk.keeps(*(frame(number) for number in range(4)))
+    asked = PullRequest(robot='thor', by='flood', made_ns=desk.clock.now_ns, expires_ns=desk.clock.now_ns + 3600 * SECOND,
+                        want=KeptFilter(sensor='camera', until_ns=NOON_NS + 2 * SECOND))  # fmt: skip
+    accepted = Counter[str]()
+    real = desk.spool.accept
+
+    def accept(row: RequestRow, chosen: Sequence[tuple[int, int]]) -> RequestRow:
+        accepted[row.id] += 1
+        return real(row, chosen)
+
+    desk.spool.accept = accept  # type: ignore[method-assign]
+    desk.server._release = lambda _: False  # type: ignore[method-assign] # the link is away, so nothing ends
+    for number in range(5):
+        entries = [replace(asked, by=f'flood{turn}', priority=(number + turn) % 10).to_json() for turn in range(200)]
+        desk.entries = entries[number:] + entries[:number]
+        desk.ask(by='other', sensor='camera', since_ns=NOON_NS + 2 * SECOND)
+        desk.step()
+    assert sorted(accepted.values()) == [1, 1]
+    del desk.server._release  # type: ignore[method-assign]
+    desk.finish()
+    assert {desk.state(number) for number in range(4)} == {'delivered'}
+
+
+def test_many_requests_are_remembered_and_the_first_ones_forgotten(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where that is too many, so that those who asked for nothing, again and again, keep nobody out."""
+    monkeypatch.setattr('shadowhound_data_logger.ship.requests.MOST_REQUESTS', 4)
+    desk.keeps(frame(1))
+    for number in range(10):
+        desk.entries.clear()
+        desk.ask(by='flood', topic=f'/none{number}')
+        desk.step()
+        desk.deliver()
+        desk.step()
+        desk.deliver()
+    assert len(desk.spool.requests()) <= 4
+    desk.ask(by='other', sensor='camera')
+    desk.finish()
+    assert desk.state(1) == 'delivered'
