@@ -247,13 +247,27 @@ def _missions(figures: Figures) -> str:
     ])  # fmt: skip
 
 
+def _keep(figures: Figures) -> str:
+    words = {'_previews': 'previews', '_kept': 'rows of what is kept'}
+    rows = [(words[name], f'{late["count"]:,}', *(f'{late[each]:.1f} s' for each in ('p50', 'p95', 'max')))
+            for name, late in figures['late_s'].items()]  # fmt: skip
+    cores, kept = figures['cores'], figures['bytes']['kept']
+    said = (
+        f'The node that keeps all: {100 * cores["kept"]:.1f} % of a core; the one beside it: {100 * cores["1 Hz"]:.1f} %.'
+        f' In {figures["seconds"]:.0f} s {kept["kept"] / 1e6:,.0f} MB were kept and {kept["delivered"] / 1e6:.1f} MB delivered;'
+        f' {figures["missed"]:,} messages were missed. The first second of the video was in the store'
+        f' {figures["begin_s"]:.1f} s after it was asked for.'
+    )
+    return '\n\n'.join((_table(('oldest message to the store', 'objects', 'p50', 'p95', 'worst'), rows), said))
+
+
 _WHOLE: Final[Mapping[str, Callable[[Figures], str]]] = {'bars': _bars, 'machine': _machine, 'commands': _commands}
 _PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
     'node_cpu': ('node_cpu', _node_cpu), 'intake': ('intake', _intake), 'vendors': ('vendors', _vendors),
     'small_messages': ('small_messages', _small), 'full_rate': ('full_rate', _full_rate), 'memory': ('full_rate', _memory),
     'backlog_memory': ('backlog_memory', _backlog_memory), 'rosbag2': ('bag_recording', _rosbag2),
     'latency': ('latency', _latency), 'encode_formats': ('encode_formats', _encode), 'spool_commits': ('spool_commits', _spool),
-    'index_growth': ('index_growth', _growth),
+    'index_growth': ('index_growth', _growth), 'keep': ('keep', _keep),
     'drain': ('drain', _drain), 'mission_calls': ('mission_calls', _mission_calls), 'missions': ('missions', _missions),
 }  # fmt: skip
 

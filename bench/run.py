@@ -56,6 +56,7 @@ STEPS: Final = (
     Step('encode_formats'),
     Step('spool_commits', quick=None),
     Step('index_growth', quick=None),
+    Step('keep', ('--seconds', '140'), None),
 )
 FOLDERLESS: Final = ('encode_formats', 'index_growth')
 

@@ -3,7 +3,7 @@
 Run it as ``python bench/transactions.py [--folder F] [--json]``; F should lie on the disk that the spool will be on. It commits
 objects as many and as large as with the default profile, with every message stored, and as one commit of the writer may be at
 most. After each commit it syncs a file to which as many bytes were written as the transaction added to the index's log: that is
-what the disk itself takes.
+what the disk itself takes. At last somebody asks for very many kept objects, and takes that back.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from _report import percentile
 from spool_commits import make, opened
 
 from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.request_table import CANCELLED, RequestRow
 from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
 
 PROFILES: Final = {
@@ -31,6 +32,8 @@ PROFILES: Final = {
 }  # fmt: skip
 """Objects of so many bytes in a commit, and the seconds from one to the next."""
 BAR_MS: Final = 50.0
+ASKED: Final = 50_000
+"""Kept objects that a request is made for."""
 
 
 class Timed:
@@ -110,6 +113,29 @@ def measured(root: Path, objects: int, size: int, period_s: float, seconds: floa
             'over_bar': sum(held > BAR_MS for held in found.held)}  # fmt: skip
 
 
+def asked(root: Path) -> dict[str, object]:
+    """How long the transactions are in which a request for very many objects is accepted, ended and forgotten."""
+    spool: Spool = opened(root)
+    with spool._index.transaction():
+        spool._index._db.executemany(
+            'INSERT INTO objects (bucket, key, state, priority, protected, sensor, topic, type, samples, bytes, sha256,'
+            " content_type, metadata, t_start_ns, t_end_ns, created_ns) VALUES ('sensor-data', ?, 'kept', 5, 0, 'camera',"
+            " '/camera', 't', 1, 50000, '0', 'image/jpeg', '{}', 1, 1, 1)",
+            ((f'thor/camera/{number:08d}.jpg',) for number in range(ASKED)),
+        )  # fmt: skip
+    chosen = [(item.id, item.bytes) for item in spool.kept()]
+    row = RequestRow(id='0' * 32, requester='bench', priority=5, made_ns=1, expires_ns=1 << 62, received_ns=1, wanted='{}')
+    with timed(spool._index) as found:
+        begun = perf_counter()
+        row = spool.accept(row, chosen)
+        accepted_s = perf_counter() - begun
+        spool.close_request(row.id, CANCELLED)
+        spool.accept(row, [])
+    spool.close()
+    return {'objects': row.objects, 'accepted_s': accepted_s, 'transactions': len(found.held), 'held_ms': spread(found.held),
+            'over_bar': sum(held > BAR_MS for held in found.held)}  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--folder', type=Path, help='where to make the spools')
@@ -121,6 +147,7 @@ def main() -> None:
             name: measured(Path(folder, str(place)), *profile, arguments.seconds)
             for place, (name, profile) in enumerate(PROFILES.items())
         }
+        result[f'a request for {ASKED:,} kept objects'] = asked(Path(folder, 'asked'))
     if arguments.json:
         print(json.dumps(result))
         return
