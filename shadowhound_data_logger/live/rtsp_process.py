@@ -19,6 +19,7 @@ PIPELINE = (
     ' ! rtpjpegpay name=pay0 pt=26 )'
 )
 MOST_SESSIONS = 16
+CLEAN_S = 5
 ROLE = 'viewer'
 
 
@@ -130,6 +131,12 @@ def main() -> None:
                 cameras.push(head['topic'], head['width'], head['height'], jpeg)
         GLib.idle_add(loop.quit)
 
+    def forget() -> bool:
+        """Sessions of players that went without a word; until this returns False."""
+        cameras.server.get_session_pool().cleanup()
+        return True
+
+    GLib.timeout_add_seconds(CLEAN_S, forget)
     say(port=cameras.server.get_bound_port())
     threading.Thread(target=follow, daemon=True).start()
     loop.run()

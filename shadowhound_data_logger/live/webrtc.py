@@ -18,6 +18,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
+from ipaddress import ip_address
 from threading import Condition
 from typing import Any, Final
 
@@ -312,7 +313,7 @@ class CameraVideo:
         """Whatever goes wrong, the peer is ended. Raises OfferRefused."""
         answer = None
         try:
-            answer = await peer.answer(offer, *addresses)
+            answer = await peer.answer(offer, *map(_plain, addresses))
         except _BROKEN as error:
             raise OfferRefused(f'the offer cannot be answered: {type(error).__name__}') from error
         finally:
@@ -384,9 +385,15 @@ class CameraVideo:
                 peer.track.offer(encoded)
 
 
+def _plain(address: str) -> str:
+    """An address without the form that IPv4 has on a socket of IPv6."""
+    mapped = getattr(ip_address(address.partition('%')[0]), 'ipv4_mapped', None)
+    return address if mapped is None else str(mapped)
+
+
 def _with_address(offer: str, remote: str) -> str:
     """The offer with candidates at the viewer's own address alone; browsers put names that few can look up in its place."""
-    lines = offer.replace('\r\n', '\n').strip().split('\n')
+    lines = offer.splitlines()  # as aiortc takes them apart
     if [line[:8] for line in lines if line.startswith('m=')] != ['m=video ']:
         raise OfferRefused('an offer has one part, which is video')
     ports = [int(found[1]) for line in lines if (found := _CANDIDATE.match(line)) and 0 < int(found[1]) < 65_536]

@@ -168,10 +168,12 @@ def test_a_page_without_the_extra_shows_jpegs_and_says_why(tmp_path: Path, monke
     asyncio.run(run())
 
 
-def test_an_offer_gives_ports_and_no_addresses() -> None:
-    """Whatever an offer names, packets go to the viewer's own address alone."""
+@pytest.mark.parametrize('end', ['\n', '\r\n', '\r', '\x0b', '\x0c', '\x85', '\u2028'])
+def test_an_offer_gives_ports_and_no_addresses(end: str) -> None:
+    """Whatever an offer names, packets go to the viewer's own address alone; aiortc ends lines in many ways."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
-    found = [line for line in webrtc._with_address(OFFER, '192.0.2.7').split('\r\n') if 'candidate:' in line]
+    offer = OFFER.replace('\na=candidate', f'{end}a=candidate')
+    found = [line for line in webrtc._with_address(offer, '192.0.2.7').splitlines() if 'candidate:' in line]
     assert [line.split()[4:6] for line in found] == [['192.0.2.7', '48973'], ['192.0.2.7', '50000']]
 
 
@@ -201,7 +203,7 @@ def test_no_more_peers_and_cameras_than_there_may_be(monkeypatch: pytest.MonkeyP
     """Whoever comes later is told so; whoever goes makes room."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
     monkeypatch.setattr(webrtc, 'MOST_PEERS', 3)
-    addresses = '127.0.0.1', '127.0.0.1'
+    addresses = '127.0.0.1', '::ffff:127.0.0.1'
 
     async def run() -> None:
         video = webrtc.CameraVideo(lambda: None)

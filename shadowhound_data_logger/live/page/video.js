@@ -31,9 +31,9 @@ export class Video {
     this.follow();
   }
 
+  // The connection to the robot was lost, and the video with it.
   lost() {
     if (this.pc) this.stop();
-    this.isAsked = false;
   }
 
   follow() {
