@@ -230,7 +230,7 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
     flags = {**flags, 'sensor': sensor}
     asked = query.labelled(source, wanted(time.time_ns(), **flags), findings)
     rows, statistics, objects = _candidates(source, asked, flags, expression, findings)
-    told = _Told(rows, statistics)
+    told = _Told(rows, statistics, findings)
     may, must, is_known = told.judged(expression)
     to_open = np.flatnonzero(may & ~must & (is_known | scan))
     found = [*_whole(rows, np.flatnonzero(must), sensor)]
@@ -273,8 +273,9 @@ def _led(source: Bucket, asked: Wanted, expression: Expression, findings: Findin
     of_leads = []
     for lead in dict.fromkeys(leads):
         first = _statistics(source, asked, [lead], findings, _bounds_of(lead))
-        some, _ = _by_statistics(lead, {name: _numbers(first, name) for name in NUMBERS})
-        of_leads.append(first.filter(pa.array(some)))
+        told = {name: _numbers(first, name) for name in NUMBERS}
+        some, _ = _by_statistics(lead, told)
+        of_leads.append(first.filter(pa.array(some | _contradictory(told))))
     chosen = np.unique(_stamps(pa.concat_tables(of_leads)))
     others = [leaf for leaf in leaves(expression) if leaf not in leads]
     found = pa.concat_tables([*of_leads, *([_only_at(_statistics(source, asked, others, findings), chosen)] if others else [])])
@@ -372,7 +373,7 @@ def _fields_instead(source: Bucket, asked: Wanted, expression: Expression, objec
 class _Told:
     """What the statistics say of each object, by its row."""
 
-    def __init__(self, rows: pa.Table, statistics: pa.Table) -> None:
+    def __init__(self, rows: pa.Table, statistics: pa.Table, findings: Findings) -> None:
         self._objects = len(rows)
         numbered = rows.select(_KEY).append_column('_row', pa.array(np.arange(len(rows)), pa.int64()))
         found = statistics.join(numbered, keys=list(_KEY), join_type='inner').combine_chunks()
@@ -390,6 +391,10 @@ class _Told:
         self._has[self._rows[whole]] = True
         self._left_out = np.zeros(self._objects, bool)
         self._left_out[self._rows[whole]] = self._values['nan_count'][whole] > 0
+        self._false = ~whole & _contradictory(self._values)
+        self._has[self._rows[self._false]] = False
+        for key in pc.unique(found['key'].filter(pa.array(self._false))).to_pylist():
+            findings.add(key, 'its statistics contradict each other')
 
     def judged(self, expression: Expression) -> tuple[Mask, Mask, Mask]:
         """Whether the condition may hold in an object; must hold in all of it; may hold by what is known alone."""
@@ -406,7 +411,7 @@ class _Told:
         return np.isin(self._fields, codes)
 
     def _leaf(self, leaf: Comparison) -> tuple[Mask, Mask, Mask]:
-        chosen = self._of(lambda name: name != ALL and covers(leaf.field, name))
+        chosen = self._of(lambda name: name != ALL and covers(leaf.field, name)) & ~self._false
         is_exact = self._of(lambda name: name == leaf.field)
         is_scalar = ~self._of(lambda name: '*' in name.split('.'))
         rows = self._rows[chosen]
@@ -440,6 +445,15 @@ def _by_statistics(leaf: Comparison, values: Mapping[str, NDArray[np.float64]]) 
         return leaf.holds(low) | leaf.holds(high), (number < low) | (high < number)
     some, every = (high, low) if leaf.sign in {'>', '>='} else (low, high)
     return leaf.holds(some), leaf.holds(every)
+
+
+def _contradictory(values: Mapping[str, NDArray[np.float64]]) -> Mask:
+    """Of statistics of fields: which cannot be true."""
+    low, high, count = values['min'], values['max'], values['count']
+    found: Mask = (low > high) | (count < 0) | (values['nan_count'] < 0) | ((count > 0) & (np.isnan(low) | np.isnan(high)))
+    for name in ('first', 'last'):
+        found |= (values[name] < low) | (values[name] > high)
+    return found
 
 
 def _numbers(table: pa.Table, name: str) -> NDArray[np.float64]:

@@ -283,6 +283,21 @@ def test_statistics_are_made_again_of_the_objects(tmp_path: Path) -> None:
     assert (found.opened, found.unknown, len(found.ranges)) == (1, 1, 1)
 
 
+@pytest.mark.parametrize('lie', [{'min': 99.0}, {'max': 1.0}, {'count': -1}, {'max': None}, {'first': 1e9}])
+def test_statistics_that_contradict_themselves_are_told(tmp_path: Path, lie: dict[str, Any]) -> None:
+    """Their object is as one without statistics, and the others are judged as ever."""
+    source = filled(tmp_path, BATCHES, [True] * 10)
+    first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.parquet'))
+    second.unlink()
+    table = pq.read_table(first)
+    rows = [{**row, **(lie if row['field'] == 'a' and row['key'].endswith('000009_s.json') else {})} for row in table.to_pylist()]
+    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), first, compression='zstd')
+    left_out = Findings(lambda _: None)
+    found = values.ranges('s.a > 11', source, findings=left_out)
+    assert (len(found.ranges), found.unknown, [one.key for one in left_out]) == (1, 1, ['thor/s/20261028/000009_s.json'])
+    assert len(values.ranges('s.a > 11', source, scan=True, findings=left_out).ranges) == 2
+
+
 def test_hostile_statistics_are_left_out(tmp_path: Path) -> None:
     """A part that is none, and rows of another robot, are told; what they spoke of is unknown, not absent."""
     source = filled(tmp_path, BATCHES, [True] * 10)
