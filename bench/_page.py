@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any, Final
 
 import _pictures
@@ -261,6 +262,18 @@ def _keep(figures: Figures) -> str:
     return '\n\n'.join((_table(('oldest message to the store', 'objects', 'p50', 'p95', 'worst'), rows), said))
 
 
+def _datasets(figures: Figures) -> str:
+    words = {'ours': '`export lerobot`', 'lerobot': 'lerobot, by default', 'lerobot, streaming': 'lerobot, `streaming_encoding`'}
+    rows = []
+    for name, runs in figures['runs'].items():
+        speed, cpu_s, memory = ([run[key] for run in runs] for key in ('frames_per_s', 'cpu_s', 'memory_mb'))
+        cpu_ms = 1000 * median(cpu_s) / figures['frames']
+        rows.append((words[name], f'{median(speed):.0f}', f'{min(speed):.0f} to {max(speed):.0f}', f'{cpu_ms:.0f} ms',
+                     f'{median(memory):.0f} MB'))  # fmt: skip
+    head = f'{figures["frames"]} frames of {figures["frame_bytes"] / 1000:.0f} KB'
+    return _table((head, 'frames a second', 'spread', 'CPU a frame', 'memory'), rows)
+
+
 _WHOLE: Final[Mapping[str, Callable[[Figures], str]]] = {'bars': _bars, 'machine': _machine, 'commands': _commands}
 _PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
     'node_cpu': ('node_cpu', _node_cpu), 'intake': ('intake', _intake), 'vendors': ('vendors', _vendors),
@@ -269,6 +282,7 @@ _PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
     'latency': ('latency', _latency), 'encode_formats': ('encode_formats', _encode), 'spool_commits': ('spool_commits', _spool),
     'index_growth': ('index_growth', _growth), 'keep': ('keep', _keep),
     'drain': ('drain', _drain), 'mission_calls': ('mission_calls', _mission_calls), 'missions': ('missions', _missions),
+    'datasets': ('datasets', _datasets),
 }  # fmt: skip
 
 if __name__ == '__main__':

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import sys
 import time
@@ -14,6 +15,8 @@ from typing import Any, Final
 
 FOLDER: Final = Path(__file__).resolve().parents[1] / '.cache' / 'bench'
 """Where spools and servers lie while they are measured, unless another folder is named: on the disk of this checkout."""
+LEROBOT: Final = Path(os.environ.get('SHADOWHOUND_LEROBOT', '~/.cache/shadowhound/lerobot/bin/python')).expanduser()
+"""Its own environment's interpreter (docs/development.md), which is not everywhere."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,10 +20,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from _report import Bar, Report, main, progress
+from _report import LEROBOT, Bar, Report, main, progress
 
 HERE: Final = Path(__file__).resolve().parent
-PYTHON: Final = Path(os.environ.get('SHADOWHOUND_LEROBOT', '~/.cache/shadowhound/lerobot/bin/python')).expanduser()
 FPS: Final = 30
 SIZE: Final = (480, 640)
 OURS: Final = """
@@ -84,14 +83,14 @@ def run(command: list[str]) -> dict[str, float]:
 
 
 def measure(options: argparse.Namespace) -> Report:
-    if not PYTHON.is_file():
-        raise SystemExit(f'there is no lerobot at {PYTHON} (docs/development.md)')
+    if not LEROBOT.is_file():
+        raise SystemExit(f'there is no lerobot at {LEROBOT} (docs/development.md)')
     folder = options.folder / 'datasets'
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     store = pictures(folder, options.frames)
     size = sum(path.stat().st_size for path in (folder / 'jpegs').glob('*.jpg'))
-    theirs = [str(PYTHON), '-P', str(HERE / '_lerobot_writer.py'), str(folder / 'jpegs'), str(folder / 'set'), str(FPS)]
+    theirs = [str(LEROBOT), '-P', str(HERE / '_lerobot_writer.py'), str(folder / 'jpegs'), str(folder / 'set'), str(FPS)]
     ways = {
         'ours': [sys.executable, '-c', OURS, str(store), str(folder / 'set')],
         'lerobot': [*theirs, 'default'], 'lerobot, streaming': [*theirs, 'streaming'],

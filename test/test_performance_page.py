@@ -47,6 +47,22 @@ def test_what_was_not_measured_says_so(page: Any) -> None:
     assert '*not measured*' in page.filled('<!-- bench vendors -->\n<!-- end vendors -->\n', {'benches': {}})
 
 
+def test_what_training_sets_cost_beside_lerobots_writer_is_on_the_page(page: Any) -> None:
+    """A line a writer, with medians of the runs."""
+    runs = {
+        'ours': [{'frames_per_s': rate, 'cpu_s': 9.0, 'memory_mb': 400.0} for rate in (30.0, 50.0, 42.0)],
+        'lerobot, streaming': [{'frames_per_s': 33.0, 'cpu_s': 15.0, 'memory_mb': 1000.0}],
+    }
+    results = {'benches': {'datasets': {'figures': {'runs': runs, 'frames': 300, 'frame_bytes': 101_000}}}}
+    lines = page.filled('<!-- bench datasets -->\n<!-- end datasets -->\n', results).splitlines()
+    assert lines[1] == '| 300 frames of 101 KB | frames a second | spread | CPU a frame | memory |'
+    assert lines[3:5] == [
+        '| `export lerobot` | 42 | 30 to 50 | 30 ms | 400 MB |',
+        '| lerobot, `streaming_encoding` | 33 | 33 to 33 | 50 ms | 1000 MB |',
+    ]
+    assert '<!-- bench datasets -->' in PAGE.read_text(encoding='utf-8')
+
+
 def test_what_rosbag2_costs_beside_the_node_is_on_the_page(page: Any) -> None:
     """Two lines for each rate; loss is a share of what was published."""
 
