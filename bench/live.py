@@ -74,7 +74,7 @@ class Watcher:
                 if flags & 2:
                     whole = parts.pop(lane)
                     head = json.loads(whole[4 : 4 + int.from_bytes(whole[:4], 'little')])
-                    if head['kind'] == 'video':
+                    if head['kind'] == 'video' and self.takes_video:
                         await video.told(head)
                     if 'at' in head and head['kind'] in KINDS:  # one machine, one monotonic clock
                         now_ms = time.monotonic() * 1e3
