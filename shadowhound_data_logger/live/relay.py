@@ -34,6 +34,9 @@ AGAIN_S: Final = 2.0
 PINGS: Final = 12
 MOST_MESSAGE: Final = 1 << 20
 MOST_ITEM: Final = 32 << 20
+MOST_SMALL: Final = 1 << 20
+"""Bytes of an item that is no picture and no cloud."""
+MOST_HEAD: Final = 1 << 20
 MOST_LANES: Final = 64
 _SHOWN: Final = {'topics', 'figures', 'pong', *(kind.name for kind in KINDS.values())}
 _BROKEN: Final = (asyncio.TimeoutError, OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
@@ -102,9 +105,11 @@ class Relay:
                 try:
                     await connection.read()
                 finally:
-                    teller.cancel()
-                    with suppress(asyncio.CancelledError, OSError, RuntimeError):
-                        await teller
+                    while not teller.done():
+                        teller.cancel()  # again: until Python 3.12 wait_for loses one that comes just as it ends
+                        await asyncio.wait([teller], timeout=0.1)
+                    if not teller.cancelled():
+                        teller.exception()  # the connection has ended, whatever it says of that
 
     async def _tell(self, connection: _Connection) -> None:
         """What is watched, when it changes, and a ping each second."""
@@ -154,10 +159,12 @@ class _Connection:
 
     def _take(self, whole: bytes) -> None:
         size = int.from_bytes(whole[:4], 'little')
+        if size > MOST_HEAD:
+            raise ValueError('it sends what no page does')
         head, body = json.loads(whole[4 : 4 + size]), whole[4 + size :]
         kind = head.pop('kind')
         topic = head.pop('topic')
-        if kind not in _SHOWN or not isinstance(topic, str):
+        if kind not in _SHOWN or not isinstance(topic, str) or (kind not in _BULK and len(whole) > MOST_SMALL):
             raise ValueError('it sends what no page does')
         if kind == 'pong':
             here = time.monotonic() * 1e3
@@ -174,10 +181,18 @@ class _Connection:
         if not math.isfinite(at):
             raise ValueError('it sends no time')
         head['at'] = round(at, 1)
+        if kind == 'figures' and not _is_figures(head['figures']):
+            raise ValueError('its figures are none')
         if kind != 'figures' and kind not in _BULK:
             rows = int(head['rows'])
             body = (np.frombuffer(body, '<f8', rows) - ahead).astype('<f8').tobytes() + body[8 * rows :]
         self._came(LiveItem(topic, kind, FULL, head, body))
+
+
+def _is_figures(told: Any) -> bool:
+    """Whether a page finds in them what it needs to be drawn."""
+    rows = told['topics']
+    return isinstance(rows, list) and all(isinstance(row['topic'], str) and isinstance(row['type'], str) for row in rows)
 
 
 def _catalogue(topics: list[list[str]], problem: str) -> LiveItem:

@@ -60,6 +60,12 @@ PAGE: Final = Path(__file__).parent / 'page'
 MOST_VIEWERS: Final = 16
 MOST_FOXGLOVES: Final = 8
 """Clients that speak Foxglove's protocol."""
+MOST_CONNECTIONS: Final = 200
+"""Of viewers and of everybody else."""
+REQUEST_S: Final = 10.0
+"""A connection's first request comes whole within this, and the body of each."""
+IDLE_S: Final = 15.0
+"""Between requests."""
 MOST_BODY: Final = 4096
 """Bytes of a request."""
 MOST_MESSAGE: Final = 16 << 10
@@ -129,6 +135,7 @@ class _Connected:
     address: str
     at: str
     """The address of ours that it reached."""
+    protocol: asyncio.BaseProtocol
     tasks: list[asyncio.Task[None]] = field(default_factory=list)
     narrow_s: float | None = None
     """Since when its link carries no full frames."""
@@ -143,6 +150,7 @@ class _Foxglove:
     client: FoxgloveClient
     nonce: str
     address: str
+    protocol: asyncio.BaseProtocol
     tasks: list[asyncio.Task[None]] = field(default_factory=list)
 
 
@@ -174,6 +182,8 @@ class LiveServer:
         self._examining = asyncio.Lock()
         self._history = HistoryProcess([] if settings.is_of_store else [str(settings.spool), settings.robot])
         self._runner: web.AppRunner | None = None
+        self._listening: asyncio.Server | None = None
+        self._silent: dict[asyncio.BaseProtocol, float] = {}  # connections that asked for nothing yet, and since when
         self._ticker: asyncio.Task[None] | None = None
         self.port = settings.port
         self.ros_problem = ''
@@ -190,7 +200,7 @@ class LiveServer:
             web.get('/foxglove', self._foxglove), web.get('/api/foxglove', self._tell_foxglove),
             web.get('/api/past/{do:robots|days|timeline|moment}', self._tell_past), web.get('/{name:.*}', self._file),
         ])  # fmt: skip
-        self._runner = web.AppRunner(app, access_log=None, handle_signals=False)
+        self._runner = web.AppRunner(app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S, lingering_time=1.0)
         await self._runner.setup()
         secure = None
         if self._settings.certificate is not None:
@@ -198,7 +208,10 @@ class LiveServer:
             secure.load_cert_chain(*self._settings.certificate)
         listener = _listener(self._settings.bind, self._settings.port)
         self.port = listener.getsockname()[1]
-        await web.SockSite(self._runner, listener, ssl_context=secure).start()
+        timeout_s = REQUEST_S if secure is not None else None
+        self._listening = await self._loop.create_server(
+            self._connected, sock=listener, ssl=secure, backlog=64, ssl_handshake_timeout=timeout_s
+        )
         if self._settings.rtsp is not None:
             password = rtsp_password(self._settings.tokens)
             self._rtsp = RtspServer(self._settings.bind, self._settings.rtsp, password, self._rewatch)
@@ -215,6 +228,8 @@ class LiveServer:
         for tasks in [one.tasks for one in self._viewers] + [one.tasks for one in self._foxgloves]:
             for task in tasks:
                 task.cancel()
+        if self._listening is not None:
+            self._listening.close()
         if self._runner is not None:
             await self._runner.cleanup()
         await self._history.close()
@@ -267,6 +282,33 @@ class LiveServer:
         topics = Topics(lambda: self._wanted, tell, show)
         topics.open()
         self._topics = topics
+
+    # -- connections -----------------------------------------------------------------------------------------------
+
+    def _connected(self) -> asyncio.BaseProtocol:
+        """Of somebody who comes: where too many are, the one leaves who asked for nothing for longest, or was here first."""
+        assert self._runner is not None
+        assert self._runner.server is not None
+        here = self._runner.server.connections
+        if len(here) >= MOST_CONNECTIONS:
+            watching = {one.protocol for one in self._viewers} | {one.protocol for one in self._foxgloves}
+            first = next((each for each in (*self._silent, *here) if each in here and each not in watching), None)
+            if first is not None:
+                self._drop(first)
+        handler: asyncio.BaseProtocol = self._runner.server()
+        self._silent[handler] = time.monotonic()
+        return handler
+
+    def _drop_silent(self) -> None:
+        """Those whose first request does not come to its end."""
+        before_s = time.monotonic() - REQUEST_S
+        for each in [each for each, since_s in self._silent.items() if since_s < before_s]:
+            self._drop(each)
+
+    def _drop(self, handler: Any) -> None:
+        self._silent.pop(handler, None)
+        if handler.transport is not None:
+            handler.transport.abort()
 
     # -- what comes ------------------------------------------------------------------------------------------------
 
@@ -342,6 +384,7 @@ class LiveServer:
         lease_s = 0.0
         while True:
             began_s = time.monotonic()
+            self._drop_silent()
             if self._topics is not None:
                 self._topics.worker.look()
             if self._video is not None:
@@ -400,6 +443,7 @@ class LiveServer:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Whom it is for, where it comes from; and the headers of each answer."""
+        self._silent.pop(request.protocol, None)
         try:
             response = await self._guarded(request, handler)
         except web.HTTPException as error:
@@ -587,7 +631,7 @@ class LiveServer:
             return _problem(429, f'{MOST_VIEWERS} viewers are here, which is the most there may be', {'Retry-After': '10'})
         ws = web.WebSocketResponse(max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0)
         own = request.transport.get_extra_info('sockname') if request.transport is not None else None
-        one = _Connected(Viewer(), self._who(request), request.remote or '', own[0] if own else '')
+        one = _Connected(Viewer(), self._who(request), request.remote or '', own[0] if own else '', request.protocol)
         self._viewers.add(one)  # before anything waits: the cap counts those that are coming
         try:
             await ws.prepare(request)
@@ -633,7 +677,7 @@ class LiveServer:
         ws = web.WebSocketResponse(
             protocols=PROTOCOLS, max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0, heartbeat=SILENT_S
         )
-        one = _Foxglove(FoxgloveClient(self._settings.robot, self._session_id), nonce, address)
+        one = _Foxglove(FoxgloveClient(self._settings.robot, self._session_id), nonce, address, request.protocol)
         self._foxgloves.add(one)
         try:
             await ws.prepare(request)
@@ -739,9 +783,11 @@ def _parsed(text: str) -> dict[str, Any]:
 
 async def _body(request: web.Request) -> dict[str, Any]:
     try:
-        return _parsed((await request.read()).decode())
+        return _parsed((await asyncio.wait_for(request.read(), REQUEST_S)).decode())
     except UnicodeDecodeError:
         return {}
+    except asyncio.TimeoutError as error:
+        raise web.HTTPRequestTimeout(text=f'the request did not come within {REQUEST_S:g} s') from error
 
 
 def _ms(request: web.Request, name: str) -> int | None:

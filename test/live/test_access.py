@@ -7,7 +7,7 @@ import json
 import re
 import stat
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -230,6 +230,37 @@ def test_the_viewers_and_their_messages_are_bounded(tmp_path: Path, monkeypatch:
             assert b'"ping":5' in message.data
             for each in there:
                 await each.close()
+
+    asyncio.run(run())
+
+
+def test_whoever_asks_for_nothing_keeps_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Connections that never say what they want, or say it for ever, go; a viewer stays, and others are answered."""
+    monkeypatch.setattr(module, 'MOST_CONNECTIONS', 8)
+
+    async def run() -> None:
+        async with (
+            serving(tmp_path, monkeypatch, '127.0.0.1') as page,
+            aiohttp.ClientSession(headers={'Origin': page.origin}) as session,
+        ):
+            viewer = await session.ws_connect(f'{page.origin}/ws')
+            slow = []
+            for number in range(40):
+                reader, writer = await asyncio.open_connection('127.0.0.1', page.server.port)
+                writer.write(b'GET / HTTP/1.1\r\nX-Slow: ' if number % 2 else b'')
+                slow.append((reader, writer))
+            assert (await page.ask('stranger', 'GET', '/'))[0] == 200
+            monkeypatch.setattr(module, 'REQUEST_S', 0.2)
+            for reader, writer in slow:
+                with suppress(ConnectionError):
+                    assert await asyncio.wait_for(reader.read(), 60) == b''
+                writer.close()
+            late = {'Content-Length': '5'}
+            assert (await page.ask('operator', 'POST', '/api/act', headers=late, body=b'{'))[0] == 408
+            await viewer.send_str('{"ping": 5}')
+            while b'"pong"' not in (await viewer.receive_bytes(timeout=60)):
+                pass
+            await viewer.close()
 
     asyncio.run(run())
 

@@ -113,12 +113,17 @@ def test_ten_viewers_cost_the_robot_one_stream(tmp_path: Path, monkeypatch: pyte
 
 
 WHOLE = b'\x00\x03\x00\x00'
+PONG = WHOLE + LiveItem('', 'pong', head={'ping': 1.0, 'now': 1.0}).packed
 
 
 @pytest.mark.parametrize('said', [
     b'', b'\x00\x03', b'\x00\x02\x00\x00ab', WHOLE + b'\xff' * 99, WHOLE + b'\x02\x00\x00\x00[]',
     WHOLE + LiveItem('', 'pong', head={'ping': 'x', 'now': {}}).packed, WHOLE + LiveItem('', 'topics', head={'topics': 7}).packed,
-    WHOLE + LiveItem('/a', 'script', head={'at': 1}).packed,
+    WHOLE + LiveItem('/a', 'script', head={'at': 1}).packed, WHOLE + b'\xff\xff\xff\x7f{}',
+    WHOLE + b'\xff\xff\x00\x00' + b'[' * 0xFFFF, *(
+        WHOLE + LiveItem('', 'figures', head={'at': 1.0, 'figures': figures}).packed
+        for figures in (None, 7, {}, {'topics': 7}, {'topics': [7]}, {'topics': [{'topic': {}, 'type': ''}]})
+    ),
 ])  # fmt: skip
 def test_a_robot_that_says_nonsense_is_said_to_be_unreadable(
     tmp_path: Path, said: bytes, monkeypatch: pytest.MonkeyPatch
@@ -129,6 +134,7 @@ def test_a_robot_that_says_nonsense_is_said_to_be_unreadable(
     async def nonsense(request: web.Request) -> web.StreamResponse:
         ws = web.WebSocketResponse()
         await ws.prepare(request)
+        await ws.send_bytes(PONG)
         await ws.send_bytes(said)
         async for _ in ws:
             pass

@@ -276,6 +276,15 @@ function Head({ onSignIn }) {
     ${session.value?.signed_in ? html`<button type="button" onClick=${signOut}>Sign out<span class="role"> (${session.value.role})</span></button>` : html`<button type="button" onClick=${onSignIn}>Sign in</button>`}</header>`;
 }
 
+// What a robot says may be no figures: then the rest of the page goes on.
+function Guarded({ of, children }) {
+  this.componentDidCatch = () => {
+    this.broken = of;
+    this.setState({});
+  };
+  return this.broken === of ? html`<p class="banner bad">The robot says what cannot be shown.</p>` : children;
+}
+
 function App() {
   const box = useRef(null);
   const who = session.value;
@@ -297,8 +306,8 @@ function App() {
         <${Chart} title="Joints" kind="joints" lines=${null} options=${{ unit: 'rad' }} figure="joints, rad" />
         <${Chart} title="Battery" kind="battery" lines=${POWER} options=${{ unit: '%', units: ['%', 'V'], seconds: 600 }} />
         <${Chart} title="Temperature" kind="battery" lines=${HEAT} options=${{ unit: '°C', seconds: 600, digits: 0 }} /></div></section>
-      ${!past.value && who.has_live && html`<section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} />
-        <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div><${Foxglove} />` : html`<p class="empty">…</p>`}</section>`}
+      ${!past.value && who.has_live && html`<section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Guarded} of=${told}><${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} />
+        <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div></${Guarded}><${Foxglove} />` : html`<p class="empty">…</p>`}</section>`}
       <section id="gaps" aria-label="Gaps"><h2>What is missing</h2><${Timeline} session=${who} /></section>
     </main>
     <dialog ref=${box}><${SignIn} box=${box} onDone=${done} /></dialog>`;
