@@ -12,6 +12,10 @@ SPEED: Final = 0.6
 """Walking speed, m/s: a calm trot."""
 RADIUS: Final = 0.4
 """Radius of the rounded corners, m."""
+COMMAND_S: Final = 0.5
+"""How long a robot obeys the last command that it got."""
+DRIVEN_SPEED, DRIVEN_TURN = 2.0, 3.0
+"""Most that it can do, m/s and rad/s."""
 
 
 class Motion(NamedTuple):
@@ -88,6 +92,49 @@ class Patrol:
                 motion = _along(piece, along)
                 best = min(best, (math.hypot(motion.x - x, motion.y - y), start + along))
         return best[1]
+
+
+class Driven:
+    """A body that does as it is told: it keeps the velocity of the last command for half a second, then it stands.
+
+    Times are seconds since the start, and do not go back: an earlier one is answered as the latest. Owned by one thread.
+    """
+
+    def __init__(self) -> None:
+        self._t = 0.0
+        self._x = self._y = self._yaw = 0.0
+        self._command = (0.0, 0.0, 0.0)
+        self._until = 0.0
+
+    def command(self, t: float, forward: float, left: float, yaw_rate: float) -> None:
+        """Velocities in the frame of the body (REP-103), m/s and rad/s, beyond what a Go2 can do cut to that."""
+        self._move(t)
+        top = (DRIVEN_SPEED, DRIVEN_SPEED, DRIVEN_TURN)
+        self._command = tuple(  # type: ignore[assignment]
+            min(max(value, -most), most) if math.isfinite(value) else 0.0
+            for value, most in zip((forward, left, yaw_rate), top, strict=True)
+        )
+        self._until = self._t + COMMAND_S
+
+    def at(self, t: float) -> Motion:
+        """The motion at that time."""
+        self._move(t)
+        forward, left, yaw_rate = self._command if self._t < self._until else (0.0, 0.0, 0.0)
+        cos, sin = math.cos(self._yaw), math.sin(self._yaw)
+        return Motion(self._x, self._y, wrapped(self._yaw), forward * cos - left * sin, forward * sin + left * cos, yaw_rate)
+
+    def _move(self, t: float) -> None:
+        """On the arc of the command, exactly, until it ends."""
+        seconds = max(min(t, self._until) - self._t, 0.0)
+        forward, left, yaw_rate = self._command
+        turned = yaw_rate * seconds
+        half = turned / 2
+        chord = math.sin(half) / half if half else 1.0
+        cos, sin = math.cos(self._yaw + half), math.sin(self._yaw + half)
+        self._x += chord * seconds * (forward * cos - left * sin)
+        self._y += chord * seconds * (forward * sin + left * cos)
+        self._yaw += turned
+        self._t = max(self._t, t)
 
 
 def _turn(before: tuple[float, float], at: tuple[float, float], after: tuple[float, float]) -> float:

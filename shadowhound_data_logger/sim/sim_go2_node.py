@@ -19,6 +19,7 @@ from types import FrameType
 from typing import Any, Final
 
 import rclpy
+from geometry_msgs.msg import Twist
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -29,6 +30,7 @@ from rclpy.utilities import remove_ros_args
 from shadowhound_data_logger.config import NOT_SETTINGS
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.sim.messages import SimulatedSensor, SimulatedTopic, sources
+from shadowhound_data_logger.sim.patrol import Driven
 from shadowhound_data_logger.sim.world import World
 
 LINGER_S: Final = 0.5
@@ -51,6 +53,8 @@ class SimSettings:
     """Publish ``camera/image_raw``."""
     compressed: bool = True
     """Publish ``camera/compressed``."""
+    obey: bool = False
+    """Walk as ``cmd_vel`` (geometry_msgs/Twist) says, instead of on the patrol."""
 
     @classmethod
     def load(cls, parameters: Mapping[str, Any]) -> SimSettings:
@@ -128,8 +132,12 @@ class SimulatedGo2:
         time.sleep(max(end - time.monotonic(), 0.0))
 
 
-def run(robot: SimulatedGo2, settings: SimSettings, is_stopped: Callable[[], bool]) -> None:
-    """Publishes until the duration is over or ``is_stopped``; a stamp is the time at which the sample was due."""
+def run(robot: SimulatedGo2, settings: SimSettings, is_stopped: Callable[[], bool],
+        hear: Callable[[float], None] = lambda _: None) -> None:  # fmt: skip
+    """Publishes until the duration is over or ``is_stopped``; a stamp is the time at which the sample was due.
+
+    Before each sample ``hear`` gets its time, to take what the robot was told by then.
+    """
     rates = {name: rate * settings.rate_scale for name, rate in robot.rates_hz.items()}
     start, start_ns = time.monotonic(), time.time_ns()
     for t, name in schedule(rates, settings.duration_s):
@@ -137,6 +145,7 @@ def run(robot: SimulatedGo2, settings: SimSettings, is_stopped: Callable[[], boo
             time.sleep(min(ahead, NAP_S))
         if is_stopped():
             return
+        hear(t)
         robot.publish(name, t, start_ns + round(t * 1e9))
 
 
@@ -160,9 +169,10 @@ def main(args: Sequence[str] | None = None) -> int:
     node = Node('sim_go2', **options)
     try:
         settings = SimSettings.load({name: parameter.value for name, parameter in node.get_parameters_by_prefix('').items()})
-        robot = SimulatedGo2(node, _sources(settings))
+        driven = Driven() if settings.obey else None
+        robot = SimulatedGo2(node, _sources(settings, driven))
         _say(f'the robot walks and publishes {" ".join(sorted(robot.published))}; Ctrl-C ends it')
-        run(robot, settings, lambda: bool(caught))
+        run(robot, settings, lambda: bool(caught), _hearing(node, driven) if driven else lambda _: None)
         robot.linger(LINGER_S)
         print(json.dumps({'published': robot.published}), flush=True)
     except SettingError as error:
@@ -178,9 +188,24 @@ def _say(text: str) -> None:
     print(f'sim_go2_node: {text}', file=sys.stderr, flush=True)
 
 
-def _sources(settings: SimSettings) -> list[SimulatedSensor]:
+def _hearing(node: Node, driven: Driven) -> Callable[[float], None]:
+    """Takes the commands that have come."""
+    now = [0.0]
+
+    def heard(told: Twist) -> None:
+        driven.command(now[0], told.linear.x, told.linear.y, told.angular.z)
+
+    def hear(t: float) -> None:
+        now[0] = t
+        rclpy.spin_once(node, timeout_sec=0.0)
+
+    node.create_subscription(Twist, 'cmd_vel', heard, 1)
+    return hear
+
+
+def _sources(settings: SimSettings, driven: Driven | None) -> list[SimulatedSensor]:
     """All sensors, those of go2_interfaces first, where it is installed."""
-    world = World.of(settings.seed)
+    world = World.of(settings.seed, driven)
     common = sources(world, image_raw=settings.image_raw, compressed=settings.compressed)
     try:
         from shadowhound_data_logger.sim.go2_messages import go2_sources  # noqa: PLC0415  # it may be missing

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from shadowhound_data_logger.sim import gait
 from shadowhound_data_logger.sim.floor_plan import FloorPlan, cross
-from shadowhound_data_logger.sim.patrol import SPEED, Motion, Patrol
+from shadowhound_data_logger.sim.patrol import SPEED, Driven, Motion, Patrol
 
 GRAVITY: Final = 9.81
 DISCHARGE_S: Final = 5.0
@@ -86,36 +86,37 @@ class World:
     """One robot on its patrol."""
 
     plan: FloorPlan
-    patrol: Patrol
+    path: Patrol | Driven
     noise: Noise
     solid: NDArray[np.float32]
     """Bounds of the boxes that stand at the height of the body."""
 
     @classmethod
-    def of(cls, seed: int) -> World:
+    def of(cls, seed: int, driven: Driven | None = None) -> World:
+        """On its patrol, or wherever it is driven."""
         plan = FloorPlan.build()
         bounds = plan.bounds
         solid = bounds[:, (bounds[4] < gait.STANCE_HEIGHT) & (bounds[5] > gait.STANCE_HEIGHT)].copy()
-        return cls(plan, Patrol.through(plan.patrol), Noise(seed), solid)
+        return cls(plan, driven or Patrol.through(plan.patrol), Noise(seed), solid)
 
     def motion(self, t: float) -> Motion:
         """Position, heading and velocity in the plane."""
-        return self.patrol.at(t)
+        return self.path.at(t)
 
     def room(self, t: float) -> str:
         """The room the robot is in."""
-        motion = self.patrol.at(t)
+        motion = self.path.at(t)
         return self.plan.room_at(motion.x, motion.y)
 
     def pose(self, t: float) -> BodyPose:
         """The pose of the body, with the sway of the trot."""
-        motion, sway = self.patrol.at(t), gait.sway(t)
+        motion, sway = self.path.at(t), gait.sway(t)
         quaternion = _quaternion(sway.roll, sway.pitch, motion.yaw)
         return BodyPose(motion.x, motion.y, sway.height, sway.roll, sway.pitch, motion.yaw, quaternion)
 
     def imu(self, t: float) -> Imu:
         """What the IMU in the body reads; specific force, so that a robot at rest reads +9.81 upwards."""
-        motion, sway = self.patrol.at(t), gait.sway(t)
+        motion, sway = self.path.at(t), gait.sway(t)
         noise = self.noise.at(_IMU, t, 6)
         sin_r, cos_r = math.sin(sway.roll), math.cos(sway.roll)
         sin_p, cos_p = math.sin(sway.pitch), math.cos(sway.pitch)
@@ -135,7 +136,7 @@ class World:
 
     def legs(self, t: float) -> tuple[gait.Leg, gait.Leg, gait.Leg, gait.Leg]:
         """The four legs in the order of gait.LEGS."""
-        yaw_rate = self.patrol.at(t).yaw_rate
+        yaw_rate = self.path.at(t).yaw_rate
         return (
             gait.leg(0, t, SPEED, yaw_rate), gait.leg(1, t, SPEED, yaw_rate),
             gait.leg(2, t, SPEED, yaw_rate), gait.leg(3, t, SPEED, yaw_rate),
@@ -158,7 +159,7 @@ class World:
 
     def obstacle_ranges(self, t: float) -> tuple[float, float, float, float]:
         """Free distance (m) from the body ahead, to the left, behind and to the right, at most RANGE_LIMIT."""
-        motion = self.patrol.at(t)
+        motion = self.path.at(t)
         yaws = motion.yaw + np.arange(4) * (math.pi / 2)
         hits = cross(self.solid, motion.x, motion.y, np.cos(yaws), np.sin(yaws))
         ahead, left, behind, right = np.minimum(hits.near.min(axis=0), RANGE_LIMIT).tolist()

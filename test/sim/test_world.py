@@ -24,7 +24,7 @@ def world() -> World:
 @pytest.fixture(scope='module')
 def lap(world: World) -> float:
     """Seconds for one round."""
-    return world.patrol.length / SPEED
+    return Patrol.through(world.plan.patrol).length / SPEED
 
 
 def test_the_robot_starts_at_the_origin_of_odom_heading_along_x(world: World) -> None:
@@ -74,7 +74,7 @@ def test_the_gyroscope_reads_the_rate_of_turn(world: World, lap: float) -> None:
 
 def test_the_gyroscope_integrates_to_the_orientation(world: World) -> None:
     """Over a round the mean of gyro z times the time is one full turn of the heading."""
-    lap = world.patrol.length / SPEED
+    lap = Patrol.through(world.plan.patrol).length / SPEED
     times = np.arange(0, lap, 0.01)
     turned = sum(world.imu(float(t)).gyroscope[2] for t in times) * 0.01
     assert abs(turned) == pytest.approx(math.tau, abs=0.15)

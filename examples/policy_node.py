@@ -1,0 +1,164 @@
+#!/usr/bin/env python3
+"""Runs the active policy on the robot: odometry in, ``cmd_vel`` out, within limits. A reference to copy from.
+
+    python examples/policy_node.py --ros-args -p max_speed:=0.6 -p max_turn:=1.0
+
+At each step, as often as the manifest says (``fps``), it takes the newest message at or before now, as the export does, and never
+one that is older than ``max_age_s``. Speeds and their changes are limited, and whatever goes wrong (no fresh odometry, a model
+that fails or gives no numbers, no policy) makes the robot stand: it is told zero until things are well again, and it stops by
+itself where this program dies. Each step's latency and failures are reported; a policy that breaks the limits of its manifest is
+rolled back, and the version before drives from the next step on.
+
+``observation.state`` may consist of what ``export --state pose,twist`` makes of odometry; a policy that wants more is refused.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping
+from functools import reduce
+from typing import Final
+
+import numpy as np
+import onnxruntime
+import rclpy
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+
+from shadowhound_data_logger.datasets.features import COMMAND, STATE_PARTS
+from shadowhound_data_logger.errors import PolicyError
+from shadowhound_data_logger.policies import active
+from shadowhound_data_logger.policies.running import ActivePolicy
+
+STATE, ACTION = 'observation.state', 'action'
+_PATHS: Final = {
+    'pose': [*(f'pose.pose.position.{axis}' for axis in 'xyz'), *(f'pose.pose.orientation.{axis}' for axis in 'xyzw')],
+    'twist': [f'twist.twist.{kind}.{axis}' for kind in ('linear', 'angular') for axis in 'xyz'],
+}
+FIELDS: Final[Mapping[str, str]] = {
+    name: path for part, paths in _PATHS.items() for name, path in zip(STATE_PARTS[part].names, paths, strict=True)
+}
+"""Name of an element of the state -> its path in nav_msgs/Odometry."""
+
+
+class Steps:
+    """One policy, as a function of odometry. Raises PolicyError for one that this program cannot drive with."""
+
+    def __init__(self, policy: ActivePolicy) -> None:
+        inputs = {one.name: one for one in policy.manifest.inputs}
+        outputs = {one.name: one for one in policy.manifest.outputs}
+        if inputs.keys() != {STATE} or not set(inputs[STATE].names) <= FIELDS.keys():
+            raise PolicyError(f'{policy.id} wants more than the pose and the twist of odometry')
+        if ACTION not in outputs or outputs[ACTION].names != COMMAND.names:
+            raise PolicyError(f'{policy.id} gives no {" ".join(COMMAND.names)}')
+        self._state, self._shape = inputs[STATE], outputs[ACTION].shape
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        self._session = onnxruntime.InferenceSession(str(policy.model), options, providers=['CPUExecutionProvider'])
+
+    def __call__(self, odometry: Odometry) -> NDArray[np.float64]:
+        """x, y (m/s) and yaw rate (rad/s) that the policy wants, in the frame of the body. Raises ValueError without numbers."""
+        values = [reduce(getattr, FIELDS[name].split('.'), odometry) for name in self._state.names]
+        given = np.array(values, self._state.dtype).reshape(self._state.shape)
+        (wanted,) = self._session.run([ACTION], {STATE: given})
+        action = np.asarray(wanted, float).reshape(-1)
+        if action.shape != (3,) or not np.isfinite(action).all():
+            raise ValueError('the policy gives no numbers')
+        return action
+
+
+class PolicyNode(Node):
+    """Drives while there is a policy and fresh odometry."""
+
+    def __init__(self) -> None:
+        super().__init__('policy')
+        self.max_speed, self.max_turn = self._number('max_speed', 0.6), self._number('max_turn', 1.0)
+        self.max_change, self.max_age_s = self._number('max_change', 2.0), self._number('max_age_s', 0.5)
+        self._odometry: Odometry | None = None
+        self._told = np.zeros(3)
+        self._commands = self.create_publisher(Twist, 'cmd_vel', 1)
+        self.create_subscription(Odometry, 'odom', self._heard, qos_profile_sensor_data)
+
+    def _number(self, name: str, default: float) -> float:
+        return float(self.declare_parameter(name, default).value or default)
+
+    def _heard(self, message: Odometry) -> None:
+        self._odometry = message
+
+    def drive(self, policy: ActivePolicy, is_stopped: Callable[[], bool]) -> None:
+        """Until another policy is active, this one broke its limits, or somebody stops it."""
+        steps = Steps(policy)
+        period_s = 1.0 / policy.manifest.fps
+        due = time.monotonic()
+        while not is_stopped() and policy.is_current():
+            due = max(due + period_s, time.monotonic())
+            while (left := due - time.monotonic()) > 0:
+                rclpy.spin_once(self, timeout_sec=left)
+            if not self._step(policy, steps, period_s):
+                self.get_logger().error(f'{policy.id} broke its limits and was rolled back')
+                return
+
+    def _step(self, policy: ActivePolicy, steps: Steps, period_s: float) -> bool:
+        odometry = self._fresh()
+        if odometry is None:  # nothing that the policy could be blamed for
+            self.tell(np.zeros(3), period_s)
+            return True
+        began = time.perf_counter()
+        try:
+            wanted = steps(odometry)
+        except Exception as error:  # noqa: BLE001 - whatever a model does, the robot stands
+            self.get_logger().warning(f'a step failed: {error}', throttle_duration_sec=5.0)
+            self.tell(np.zeros(3), period_s)
+            return policy.report(time.perf_counter() - began, failed=True)
+        self.tell(wanted, period_s)
+        return policy.report(time.perf_counter() - began)
+
+    def _fresh(self) -> Odometry | None:
+        """The newest message, unless it is too old; by the clock that stamped it."""
+        if self._odometry is None:
+            return None
+        stamp = self._odometry.header.stamp
+        age_s = self.get_clock().now().nanoseconds * 1e-9 - stamp.sec - stamp.nanosec * 1e-9
+        return self._odometry if age_s <= self.max_age_s else None
+
+    def tell(self, wanted: NDArray[np.float64], period_s: float) -> None:
+        """Within the limits: of speed, of turning, and of how fast either may change. Zero is told at once."""
+        top = np.array([self.max_speed, self.max_speed, self.max_turn])
+        limited = np.clip(wanted, -top, top)
+        if limited.any():
+            change = self.max_change * period_s
+            limited = np.clip(limited, self._told - change, self._told + change)
+        self._told = limited
+        command = Twist()
+        command.linear.x, command.linear.y, command.angular.z = map(float, limited)
+        self._commands.publish(command)
+
+
+def main() -> int:
+    """Until Ctrl-C."""
+    rclpy.init()
+    node = PolicyNode()
+    try:
+        while rclpy.ok():
+            try:
+                with active() as policy:
+                    node.get_logger().info(f'{policy.id} drives')
+                    node.drive(policy, lambda: not rclpy.ok())
+            except PolicyError as error:
+                node.get_logger().warning(f'no policy drives: {error}', throttle_duration_sec=30.0)
+                node.tell(np.zeros(3), 1.0)
+                rclpy.spin_once(node, timeout_sec=1.0)
+    except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
