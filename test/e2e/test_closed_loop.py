@@ -45,7 +45,7 @@ def fitted(exported: Path, folder: Path) -> str:
     states = np.array(table['observation.state'].to_pylist(), 'f8')
     actions = np.array(table['action'].to_pylist(), 'f8')
     moving = np.abs(actions).sum(axis=1) > 0
-    assert moving.sum() > 10
+    assert moving.sum() >= 3
     bias = actions[moving].mean(axis=0)
     weights = np.linalg.lstsq(states[moving], actions[moving] - bias, rcond=1e-3)[0]
     nodes = [helper.make_node('MatMul', ['observation.state', 'w'], ['m']), helper.make_node('Add', ['m', 'b'], ['action'])]
@@ -128,9 +128,13 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
     # A person drives, and all is recorded.
     command = Twist()
     command.linear.x, command.angular.z = FORWARD, TURN
+    until(lambda: told.get_subscription_count() == 2, 'robot and node listen to the teacher')
     begun = time.monotonic()
-    taught = mission(f'taught {robot}', lambda: time.monotonic() - begun > 8.0, lambda: told.publish(command))
-    assert max(one.pose.pose.position.x for one in heard) > 0.5, 'it went'
+
+    def went() -> bool:
+        return time.monotonic() - begun > 8.0 and any(one.pose.pose.position.x > 0.5 for one in heard)
+
+    taught = mission(f'taught {robot}', went, lambda: told.publish(command))
     # The mission becomes a data set, and that a policy.
     asked = ('query', "SELECT count(*) AS rows FROM objects WHERE sensor = 'cmd_vel'", '--mission', taught, '--json')
     until(lambda: sum(row['rows'] for row in run(*asked)), 'the catalogue has arrived')
@@ -141,8 +145,9 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
     digest = fitted(exported, tmp_path / 'trained')
     key, packed = tmp_path / 'spark.key', str(tmp_path / 'packed')
     run('policy', 'keygen', str(key))
-    made = run('policy', 'pack', str(tmp_path / 'trained'), '--name', policy, '--smoke', str(tmp_path / 'trained.npz'), '--dataset',
-               digest, '--fps', '10', '--p99-ms', '10000', '-o', packed, '--json')['policy']  # fmt: skip
+    sample = str(tmp_path / 'trained.npz')
+    pack = ('policy', 'pack', str(tmp_path / 'trained'), '--name', policy, '--smoke', sample, '--dataset', digest)
+    made = run(*pack, '--fps', '10', '--p99-ms', '10000', '-o', packed, '--json')['policy']
     run('policy', 'sign', packed, '--key', str(key))
     run('policy', 'publish', packed, '--alias', 'canary', '--robots', robot)
     # The canary takes it; another robot does not.
