@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 from uuid import uuid4
 
+import boto3
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -87,7 +88,13 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
         monkeypatch.setenv(name, value)
     robot = processes.robot
     policy = f'loop_{uuid4().hex[:8]}'
-    spark = {**os.environ, **environ, 'SHADOWHOUND_HOME': str(tmp_path / 'spark'), 'PYTHONPATH': str(ROOT)}
+    client = boto3.client('s3', endpoint_url=tower.endpoint_url, region_name='us-east-1',
+                          aws_access_key_id=environ['AWS_ACCESS_KEY_ID'],
+                          aws_secret_access_key=environ['AWS_SECRET_ACCESS_KEY'])  # fmt: skip
+    if 'lerobot' not in {bucket['Name'] for bucket in client.list_buckets()['Buckets']}:
+        client.create_bucket(Bucket='lerobot')
+    spark = {**os.environ, **tower.environment('spark'), **tower.tracking('spark'), 'PYTHONPATH': str(ROOT),
+             'SHADOWHOUND_HOME': str(tmp_path / 'spark')}  # fmt: skip
 
     def run(*command: str, **more: str) -> Any:
         ran = subprocess.run([*MAIN, *command], env={**spark, **more}, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -151,7 +158,11 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
     run('policy', 'sign', packed, '--key', str(key))
     run('policy', 'publish', packed, '--alias', 'canary', '--robots', robot)
     # The canary takes it; another robot does not.
-    thor = {'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_POLICY': policy, 'SHADOWHOUND_ROBOT': robot}
+    thor = (
+        tower.environment('thor')
+        | tower.tracking('thor')
+        | {'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_POLICY': policy, 'SHADOWHOUND_ROBOT': robot}
+    )
     keys = node.home / 'policies' / 'keys'
     run('policy', 'list', '--json', **thor)
     keys.mkdir(parents=True, exist_ok=True)
