@@ -81,7 +81,7 @@ class BatchStatistics:
     def told(self, messages: Sequence[bytes]) -> bytes | None:
         """As ``packed``; None where the messages are not of one layout."""
         size = len(messages[0])
-        if size <= ENCAPSULATION_BYTES or any(len(each) != size for each in messages):
+        if size <= ENCAPSULATION_BYTES or len(set(map(len, messages))) > 1:
             return None
         joined = b''.join(messages)
         rows = np.frombuffer(joined, np.uint8).reshape(len(messages), size)
@@ -211,7 +211,7 @@ def _told(layout: _Layout, rows: NDArray[Any]) -> bytes:
             else:
                 parts += [_one(name, table[:, column], is_float=is_float) for name, column in zip(names, columns, strict=True)]
         for name, runs in layout.manies:
-            values = np.concatenate([rows[run] for run in runs], axis=1).reshape(-1)
+            values = (rows[runs[0]] if len(runs) == 1 else np.concatenate([rows[run] for run in runs], axis=1)).reshape(-1)
             parts.append(_one(name, values, is_float=values.dtype == np.float32))
     return packed_parts(messages, layout.left_out, parts)
 
