@@ -3,12 +3,12 @@
 
     python examples/policy_node.py --ros-args -p max_speed:=0.6 -p max_turn:=1.0
 
-At each step, as often as the manifest says (``fps``), it takes the newest message at or before now, as the export does, and never
-one that is older than ``max_age_s``. Speeds and their changes are limited, and whatever goes wrong (no fresh odometry, a model
-that fails or gives no numbers, no policy) makes the robot stand: it is told zero until things are well again. Where this
-program dies or hangs nobody tells it anything: the robot's driver has to stop it then, as the simulated one does after half a second. Each
-step's latency and failures are reported; a policy that breaks the limits of its manifest is rolled back, and the version before
-drives from the next step on.
+At each step, as often as the manifest says (``fps``), it takes the newest message at or before now, as the export does, and
+never one that is older than ``max_age_s``. Speeds and their changes are limited, and whatever goes wrong (no fresh odometry, a
+model that fails or gives no numbers, no policy) makes the robot stand: it is told zero until things are well again. Where this
+program dies or hangs nobody tells it anything: the robot's driver has to stop it then, as the simulated one does after half a
+second. Each step's latency and failures are reported; a policy that breaks the limits of its manifest is rolled back, and the
+version before drives from the next step on.
 
 ``observation.state`` may consist of what ``export --state pose,twist`` makes of odometry; a policy that wants more is refused.
 """
