@@ -75,6 +75,7 @@ def test_what_python_writes_is_read(time: datetime, minutes: int) -> None:
     assert moment('since', zoned.isoformat(), NOON_NS) == moment('since', zoned, NOON_NS)
 
 
+@pytest.mark.long('a process for each')
 def test_gnu_date_agrees() -> None:
     """On what both read."""
     for text in ('2026-10-28T14:00:00+02:00', '2025-02-28 23:59:59', '20240229', '1969-12-31T23:59:59Z'):

@@ -124,6 +124,7 @@ def test_what_follows_a_line_that_makes_no_sense_counts(folder: Path) -> None:
     assert (list(state.slices), state.ended) == ([f'{BAG}_0.mcap'], True)
 
 
+@pytest.mark.long('processes with little memory')
 def test_lines_of_any_size_take_little_memory(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A file that has grown to gigabytes, in one line or none."""
     os.truncate(folder / LINES, 4 * MOST_BYTES)

@@ -145,6 +145,7 @@ def test_what_is_not_known_is_not_made_up(times: list[float], asked: float, know
     assert (pose(walking([(t, odometry(1, 1, 0)) for t in times]), asked) is not None) is known
 
 
+@pytest.mark.long('a minute of poses')
 def test_the_track_is_a_minute_long() -> None:
     """What is older is forgotten, so that it does not grow; of fast odometry some messages are kept, of each second."""
     found = walking([(number / 200, odometry(number / 200, 0.0, 0.0)) for number in range(200 * 200)])

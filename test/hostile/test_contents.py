@@ -172,6 +172,7 @@ def packed_zip(how: int) -> bytes:
     ],
     ids=['a hole of a terabyte', 'many in a tar', 'many in a zip', 'deflated', 'LZMA'],
 )  # fmt: skip
+@pytest.mark.long('archives of many')
 def test_an_archive_holds_no_more_than_it_is_large(make: Callable[[], bytes], kind: str) -> None:
     """Robots store what is in it as it is."""
     body = make()

@@ -14,10 +14,8 @@ from shadowhound_data_logger.lake import reading
 ROUNDS = 25
 
 
-PARTS = pytest.param('parts', marks=pytest.mark.long('two seconds'))
-
-
-@pytest.mark.parametrize('kind', [PARTS, *(kind for kind in KINDS if kind != 'parts')])
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.long('a campaign in short')
 def test_rounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """No other exception, whatever is in the file; and not everything is refused, or nothing."""
     monkeypatch.setattr(reading, 'SMALL_BYTES', reading.SMALL_BYTES)

@@ -296,6 +296,7 @@ def test_by_size_the_oldest_days_go(settings: StoreSettings) -> None:
     _check(settings)
 
 
+@pytest.mark.long('a death after each request')
 def test_it_may_die_anywhere(tmp_path: Path) -> None:
     """After each single thing that it does, whatever the catalogue names is there; the next run ends it, once for each object."""
     for life in range(100):

@@ -334,6 +334,7 @@ def documented(headers: dict[str, str], body: bytes) -> None:
         assert isinstance(json.loads(document, parse_constant=pytest.fail), dict)
 
 
+@pytest.mark.long('many small requests')
 def test_a_request_that_is_too_large_is_halved(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """Down to one document, which is then refused."""
     with between(url, lambda _, body: (413, b'{}') if body.count(b'\n') > 4 else None) as (proxy, _):

@@ -124,6 +124,7 @@ def test_a_speed_is_no_noise() -> None:
     assert _speed(np.zeros(3), np.ones((3, 2))).tolist() == [0.0] * 3
 
 
+@pytest.mark.long('a process that imports much')
 def test_a_process_draws(tmp_path: Path) -> None:
     """Nobody waits for it; its notes stay, and a later sender does not draw again."""
     folder = fly(tmp_path, rows=path())

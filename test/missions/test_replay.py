@@ -61,6 +61,7 @@ def test_all_missions_are_sent(tmp_path: Path) -> None:
     assert (len(tracking.runs), replay.owes) == (3, False)
 
 
+@pytest.mark.long('an hour of a simulated outage')
 def test_an_outage_is_probed_ever_more_rarely(tmp_path: Path) -> None:
     """At most one request a round, pauses up to a minute; the state says what is wrong and what to do, until it is over."""
     for _ in range(5):

@@ -24,6 +24,7 @@ def _frame(front: Camera, t: float, caption: str = '') -> np.ndarray:
     return image
 
 
+@pytest.mark.long('every pixel')
 def test_every_pixel_is_drawn_anew(front: Camera) -> None:
     """A frame depends on the time alone: what was drawn before shows nowhere."""
     first = {t: _frame(front, t) for t in np.arange(0, 60, 5.9)}

@@ -184,6 +184,7 @@ def test_killed_between_two_steps(opened: Open, root: Path, moment: str, state: 
     assert {item.key for item in spool.pending(9)} == {'thor/final/a', 'thor/final/b'}
 
 
+@pytest.mark.long('a death after each step')
 def test_death_at_any_moment_of_a_binding(root: Path, moments: Moments) -> None:
     """Objects are bound all or none; what is left can be bound and delivered, and the ledger closes."""
     spool = new_spool(root)

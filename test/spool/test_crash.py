@@ -126,6 +126,7 @@ def settled(root: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize('index', ['whole', 'lost'])
+@pytest.mark.long('a death after each step')
 def test_death_at_any_moment_of_a_start(root: Path, moments: Moments, index: str) -> None:
     """A start that died half-way is completed by the next one, as if it had been the first, also when it rebuilt the index."""
     leave_a_mess(root)

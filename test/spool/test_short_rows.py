@@ -65,6 +65,7 @@ def used(root: Path) -> tuple[int, int]:
     return (count - free) * size, count * size
 
 
+@pytest.mark.long('an hour of rows')
 def test_what_left_an_hour_ago_takes_a_tenth(spool: Spool, root: Path) -> None:
     """Of the bytes that it took in the index before."""
     empty = used(root)[0]
@@ -75,6 +76,7 @@ def test_what_left_an_hour_ago_takes_a_tenth(spool: Spool, root: Path) -> None:
     assert rows(root) == []
 
 
+@pytest.mark.long('an hour of rows')
 def test_pages_are_used_again(spool: Spool, root: Path) -> None:
     """The file does not grow once as much is forgotten as comes."""
     sizes = []

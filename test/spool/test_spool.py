@@ -241,6 +241,7 @@ def test_the_drain_lock_dies_with_its_process(spool: Spool, root: Path) -> None:
         assert mine
 
 
+@pytest.mark.long('two processes')
 def test_two_processes_add_at_once(opened: Open, root: Path) -> None:
     """Both get all of their objects in, whole and under keys of their own, whoever opens the spool meanwhile."""
     with started('add', root, 'one', 150) as one, started('add', root, 'two', 150) as two:

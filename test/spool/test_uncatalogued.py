@@ -97,6 +97,7 @@ def test_a_commit_that_fails_takes_nothing_off(spool: Spool, root: Path, monkeyp
     assert listed(root) == []
 
 
+@pytest.mark.long('a death after each step')
 def test_death_at_any_moment_of_a_part(root: Path, moments: Moments) -> None:
     """After a kill every delivered object is listed, or in a part that is there to be delivered: never both, never neither."""
     spool = new_spool(root)
