@@ -14,6 +14,7 @@ import click
 from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, robot_name, the_home, the_store_settings
 from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, progress
 from shadowhound_data_logger.cli.question import asking, quietly, tell_left_out
+from shadowhound_data_logger.errors import StoreUnavailable
 
 SHOWN: Final = 10
 
@@ -27,16 +28,16 @@ SHOWN: Final = 10
 @click.option('--robot', metavar='NAME', callback=robot_name, help='Only of this robot.')
 @click.option('--ca', type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar='FILE',
               help="Certificate of the authority that signed the server's.")  # fmt: skip
-@click.option('--follow', is_flag=True, help='Go on until Ctrl-C, and send what is new.')
+@click.option('--follow', is_flag=True, help='Keep running until Ctrl-C, and send what is new.')
 @click.option('--every', type=click.FloatRange(1.0), default=60.0, show_default=True, metavar='S',
-              help='With --follow: seconds between two looks.')  # fmt: skip
+              help='With --follow: seconds between checks.')  # fmt: skip
 @as_json
 def lake_sink(*, url: str, index: str, robot: str | None, ca: Path | None, follow: bool, every: float, as_json: bool) -> ExitCode:
     """Send the catalogue to Elasticsearch or OpenSearch.
 
-    The rows of the catalogue, gaps, missions, their events, and labels. What the server has is noted in
-    $SHADOWHOUND_HOME/sink, so a run that was interrupted resumes there, and nothing is there twice. ELASTIC_API_KEY, or
-    ELASTIC_USERNAME and ELASTIC_PASSWORD, name who sends.
+    It sends catalogue rows, gaps, missions, their events, and labels. $SHADOWHOUND_HOME/sink records what the server has
+    accepted, so an interrupted run resumes there, and no document is created twice. ELASTIC_API_KEY, or
+    ELASTIC_USERNAME and ELASTIC_PASSWORD, authenticate.
 
     Exit code 1 when the server refused documents, or something was left out.
     """
@@ -53,19 +54,27 @@ def lake_sink(*, url: str, index: str, robot: str | None, ca: Path | None, follo
         sink = library.Sink(
             source, server, index, position, left_out, tries=float('inf') if follow else library.TRIES, tell=bar.say
         )
-        total += sink.send(robot)
-        while follow:
-            bar.say(f'{number(total.added)} sent; waiting for more')
+        while True:
+            try:
+                total += sink.send(robot)
+                bar.say(f'{number(total.added)} sent; waiting for more')
+            except StoreUnavailable as error:
+                if not follow:
+                    raise
+                bar.say(f'{error.what}; trying again')
+            if not follow:
+                break
             time.sleep(every)
-            total += sink.send(robot)
     if as_json:
-        print_json({'url': server.url, 'index': index, 'position': str(position.path), **asdict(total)})
+        print_json(
+            {'url': server.url, 'index': index, 'position': str(position.path), **asdict(total), 'refused': dict(total.refused)}
+        )
     else:
-        print_lines(f'{counted(total.added, "document")} sent, {number(total.present)} were there.')
+        print_lines(f'{counted(total.added, "document")} sent; {number(total.present)} were already there.')
         for one in total.restarted:
             print_lines(f'{one} is not the index of the last run: all was sent again.')
         for reason, count in total.refused.most_common(SHOWN):
             print_lines(plain(f'{number(count)} refused: {reason}'))
         if total.refused:
-            print_lines(f'Which they are is in {position.path}, table refused.')
+            print_lines(f'{position.path} lists them, in the table refused.')
     return tell_left_out(left_out) or exit_code(finding=total.refused)

@@ -1,7 +1,8 @@
 """The simulated Go2 in its building: what its sensors would read at any time, pure and deterministic.
 
-Everything is a function of (seed, t): no clock, no state, no ROS. ``t`` is in seconds since the start, units are SI, and
-all sensors derive from the one motion, so that they agree with each other.
+On its patrol everything is a function of (seed, t): no clock, no state, no ROS. A robot that is driven also depends on the commands
+it got. ``t`` is in seconds since the start, units are SI, and all sensors derive from the one motion, so that they agree with each
+other.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ class Power(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """One robot on its patrol."""
+    """One robot on its path."""
 
     plan: FloorPlan
     path: Patrol | Driven

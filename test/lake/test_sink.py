@@ -18,11 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 from lake import gap_parts
 from lake.making import NOON_NS, add, fill, folder_store, minutes
 
 from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.catalogue.gaps import WITHDRAWN
+from shadowhound_data_logger.cli.common import ExitCode
+from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import LakeError, SettingError, SinkUnavailable
@@ -424,6 +427,22 @@ def test_dashboards(kind: str) -> None:
     assert ('dashboard', f'robots-{kind}') in there
     known = sink.template('robots', is_opensearch=False)['template']['mappings']['properties']
     assert {name for each in objects for name in fields(each)} <= set(known)
+
+
+def test_the_command_tells_what_was_refused(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """In JSON as on the screen, with exit code 1; the second run has nothing to send."""
+    home = {'SHADOWHOUND_HOME': str(tmp_path), 'AWS_ENDPOINT_URL': ''}
+
+    def answer(number: int, body: bytes) -> tuple[int, bytes] | None:
+        item = {'create': {'status': 400, 'error': {'type': 'mapper_parsing_exception', 'reason': 'no date'}}}
+        return (200, json.dumps({'items': [item] * (body.count(b'\n') // 2)}).encode()) if number == 1 else None
+
+    with between(url, answer) as (proxy, _):
+        ran = CliRunner().invoke(cli, ['lake', 'sink', proxy, '--json'], env=home, standalone_mode=False)
+        assert ran.return_value == ExitCode.FINDING
+        assert json.loads(ran.stdout)['refused'] == {'mapper_parsing_exception: no date': COUNTS['objects']}
+        shown = CliRunner().invoke(cli, ['lake', 'sink', proxy], env=home, standalone_mode=False)
+        assert (shown.return_value, '0 documents sent' in shown.stdout) == (ExitCode.FINE, True)
 
 
 @pytest.mark.long('processes that are killed')
