@@ -1,8 +1,8 @@
 """The simulated Go2 in its building: what its sensors would read at any time, pure and deterministic.
 
-On its patrol everything is a function of (seed, t): no clock, no state, no ROS. A robot that is driven also depends on the commands
-it got. ``t`` is in seconds since the start, units are SI, and all sensors derive from the one motion, so that they agree with each
-other.
+On its patrol everything is a function of (seed, t): no clock, no state, no ROS. A robot that is driven also depends on the
+commands it got. ``t`` is in seconds since the start, units are SI, and all sensors derive from the one motion, so that they
+agree with each other.
 """
 
 from __future__ import annotations
