@@ -30,6 +30,7 @@ from aiortc.exceptions import InvalidAccessError, InvalidStateError, OperationEr
 from aiortc.rtp import RTCP_PSFB_APP, RTCP_PSFB_FIR, RTCP_PSFB_PLI, RtcpPsfbPacket, unpack_remb_fci
 
 from shadowhound_data_logger.live.kinds import LiveItem
+from shadowhound_data_logger.untrusted import check_pixels
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -155,6 +156,7 @@ class _VideoEncoder:
 def _frame(jpeg: bytes) -> Any:
     """A frame (av.VideoFrame, yuv420p) with even sides of at most MOST_SIDE pixels. Raises ValueError."""
     height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
+    check_pixels(width, height)
     least = -(-max(height, width) // MOST_SIDE)
     pixels = simplejpeg.decode_jpeg(jpeg, 'RGB', fastdct=True, fastupsample=True,
                                     min_height=height // least, min_width=width // least)  # fmt: skip

@@ -237,3 +237,8 @@ def test_frames_of_any_size_become_video() -> None:
     for broken in (b'', b'\xff\xd8\xff', simplejpeg.encode_jpeg(np.zeros((1, 1, 3), np.uint8))):
         with pytest.raises(ValueError):
             webrtc._frame(broken)
+    bomb = bytearray(simplejpeg.encode_jpeg(np.zeros((8, 8, 3), np.uint8)))
+    at = bomb.index(b'\xff\xc0') + 5  # height and width of its frame (ITU T.81, B.2.2)
+    bomb[at : at + 4] = b'\xff\xf8\xff\xf8'
+    with pytest.raises(ValueError, match='65,528 x 65,528 pixels'):
+        webrtc._frame(bytes(bomb))
