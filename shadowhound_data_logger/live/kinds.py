@@ -20,6 +20,7 @@ from shadowhound_data_logger.encode.image import JPEG_MAGIC
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+from shadowhound_data_logger.untrusted import check_pixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -184,6 +185,7 @@ def frames(topic: str, type_name: str, types: MessageTypes, at_ms: float, cdr: b
 def _smaller(jpeg: bytes, size: int) -> bytes:
     try:
         height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
+        check_pixels(width, height)
         side = _SIDE[size]
         pixels = simplejpeg.decode_jpeg(
             jpeg, 'BGR', fastdct=True, fastupsample=True, min_height=height // side, min_width=width // side
