@@ -180,14 +180,15 @@ def sync(*, as_json: bool, **given: Any) -> ExitCode:
 def run(*, every: float, **given: Any) -> ExitCode:
     """Follow the registry until interrupted.
 
-    A Tower that is away changes nothing: what is active goes on.
+    A Tower that is away changes nothing: what is active goes on. Where there is ROS, the node shadowhound_policy publishes the
+    active version as ~/policy (std_msgs/String, latched), and takes word of its health on ~/health.
     """
     logging.basicConfig(level=logging.INFO, format='%(message)s')
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     said = ''
-    with _syncing(given) as one:
+    with _syncing(given) as one, _telling():
         while not stop.is_set():
             try:
                 text = _sentence(one.run(again=False))
@@ -318,6 +319,23 @@ def _syncing(given: dict[str, Any]) -> Iterator[PolicySync]:
         yield PolicySync(_policies(), store, _registry(), settings, may_activate)
 
 
+@contextmanager
+def _telling() -> Iterator[None]:
+    """The topics of the policy meanwhile, where there is ROS."""
+    try:
+        from shadowhound_data_logger.ros.policy_topics import telling  # noqa: PLC0415 - ROS is not everywhere
+    except ImportError as error:
+        print(
+            f'without ROS ({error}): ~/policy is not published, and only `policy report` tells of health',
+            file=sys.stderr,
+            flush=True,
+        )
+        yield
+        return
+    with telling(_policies()):
+        yield
+
+
 def _no_mission(robot: str = '') -> Callable[[], bool]:
     missions = MissionFinder(the_home(), robot or os.environ.get('SHADOWHOUND_ROBOT') or 'thor')
     return lambda: missions.look() is None
@@ -331,7 +349,8 @@ def _registry() -> MlflowRegistry:
 
 
 def _told(result: SyncResult) -> dict[str, object]:
-    return {'wanted': result.wanted, 'active': result.active, 'done': result.done, 'p99_ms': result.p99_ms}
+    return {'wanted': result.wanted, 'active': result.active, 'done': result.done, 'p99_ms': result.p99_ms,
+            'fetched_bytes': result.fetched_bytes, 'begun_anew': result.begun_anew}  # fmt: skip
 
 
 def _sentence(result: SyncResult) -> str:

@@ -12,12 +12,20 @@ from typing import Any, Final
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import PolicyRefused
 from shadowhound_data_logger.policies.manifest import MANIFEST, SIGNATURE, PolicyManifest
-from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json
+from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json, from_strict_json
 
-MOST_HEADER_BYTES: Final = 100 << 20
-"""Of a safetensors file; the library's own bound (https://github.com/huggingface/safetensors)."""
+MOST_HEADER_BYTES: Final = 1 << 20
+"""Of a safetensors file: enough for some 8,000 tensors. The library's own bound of 100 MB would take gigabytes to parse."""
+DTYPE_BITS: Final[dict[str, int]] = {
+    'BOOL': 8, 'U8': 8, 'I8': 8, 'F8_E4M3': 8, 'F8_E5M2': 8, 'F8_E8M0': 8, 'U16': 16, 'I16': 16, 'F16': 16, 'BF16': 16, 'U32': 32,
+    'I32': 32, 'F32': 32, 'U64': 64, 'I64': 64, 'F64': 64,
+}  # fmt: skip
+"""Of safetensors, by element."""
+MOST_RANK: Final = 32
 MOST_ONNX_BYTES: Final = (1 << 31) - 1
 """Protobuf's own bound on a message."""
+ORT_FORMAT: Final = b'ORTM'
+"""At byte 4; https://github.com/microsoft/onnxruntime/blob/main/onnxruntime/core/flatbuffers/schema/ort.fbs"""
 MOST_NODES: Final = 5_000_000
 MOST_DEPTH: Final = 16
 _TENSOR: Final = 'tensor'
@@ -42,7 +50,7 @@ def check_files(folder: Path, manifest: PolicyManifest, *, hashes: bool = True) 
     Raises PolicyRefused (``link``, ``files``, ``damaged``, ``external``, ``file_type``) and OSError.
     """
     named = {file.path: file for file in manifest.files}
-    found = set(_files(folder))
+    found = set(files_of(folder))
     if odd := sorted(found ^ {*named, MANIFEST, SIGNATURE}):
         what = 'is in its folder, and not in the manifest' if odd[0] in found else 'is not there'
         raise PolicyRefused('files', f'{odd[0]!r} of {manifest.id} {what}')
@@ -56,7 +64,7 @@ def check_files(folder: Path, manifest: PolicyManifest, *, hashes: bool = True) 
             check_content(place, path)
 
 
-def _files(folder: Path) -> Iterator[str]:
+def files_of(folder: Path) -> Iterator[str]:
     """All that is no folder, as paths below it. Raises PolicyRefused for what is neither file nor folder."""
     for parent, folders, names in os.walk(folder):
         for name in (*folders, *names):
@@ -90,13 +98,45 @@ def _check_npy(path: Path) -> None:
 
 
 def _check_safetensors(path: Path) -> None:
-    """Eight bytes of length and a header in JSON; https://github.com/huggingface/safetensors#format."""
+    """Eight bytes of length, a header in JSON, and tensors, one behind the other; https://github.com/huggingface/safetensors#format.
+
+    As strict as the library: each byte behind the header is of exactly one tensor.
+    """
     size = path.stat().st_size
     with path.open('rb') as file:
         length = int.from_bytes(file.read(8), 'little')
         if not 2 <= length <= min(MOST_HEADER_BYTES, size - 8):
-            raise ValueError('it has no header of safetensors')
-        from_json(file.read(length), MOST_HEADER_BYTES)
+            raise ValueError(f'it has no header of safetensors of at most {MOST_HEADER_BYTES:,} bytes')
+        header = from_strict_json(file.read(length), MOST_HEADER_BYTES)
+    try:
+        texts = header.pop('__metadata__', {})
+        if not all(isinstance(text, str) for text in texts.values()):
+            raise ValueError('its metadata are no texts')
+        end = 0
+        for begin, after in sorted(_place(told) for told in header.values()):
+            if begin != end:
+                raise ValueError('its tensors overlap, or leave a gap')
+            end = after
+    except (AttributeError, TypeError, KeyError) as error:
+        raise ValueError('its header is not one of safetensors') from error
+    if end != size - 8 - length:
+        raise ValueError('its tensors are not what is behind the header')
+
+
+def _place(told: Any) -> tuple[int, int]:
+    """Where a tensor begins and ends. Raises ValueError, TypeError, KeyError."""
+    shape, (begin, after) = told['shape'], told['data_offsets']
+    bits = DTYPE_BITS[told['dtype']]
+    if len(told) != 3 or not isinstance(shape, list) or len(shape) > MOST_RANK:
+        raise ValueError('a tensor has not a type, a shape and a place alone')
+    for number in (*shape, begin, after):
+        if type(number) is not int or not 0 <= number < 1 << 48:
+            raise ValueError('the shape or the place of a tensor is no number of bytes')
+    for size in shape:
+        bits *= size
+    if bits != (after - begin) * 8:
+        raise ValueError('a tensor has not the bytes of its shape')
+    return begin, after
 
 
 def _check_onnx(path: Path) -> None:
@@ -105,6 +145,8 @@ def _check_onnx(path: Path) -> None:
     if not 0 < size <= MOST_ONNX_BYTES:
         raise ValueError(f'it has {size:,} bytes')
     with path.open('rb') as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        if content[4:8] == ORT_FORMAT:  # by which the runtime tells them, whatever else they are
+            raise ValueError('it is a model in the format of ONNX Runtime, not in that of ONNX')
         _Onnx(content, path.name).walk('model', 0, size, 0)
 
 

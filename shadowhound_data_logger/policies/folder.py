@@ -83,11 +83,20 @@ class PolicyFolder:
         self.check_owner()
 
     def check_owner(self) -> None:
-        """Raises PolicyError for a folder that is a link, or in which others may write: they could change what was verified."""
-        for folder in (self.path, self.path / 'keys', self.versions):
-            found = folder.lstat()
-            if not stat.S_ISDIR(found.st_mode) or found.st_uid not in {os.getuid(), 0} or found.st_mode & 0o022:
-                raise PolicyError(f'{folder} is a link, or others may write in it', remedy=f'chmod go-w {folder}')
+        """Raises PolicyError for a folder that is a link, or in which others may write: they could change what was verified.
+
+        So could they with a key that they may write, or that is a link, and where anybody may rename the folder itself.
+        """
+        for parent in self.path.parents:
+            if parent.stat().st_mode & (stat.S_IWOTH | stat.S_ISVTX) == stat.S_IWOTH:
+                raise PolicyError(f'{parent} is a folder in which others may write', remedy=f'chmod o-w {parent}')
+        keys = self.path / 'keys'
+        for place in (self.path, keys, self.versions, self.incoming, *keys.glob('*.pub')):
+            found = place.lstat()
+            is_right = stat.S_ISDIR(found.st_mode) if place.suffix != '.pub' else stat.S_ISREG(found.st_mode)
+            if not is_right or found.st_uid not in {os.getuid(), 0} or found.st_mode & 0o022:
+                what = f'{place} is a link, belongs to another user, or others may write in it'
+                raise PolicyError(what, remedy=f'ls -ld {place}; chmod go-w {place}')
 
     # -- what is there ---------------------------------------------------------------------------------------------
 
@@ -171,9 +180,10 @@ class PolicyFolder:
 
     def use(self, name: str) -> None:
         """Activate and pin a version, also one that misbehaved. Raises PolicyRefused, OSError."""
-        with disk.flock(self.path / 'lock'):
+        self.check(name, self.state())
+        with disk.flock(self.path / 'lock'):  # for which a rollback does not wait long
             state = self.state()
-            manifest = self.check(name, state)
+            manifest = self.check(name, state, hashes=False)
             state.bad.pop(name, None)
             state.pin = name
             self._activate(state, manifest)
@@ -196,9 +206,11 @@ class PolicyFolder:
             if state.pin == now:
                 state.pin = None
             target = self._last_good(state, now)
-            state.history = [name for name in state.history if name not in {now, target}]
-            self._write(state)
-            self._link(target)
+            state.history = [name for name in state.history if name != now]  # with the target: this may end here, and be repeated
+            try:
+                self._write(state)
+            finally:  # also where the disk is full: then it is out, and nobody remembers why
+                self._link(target)
             return target
 
     def pin(self) -> str:
@@ -222,20 +234,25 @@ class PolicyFolder:
             spare = [name for name in self.installed() if name not in wanted]
             spare.sort(key=lambda name: (self.versions / name).lstat().st_mtime)
             most = max(0, keep - len(wanted - {None}))
-            return [name for name in spare[: max(0, len(spare) - most)] if self._remove(name)]
+            gone = [name for name in spare[: max(0, len(spare) - most)] if self._set_aside(name)]
+        for name in gone:  # gigabytes take their time, and a rollback does not wait for them
+            shutil.rmtree(self._gone(name))
+        return gone
 
-    def _remove(self, name: str) -> bool:
+    def _set_aside(self, name: str) -> bool:
         """Unless somebody uses it (``active``)."""
-        place, gone = self.versions / name, self.incoming / f'{name}.gone'
+        place = self.versions / name
         descriptor = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             if not disk.lock(descriptor, wait=False):
                 return False
-            os.replace(place, gone)
+            os.replace(place, self._gone(name))
         finally:
             os.close(descriptor)
-        shutil.rmtree(gone)
         return True
+
+    def _gone(self, name: str) -> Path:
+        return self.incoming / f'{name}.gone'
 
     def _activate(self, state: PolicyState, manifest: PolicyManifest) -> None:
         now = self.current()

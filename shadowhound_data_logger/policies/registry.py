@@ -20,6 +20,9 @@ CHAMPION, CANARY = 'champion', 'canary'
 ROBOTS_TAG: Final = 'shadowhound.robots'
 """Of a version: the robots that take it as a canary, with commas between them."""
 ID_TAG: Final = 'shadowhound.policy'
+PAGE: Final = 200
+"""Versions that are asked for at once: an answer with them has some 200 KB."""
+MOST_PAGES: Final = 500
 _NOT_THERE: Final = frozenset({'RESOURCE_DOES_NOT_EXIST', 'INVALID_PARAMETER_VALUE'})
 """MLflow says the latter of an alias that a model does not have."""
 
@@ -58,10 +61,16 @@ class MlflowRegistry:
         return _version(told.get('model_version'))
 
     def versions(self, name: str) -> list[RegisteredVersion]:
-        """All of a model, the newest first."""
-        query = urlencode({'filter': f"name='{name}'", 'max_results': 200, 'order_by': 'version_number DESC'})
-        told = self._rest.json('GET', f'model-versions/search?{query}')
-        return [_version(each) for each in told.get('model_versions', [])]
+        """All of a model, the newest first. Raises PolicyError for more than anybody can have made."""
+        asked = {'filter': f"name='{name}'", 'max_results': str(PAGE), 'order_by': 'version_number DESC'}
+        found: list[RegisteredVersion] = []
+        for _ in range(MOST_PAGES):
+            told = self._rest.json('GET', f'model-versions/search?{urlencode(asked)}')
+            found += map(_version, told.get('model_versions', []))
+            if not (token := told.get('next_page_token')):
+                return found
+            asked['page_token'] = str(token)
+        raise PolicyError(f'the registry names more than {PAGE * MOST_PAGES:,} versions of {name}')
 
     def register(self, name: str, source: str, tags: dict[str, str], run: str) -> int:
         """The number of a new version, or of the one that has this source already."""

@@ -40,8 +40,10 @@ def keygen(path: Path) -> str:
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), 'wb') as file:
         file.write(body)
     raw = key.public_key().public_bytes_raw()
-    with path.with_name(f'{path.name}.pub').open('x', encoding='ascii') as file:
+    public = path.with_name(f'{path.name}.pub')
+    with public.open('x', encoding='ascii') as file:
         file.write(base64.b64encode(raw).decode() + '\n')
+    public.chmod(0o644)  # a robot takes none that others may write, and copies keep the mode
     return key_id(raw)
 
 

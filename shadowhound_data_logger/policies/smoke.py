@@ -1,7 +1,8 @@
 """One run of a policy before it may run: a child process with limits, a sample with the output that has to come out.
 
 The child has no environment of ours but the path of Python's packages, no network where the system lets it leave that, and
-limits of memory, time and files. What it says is read with a bound.
+limits of memory and time. It can start no process and no thread, and write no file. What it says is read with a bound, and its
+process group ends with it.
 """
 
 from __future__ import annotations
@@ -10,10 +11,13 @@ import ctypes
 import json
 import os
 import resource
+import select
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -43,22 +47,16 @@ def run_smoke(folder: Path, manifest: PolicyManifest, *, limit_s: float = SMOKE_
     Raises PolicyRefused: ``nan`` ``output`` ``slow`` ``inputs`` ``pickle`` ``memory`` ``time`` or ``smoke`` (it crashed), and
     PolicyError where this machine has no onnxruntime.
     """
-    with tempfile.TemporaryDirectory(prefix='shadowhound-policy-') as empty, tempfile.TemporaryFile() as output:
-        environ = {'PATH': '/usr/bin:/bin', 'HOME': empty, 'TMPDIR': empty, 'LANG': 'C.UTF-8',
-                   'PYTHONPATH': os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))}  # fmt: skip
-        command = [sys.executable, '-B', '-m', __name__, str(folder.absolute())]  # its limits would cut off files of bytecode
-        try:
-            ran = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.DEVNULL, env=environ,
-                                 cwd=empty, timeout=limit_s, check=False, start_new_session=True)  # fmt: skip
-        except subprocess.TimeoutExpired as error:
-            raise PolicyRefused('time', f'the smoke run of {manifest.id} took more than {limit_s:g} s') from error
-        output.seek(0)
-        told = output.read(MOST_ANSWER_BYTES)
+    with tempfile.TemporaryDirectory(prefix='shadowhound-policy-') as empty:
+        command = [sys.executable, '-B', '-m', __name__, str(folder.absolute())]  # it may write no file, such as one of bytecode
+        told, code = _ran(command, environ_of(empty), empty, limit_s)
+    if code is None:
+        raise PolicyRefused('time', f'the smoke run of {manifest.id} took more than {limit_s:g} s')
     try:
         answer = from_json(told, MOST_ANSWER_BYTES)
         reason, text, p99_ms = str(answer['reason']), str(answer['text'])[:300], float(answer['p99_ms'])
     except (ValueError, KeyError, TypeError) as error:
-        what = f'signal {-ran.returncode}' if ran.returncode < 0 else f'exit code {ran.returncode}'
+        what = f'signal {-code}' if code < 0 else f'exit code {code}'
         raise PolicyRefused('smoke', f'the smoke run of {manifest.id} ended with {what}') from error
     if reason == 'runtime':
         raise PolicyError(f'a policy cannot be run here: {text}', remedy="pip install 'shadowhound_data_logger[policies]'")
@@ -68,6 +66,38 @@ def run_smoke(folder: Path, manifest: PolicyManifest, *, limit_s: float = SMOKE_
         text = f'{manifest.id} takes {p99_ms:.1f} ms (p99) on this machine, allowed are {manifest.p99_ms:g} ms'
         raise PolicyRefused('slow', text)
     return p99_ms
+
+
+def environ_of(folder: str) -> dict[str, str]:
+    """The environment of the child, which works in this folder. One thread: those of linear algebra could not start theirs."""
+    paths = [str(Path(path).absolute()) for path in sys.path if path]  # without the current folder, whoever may write in it
+    return {'PATH': '/usr/bin:/bin', 'HOME': folder, 'TMPDIR': folder, 'LANG': 'C.UTF-8', 'OPENBLAS_NUM_THREADS': '1',
+            'OMP_NUM_THREADS': '1', 'PYTHONPATH': os.pathsep.join(paths)}  # fmt: skip
+
+
+def _ran(command: Sequence[str], environ: Mapping[str, str], folder: str, limit_s: float) -> tuple[bytes, int | None]:
+    """What a child writes, and its exit code; None where it took longer. Nothing that it started outlives this."""
+    child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environ,
+                             cwd=folder, start_new_session=True)  # fmt: skip
+    with child:
+        try:
+            told, has_ended = _read(child, time.monotonic() + limit_s)
+        finally:
+            os.killpg(child.pid, signal.SIGKILL)  # its number is taken until it was waited for
+        code = child.wait()
+    return told, code if has_ended else None
+
+
+def _read(child: subprocess.Popen[bytes], until_s: float) -> tuple[bytes, bool]:
+    """What it writes, up to a bound, and whether that was all."""
+    assert child.stdout is not None
+    told = b''
+    while len(told) <= MOST_ANSWER_BYTES and select.select([child.stdout], [], [], max(0.0, until_s - time.monotonic()))[0]:
+        piece = os.read(child.stdout.fileno(), MOST_ANSWER_BYTES)
+        if not piece:
+            return told, True
+        told += piece
+    return told, len(told) > MOST_ANSWER_BYTES
 
 
 def load_arrays(folder: Path, files: Any) -> dict[str, Any]:
@@ -157,8 +187,9 @@ def _confine() -> None:
     if libc.unshare(_NEW_NET):
         libc.unshare(_NEW_USER | _NEW_NET)  # refused in many containers: then it has the network of its parent
     libc.prctl(_NO_NEW_PRIVS, 1, 0, 0, 0)
-    for what, most in ((resource.RLIMIT_AS, MEMORY_BYTES), (resource.RLIMIT_FSIZE, MOST_ANSWER_BYTES), (resource.RLIMIT_CORE, 0),
-                       (resource.RLIMIT_CPU, int(SMOKE_S)), (resource.RLIMIT_NOFILE, 256)):  # fmt: skip
+    for what, most in ((resource.RLIMIT_AS, MEMORY_BYTES), (resource.RLIMIT_FSIZE, 0), (resource.RLIMIT_CORE, 0),
+                       (resource.RLIMIT_NPROC, 0), (resource.RLIMIT_CPU, int(SMOKE_S)),
+                       (resource.RLIMIT_NOFILE, 256)):  # fmt: skip
         with suppress(ValueError, OSError):
             resource.setrlimit(what, (most, most))
 

@@ -20,6 +20,7 @@ from shadowhound_data_logger.errors import ObjectRefused, PolicyError, PolicyRef
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.options import GIBI
 from shadowhound_data_logger.policies import signing
+from shadowhound_data_logger.policies.content import files_of
 from shadowhound_data_logger.policies.folder import PolicyFolder, id_refused_as_old
 from shadowhound_data_logger.policies.manifest import (
     MANIFEST,
@@ -33,13 +34,17 @@ from shadowhound_data_logger.policies.registry import BUCKET, PolicyRegistry, Re
 from shadowhound_data_logger.policies.smoke import run_smoke
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.download import download
+from shadowhound_data_logger.stores.download import UNFINISHED, download
 
 log = logging.getLogger(__name__)
 
 REFUSED_AGAIN_S: Final = 3600.0
 """A version that was refused is not fetched again sooner: a smoke run may have been slow because the machine was busy."""
 MOST_LISTS: Final = 1000
+MOST_EXCHANGED: Final = 5
+"""Lists that are none: behind so many no other is asked for, else they would cost bandwidth at each look."""
+LATE_S: Final = 0.1
+"""So much of the cap, and the time of two pieces, may be caught up with: while one arrives, no other is asked for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +75,10 @@ class SyncResult:
     """``unchanged`` ``activated`` ``waiting`` (a mission is active) ``rolled_back`` (a key was revoked) ``pinned`` ``none``."""
     p99_ms: float | None = None
     """Of the smoke run, where there was one."""
+    fetched_bytes: int = 0
+    """That arrived, repeats among them."""
+    begun_anew: int = 0
+    """Files of which what had arrived was thrown away: it was damaged, or the object changed meanwhile."""
 
 
 @dataclass(slots=True)
@@ -83,6 +92,7 @@ class PolicySync:
     may_activate: Callable[[], bool] = lambda: True
     """Whether no mission is active."""
     pause: Callable[[float], object] = time.sleep
+    monotonic: Callable[[], float] = time.monotonic
     _refused: dict[str, tuple[float, PolicyRefused]] = field(default_factory=dict)
 
     def run(self, *, again: bool = True) -> SyncResult:
@@ -96,9 +106,12 @@ class PolicySync:
                 raise PolicyError('another process is looking for policies here', remedy='wait until it is done')
             if self._revoke():
                 return SyncResult('', self.folder.current(), 'rolled_back')
+            self._end_rollback()
             state = self.folder.state()
             if state.pin is not None:
                 if state.pin != self.folder.current():
+                    if not self.may_activate():
+                        return SyncResult(state.pin, self.folder.current(), 'waiting')
                     self.folder.activate(state.pin)
                 return SyncResult(state.pin, self.folder.current(), 'pinned')
             chosen = choose(self.registry, self.settings.name, self.settings.robot)
@@ -106,45 +119,52 @@ class PolicySync:
                 return SyncResult('', self.folder.current(), 'none')
             return self._follow(chosen, again=again)
 
+    def _end_rollback(self) -> None:
+        """What was rolled back and is active all the same: that was cut off."""
+        state, now = self.folder.state(), self.folder.current()
+        if now in state.bad:
+            self.folder.roll_back(state.bad[now], of=now)
+
     def _follow(self, chosen: RegisteredVersion, *, again: bool) -> SyncResult:
         wanted = f'{chosen.name}@{chosen.version}'
         prefix = folder_of(chosen, self.settings.name)
         now = self.folder.current()
         if now is not None and now.partition('#')[0] == wanted:
+            self.folder.check(now, self.folder.state(), hashes=False)
             return SyncResult(now, now, 'unchanged')
         since, refusal = self._refused.get(wanted, (float('-inf'), None))
-        if refusal is not None and not again and time.monotonic() - since < REFUSED_AGAIN_S:
+        if refusal is not None and not again and self.monotonic() - since < REFUSED_AGAIN_S:
             raise refusal
         try:
             return self._take(wanted, prefix)
         except PolicyRefused as error:
-            self._refused[wanted] = time.monotonic(), error
+            self._refused[wanted] = self.monotonic(), error
             raise
 
     def _take(self, wanted: str, prefix: str) -> SyncResult:
         known = [name for name in self.folder.installed() if name.partition('#')[0] == wanted]
-        p99_ms = None
+        p99_ms, traffic = None, _Traffic(self.settings.max_mbps, self.pause, self.monotonic)
         if known:
             name = known[0]
         else:
-            manifest = self._fetch(wanted, prefix)
+            manifest = self._fetch(wanted, prefix, traffic)
             name = manifest.id
             p99_ms = self._try(manifest)
             self.folder.install(name)
         if not self.may_activate():
-            return SyncResult(name, self.folder.current(), 'waiting', p99_ms)
+            return SyncResult(name, self.folder.current(), 'waiting', p99_ms, traffic.fetched_bytes, traffic.begun_anew)
         self.folder.activate(name)
         log.info('the policy %s is active', name)
         self.folder.clean(self.settings.keep)
-        return SyncResult(name, name, 'activated', p99_ms)
+        return SyncResult(name, name, 'activated', p99_ms, traffic.fetched_bytes, traffic.begun_anew)
 
     # -- what came -------------------------------------------------------------------------------------------------
 
-    def _fetch(self, wanted: str, prefix: str) -> PolicyManifest:
+    def _fetch(self, wanted: str, prefix: str, traffic: _Traffic) -> PolicyManifest:
         """The whole version into ``incoming``, verified as far as it can be without running it."""
         state = self.folder.state()
-        content = self._get(f'{prefix}/{MANIFEST}', MOST_MANIFEST_BYTES)
-        signature = self._get(f'{prefix}/{SIGNATURE}', signing.MOST_SIGNATURE_BYTES)
+        signature = self._get(f'{prefix}/{SIGNATURE}', signing.MOST_SIGNATURE_BYTES, traffic)
+        content = self._get(f'{prefix}/{MANIFEST}', MOST_MANIFEST_BYTES, traffic)
         signing.check_signature(content, signature, signing.FOR_POLICY, self.folder.keys(), state.revoked)
         manifest = parse_manifest(content)
         if f'{manifest.name}@{manifest.version}' != wanted:
@@ -157,34 +177,35 @@ class PolicySync:
                                 remedy='a version that was on this robot comes back by policy use or rollback')  # fmt: skip
         if manifest.id in state.bad:
             raise PolicyRefused('bad', f'{manifest.id} was taken out here: {state.bad[manifest.id]}')
-        place = self._incoming(manifest.id)
+        place = self._incoming(manifest)
         self._check_room(manifest, place)
         for file in manifest.files:
-            self._download(f'{prefix}/{file.path}', file.size, file.sha256, place / file.path)
+            self._download(ObjectInfo(BUCKET, f'{prefix}/{file.path}', file.size, file.sha256), place / file.path, traffic)
         (place / MANIFEST).write_bytes(content)
         (place / SIGNATURE).write_bytes(signature)
         return self.folder.check(manifest.id, state, folder=place)
 
-    def _get(self, key: str, most: int) -> bytes:
+    def _get(self, key: str, most: int, traffic: _Traffic) -> bytes:
         try:
-            return steadily(lambda: self.store.get(BUCKET, key, most), pause=self.pause)
+            content = steadily(lambda: self.store.get(BUCKET, key, most), pause=self.pause)
         except ObjectRefused as error:
             reason = 'size' if error.data.get('reason') == 'size' else 'missing'
             raise PolicyRefused(reason, f'{error.what}') from error
+        traffic.count(len(content))
+        return content
 
-    def _incoming(self, name: str) -> Path:
-        """The folder of a download, which goes on where an earlier one of the same version ended; others go."""
-        self.folder.incoming.mkdir(exist_ok=True)
+    def _incoming(self, manifest: PolicyManifest) -> Path:
+        """The folder of a download, which goes on where an earlier one of the same version ended; whatever else is there goes."""
+        place = self.folder.incoming / manifest.id
         for other in self.folder.incoming.iterdir():
-            if other.name != name:
-                shutil.rmtree(other)
-        place = self.folder.incoming / name
+            if other != place or not _is_begun(place, manifest):
+                _remove(other)
         place.mkdir(mode=0o700, exist_ok=True)
         return place
 
     def _check_room(self, manifest: PolicyManifest, place: Path) -> None:
         there = sum(_size(self.folder.versions / name) for name in self.folder.installed())
-        if there + manifest.size > self.settings.max_bytes:
+        if manifest.size <= self.settings.max_bytes < there + manifest.size:
             self.folder.clean(1)
             there = sum(_size(self.folder.versions / name) for name in self.folder.installed())
         free = shutil.disk_usage(place).free + _size(place) - self.settings.min_free_bytes
@@ -193,21 +214,22 @@ class PolicySync:
             text = f'{manifest.id} has {manifest.size:,} bytes, and there is room for {max(0, room):,} in {self.folder.path}'
             raise PolicyRefused('disk', text, remedy='--max-gib and --min-free-gib say how much policies may take')
 
-    def _download(self, key: str, size: int, sha256: str, path: Path) -> None:
-        """Goes on for as long as each attempt brings something; what an earlier one brought whole is not fetched again."""
-        if path.is_file() and disk.fingerprint(path) == (size, sha256):
+    def _download(self, wanted: ObjectInfo, path: Path, traffic: _Traffic) -> None:
+        """Goes on for as long as each attempt brings something; what an earlier one brought whole is not fetched again.
+
+        Not for ever: of a store that damages what it sends, and then breaks off, not more than twice the file is thrown away.
+        """
+        if path.is_file() and disk.fingerprint(path) == (wanted.size, wanted.sha256):
             return
-        wanted = ObjectInfo(BUCKET, key, size, sha256)
-        had = -1
-        cap = _Cap(self.settings.max_mbps, self.pause)
+        had, most_anew = -1, traffic.begun_anew + 1
         while True:
             try:
-                download(self.store, wanted, path, tell=cap.count, pause=self.pause)
+                download(self.store, wanted, path, tell=traffic.count, pause=self.pause)
                 return
             except StoreUnavailable:
-                if cap.counted <= had:
+                if traffic.fetched_bytes <= had or traffic.begun_anew > most_anew:
                     raise
-                had = cap.counted
+                had = traffic.fetched_bytes
             except ObjectRefused as error:
                 reason = 'damaged' if error.data.get('reason') == 'damaged' else 'missing'
                 raise PolicyRefused(reason, f'{error.what}: {error.data.get("why", "")}') from error
@@ -223,7 +245,7 @@ class PolicySync:
 
     def _revoke(self) -> bool:
         """Read the lists of revoked keys that are new; whether the active version went because of them."""
-        is_whole = True  # a list that was exchanged on its way is asked for again, and so are all after it
+        exchanged = 0  # lists that were exchanged on their way are asked for again, and so are all after them
         for number in range(self.folder.state().revocations + 1, MOST_LISTS + 1):
             key = revocation_key(number)
             try:
@@ -237,11 +259,13 @@ class PolicySync:
                 found = signing.read_revocation(content, number, self.folder.keys(), self.folder.state().revoked)
             except PolicyRefused as error:
                 log.warning('a list of revoked keys counts for nothing: %s', error)
-                is_whole = False
-                continue
+                exchanged += 1
+                if exchanged < MOST_EXCHANGED:
+                    continue
+                break
             with self.folder.changing() as state:
                 state.revoked = sorted({*state.revoked, *found})
-                state.revocations = number if is_whole else state.revocations
+                state.revocations = state.revocations if exchanged else number
         return self._drop_revoked()
 
     def _drop_revoked(self) -> bool:
@@ -251,28 +275,58 @@ class PolicySync:
         try:
             self.folder.check(now, self.folder.state(), hashes=False)
         except PolicyRefused as error:
-            if error.reason != 'revoked':
-                raise
+            if error.reason != 'revoked':  # whoever runs it is told; a newer version may be on its way
+                log.warning('the active policy %s is refused: %s', now, error)
+                return False
             log.warning('the policy %s goes: %s', now, error)
             self.folder.roll_back(f'{error.what}', of=now)
             return True
         return False
 
 
-class _Cap:
-    """Counts what arrives, and waits so that it is no faster than the cap."""
+def _is_folder(path: Path) -> bool:
+    """And no link to one."""
+    return path.is_dir() and not path.is_symlink()
 
-    def __init__(self, max_mbps: float, pause: Callable[[float], object]) -> None:
+
+def _remove(path: Path) -> None:
+    """Whatever it is."""
+    if _is_folder(path):
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+
+
+def _is_begun(place: Path, manifest: PolicyManifest) -> bool:
+    """Whether what is there is of this download and nothing else."""
+    names = {file.path for file in manifest.files}
+    names |= {MANIFEST, SIGNATURE, *(f'{name}{UNFINISHED}' for name in names)}
+    try:
+        return _is_folder(place) and names.issuperset(files_of(place)) and not any((place / name).is_dir() for name in names)
+    except PolicyRefused:
+        return False
+
+
+class _Traffic:
+    """What arrives for one look: counted, and kept to the cap, which it reaches where the line carries more."""
+
+    def __init__(self, max_mbps: float, pause: Callable[[float], object], monotonic: Callable[[], float]) -> None:
         self._bytes_s = max_mbps * BYTES_PER_MEGABIT
         self._pause = pause
-        self._free_at = time.monotonic()
-        self.counted = 0
+        self._now = monotonic
+        self._free_at = monotonic()
+        self.fetched_bytes = 0
+        self.begun_anew = 0
 
     def count(self, size: int) -> None:
-        self.counted += abs(size)
-        if self._bytes_s and size > 0:
-            now = time.monotonic()
-            self._free_at = max(self._free_at, now - 0.1) + size / self._bytes_s
+        """So many bytes arrived, or were thrown away."""
+        if size < 0:
+            self.begun_anew += 1
+            return
+        self.fetched_bytes += size
+        if self._bytes_s and size:
+            now, takes_s = self._now(), size / self._bytes_s
+            self._free_at = max(self._free_at, now - LATE_S - 2.0 * takes_s) + takes_s
             if self._free_at > now:
                 self._pause(self._free_at - now)
 

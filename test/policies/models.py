@@ -1,19 +1,27 @@
-"""Policies to be packed: small ONNX models that do what a test needs, and the folders that a training would write."""
+"""Policies to be packed, small ONNX models that do what a test needs, and a robot that takes them."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
+import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from shadowhound_data_logger.errors import PolicyRefused
+from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.policies import packing, signing
-from shadowhound_data_logger.policies.manifest import PolicyManifest
+from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.policies.manifest import MANIFEST, SIGNATURE, PolicyManifest
 from shadowhound_data_logger.policies.registry import RegisteredVersion, source_of
+from shadowhound_data_logger.policies.sync import PolicySettings, PolicySync
+from shadowhound_data_logger.stores import open_store
 
 STATE, ACTION = 'observation.state', 'action'
 
@@ -82,3 +90,52 @@ class Aliases:
     def say(self, alias: str, version: int, *, source: str = '', robots: frozenset[str] = frozenset(), name: str = 'go2_patrol'
             ) -> None:  # fmt: skip
         self.told[alias] = RegisteredVersion(name, version, source or source_of('go2', name, version), robots)
+
+
+@dataclass
+class Scene:
+    """A Spark, a store in a folder, a registry, and a robot that trusts the key."""
+
+    path: Path
+    registry: Aliases = field(default_factory=Aliases)
+
+    def __post_init__(self) -> None:
+        self.spark = Spark(self.path / 'spark')
+        self.store = open_store(StoreSettings(directory=self.path / 'store'), UploadSettings())
+        self.robot = self.new_robot('thor')
+        self.folder = self.robot.folder
+
+    def new_robot(self, name: str, **given: Any) -> PolicySync:
+        folder = PolicyFolder(self.path / name)
+        folder.make()
+        shutil.copy(self.spark.public, folder.path / 'keys' / 'spark.pub')
+        settings = PolicySettings(**{'name': 'go2_patrol', 'robot': name, 'min_free_bytes': 0, **given})
+        return PolicySync(folder, self.store, self.registry, settings, pause=lambda _: None)
+
+    def place(self, version: int) -> Path:
+        return self.path / 'store' / 'lerobot' / 'policies' / 'go2' / f'go2_patrol_v{version}'
+
+    def publish(self, version: int, model: onnx.ModelProto | None = None, alias: str = 'champion', **given: Any) -> str:
+        packed, manifest = self.spark.packed(version, model, **given)
+        shutil.copytree(packed, self.place(version))
+        self.registry.say(alias, version)
+        return manifest.id
+
+    def forge(self, version: int, change: Callable[[dict[str, Any]], object]) -> None:
+        """A manifest that says something else, well signed."""
+        path = self.place(version) / MANIFEST
+        told = json.loads(path.read_bytes())
+        change(told)
+        self.sign(version, json.dumps(told).encode(), self.spark.key)
+
+    def sign(self, version: int, content: bytes, key: Path) -> None:
+        (self.place(version) / MANIFEST).write_bytes(content)
+        signature = signing.sign(signing.load_key(key), signing.FOR_POLICY, content)
+        (self.place(version) / SIGNATURE).write_bytes(signature)
+
+    def refused(self) -> str:
+        before = self.folder.current()
+        with pytest.raises(PolicyRefused) as raised:
+            self.robot.run()
+        assert self.folder.current() == before
+        return raised.value.reason

@@ -14,15 +14,17 @@ from urllib.parse import urlsplit
 
 import boto3
 import pytest
-from policies.models import Aliases, Spark, linear
+from policies.models import Aliases, Scene, Spark, linear
 
 from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.errors import PolicyRefused, StoreUnavailable
 from shadowhound_data_logger.policies import sync
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores.base import Content
+from shadowhound_data_logger.stores.directory import DirectoryStore
+from shadowhound_data_logger.stores.download import TRIES
 from shadowhound_data_logger.stores.s3 import S3Store
-
-pytestmark = [pytest.mark.seaweedfs, pytest.mark.long('100 MB, and seconds under a cap')]
 
 CUTS = 20
 
@@ -129,6 +131,8 @@ def follow(seaweed: Tower, spark: Spark, home: Path, version: int, port: int | N
         assert sync.PolicySync(folder, store, registry, settings, pause=pause).run().done == 'activated'
 
 
+@pytest.mark.seaweedfs
+@pytest.mark.long('100 MB, and seconds under a cap')
 def test_a_link_that_is_cut_and_one_that_is_capped(
     seaweed: Tower, spark: Spark, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,3 +148,83 @@ def test_a_link_that_is_cut_and_one_that_is_capped(
     follow(seaweed, spark, tmp_path / 'capped', 2, max_mbps=40.0)
     mbps = size * 8e-6 / (time.monotonic() - begin)
     assert mbps <= 44.0
+
+
+class Line(DirectoryStore):
+    """A store behind a line of so many Mbit/s and pieces of this size, which at times stands still; in virtual time."""
+
+    def __init__(self, folder: Path, mbps: float, piece: int, stands_s: float) -> None:
+        super().__init__(folder)
+        self.mbps, self.piece, self.stands_s = mbps, piece, stands_s
+        self.now = 1000.0
+        self.arrived = 0
+
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
+        content = super().content(bucket, key, start, version)
+        return replace(content, pieces=self._arriving(b''.join(content.pieces)))
+
+    def _arriving(self, body: bytes) -> Iterator[bytes]:
+        for place in range(0, len(body), self.piece):
+            piece = body[place : place + self.piece]
+            self.now += len(piece) * 8e-6 / self.mbps + (self.stands_s if place // self.piece % 20 == 19 else 0.0)
+            self.arrived += len(piece)
+            yield piece
+
+    def pause(self, seconds: float) -> None:
+        """It wakes late, as any sleep."""
+        self.now += seconds + 0.001
+
+
+@pytest.mark.parametrize(('cap', 'line', 'piece', 'stands_s'), [
+    (0.8, 0.82, 20_000, 0.0), (0.8, 1.0, 20_000, 0.0), (0.8, 1.0, 40_000, 0.0), (0.8, 20.0, 20_000, 0.1),
+    (0.04, 1.0, 20_000, 2.0), (4.0, 4.2, 1300, 0.0),
+])  # fmt: skip
+def test_a_cap_is_kept_and_made_use_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap: float, line: float, piece: int, stands_s: float
+) -> None:
+    """No faster than the cap and at most a tenth slower, where the line carries more; also where that is hardly more."""
+    monkeypatch.setattr(sync, 'run_smoke', lambda *_: 1.0)
+    scene = Scene(tmp_path)
+    scene.publish(1, linear(extra=100_000))
+    scene.robot.store = store = Line(tmp_path / 'store', line, piece, stands_s)
+    scene.robot.settings = replace(scene.robot.settings, max_mbps=cap)
+    scene.robot.pause, scene.robot.monotonic = store.pause, lambda: store.now
+    fetched = scene.robot.run().fetched_bytes
+    assert fetched > store.arrived > 400_000
+    mbps = fetched * 8e-6 / (store.now - 1000.0)
+    assert 0.9 * cap <= mbps <= cap
+
+
+class Liar(DirectoryStore):
+    """Sends something else whenever it is asked for a model, and breaks off more often than one download goes on."""
+
+    asked = sent = 0
+    breaks = True
+
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
+        content = super().content(bucket, key, start, version)
+        return replace(content, pieces=self._lying(content.info.size - start)) if key.endswith('.onnx') else content
+
+    def _lying(self, size: int) -> Iterator[bytes]:
+        self.asked += 1
+        for _ in range(0, size, 1000):
+            self.sent += 1
+            assert self.sent < 1000
+            yield bytes(min(1000, size))
+            if self.breaks and self.asked % (TRIES + 1):
+                raise StoreUnavailable('cut')
+
+
+@pytest.mark.parametrize(('breaks', 'error'), [(True, StoreUnavailable), (False, PolicyRefused)])
+def test_a_store_that_lies_costs_a_bounded_transfer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, breaks: bool, error: type[Exception]
+) -> None:
+    """One that sends something else, and whenever it was found out breaks off before the second time."""
+    monkeypatch.setattr(sync, 'run_smoke', lambda *_: 1.0)
+    scene = Scene(tmp_path)
+    scene.publish(1, linear(extra=2_500))
+    scene.robot.store = store = Liar(tmp_path / 'store')
+    store.breaks = breaks
+    with pytest.raises(error):
+        scene.robot.run()
+    assert store.sent <= 50

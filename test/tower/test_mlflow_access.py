@@ -193,7 +193,15 @@ def test_a_robot_does_nothing_else(users: dict[str, User], run: dict[str, Any]) 
             ('registered-models/create', {'name': 'mine'}),
             ('users/create', {'username': 'mallory', 'password': 'x' * 20}),
             ('model-versions/create', {'name': 'm', 'source': 's'}),
+            ('registered-models/alias', {'name': 'm', 'alias': 'champion', 'version': '1'}),
+            ('model-versions/set-tag', {'name': 'm', 'version': '1', 'key': 'shadowhound.robots', 'value': 'thor'}),
+            ('registered-models/set-tag', {'name': 'm', 'key': 'a', 'value': 'b'}),
         )),
+        *(('DELETE', f'{api}/registered-models/{what}?name=m&alias=champion', None) for api in API
+          for what in ('alias', 'delete')),
+        *(('PATCH', f'{api}/model-versions/update', {'name': 'm', 'version': '1', 'description': 'x'}) for api in API),
+        *(('GET', f'{api}/{what}', None) for api in API
+          for what in ('registered-models/get?name=m', 'registered-models/search', 'model-versions/search')),
         ('DELETE', _artifact(run), None),
         ('PATCH', '/api/2.0/mlflow/users/update-password', {'username': 'thor', 'password': 'x' * 20}),
         ('PATCH', '/api/2.0/mlflow/users/update-admin', {'username': 'thor', 'is_admin': True}),

@@ -1,0 +1,123 @@
+"""Which policy is active, for the robot's nodes; and their word that it misbehaves.
+
+The node ``shadowhound_policy`` publishes ``~/policy`` (std_msgs/msg/String, latched): the id of the active version, such as
+``go2_patrol@7#0123456789abcdef``, empty while none is. It listens to ``~/health`` (std_msgs/msg/String): JSON such as
+``{"policy": "go2_patrol@7#0123456789abcdef", "failures": 4, "p99_ms": 180.0}``. A version that breaks the limits of its
+manifest is rolled back. So whoever is on the robot's ROS network can send a policy out, and nobody can bring one in.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import String
+
+from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.policies.running import judge
+from shadowhound_data_logger.untrusted import from_json
+
+log = logging.getLogger(__name__)
+
+NODE: Final = 'shadowhound_policy'
+LOOK_S: Final = 0.1
+"""How late a change of the active version is published."""
+MOST_HEALTH_BYTES: Final = 4096
+END_S: Final = 5.0
+
+
+class PolicyTopics:
+    """The two topics, of a node. New; all of it on the thread of the node's executor."""
+
+    def __init__(self, node: Node, folder: PolicyFolder) -> None:
+        self._folder = folder
+        self._told: str | None = None
+        self.ignored = Counter[str]()
+        """Messages about health that count for nothing, by reason: ``size`` ``json`` ``values`` ``other`` (another version)."""
+        latched = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._publisher = node.create_publisher(String, '~/policy', latched)
+        self._subscription = node.create_subscription(String, '~/health', self._on_health, 10)
+        self._timer = node.create_timer(LOOK_S, self.look)
+        self.look()
+
+    def look(self) -> None:
+        """Publish the active version if it is another one."""
+        now = self._folder.current() or ''
+        if now != self._told:
+            self._told = now
+            self._publisher.publish(String(data=now))
+
+    def _on_health(self, message: String) -> None:
+        reason = self._judged(message.data)
+        if reason:
+            self.ignored[reason] += 1
+            if str(self.ignored[reason]).strip('0') == '1':
+                log.warning('%d messages about the health of a policy are ignored so far (%s)', self.ignored[reason], reason)
+
+    def _judged(self, text: str) -> str:
+        """Why it counts for nothing; empty where it was judged."""
+        if len(text) > MOST_HEALTH_BYTES:
+            return 'size'
+        try:
+            told = from_json(text.encode(), MOST_HEALTH_BYTES)
+            name, failures, p99_ms = told['policy'], told.get('failures', 0), told.get('p99_ms', 0.0)
+        except (ValueError, KeyError, TypeError, AttributeError):
+            return 'json'
+        if (
+            type(failures) is not int
+            or type(p99_ms) not in {int, float}
+            or not math.isfinite(p99_ms)
+            or min(failures, p99_ms) < 0
+        ):
+            return 'values'
+        if not name or name != self._folder.current():
+            return 'other'
+        try:
+            manifest = self._folder.check(name, self._folder.state(), hashes=False)
+            if not judge(self._folder, name, manifest, failures, p99_ms):
+                log.warning('%s is rolled back: %d failures, p99 %g ms; active: %s', name, failures, p99_ms,
+                            self._folder.current() or 'none')  # fmt: skip
+        except (DataLoggerError, OSError) as error:
+            log.warning('%s cannot be judged: %s', name, error)
+        self.look()
+        return ''
+
+
+@contextmanager
+def telling(folder: PolicyFolder) -> Iterator[PolicyTopics]:
+    """Serve the topics meanwhile, on a thread of their own."""
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = Node(NODE, context=context)
+        topics = PolicyTopics(node, folder)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+
+        def spin() -> None:
+            try:
+                executor.spin()
+            except ExternalShutdownException:
+                return
+
+        thread = threading.Thread(target=spin, name='policy-topics', daemon=True)
+        thread.start()
+        try:
+            yield topics
+        finally:
+            executor.shutdown(END_S)
+            thread.join(END_S)
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown(context=context)
