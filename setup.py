@@ -44,6 +44,7 @@ setup(
         'datasets': ['av>=15', 'daft>=0.7.26,<0.8', 'h5py>=3.8', 'obstore>=0.11', 'pyarrow>=16'],
         'lake': ['daft>=0.7.26,<0.8', 'matplotlib>=3.6', 'obstore>=0.11', 'pyarrow>=16'],
         'policies': ['cryptography>=41', 'onnxruntime>=1.17'],
+        'likeness': ['onnxruntime>=1.17', 'tokenizers>=0.15'],
         'missions': ['matplotlib>=3.6', 'mlflow-skinny>=2.14'],
         'train': ['mlflow-skinny>=2.14', 'torch>=2.2'],  # examples/train_navigation_policy.py; torch alone needs 200 MB and more
         'webrtc': ['aiortc>=1.15,<1.17', 'av>=15'],

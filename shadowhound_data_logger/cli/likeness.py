@@ -1,0 +1,96 @@
+"""What looks like this: ``shadowhound-data lake embed`` makes vectors of pictures, and ``query --like`` asks by them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
+from shadowhound_data_logger.cli.output import counted, duration, number, plain, print_json, print_page, progress
+from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.lake.findings import Findings
+    from shadowhound_data_logger.lake.likeness import Embedded
+
+REASONS: Final = {
+    'missing': 'not in the store any more', 'too_large': 'too large', 'changed': 'another content than the catalogue says',
+    'unreadable': 'no JPEG, PNG or TIFF that can be decoded, or the model makes no vector of it',
+}  # fmt: skip
+model_option = click.option(
+    '--model', type=click.Path(path_type=Path, exists=True, file_okay=False), metavar='DIR',
+    help='Folder with the ONNX models of pictures and text, such as those of CLIP  [default: a perceptual hash, no model]',
+)  # fmt: skip
+
+
+@click.command(
+    'embed', epilog=examples('lake embed --sensor camera', 'lake embed --sensor camera --since 7d --model clip-vit-base-patch32')
+)
+@question
+@model_option
+@as_json
+def lake_embed(*, flags: Mapping[str, Any], model: Path | None, as_json: bool) -> ExitCode:
+    """Make vectors of pictures, by which `query --like` finds them.
+
+    Of all pictures that the flags choose and that have none of this model yet. They are kept beside the catalogue, in
+    sensor-data/_vectors/: run it again whenever there are new pictures, or after it was interrupted.
+
+    Without --model it is the perceptual hash dHash, which finds pictures that are nearly the same. A model is a folder with
+    vision_model.onnx and, for --like-text, text_model.onnx and tokenizer.json, as Hugging Face exports CLIP and SigLIP.
+
+    Exit code 1 when pictures could not be read.
+    """
+    begun_s = time.monotonic()
+    with asking():
+        from shadowhound_data_logger.lake import likeness  # noqa: PLC0415 - Daft takes half a second
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.image_models import open_model  # noqa: PLC0415
+
+        chosen, left_out = open_model(model), quietly()
+        with the_store() as store, progress('pictures', of='objects') as bar:
+            found = likeness.embed(store, default_source(the_store_settings()), chosen, findings=left_out, told=bar, **flags)
+    took_s = time.monotonic() - begun_s
+    if as_json:
+        print_json({'model': chosen.digest, 'pictures': found.pictures, 'known': found.known, 'made': found.made,
+                    'refused': dict(found.refused), 'took_s': round(took_s, 3)})  # fmt: skip
+    else:
+        print_page(*_told(found, chosen.name, took_s))
+    told = tell_left_out(left_out)
+    return told or exit_code(finding=bool(found.refused))
+
+
+def _told(found: Embedded, name: str, took_s: float) -> Iterator[Any]:
+    yield plain(f'{counted(found.made, "vector")} made by {name} in {duration(took_s)}; {number(found.known)} of '
+                f'{counted(found.pictures, "picture")} had one.')  # fmt: skip
+    for reason, count in sorted(found.refused.items()):
+        yield plain(f'{counted(count, "picture")} without one: {REASONS[reason]}.', 'yellow')
+
+
+def likest(source: Any, like: Path | None, text: str | None, folder: Path | None, limit: int, left_out: Findings,
+           flags: Mapping[str, Any]) -> Any:  # fmt: skip
+    """The rows of the likest pictures, with how like they are; what has no vector is said on standard error."""
+    from shadowhound_data_logger.lake import likeness  # noqa: PLC0415 - Daft takes half a second
+    from shadowhound_data_logger.lake.image_models import open_model  # noqa: PLC0415
+    from shadowhound_data_logger.untrusted import open_image  # noqa: PLC0415
+
+    model = open_model(folder)
+    try:
+        if like is not None:
+            with open_image(like) as opened:
+                wanted = model.of_pictures([opened])[0]
+        else:
+            wanted = model.of_text(text or '')
+    except (OSError, ValueError, SyntaxError) as error:
+        raise BadUsage(f'{like or "the text"} cannot be compared: {error}', 'a JPEG, PNG or TIFF is a picture') from error
+    found = likeness.like(source, model, wanted, limit=limit, findings=left_out, **flags)
+    if found.without:
+        again = 'shadowhound-data lake embed' + (f' --model {folder}' if folder else '')
+        told = (
+            f'{number(found.without)} of {counted(found.pictures, "picture")} have no vector by {model.name}: {again} makes them'
+        )
+        click.echo(told, err=True)
+    return found.rows
