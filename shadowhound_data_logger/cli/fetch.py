@@ -15,6 +15,7 @@ from rich.text import Text
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, store_hint, the_store_settings
 from shadowhound_data_logger.cli.output import counted, duration, number, plain, print_json, print_lines, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
+from shadowhound_data_logger.lake.bucket import default_source
 from shadowhound_data_logger.stores import open_reader
 
 THREADS: Final = 16
@@ -111,7 +112,7 @@ def _asked(flags: Mapping[str, Any], limit: int | None, left_out: Any) -> list[d
     from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
 
     with lake.answering():
-        rows = lake.objects(lake.default_source(the_store_settings()), findings=left_out, **flags).sort('t_start_ns')
+        rows = lake.objects(default_source(the_store_settings()), findings=left_out, **flags).sort('t_start_ns')
         found: list[dict[str, Any]] = (rows.limit(limit) if limit else rows).to_pylist()
     return found
 

@@ -75,8 +75,11 @@ class ObjectStore(Protocol):
     def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
         """These parts of the content, each from begin to before its end; shorter, or empty, where it ends before."""
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
-        """The content from ``start`` on."""
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
+        """The content from ``start`` on.
+
+        ``version`` is the ETag of an earlier answer: raises ObjectRefused (reason ``changed``) where it has another one now.
+        """
 
     def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
         """The whole content and its version (an ETag); None where it has this version still. As ``get`` otherwise."""
@@ -115,6 +118,11 @@ def joined(content: Content, most: int | None) -> bytes:
                 raise too_large(info.bucket, info.key, info.size)
             pieces.append(piece)
         return bytes(pieces[0]) if len(pieces) == 1 else b''.join(pieces)  # obstore's are no bytes to json
+
+
+def changed_meanwhile(bucket: str, key: str) -> ObjectRefused:
+    """The error for an object that is no longer the one that was asked for."""
+    return ObjectRefused(f'{bucket}/{key} has changed meanwhile', reason='changed', bucket=bucket, key=key)
 
 
 def too_large(bucket: str, key: str, most: int) -> ObjectRefused:

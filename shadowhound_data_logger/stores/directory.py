@@ -22,7 +22,7 @@ from shadowhound_data_logger.bandwidth import Pace
 from shadowhound_data_logger.disk import fingerprint, flock, sync
 from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.stores.base import Content, too_large
+from shadowhound_data_logger.stores.base import Content, changed_meanwhile, too_large
 from shadowhound_data_logger.stores.content import (
     CHUNK_BYTES,
     check_read,
@@ -97,9 +97,12 @@ class DirectoryStore:
         with self._reading(bucket, key), self._path(bucket, key).open('rb', buffering=0) as file:
             return [os.pread(file.fileno(), end - start, start) for start, end in spans]
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         with self._reading(bucket, key):
-            return Content(self._info(bucket, key), self._pieces(bucket, key, start))
+            info = self._info(bucket, key)
+            if version not in {'', info.etag}:
+                raise changed_meanwhile(bucket, key)
+            return Content(info, self._pieces(bucket, key, start))
 
     def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
         body = self.get(bucket, key, most)
@@ -188,13 +191,14 @@ class DirectoryStore:
         sync(beside.parent)
 
     def _info(self, bucket: str, key: str) -> ObjectInfo:
-        size = self._path(bucket, key).stat().st_size
+        seen = self._path(bucket, key).stat()
+        size, etag = seen.st_size, str(seen.st_mtime_ns)
         try:
             record = from_json(self._beside(bucket, key).read_bytes())
             metadata, content_type = dict(record['metadata']), str(record['content_type'])
         except (FileNotFoundError, ValueError, TypeError, LookupError):  # cut short, or written by anybody
-            return ObjectInfo(bucket, key, size, None)
-        return ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, content_type)
+            return ObjectInfo(bucket, key, size, None, etag=etag)
+        return ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, content_type, etag)
 
     def _beside(self, bucket: str, key: str) -> Path:
         return self._directory / METADATA / bucket / f'{key}.json'

@@ -41,7 +41,8 @@ def download(
     """The object as ``path``, of the wanted size and SHA-256, else of the one that its metadata name.
 
     What arrives lies in ``part`` (``<path>.part``), which the next call continues. ``tell`` is called with the bytes that each
-    piece adds, negative where they are thrown away; what it raises ends the download. What is damaged is fetched once more.
+    piece adds, negative where they are thrown away; what it raises ends the download. What is damaged, or changes on its
+    way, is fetched once more.
     Raises StoreUnavailable where it broke off after some tries, ObjectRefused where there is none or it is not what it has to
     be (``data['reason'] == 'damaged'``, ``data['why']`` says how), OSError of the file.
     """
@@ -96,6 +97,7 @@ class _Transfer:
         self._wanted = wanted
         self._file = file
         self._tell = tell
+        self._version = ''  # an ETag, once the store told one
         self._digest = hashlib.sha256()
         self._size = 0
         if file.tell():  # which was opened at its end
@@ -107,8 +109,15 @@ class _Transfer:
     def complete(self) -> Downloaded:
         """One try: add what is missing, and judge the whole. What is damaged is thrown away."""
         wanted = self._wanted
-        with self._store.content(wanted.bucket, wanted.key, self._size) as content:
+        try:
+            found = self._store.content(wanted.bucket, wanted.key, self._size, self._version)
+        except ObjectRefused as error:
+            if error.data.get('reason') != 'changed':
+                raise
+            raise self._damaged('it changed while it was fetched') from error
+        with found as content:
             info = content.info
+            self._version = info.etag
             if info.size != wanted.size:  # before a byte of it takes room
                 raise self._damaged(f'it has {info.size} bytes instead of {wanted.size}')
             if self._size < info.size:
@@ -136,5 +145,5 @@ class _Transfer:
     def _damaged(self, why: str, **data: str) -> ObjectRefused:
         self._tell(-self._size)
         self._file.truncate(0)
-        self._digest, self._size = hashlib.sha256(), 0
+        self._digest, self._size, self._version = hashlib.sha256(), 0, ''
         return damaged(self._wanted.bucket, self._wanted.key, why, **data)

@@ -12,7 +12,7 @@ from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bandwidth import Pace
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.stores.base import Content, joined, too_large
+from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined, too_large
 from shadowhound_data_logger.stores.content import (
     CHUNK_BYTES,
     check_read,
@@ -74,8 +74,10 @@ class MemoryStore:
         _, body = self._held(bucket, key)
         return [body[start:end] for start, end in spans]
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         info, body = self._held(bucket, key)
+        if version not in {'', info.etag}:
+            raise changed_meanwhile(bucket, key)
         return Content(info, (body[place : place + CHUNK_BYTES] for place in range(start, len(body), CHUNK_BYTES)))
 
     def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:

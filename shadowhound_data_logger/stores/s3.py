@@ -104,9 +104,9 @@ class S3Store:
         check_read(bucket, key)
         return [self._asking(lambda: self._s3.range(bucket, key, *span)) if span[0] < span[1] else b'' for span in spans]  # noqa: B023 - called at once
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         check_read(bucket, key)
-        return self._asking(lambda: self._s3.content(bucket, key, start))
+        return self._asking(lambda: self._s3.content(bucket, key, start, version))
 
     def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
         check_read(bucket, key)

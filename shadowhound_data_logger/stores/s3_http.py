@@ -111,15 +111,18 @@ class ContentRequests:
         query = f'partNumber={number}&uploadId={quote(upload, safe="")}'
         return self._send(item, query, headers, UNSIGNED, self._pace.pieces(part, item.priority, stands_back=True))
 
-    def get(self, bucket: str, key: str, wanted: str = '', unless: str = '') -> tuple[Mapping[str, str], StreamingBody]:
+    def get(
+        self, bucket: str, key: str, wanted: str = '', unless: str = '', version: str = ''
+    ) -> tuple[Mapping[str, str], StreamingBody]:
         """One request, of all bytes or of a range (``bytes=0-9``): the headers of a successful answer, and a body to close.
 
-        ``unless`` is an ETag: the answer of an object that has it is an error, 304.
+        ``unless`` is an ETag: the answer of an object that has it is an error, 304. So is 412, of one that has another ETag than
+        ``version``.
         """
         target = f'{self._root}/{bucket}/{quote(key)}'
         headers = self._signed('GET', target, {'host': self._host}, EMPTY)
         sent = {**headers, 'user-agent': AGENT, 'accept-encoding': 'identity', **({'range': wanted} if wanted else {}),
-                **({'if-none-match': unless} if unless else {})}  # fmt: skip
+                **({'if-none-match': unless} if unless else {}), **({'if-match': version} if version else {})}  # fmt: skip
         answer = self._session.send(_prepared('GET', f'{self._server}{target}', sent, None, stream_output=True))
         if answer.status_code >= 300:
             raise self._error(answer, 'GetObject')

@@ -10,6 +10,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import timedelta
 from operator import attrgetter
 from pathlib import Path
@@ -30,7 +31,7 @@ from shadowhound_data_logger.errors import (
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.retry import steadily
-from shadowhound_data_logger.stores.base import Content, joined
+from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_read
 
 if TYPE_CHECKING:
@@ -194,16 +195,22 @@ class ObstoreStore:
             else:
                 return found
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         check_read(bucket, key)
+        options: Any = {**({'range': {'offset': start}} if start else {}), **({'if_match': version} if version else {})}
         with self._asking(bucket, key):
             try:
-                found = obstore.get(self._client(bucket), key, options={'range': {'offset': start}} if start else None)
+                found = obstore.get(self._client(bucket), key, options=options or None)
+            except refused.PreconditionError:
+                raise changed_meanwhile(bucket, key) from None
             except refused.BaseError as error:
                 if not start or _said(error)[0] != NOTHING_THERE or (info := self.head(bucket, key)) is None:
                     raise
                 return Content(info, iter(()))  # it ends before
-            return Content(_info(bucket, key, found), self._pieces(bucket, key, found, is_small=not start))
+            info = replace(_info(bucket, key, found), etag=found.meta['e_tag'] or '')
+            if version not in {'', info.etag}:  # of a server that does not know the condition
+                raise changed_meanwhile(bucket, key)
+            return Content(info, self._pieces(bucket, key, found, is_small=not start))
 
     def _pieces(self, bucket: str, key: str, found: Any, *, is_small: bool) -> Iterator[bytes]:
         with self._asking(bucket, key):

@@ -19,7 +19,7 @@ from shadowhound_data_logger.bandwidth import Body, Pace
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import AccessDenied, CredentialsRejected, SettingError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, SpooledObject
-from shadowhound_data_logger.stores.base import Content, joined
+from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, Part
 from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted
 from shadowhound_data_logger.stores.s3_errors import REQUEST_ERRORS, Request, classify, code_of, public_url, status_of
@@ -29,6 +29,8 @@ OLDEST_BOTOCORE: Final = (1, 36)
 """The first with If-None-Match on PUT and the checksum settings; Debian's of Humble and Jazzy are older."""
 FORBIDDEN: Final = 403
 NOT_MODIFIED: Final = 304
+CHANGED: Final = 412
+"""It has another ETag than that which was asked for."""
 RANGE_NOT_SATISFIABLE: Final = 416
 """Nothing is behind the first byte that was asked for."""
 META: Final = 'x-amz-meta-'
@@ -128,12 +130,14 @@ class S3Requests:
         metadata = answer.get('Metadata', {})
         return ObjectInfo(bucket, key, answer['ContentLength'], metadata.get('sha256'), metadata, answer.get('ContentType', ''))
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
-        """The object, or what of it is behind ``start``, in pieces. Raises ObjectRefused when there is none."""
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
+        """The object, or what of it is behind ``start``, in pieces. Raises ObjectRefused when there is none of that version."""
         with self._asking(bucket, key, self._http) as http:
             try:
-                headers, body = http.get(bucket, key, f'bytes={start}-' if start else '')
+                headers, body = http.get(bucket, key, f'bytes={start}-' if start else '', version=version)
             except ClientError as error:
+                if version and status_of(error) == CHANGED:
+                    raise changed_meanwhile(bucket, key) from error
                 if not start or status_of(error) != RANGE_NOT_SATISFIABLE:
                     raise
                 info = self.head(bucket, key)  # it ends before
@@ -145,9 +149,12 @@ class S3Requests:
             except BaseException:
                 body.close()
                 raise
+            if version not in {'', headers['etag']}:  # of a server that does not know the condition
+                body.close()
+                raise changed_meanwhile(bucket, key)
         metadata = {name.lower()[len(META) :]: value for name, value in headers.items() if name.lower().startswith(META)}
         kind = headers.get('content-type', '')
-        info = ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, kind)
+        info = ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, kind, headers['etag'])
         return Content(info, self._pieces(bucket, key, body), body.close)
 
     def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:

@@ -31,8 +31,8 @@ class Counting(MemoryStore):
     limit = 1 << 62
     sent = 0
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
-        found = super().content(bucket, key, start)
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
+        found = super().content(bucket, key, start, version)
         return Content(found.info, self._cut_off(found.pieces))
 
     def _cut_off(self, pieces: Iterator[bytes]) -> Iterator[bytes]:

@@ -89,3 +89,16 @@ def test_bad_usage(home: Path) -> None:
     """Neither or both of prefix and question; a time that is none."""
     for arguments in ([], ['thor/', '--sensor', 'odom'], ['--since', 'soon']):
         assert isinstance(run(home, *arguments).exception, click.UsageError)
+
+
+def test_by_the_times_of_an_answer(home: Path) -> None:
+    """Objects that reach into one of them, of its robot."""
+    times = [
+        {'robot': 'thor', 'since_ns': TIMES[1], 'until_ns': TIMES[2]},
+        {'robot': 'tachi', 'since_ns': 0, 'until_ns': TIMES[4]},
+    ]
+    file = home / 'times.json'
+    file.write_text(json.dumps({'ranges': times}), encoding='utf-8')
+    told = json.loads(run(home, '--sensor', 'odom', '--ranges', str(file), '--json').output)
+    assert told['moved'] == 2
+    assert files(home) == sorted(row('odom', stamp_ns)['key'] for stamp_ns in TIMES[1:3])

@@ -55,9 +55,9 @@ class Asked(DirectoryStore):
         self.settings = settings
         self.asked: list[str] = []
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         self.asked.append(key)
-        return super().content(bucket, key, start)
+        return super().content(bucket, key, start, version)
 
 
 class Real(ObstoreStore):
@@ -68,9 +68,9 @@ class Real(ObstoreStore):
         self.settings = settings
         self.asked: list[str] = []
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         self.asked.append(key)
-        return super().content(bucket, key, start)
+        return super().content(bucket, key, start, version)
 
 
 def run(store: Asked | Real, to: Path, **how: Any) -> FetchResult:
@@ -146,8 +146,8 @@ def test_damage_on_the_way_is_tried_again_and_never_kept(settings: StoreSettings
     damaged = {once: 1, always: 99}
 
     class Damaging(Asked):
-        def content(self, bucket: str, key: str, start: int = 0) -> Content:
-            content = super().content(bucket, key, start)
+        def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
+            content = super().content(bucket, key, start, version)
             if damaged.get(key, 0):
                 damaged[key] -= 1
                 return replace(content, pieces=iter([bytes(content.info.size)]))
@@ -216,7 +216,7 @@ def test_a_store_that_is_away_ends_it(settings: StoreSettings, tmp_path: Path, m
     tried = 0
 
     class Away(Asked):
-        def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
             nonlocal tried
             tried += 1
             raise error

@@ -126,7 +126,7 @@ class Failing(MemoryStore):
         self.asked.append(key)
         return self._store.head(bucket, key)
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         return self._store.content(bucket, key, start)
 
     def probe(self) -> None:

@@ -121,12 +121,53 @@ def test_what_is_not_what_was_asked_for_is_no_file(
     assert sum(told) == 0
 
 
+def test_content_of_another_version_is_refused(store: ObjectStore, spool: Spool, bucket: str) -> None:
+    """Each answer names its version, and one that is asked for by its name is that one or none."""
+    store.put(spool('a', b'0123456789'))
+    with store.content(bucket, 'a') as content:
+        before = content.info.etag
+    assert b''.join(store.content(bucket, 'a', 4, before)) == b'456789'
+    assert store.replace(bucket, 'a', b'9876543210', known(store, bucket, 'a'))
+    for start in (0, 4):
+        with pytest.raises(ObjectRefused) as caught:
+            store.content(bucket, 'a', start, before)
+        assert caught.value.data['reason'] == 'changed'
+    with store.content(bucket, 'a') as content:
+        after = content.info.etag
+    assert b''.join(store.content(bucket, 'a', 4, after)) == b'543210'
+
+
+def known(store: ObjectStore, bucket: str, key: str) -> str:
+    """The version of an object as ``replace`` knows it."""
+    found = store.changed(bucket, key, '"none"', 1 << 30)
+    assert found is not None
+    return found[1]
+
+
+def test_an_object_that_changes_on_its_way_is_begun_anew(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
+    """Where a connection broke and another content is there meanwhile, none of the first one stays."""
+    store.put(spool(KEY, CONTENT))
+    told: list[int] = []
+    after = os.urandom(len(CONTENT))
+
+    def tell(size: int) -> None:
+        told.append(size)
+        if len(told) == 1:
+            assert store.replace(bucket, KEY, after, known(store, bucket, KEY))
+            raise StoreUnavailable('cut')
+
+    download(store, wanted(bucket), tmp_path / 'a.mcap', tell=tell, pause=lambda _: None)
+    assert (tmp_path / 'a.mcap').read_bytes() == after
+    assert told[0] == -told[1] > 0
+    assert sum(told) == len(CONTENT)
+
+
 class Short(MemoryStore):
     """Breaks off after four bytes each time."""
 
     asked = 0
 
-    def content(self, bucket: str, key: str, start: int = 0) -> Content:
+    def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         self.asked += 1
         return Content(ObjectInfo(bucket, key, 10, None), iter([b'0123456789'[start : start + 4]]))
 
@@ -143,10 +184,10 @@ def test_a_store_that_stays_away_keeps_what_came(tmp_path: Path) -> None:
     """So many tries, then the error; the next call goes on."""
 
     class Away(Short):
-        def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
             if start:
                 raise StoreUnavailable('away')
-            return super().content(bucket, key, start)
+            return super().content(bucket, key, start, version)
 
     pauses: list[float] = []
     with pytest.raises(StoreUnavailable, match='away'):

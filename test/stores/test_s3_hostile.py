@@ -64,7 +64,7 @@ def test_a_download_ends_where_more_comes_than_was_said(tmp_path: Path) -> None:
     class Endless(MemoryStore):
         sent = 0
 
-        def content(self, bucket: str, key: str, start: int = 0) -> Content:
+        def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
             def pieces() -> Iterator[bytes]:
                 while self.sent < 10:
                     self.sent += 1
