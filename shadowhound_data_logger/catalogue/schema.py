@@ -91,8 +91,6 @@ class TableSchema:
 
 
 OBJECTS: Final = TableSchema(SENSOR, COLUMNS, REQUIRED, {'shadowhound.catalog': str(FORMAT_VERSION)})
-ON_ROBOT, LOST = 'robot', 'lost'
-"""The values of ``where``."""
 KEPT: Final = TableSchema(
     '_kept', {**COLUMNS, 'where': STRING, 'reason': STRING}, (*REQUIRED, 'where'), {'shadowhound.kept': str(FORMAT_VERSION)}
 )

@@ -17,14 +17,14 @@ from typing import Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue import parts
 from shadowhound_data_logger.catalogue.gaps import GAP, GAPS, WITHDRAWN, Statement, complete, date_of, name_of, statement
-from shadowhound_data_logger.catalogue.schema import BUCKET, KEPT, LOST, OBJECTS, ON_ROBOT, SENSOR, Row, TableSchema, row_of
+from shadowhound_data_logger.catalogue.schema import BUCKET, KEPT, OBJECTS, SENSOR, Row, TableSchema, row_of
 from shadowhound_data_logger.catalogue.statistics import STATISTICS, statistic_rows
 from shadowhound_data_logger.clock import Clock, utc
 from shadowhound_data_logger.config import CatalogueSettings
 from shadowhound_data_logger.encode.statistics import unpacked_statistics
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_name
-from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.model import LOST, ON_ROBOT, DataObject
 from shadowhound_data_logger.spool import clock_record
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index

@@ -125,7 +125,7 @@ def label_list(*, robot: str | None, name: str | None, as_json: bool) -> ExitCod
     """Show the labels that stand."""
     with asking():
         from shadowhound_data_logger.lake import labels  # noqa: PLC0415
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
         left_out, source = quietly(), default_source(the_store_settings())
         found = labels.read(source, robot, label=name, findings=left_out)
@@ -164,7 +164,7 @@ def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, by:
         raise BadUsage('give either ids or --label', 'shadowhound-data label list')
     with asking():
         from shadowhound_data_logger.lake import labels  # noqa: PLC0415
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
         left_out = quietly()
         standing = labels.read(default_source(the_store_settings()), robot, label=name, findings=left_out)
@@ -183,7 +183,7 @@ def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, by:
 
 def _add(found: Sequence[Label], by: str | None, *, is_json: bool) -> ExitCode:
     from shadowhound_data_logger.lake import labels  # noqa: PLC0415
-    from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+    from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
     left_out = quietly()
     with asking():
@@ -213,7 +213,7 @@ def _named(robot: str | None) -> str:
 def _only_robot() -> str:
     """The one that the store has. Raises BadUsage where there are several."""
     from shadowhound_data_logger.lake import live_files  # noqa: PLC0415
-    from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+    from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
     found = live_files.robots(default_source(the_store_settings()))
     if len(found) != 1:

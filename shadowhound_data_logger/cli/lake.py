@@ -66,8 +66,8 @@ def lake() -> None:
 def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
     """Show the size of the catalogue, by robot."""
     with asking():
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
         from shadowhound_data_logger.lake.live_files import state  # noqa: PLC0415
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
 
     source = default_source(the_store_settings())
     left_out = quietly()
@@ -106,7 +106,7 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
     with asking():
         before = before and f'{utc(moment("--before", before, SystemClock.of_this_machine().wall_ns())):%Y-%m-%d}'
         from shadowhound_data_logger.lake import compact as library  # noqa: PLC0415
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
     left_out = quietly()
     how: dict[str, Any] = {'robot': robot, 'before': before or '', 'grace': None if keep else timedelta(minutes=grace)}
@@ -158,7 +158,7 @@ def lake_prune(
     with asking():
         now_ns = SystemClock.of_this_machine().wall_ns()
         from shadowhound_data_logger.lake import prune as library  # noqa: PLC0415
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
         keep = library.keep_rules(rules, now_ns)
         how: dict[str, Any] = {'robot': robot, 'most_bytes': None if most is None else library.size_of(most), 'is_forced': force}
@@ -254,7 +254,7 @@ def lake_reindex(*, robot: str, statistics: bool, as_json: bool) -> ExitCode:
     """
     with asking():
         from shadowhound_data_logger.lake import reindex as library  # noqa: PLC0415
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
     left_out = quietly()
     with the_store() as target, progress() as bar:
@@ -295,13 +295,14 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
     if catalogue and 'success' in flags:
         raise BadUsage('a catalogue does not say which missions failed', 'leave out --failed and --succeeded, or --catalogue')
     with asking():
-        from shadowhound_data_logger.lake import query, selecting  # noqa: PLC0415 - Daft takes half a second
+        from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - Daft takes half a second
         from shadowhound_data_logger.lake import verify as library  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
         store = the_store_settings()
         begun_s = time.monotonic()
         left_out = quietly()
-        own = library.rows(query.default_source(store), left_out, **flags)
+        own = library.rows(default_source(store), left_out, **flags)
         theirs = library.rows(selecting.fetched(catalogue), left_out, **flags) if catalogue else own
         if not len(theirs) and catalogue:
             raise BadUsage(f'there are no rows in {catalogue}', f'shadowhound-data fetch ROBOT/_catalog/ --to {catalogue}')
@@ -357,7 +358,7 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
     """
     with asking():
         from shadowhound_data_logger.lake import gaps as library  # noqa: PLC0415 - pyarrow takes a moment
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
         now_ns = SystemClock.of_this_machine().wall_ns()
         since_ns, until_ns = moment('--since', since, now_ns), moment('--until', until, now_ns)
@@ -385,7 +386,7 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
 
 def _wifi(target: Path, robot: str | None, since_ns: int, until_ns: int, left_out: Any, *, as_json: bool) -> ExitCode:
     from shadowhound_data_logger.lake import link, live_files, pictures  # noqa: PLC0415
-    from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+    from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
     source = default_source(the_store_settings())
     names = [robot] if robot else live_files.robots(source)

@@ -15,6 +15,7 @@ import click
 from rich.console import RenderableType
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, store_hint, the_store_settings
+from shadowhound_data_logger.cli.likeness import likest, model_option
 from shadowhound_data_logger.cli.output import (
     counted,
     duration,
@@ -29,6 +30,7 @@ from shadowhound_data_logger.cli.output import (
 )
 from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, tell_left_out
 from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.lake.bucket import default_source
 from shadowhound_data_logger.untrusted import csv_cell, visible
 
 if TYPE_CHECKING:
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
 
 SHOWN: Final = 30
 """Rows of a table unless --limit says more."""
-COLUMNS: Final = ('t_start', 'sensor', 'key', 'bytes', 'x', 'y', 'battery_pct', 'mission_type', 'labels')
+COLUMNS: Final = ('likeness', 't_start', 'sensor', 'key', 'bytes', 'x', 'y', 'battery_pct', 'mission_type', 'labels')
 """Of a table of objects; the other formats have all."""
 MOST_POSES: Final = 20_000
 MOST_TIMES: Final = 100
@@ -49,6 +51,7 @@ _OBJECTS: Final = {'bucket', 'key'}
         'query --topic /odom --limit 5 --format csv',
         "query --where 'imu.accelerometer.2 > 15' --since 7d --json > bumps.json",
         'query --sensor camera --ranges bumps.json',
+        'query --sensor camera --like door.jpg --limit 20 --sheet doors.jpg',
         'query "SELECT sensor, count(*) AS n FROM objects GROUP BY sensor" --since 7d',
     )
 )
@@ -61,6 +64,10 @@ _OBJECTS: Final = {'bucket', 'key'}
 @click.option('--join', 'join_s', type=click.FloatRange(0.0), default=1.0, show_default=True, metavar='S',
               help='Times at most so far apart are one.')  # fmt: skip
 @click.option('--pad', 'pad_s', type=click.FloatRange(0.0), default=0.0, metavar='S', help='So much before and after each time.')
+@click.option('--like', 'like', type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar='FILE',
+              help='The pictures that are most like this one, by vectors that `lake embed` made.')  # fmt: skip
+@click.option('--like-text', metavar='TEXT', help='The pictures that are most like these words; needs --model.')
+@model_option
 @click.option('--labels', 'with_labels', is_flag=True, help='Add a column with the labels of each object.')
 @as_json
 @click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')
@@ -68,8 +75,8 @@ _OBJECTS: Final = {'bucket', 'key'}
     '--map', 'ground', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw where the objects were recorded.'
 )
 def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str,  # noqa: PLR0913 - one an option
-          as_json: bool, with_labels: bool, scan: bool, join_s: float, pad_s: float, sheet: Path | None,
-          ground: Path | None) -> ExitCode:  # fmt: skip
+          as_json: bool, with_labels: bool, scan: bool, join_s: float, pad_s: float, like: Path | None, like_text: str | None,
+          model: Path | None, sheet: Path | None, ground: Path | None) -> ExitCode:  # fmt: skip
     """Search what is stored, by flags or SQL.
 
     An object must match all flags; times are UTC.
@@ -79,11 +86,12 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
     A --where with SENSOR.FIELD, such as 'imu.accelerometer.2 > 15 and max(imu.temperature) < 60', asks for values: the answer is
     times, which --ranges takes. A plain name is about each message, first last min max mean count nan_count about each object.
 
+    --like and --like-text compare all pictures that the flags choose and answer with the likest: 1 is the same, to the model.
+
     Exit code 1 when files of the catalogue are damaged: they are left out, and named on standard error.
     """
     with asking():
         from shadowhound_data_logger.lake import labels, values  # noqa: PLC0415
-        from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
 
         if values.is_about_values(flags.get('where', '')):
             if sql or sheet or ground or order or limit or with_labels or kind not in {'table', 'json'}:
@@ -91,18 +99,21 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
                                'write them to a file with --json, and ask again with --ranges FILE')  # fmt: skip
             left_out = quietly()
             others = {name: value for name, value in flags.items() if name != 'where'}
-            found = values.ranges(flags['where'], lake.default_source(the_store_settings()), scan=scan, join_s=join_s,
+            found = values.ranges(flags['where'], default_source(the_store_settings()), scan=scan, join_s=join_s,
                                   pad_s=pad_s, findings=left_out, **others)  # fmt: skip
             _print_times(flags['where'], found, is_json=as_json or kind == 'json')
             return tell_left_out(left_out)
         if sql and with_labels:
             raise BadUsage('--labels adds a column to objects, not to SQL', 'SQL has a view of its own: SELECT * FROM labels')
-        source, left_out = lake.default_source(the_store_settings()), quietly()
-        ask = functools.partial(lake.sql, sql) if sql else lake.objects
-        frame = ask(source, findings=left_out, **flags)
-        with lake.answering():
-            frame = _ordered(frame, order or ('t_start_ns' if not sql else None))
-            found = (frame.limit(limit) if limit else frame).to_arrow()
+        source, left_out = default_source(the_store_settings()), quietly()
+        if like or like_text or model:
+            if sql or order or bool(like) is bool(like_text):
+                raise BadUsage('--like FILE or --like-text TEXT asks for pictures, the likest first',
+                               'leave out the other one, SQL and --order')  # fmt: skip
+            found = likest(source, like, like_text, model, limit or SHOWN, left_out, flags)
+            limit = limit or SHOWN
+        else:
+            found = _found(source, sql, flags, order, limit, left_out)
         if with_labels:
             found = labels.with_column(found, labels.read(source, flags.get('robot'), findings=left_out))
     if (sheet or ground or kind == 'keys') and not _OBJECTS.issubset(found.column_names):
@@ -112,6 +123,16 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
             _pictures(source, found.to_pylist(), flags, left_out, sheet, ground)
     _print(found, 'json' if as_json else kind, source.describe(), is_objects=not sql, is_limited=limit is not None)
     return tell_left_out(left_out)
+
+
+def _found(source: Any, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, left_out: Any) -> Any:
+    from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
+
+    ask = functools.partial(lake.sql, sql) if sql else lake.objects
+    frame = ask(source, findings=left_out, **flags)
+    with lake.answering():
+        frame = _ordered(frame, order or ('t_start_ns' if not sql else None))
+        return (frame.limit(limit) if limit else frame).to_arrow()
 
 
 def _print_times(condition: str, found: ValueAnswer, *, is_json: bool) -> None:
@@ -135,7 +156,8 @@ def _about_times(found: ValueAnswer) -> Iterator[RenderableType]:
         yield plain(f'There are no such objects.{store_hint()}')
         return
     more = f'; the first {MOST_TIMES} are shown (--json has all)' if len(found.ranges) > MOST_TIMES else ''
-    share = f'{100 * found.opened / found.objects:.2g} %' if found.opened else 'none'
+    percent = 100 * found.opened / found.objects
+    share = f'{percent:.{0 if percent >= 10 else 2}{"f" if percent >= 10 else "g"}} %' if found.opened else 'none'
     opened = f'{number(found.opened)} of {counted(found.objects, "object")} opened ({share})'
     yield plain(f'{counted(len(found.ranges), "time")}{more}. {opened}.')
     if found.fields:
@@ -202,7 +224,7 @@ def _cell(name: str, value: Any) -> str:
     if isinstance(value, list):
         return ', '.join(map(str, value)) or '-'
     if isinstance(value, float):
-        return f'{value:.2f}' if name in {'x', 'y', 'yaw'} else f'{value:g}'
+        return f'{value:.2f}' if name in {'x', 'y', 'yaw'} else f'{value:.3f}' if name == 'likeness' else f'{value:g}'
     return number(value) if isinstance(value, int) and not isinstance(value, bool) else str(value)
 
 

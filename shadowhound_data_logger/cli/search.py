@@ -38,6 +38,8 @@ from shadowhound_data_logger.cli.output import (
 from shadowhound_data_logger.cli.question import FLAGS, asking, quietly, tell_left_out
 
 FILE: Final = 'search.db'
+MOST_SAID: Final = 80
+"""Letters of a document in the table; JSON has all."""
 _ASKED: Final = ('robot', 'since', 'until', 'mission', 'mission_type', 'success', 'label', 'ranges')
 _URL: Final = re.compile(r's3://([a-z0-9][a-z0-9.-]{1,61}[a-z0-9])/([^/].*[^/])')
 _Command = TypeVar('_Command', bound=Callable[..., Any])
@@ -60,7 +62,7 @@ def _flags(command: _Command) -> _Command:
     epilog=examples(
         'search door handle',
         'search \'"door handle" -kitchen\' --failed --since 30d',
-        'search stair* --kind event --json',
+        "search 'stair*' --kind event --json",
     )
 )
 @click.argument('words', nargs=-1, required=True)
@@ -74,7 +76,8 @@ def search(*, words: tuple[str, ...], flags: Mapping[str, Any], kind: str | None
     """Search what was said: missions, events, errors, labels.
 
     All words must be there: door handle. "A phrase" has them in this order, door* what begins so, -door leaves out what has it,
-    and door OR gate takes either. The best match comes first. `lake index` makes the index, and brings it up to date.
+    and door OR gate takes either. The best match comes first. `lake index` makes the index, and brings it up to date: what came
+    later is not in the answer, which says when that was.
     """
     with asking():
         from shadowhound_data_logger.lake import search as library  # noqa: PLC0415
@@ -83,18 +86,23 @@ def search(*, words: tuple[str, ...], flags: Mapping[str, Any], kind: str | None
         asked = wanted(time.time_ns(), **flags)
         with _index(index) as path:
             found = library.search(path, ' '.join(words), asked, kind=kind, limit=limit)
+            fresh_ns, waiting = library.updated(path) or (None, 0)
     if as_json:
-        print_json([with_dates(each) for each in found])
+        print_json(with_dates({'found': [with_dates(each) for each in found], 'fresh_ns': fresh_ns, 'waiting': waiting}))
         return ExitCode.FINE
-    table = plain_table(
-        '', ('what', 'robot', 'when (UTC)', 'mission', 'found'), ('what', 'robot', 'when (UTC)', 'mission', 'found')
-    )
+    columns = ['what', 'robot', 'when (UTC)', 'mission', 'found', *(['labels'] if any(each['labels'] for each in found) else [])]
+    table = plain_table('', columns, columns)
     table.title = None
     for each in found:
         said = each['title'] if not each['excerpt'] or each['excerpt'] == each['title'] else f'{each["title"]}: {each["excerpt"]}'
-        table.add_row(*map(plain, (each['kind'], each['robot'], shown_time(each['since_ns']), each['mission_id'] or '-',
-                                   said.removeprefix(': '))))  # fmt: skip
-    print_page(table if found else plain(f'Nothing has these words.{store_hint()}'))
+        said = said.removeprefix(': ')
+        cells = [each['kind'], each['robot'], shown_time(each['since_ns']), each['mission_id'] or '-',
+                 said if len(said) <= MOST_SAID else f'{said[:MOST_SAID]} ...', ', '.join(each['labels'])]  # fmt: skip
+        table.add_row(*map(plain, cells[: len(columns)]))
+    until = f'up to {shown_time(fresh_ns)}' if fresh_ns is not None else 'up to a time that is not known'
+    more = f'; {counted(waiting, "mission")} had no summary yet' if waiting else ''
+    print_page(*([table, ''] if found else [plain(f'Nothing has these words.{store_hint()}')]),
+               plain(f'Fresh {until} (`lake index`){more}.'))  # fmt: skip
     return ExitCode.FINE
 
 
@@ -109,7 +117,7 @@ def lake_index(*, to: str | None, as_json: bool) -> ExitCode:
     """
     with asking():
         from shadowhound_data_logger.lake import search as library  # noqa: PLC0415
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
         place = _place(to) if to and '://' in to else None
         path = the_home() / FILE if place or not to else Path(to)

@@ -43,7 +43,7 @@ def lake_sink(*, url: str, index: str, robot: str | None, ca: Path | None, follo
     """
     with asking():
         from shadowhound_data_logger.lake import sink as library  # noqa: PLC0415
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
     source, left_out, total = default_source(the_store_settings()), quietly(), library.SinkTally()
     with (

@@ -90,7 +90,8 @@ def covers(asked: str, field: str) -> bool:
 
 def values_of(record: Mapping[str, Any], asked: str) -> list[float]:
     """The finite numbers of all fields of a record that a name means."""
-    found = (values for name, values in _fields('', [record], 0) if covers(asked, name))
+    some = {name: value for name, value in record.items() if covers(asked, name) or covers(name, asked)}
+    found = (values for name, values in _fields('', [some], 0) if covers(asked, name))
     return [float(value) for values in found for value in values if value is not None]
 
 

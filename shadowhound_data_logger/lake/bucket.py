@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -15,6 +16,7 @@ from typing import Final, TypeVar
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue.parts import CONTENT_TYPE
 from shadowhound_data_logger.catalogue.schema import BUCKET, SENSOR
+from shadowhound_data_logger.config import home, store_settings
 from shadowhound_data_logger.errors import ForeignObject
 from shadowhound_data_logger.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.options import StoreSettings
@@ -63,6 +65,11 @@ class Bucket:
 
     def _ask(self, ask: Callable[[ObjectStore], _Answer]) -> _Answer:
         return steadily(lambda: ask(_reader(self.settings)))
+
+
+def default_source(settings: StoreSettings | None = None) -> Bucket:
+    """The bucket with the catalogue in the store that the environment names."""
+    return Bucket(settings or store_settings(os.environ, home(os.environ)), BUCKET)
 
 
 def put_part(store: ObjectStore, key: str, robot: str, body: bytes, rows: int) -> None:

@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from shadowhound_data_logger.catalogue.gaps import GAPS
+from shadowhound_data_logger.catalogue.parquet import INT32, STRING
 from shadowhound_data_logger.catalogue.schema import KEPT, OBJECTS, TableSchema
 from shadowhound_data_logger.catalogue.statistics import STATISTICS
 from shadowhound_data_logger.errors import AccessDenied
@@ -58,6 +59,9 @@ STATISTICS_ROWS: Final = 16_384
 CELL_M: Final = 4.0
 """Rows are sorted by sensor, by squares of this side along a Z-order curve, then by time: rows of one place are read together."""
 _CELLS: Final = 1 << 15
+_UNIQUE: Final = frozenset({'key', 'sha256', 'id'})
+_COUNTS: Final = frozenset({'count', 'nan_count', 'clock_offset_ns', 'merged'})
+"""Numbers that repeat. A dictionary of those that do not, such as times, costs a quarter of a file and of the time to read it."""
 _BY_FIELD: Final = [(name, 'ascending') for name in ('sensor', 'field', 't_start_ns', 'bucket', 'key')]
 _BY_TOPIC: Final = [(name, 'ascending') for name in ('sink', 'topic', 'what', 'from_ns', 'id')]
 
@@ -149,7 +153,8 @@ _IN_ORDER: Final[Mapping[str, Callable[[pa.Table], pa.Table]]] = {
 
 def _encoded(rows: pa.Table, of: TableSchema, sources: frozenset[str]) -> bytes:
     body = pa.BufferOutputStream()
-    with pq.ParquetWriter(body, arrow_schema(of), compression='zstd', store_schema=False) as file:
+    repeated = [name for name, kind in of.columns.items() if name in _COUNTS or (kind in {STRING, INT32} and name not in _UNIQUE)]
+    with pq.ParquetWriter(body, arrow_schema(of), compression='zstd', use_dictionary=repeated, store_schema=False) as file:
         file.write_table(rows.cast(arrow_schema(of)), row_group_size=STATISTICS_ROWS if of is STATISTICS else GROUP_ROWS)
         file.add_key_value_metadata({**of.about, SOURCES: encode_sources(sources)})
     return bytes(body.getvalue().to_pybytes())

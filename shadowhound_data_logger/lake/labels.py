@@ -31,7 +31,7 @@ from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import days, robots
 from shadowhound_data_logger.lake.reading import tables
-from shadowhound_data_logger.lake.select import TimeSpan
+from shadowhound_data_logger.lake.select import TimeSpan, Wanted, within
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.times import moment
 from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json, is_path
@@ -140,6 +140,16 @@ def spans(found: Iterable[Label]) -> tuple[list[TimeSpan], list[tuple[str, str]]
         else:
             keys.append((each.bucket or BUCKET, each.key))
     return times, keys
+
+
+def labelled(source: Bucket, asked: Wanted, findings: Findings) -> Wanted:
+    """What is asked, with the times and objects that bear its label instead of that. Raises StoreError."""
+    if asked.label is None:
+        return asked
+    found = read(source, asked.robot, label=asked.label, findings=findings)
+    times, keys = spans(found)
+    ends = [end_ns for each in found for end_ns in (each.since_ns, each.until_ns)]
+    return within(replace(asked, label=None), times, keys, ends)
 
 
 def column(rows: pa.Table, found: Sequence[Label]) -> list[list[str]]:

@@ -11,18 +11,17 @@ import random
 import re
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shadowhound_data_logger.catalogue.schema import KEPT, ON_ROBOT
+from shadowhound_data_logger.catalogue.schema import KEPT
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -45,8 +44,9 @@ from shadowhound_data_logger.mailbox import (
     encode_inbox,
     inbox_key,
     read_entry,
+    size_of,
 )
-from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.model import ON_ROBOT, SpooledObject
 from shadowhound_data_logger.options import UploadSettings
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores import open_store
@@ -66,7 +66,7 @@ ANSWERS_TRIED: Final = 8
 MOST_ANSWER_BYTES: Final = 1 << 20
 LOOK_S: Final = 2.0
 LOOKS: Final = 90
-"""For the rows of what has come: a robot tells them each minute."""
+"""For the rows of what has come."""
 _OF_ROBOT: Final = ('robot', 'since', 'until', 'near', 'mission', 'mission_type')
 """What of a query a robot can be asked for; the rest chooses among what has come."""
 _DAY_NS: Final = 24 * 3600 * 10**9
@@ -98,20 +98,17 @@ def known(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> p
     with ThreadPoolExecutor(THREADS) as pool:
         found = days(source, [robot], early.dates(time.time_ns()), pool, findings, early.has_date, KEPT)
     entries = [entry for day in found for entry in day.entries]
+    if not entries:
+        return arrow_schema(KEPT).empty_table()
     rows = pa.concat_tables([arrow_schema(KEPT).empty_table(), *tables(source, entries, tuple(KEPT.columns), findings, of=KEPT)])
     stored = [entry for day in folders(source, early, findings) for entry in day.entries]
     keys = pa.concat_tables([arrow_schema().empty_table().select(KEY), *tables(source, stored, KEY, findings)])
     rows = superseding(rows, keys)
-    return rows.filter(pa.array([_takes(want, row) for row in rows.to_pylist()], pa.bool_()))
+    return rows.filter(pa.array([takes(want, row) for row in rows.to_pylist()], pa.bool_()))
 
 
-def size_of(want: KeptFilter, row: Mapping[str, Any]) -> int:
-    """About how many bytes of a kept object a request makes a robot send: of a slice at its ends a part."""
-    begin_ns = row['t_start_ns'] or 0
-    return want.bytes_of(row['key'], row['sensor'] or '', row['bytes'] or 0, begin_ns, row['t_end_ns'] or begin_ns, {})
-
-
-def _takes(want: KeptFilter, row: dict[str, Any]) -> bool:
+def takes(want: KeptFilter, row: Mapping[str, Any]) -> bool:
+    """Whether an object is wanted, by its row."""
     metadata = {name: row[name] for name in ('mission_id', 'run_id', 'mission_type') if row[name] is not None}
     if row['x'] is not None and row['y'] is not None:
         metadata['pose'] = f'{row["x"]} {row["y"]} 0 odom'
@@ -154,21 +151,29 @@ def cancel(store: ObjectStore, source: Bucket, robot: str, request: str, *, by: 
     _change(store, robot, add)
 
 
-def listed(store: ObjectStore, source: Bucket, robot: str) -> list[PullState]:
+def listed(source: Bucket, robot: str) -> list[PullState]:
     """What is asked of a robot, and how far that is: the mailbox's entries. Raises StoreError, LakeError."""
+    requests = _requests(robot, _entries(source, robot))
+    with ThreadPoolExecutor(THREADS) as pool:
+        answers = pool.map(lambda request: newest_answer(source, robot, request.id), requests)
     found = []
-    entries, _ = _read(store, robot)
-    for request in _requests(robot, entries):
-        answer = newest_answer(source, robot, request.id)
-        state = 'asked' if answer is None else str(answer.get('state'))
+    for request, newest in zip(requests, answers, strict=True):
+        is_of_it = newest is not None and (newest['state'] not in FINAL or _is_last(newest, request.made_ns))
+        answer = newest if is_of_it else None
+        state = 'asked' if answer is None else str(answer['state'])
         found.append(PullState(request.id, request.by, state, request.priority, request.want.to_json(), answer))
     return found
 
 
 def unanswered(source: Bucket, robot: str) -> list[PullRequest]:
     """The requests in the mailbox of a robot that have no last answer yet. Raises StoreError, LakeError."""
+    return _requests(robot, _unanswered(source, robot, _entries(source, robot)))
+
+
+def _entries(source: Bucket, robot: str) -> list[Any]:
+    """Of the mailbox of a robot; none where it has none."""
     try:
-        entries = decode_inbox(source.get(inbox_key(robot), MOST_INBOX_BYTES))
+        return decode_inbox(source.get(inbox_key(robot), MOST_INBOX_BYTES))
     except ObjectRefused as error:
         if error.data.get('reason') == 'missing':
             return []
@@ -177,7 +182,6 @@ def unanswered(source: Bucket, robot: str) -> list[PullRequest]:
         raise LakeError(
             f'the mailbox of {robot}: {error}', remedy='somebody damaged it: put an empty one in its place'
         ) from error
-    return _requests(robot, _unanswered(source, robot, entries))
 
 
 def newest_answer(source: Bucket, robot: str, request: str) -> dict[str, Any] | None:
@@ -222,24 +226,42 @@ def bring(source: Bucket, flags: Mapping[str, Any], *, sensors: Collection[str] 
     """
     asked = wanted(time.time_ns(), **{name: flags[name] for name in _OF_ROBOT if flags.get(name) is not None})
     findings = Findings() if findings is None else findings
-    total, requests = 0, list[PullRequest]()
+    total, requests = 0, list[tuple[PullRequest, list[dict[str, Any]]]]()
     with closing(open_store(source.settings, UploadSettings())) as store:
         for robot in robots(source) if asked.robot is None else [asked.robot]:
             want = KeptFilter(
                 since_ns=asked.since_ns, until_ns=asked.until_ns, mission=asked.mission, mission_type=asked.mission_type
             )
-            there = Counter(row['sensor'] for row in kept(source, robot, want, findings).to_pylist())
+            rows = kept(source, robot, want, findings).to_pylist()
+            there = {row['sensor'] for row in rows}
             for sensor in sorted(there) if sensors is None else sensors:
-                if there[sensor] and sensor != BAG_SENSOR:
+                if sensor in there and sensor != BAG_SENSOR:
                     near = asked.near if sensors is not None and sensor == next(iter(sensors)) else None
-                    requests.append(ask(store, source, robot, replace(want, sensor=sensor, near=near), by=requester()))
-                    total += there[sensor]
-    for request in requests:
-        _await(source, request, say, findings)
+                    of_it = replace(want, sensor=sensor, near=near)
+                    found = [row for row in rows if takes(of_it, row)]
+                    requests.append((ask(store, source, robot, of_it, by=requester()), found))
+                    total += len(found)
+    for request, found in requests:
+        _await(source, request, found, say, findings)
     return total
 
 
-def _await(source: Bucket, request: PullRequest, say: Callable[[str], None], findings: Findings) -> None:
+def await_rows(source: Bucket, robot: str, want: KeptFilter, rows: Iterable[Mapping[str, Any]], findings: Findings,
+               say: Callable[[str], None] = lambda _: None) -> None:  # fmt: skip
+    """Until the catalogue says that the store has these objects, which a robot has sent; three minutes at most.
+
+    Slices of which a part was sent stay where they are. Raises StoreError.
+    """
+    names = {row['key'] for row in rows if row['where'] == ON_ROBOT and size_of(want, row) == (row['bytes'] or 0)}
+    for _ in range(LOOKS):
+        if names.isdisjoint(kept(source, robot, want, findings)['key'].to_pylist()):
+            return
+        say(f'waiting for the catalogue of {robot}: {want.sensor or "what it sent"}')
+        time.sleep(LOOK_S)
+
+
+def _await(source: Bucket, request: PullRequest, rows: Sequence[Mapping[str, Any]], say: Callable[[str], None],
+           findings: Findings) -> None:  # fmt: skip
     """Until a request is done, and the catalogue knows of what came."""
 
     def tell(answer: Mapping[str, Any] | None) -> None:
@@ -249,27 +271,34 @@ def _await(source: Bucket, request: PullRequest, say: Callable[[str], None], fin
     if answer['state'] != 'done':
         raise LakeError(f'{request.robot} did not send all of {request.want.sensor}: {visible(_how_far(answer))}',
                         remedy='`shadowhound-data pull --list`, or ask again')  # fmt: skip
-    for _ in range(LOOKS):
-        if not kept(source, request.robot, request.want, findings).num_rows:
-            return
-        say(f'waiting for the catalogue of {request.robot}: {request.want.sensor}')
-        time.sleep(LOOK_S)
+    await_rows(source, request.robot, request.want, rows, findings, say)
 
 
 def _how_far(answer: Mapping[str, Any] | None) -> str:
     if answer is None:
         return 'asked'
-    objects, sent = how_many(answer)
-    return f'{answer["state"]}, {sent} of {objects} objects'
+    told = told_by(answer)
+    return f'{answer["state"]}, {told.sent} of {told.objects} objects'
 
 
-def how_many(answer: Mapping[str, Any]) -> tuple[int, int]:
-    """Objects that a request found, and how many of them the store has, as an answer says; 0 for what says no number."""
+class RequestFigures(NamedTuple):
+    """What an answer says of a request; 0 for what says no number."""
+
+    objects: int
+    """That it found."""
+    bytes: int
+    sent: int
+    """Of them the store has so many."""
+    sent_bytes: int
+
+
+def told_by(answer: Mapping[str, Any]) -> RequestFigures:
+    """The figures of an answer, which anything may be in."""
     outcomes = answer.get('outcomes')
     delivered = outcomes.get('delivered') if isinstance(outcomes, dict) else None
-    said = answer.get('objects'), delivered.get('objects') if isinstance(delivered, dict) else 0
-    objects, sent = (count if type(count) is int else 0 for count in said)
-    return objects, sent
+    sent = delivered if isinstance(delivered, dict) else {}
+    said = answer.get('objects'), answer.get('bytes'), sent.get('objects'), sent.get('bytes')
+    return RequestFigures(*(count if type(count) is int else 0 for count in said))
 
 
 def _is_last(answer: dict[str, Any], made_ns: int) -> bool:

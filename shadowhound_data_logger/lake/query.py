@@ -5,46 +5,56 @@ A frame is lazy: it looks which parts there are when it is computed, and of othe
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from operator import and_
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.catalogue.gaps import GAP, GAPS
 from shadowhound_data_logger.catalogue.labels import LABELS
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import home, store_settings
-from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.errors import LakeError, ObjectRefused, PolicyRefused, StoreError
+from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake import labels
-from shadowhound_data_logger.lake.bucket import THREADS, Bucket
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket, default_source
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.forgotten import forgotten
 from shadowhound_data_logger.lake.gaps import newest, watermarks
-from shadowhound_data_logger.lake.reading import narrow
-from shadowhound_data_logger.lake.scan import Catalogue
-from shadowhound_data_logger.lake.select import Wanted, wanted, within
-from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.lake.reading import arrow_schema, narrow
+from shadowhound_data_logger.lake.scan import PartGroup, catalogue_rows, planned
+from shadowhound_data_logger.lake.select import Wanted, wanted
+from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, parse_manifest, split_id
+from shadowhound_data_logger.policies.registry import BUCKET as POLICIES
+from shadowhound_data_logger.policies.registry import PREFIX
 from shadowhound_data_logger.untrusted import MOST_SUMMARY_BYTES, from_json
 
-import daft  # isort: skip - after scan, which turns its telemetry off
-from daft import DataFrame, Expression, col, lit  # isort: skip
+os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # else it tells its makers of each run, over the network
+os.environ.setdefault('DAFT_PROGRESS_BAR', '0')
+
+import daft
+from daft import DataFrame, Expression, col, lit
+from daft.io.pushdowns import Pushdowns
+from daft.io.source import DataSource, DataSourceTask
+from daft.recordbatch import RecordBatch
+
+_Answer = TypeVar('_Answer')
 
 _MISSIONS: Final = re.compile(r'\bmissions\b', re.IGNORECASE)
 _LABELS: Final = re.compile(r'\blabels\b', re.IGNORECASE)
 _FORGOTTEN: Final = re.compile(r'\bforgotten\b', re.IGNORECASE)
 _GAPS: Final = re.compile(r'\b(gaps|watermarks)\b', re.IGNORECASE)
-_OF_OBJECTS: Final = ('near', 'mission_type', 'success', 'where', 'label')
+_OF_OBJECTS: Final = ('near', 'mission_type', 'success', 'policy', 'where', 'label')
 """Flags that gaps know nothing of."""
 _UNSEEN: Final = {'what', 'id', 'revision', 'received', 'skipped', 'format_version'}
 _GAP_COLUMNS: Final = [name for name in GAPS.columns if name not in _UNSEEN]
@@ -74,6 +84,7 @@ _SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
     'distance_m': ('distance_m', pa.float64()),
     'duration_s': ('duration_s', pa.float64()),
     'battery_consumed_pct': ('battery_consumed_pct', pa.float64()),
+    'policy': ('policy', pa.string()),
 }
 """Columns of ``missions`` that come from ``summary.json``, null for a mission that has none yet: name there, type."""
 
@@ -133,11 +144,6 @@ def chosen(rows: pa.Table, where: str) -> pa.Table:
         return daft.from_arrow(rows).where(daft.sql_expr(where)).to_arrow()
 
 
-def default_source(settings: StoreSettings | None = None) -> Bucket:
-    """The bucket with the catalogue in the store that the environment names."""
-    return Bucket(settings or store_settings(os.environ, home(os.environ)), schema.BUCKET)
-
-
 @contextmanager
 def answering() -> Iterator[None]:
     """What Daft cannot make sense of is a LakeError; use it around what computes a frame, too."""
@@ -149,30 +155,33 @@ def answering() -> Iterator[None]:
         raise LakeError(f'the query cannot be answered: {" ".join(str(error).split())}') from error
 
 
-def labelled(source: Bucket, asked: Wanted, findings: Findings) -> Wanted:
-    """What is asked, with the times and objects that bear its label instead of that. Raises StoreError."""
-    if asked.label is None:
-        return asked
-    found = labels.read(source, asked.robot, label=asked.label, findings=findings)
-    times, keys = labels.spans(found)
-    ends = [end_ns for each in found for end_ns in (each.since_ns, each.until_ns)]
-    return within(replace(asked, label=None), times, keys, ends)
-
-
 def _objects(lake: _Asked, asked: Wanted) -> DataFrame:
-    asked = labelled(lake.source, asked, lake.findings)
-    rows = Catalogue(lake.source, asked, lake.findings).read()
+    asked = labels.labelled(lake.source, asked, lake.findings)
+    rows = _Catalogue(lake.source, asked, lake.findings).read()
     with answering():
         conditions = list(_conditions(asked))
         if asked.mission is not None:
             runs = {} if '_' in asked.mission else _runs(lake, asked)  # no id of a run has one, every one of a mission
             of_run = [mission for mission, run in runs.items() if run.startswith(asked.mission)]
             conditions.append(col('mission_id').startswith(asked.mission) | col('mission_id').is_in(of_run or ['']))
-        if asked.success is not None:
-            ended = _missions(lake, replace(asked, success=None)).where(col('success') == lit(asked.success))
-            ids = ended.select('mission_id').to_pydict()['mission_id']
+        if asked.success is not None or asked.policy is not None:
+            ids = _missions_of(lake, asked)
             conditions.append(col('mission_id').is_in(ids) if ids else lit(False))
         return rows.where(reduce(and_, conditions)) if conditions else rows
+
+
+def _missions_of(lake: _Asked, asked: Wanted) -> list[str]:
+    """The missions that ended so, and at whose beginning that policy was active."""
+    found = _missions(lake, replace(asked, success=None, policy=None)).select('mission_id', 'success', 'policy').to_pydict()
+    rows = zip(found['mission_id'], found['success'], found['policy'], strict=True)
+    return [mission for mission, success, policy in rows
+            if asked.success in {None, success} and (asked.policy is None or _is_policy(policy or '', asked.policy))]  # fmt: skip
+
+
+def _is_policy(name: str, wanted: str) -> bool:
+    """Whether an id such as ``go2_patrol@7#0123456789abcdef`` is meant: by its name, with or without version, or as it begins."""
+    version = name.partition('#')[0]
+    return wanted in {name, version, version.partition('@')[0]} or ('#' in wanted and name.startswith(wanted))
 
 
 def _conditions(asked: Wanted) -> Iterator[Expression]:
@@ -223,7 +232,26 @@ def _missions(lake: _Asked, asked: Wanted) -> DataFrame:
     found = found.set_column(found.column_names.index('mission_type'), 'mission_type', pa.array(kinds, pa.string()))
     for column, (name, kind) in _SUMMARY.items():
         found = found.append_column(column, pa.array([_value(one.get(name), kind) for one in told], kind))
-    return daft.from_arrow(found)
+    policies = found['policy'].to_pylist()
+    datasets = {each: _dataset_of(lake.source, each) for each in {*policies} - {None}}
+    return daft.from_arrow(found.append_column('policy_dataset', pa.array(map(datasets.get, policies), pa.string())))
+
+
+def _dataset_of(source: Bucket, policy: str) -> str | None:
+    """The digest of the data set that a policy was trained on, by its manifest in the store; None where that is not there.
+
+    The id has the beginning of the manifest's hash: a mission cannot name another one.
+    """
+    name, version, sha256 = split_id(policy) or ('', 0, '')
+    models = Bucket(source.settings, POLICIES)
+    with suppress(StoreError, PolicyRefused):
+        for robot_type in models.folders(f'{PREFIX}/') if name else ():
+            key = f'{PREFIX}/{robot_type}/{name}_v{version}/{MANIFEST}'
+            if is_name(robot_type) and models.head(key) is not None:
+                manifest = parse_manifest(models.get(key, MOST_MANIFEST_BYTES))
+                if manifest.sha256.startswith(sha256):
+                    return manifest.dataset or None
+    return None
 
 
 def _labels(lake: _Asked, asked: Wanted) -> DataFrame:
@@ -275,7 +303,7 @@ def _gaps(lake: _Asked, asked: Wanted) -> dict[str, DataFrame]:
 def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:
     """The run of each mission of that time, by whichever object knows it: one that came before there was a run does not."""
     until_ns = None if asked.until_ns is None else asked.until_ns + LONGEST_NS
-    rows = Catalogue(lake.source, Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns), lake.findings).read()
+    rows = _Catalogue(lake.source, Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns), lake.findings).read()
     with answering():
         known = rows.where(col('mission_id').not_null() & col('run_id').not_null())
         found = known.groupby('mission_id').agg(col('run_id').max()).to_pydict()
@@ -300,3 +328,71 @@ def _value(value: Any, kind: pa.DataType) -> Any:
     if kind == pa.string():  # half a surrogate pair is not text
         return value.encode(errors='replace').decode() if isinstance(value, str) else None
     return value if isinstance(value, bool) else None
+
+
+# -- the catalogue as a source of Daft's ---------------------------------------------------------------------------------------
+
+
+class _Catalogue(DataSource):
+    """Reads the rows of one bucket's catalogue that may match a query.
+
+    Stateless, except for what it leaves out: each run lists anew.
+    """
+
+    def __init__(self, source: Bucket, wanted: Wanted, findings: Findings) -> None:
+        self._source = source
+        self._wanted = wanted
+        self._findings = findings
+        self._schema = daft.Schema.from_pyarrow_schema(arrow_schema())
+
+    @property
+    def name(self) -> str:
+        return f'the catalogue in {self._source.describe()}'
+
+    @property
+    def schema(self) -> daft.Schema:
+        return self._schema
+
+    async def get_tasks(self, pushdowns: Pushdowns) -> AsyncIterator[DataSourceTask]:
+        columns = _columns(pushdowns)
+        for parts in await _apart(lambda: list(planned(self._source, self._wanted, self._findings))):
+            yield _Parts(self._source, parts, columns, self._wanted, self._findings)
+
+
+class _Parts(DataSourceTask):
+    """Parts that are read together, from the store to batches of the columns that are needed."""
+
+    def __init__(self, source: Bucket, parts: PartGroup, columns: Sequence[str], wanted: Wanted, findings: Findings) -> None:
+        self._source = source
+        self._parts = parts
+        self._columns = tuple(columns)
+        self._wanted = wanted
+        self._findings = findings
+
+    @property
+    def schema(self) -> daft.Schema:
+        return daft.Schema.from_pyarrow_schema(narrow(self._columns))
+
+    async def read(self) -> AsyncIterator[RecordBatch]:
+        found = catalogue_rows(self._source, self._parts, self._columns, self._wanted, self._findings)
+        try:
+            while (table := await _apart(lambda: next(found, None))) is not None:
+                for batch in table.to_batches():
+                    yield RecordBatch.from_arrow_record_batches([batch], batch.schema)
+        finally:
+            found.close()
+
+
+async def _apart(work: Callable[[], _Answer]) -> _Answer:
+    """In a thread of its own, which ends with it: Daft's loop serves all tasks."""
+    with ThreadPoolExecutor(1) as pool:
+        return await asyncio.get_running_loop().run_in_executor(pool, work)
+
+
+def _columns(pushdowns: Pushdowns) -> tuple[str, ...]:
+    """In the order of the schema: those of the answer, and those that a filter looks at."""
+    names = arrow_schema().names
+    if pushdowns.columns is None:
+        return tuple(names)
+    needed = {*pushdowns.columns, *pushdowns.filter_required_column_names()}
+    return tuple(name for name in names if name in needed)

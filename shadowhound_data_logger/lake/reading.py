@@ -12,20 +12,23 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from shadowhound_data_logger.catalogue.gaps import GAPS, STATEMENT_KINDS
 from shadowhound_data_logger.catalogue.labels import LABEL_KINDS, LABELS
 from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
 from shadowhound_data_logger.catalogue.schema import FORGOTTEN, KEPT, OBJECTS, TableSchema
 from shadowhound_data_logger.catalogue.statistics import STATISTICS
+from shadowhound_data_logger.encode.statistics import NUMBERS
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
@@ -70,7 +73,7 @@ _OWNER: Final = {
     LABELS.folder: 'robot',
 }
 """The column that says whose a row is, by the table's folder."""
-_COUNTS: Final = ('bytes', 'revision', 'merged', 'received', 'skipped', 'nan_count')
+_COUNTS: Final = ('bytes', 'revision', 'merged', 'received', 'skipped')
 _SPANS: Final = (('from_ns', 'to_ns'), ('since_ns', 'until_ns'))
 _TIMES: Final = ('t_start', 't_end', 't_from', 't_to', 'made', 'forgotten')
 _YEARS_US: Final = (-62_135_596_800_000_000, 253_402_300_799_999_999)
@@ -79,19 +82,27 @@ UNREADABLE: Final = (pa.ArrowException, OSError, MemoryError, ValueError, Lookup
 """What comes of a file that is not a part."""
 
 
+class Only(NamedTuple):
+    """The rows that are wanted, by a few columns: the others are read only of row groups with such rows."""
+
+    columns: tuple[str, ...]
+    holds: Callable[[pa.Table], NDArray[np.bool_]]
+    """Of a table of those columns. What it is shown has not been checked yet."""
+
+
 def tables(source: Bucket, entries: Sequence[ObjectInfo], columns: Sequence[str], findings: Findings,
-           wanted: Wanted | None = None, of: TableSchema = OBJECTS) -> Iterator[pa.Table]:  # fmt: skip
+           wanted: Wanted | None = None, of: TableSchema = OBJECTS, only: Only | None = None) -> Iterator[pa.Table]:  # fmt: skip
     """The rows of these parts, in their order, some megabytes at a time; a column that a part does not have yet is null.
 
-    Row groups that cannot hold what is ``wanted`` are left out. Raises StoreError.
+    Row groups that cannot hold what is ``wanted`` are left out, and so are rows that ``only`` does not name. Raises StoreError.
     """
-    schema = narrow(_needed(columns, of), of)
+    schema = narrow(_needed((*columns, *only.columns) if only else columns, of), of)
     rows = _Rows(schema, findings, of=of)
     for entry, body in _bodies(source, entries):
         if rows.robot != of.robot_of(entry.key) or rows.nbytes > BATCH_BYTES:
             yield from rows.taken(columns)
             rows = _Rows(schema, findings, of.robot_of(entry.key), of)
-        for table, size in _contents(source, entry, body, schema, findings, wanted, of):
+        for table, size in _contents(source, entry, body, schema, findings, of, _Choice(columns, wanted, only)):
             rows.add(entry.key, table, size)
             if rows.nbytes > BATCH_BYTES:
                 yield from rows.taken(columns)
@@ -106,7 +117,7 @@ def whole(source: Bucket, entries: Sequence[ObjectInfo], findings: Findings,
     for entry, body in _bodies(source, entries):
         found = Findings(lambda _: None)
         rows = _Rows(schema, found, of.robot_of(entry.key), of)
-        for table, size in _contents(source, entry, body, schema, found, None, of):
+        for table, size in _contents(source, entry, body, schema, found, of, _Choice(schema.names)):
             rows.add(entry.key, table, size)
         made = list(rows.taken(schema.names))
         if not len(found):
@@ -157,15 +168,23 @@ def _bodies(source: Bucket, entries: Sequence[ObjectInfo]) -> Iterator[tuple[Obj
             yield from zip(some, pool.map(body, some), strict=True)
 
 
+class _Choice(NamedTuple):
+    """What of a part is asked for: beyond these columns only what tells whose a row is."""
+
+    columns: Sequence[str]
+    wanted: Wanted | None = None
+    only: Only | None = None
+
+
 def _contents(source: Bucket, entry: ObjectInfo, body: bytes | ObjectRefused | None, schema: pa.Schema, findings: Findings,
-              wanted: Wanted | None, of: TableSchema) -> Iterator[tuple[pa.Table, int]]:  # fmt: skip
+              of: TableSchema, choice: _Choice) -> Iterator[tuple[pa.Table, int]]:  # fmt: skip
     """The rows of one part, as far as it is one, and how many bytes they take."""
     done, part = 0, None
     try:
         if isinstance(body, ObjectRefused) or not is_path(entry.key):
             raise ValueError('its name is not a path, or it is larger than its listing says')
         part = _Part(source, entry, body, of)
-        for table, size in part.tables(schema, wanted):
+        for table, size in part.tables(schema, choice):
             yield table, size
             done += len(table)
     except UNREADABLE as error:
@@ -255,9 +274,12 @@ def _is_own(table: pa.Table, robot: str, of: TableSchema) -> pa.ChunkedArray:
 
 
 def _is_sane(table: pa.Table, of: TableSchema) -> pa.ChunkedArray:
-    """Whether what must be there is, and dates are dates; of the columns that were read."""
+    """Whether what must be there is, and dates are dates; of the columns that were read.
+
+    Numbers of statistics are judged by those who ask for them: an object without such a row would seem to be without the field.
+    """
     sane = pc.is_valid(table[_OWNER[of.folder]])
-    for name in (name for name in of.required if name in table.column_names):
+    for name in (name for name in of.required if name in table.column_names and not (of is STATISTICS and name in NUMBERS)):
         sane = pc.and_(sane, pc.is_valid(table[name]))
     if 'bucket' in table.column_names:
         named = [each for each in pc.unique(table['bucket']).to_pylist() if each is None or is_name(each)]
@@ -302,23 +324,79 @@ class _Part:
         """Bytes that it may still unpack to."""
         self.count: int = self._about.num_rows
 
-    def tables(self, schema: pa.Schema, wanted: Wanted | None) -> Iterator[tuple[pa.Table, int]]:
+    def tables(self, schema: pa.Schema, choice: _Choice) -> Iterator[tuple[pa.Table, int]]:
         """The columns of the schema that it has, and how many bytes they take."""
         places = _places(self._file, schema, self._of)
         groups = range(self._about.num_row_groups)
-        if wanted is not None and len(groups) > 1:
-            bounds = _bounds(wanted)
+        if choice.wanted is not None and len(groups) > 1:
+            bounds = _bounds(choice.wanted)
             groups = [number for number in groups if _may_hold(self._about.row_group(number), places, bounds)]  # type: ignore[assignment]
         some: list[int] = []
-        chunks: list[_Chunk] = []
+        size = 0
         for number in groups:
             some.append(number)
-            chunks += self._chunks(number, places)
-            if sum(chunk.end - chunk.begin for chunk in chunks) > BATCH_BYTES:
-                yield self._read(some, chunks, list(places))
-                some, chunks = [], []
+            size += sum(chunk.end - chunk.begin for chunk in self._chunks(number, places))
+            if size > BATCH_BYTES:
+                yield from self._chosen(some, places, choice)
+                some, size = [], 0
         if some:
-            yield self._read(some, chunks, list(places))
+            yield from self._chosen(some, places, choice)
+
+    def _chosen(self, groups: Sequence[int], places: Mapping[str, int], choice: _Choice) -> Iterator[tuple[pa.Table, int]]:
+        before = self._left
+        if choice.only is None:
+            table = self._columns(groups, places, choice)
+            yield table, before - self._left
+            return
+        first = {name: place for name, place in places.items() if name in choice.only.columns}
+        table = self._columns(groups, first, choice)
+        kept = choice.only.holds(_fit(table, narrow(choice.only.columns, self._of)))
+        ends = np.cumsum([self._about.row_group(number).num_rows for number in groups])
+        spans = list(zip(groups, [0, *ends[:-1]], ends, strict=True))
+        held = [(number, begin, end) for number, begin, end in spans if kept[begin:end].any()]
+        if not held:
+            return
+        table = table.filter(pa.array(kept))
+        if rest := {name: place for name, place in places.items() if name not in first}:
+            more = self._columns([number for number, _, _ in held], rest, choice)
+            more = more.filter(pa.array(np.concatenate([kept[begin:end] for _, begin, end in held])))
+            table = pa.table({name: (table if name in first else more)[name] for name in places})
+        yield table, before - self._left
+
+    def _columns(self, groups: Sequence[int], places: Mapping[str, int], choice: _Choice) -> pa.Table:
+        """These columns; of a large file, texts are not read where the statistics of a row group say enough of them."""
+        texts = [name for name in places if self._body is None and self._of.columns[name] == STRING]
+        told = {name: [self._told(number, name, places[name], choice) for number in groups] for name in texts}
+        read = [name for name in places if all(text is None for text in told.get(name, ()))]
+        found = dict(zip(read, self._read(groups, {name: places[name] for name in read}).columns, strict=True)) if read else {}
+        for name in (name for name in places if name not in found):
+            unsaid = [number for number, text in zip(groups, told[name], strict=True) if text is None]
+            rest = self._read(unsaid, {name: places[name]})[name] if unsaid else None
+            pieces, done = [], 0
+            for number, text in zip(groups, told[name], strict=True):
+                rows = self._about.row_group(number).num_rows
+                if text is not None:
+                    self._spend((8 + len(text)) * rows)
+                    pieces.append(pa.repeat(text, rows))
+                elif rest is not None:
+                    pieces += rest.slice(done, rows).chunks
+                    done += rows
+            found[name] = pa.chunked_array(pieces, pa.string())
+        return pa.table({name: found[name] for name in places})
+
+    def _told(self, number: int, name: str, place: int, choice: _Choice) -> str | None:
+        """The text that all rows of a row group have; where nobody asked for the key, what all keys begin with."""
+        told = self._about.row_group(number).column(place).statistics
+        if told is None or not told.has_min_max or not told.has_null_count or told.null_count:
+            return None
+        low, high = told.min, told.max
+        if not (isinstance(low, str) and isinstance(high, str)):
+            return None
+        if low == high:
+            return low
+        own = f'{self._of.robot_of(self._entry.key)}/'
+        is_enough = name == 'key' and name not in choice.columns and low.startswith(own) and high.startswith(own)
+        return own if is_enough else None
 
     def _chunks(self, number: int, places: Mapping[str, int]) -> list[_Chunk]:
         """Raises ValueError for one that does not lie in the file or has not a value a row."""
@@ -336,8 +414,9 @@ class _Part:
             found.append(chunk)
         return found
 
-    def _read(self, groups: Sequence[int], chunks: Sequence[_Chunk], columns: Sequence[str]) -> tuple[pa.Table, int]:
-        before = self._left
+    def _read(self, groups: Sequence[int], places: Mapping[str, int]) -> pa.Table:
+        chunks = [chunk for number in groups for chunk in self._chunks(number, places)]
+        columns = list(places)
         values = sum(chunk.values for chunk in chunks)
         self._spend(values * 8)
         if self._body is not None:
@@ -349,8 +428,8 @@ class _Part:
             walked = [(chunk.name, _walk(held[chunk.begin], 0, chunk.end - chunk.begin)) for chunk in chunks]
         self._spend(sum(size for _, (size, _) in walked))
         packed = {name for name, (_, has_dictionary) in walked if has_dictionary}
-        table = self._file_of(held, packed).read_row_groups(groups, columns, use_threads=False)
-        return self._plain(table, packed, values // len(columns)), before - self._left
+        table = self._file_of(held, packed).read_row_groups(groups, columns, use_threads=held is not None)
+        return self._plain(table, packed, values // len(columns))
 
     def _file_of(self, held: Mapping[int, bytes] | None, packed: set[str]) -> pq.ParquetFile:
         """Texts that stand in dictionaries stay there, until it is known how long they would be altogether."""
@@ -478,6 +557,17 @@ _COLUMN: Final[_Fields] = {3: {1: None, 16: {1: None, 2: None, 3: None}}, 8: Non
 """Of a ColumnChunk: its metadata (type, size statistics), crypto metadata, encrypted metadata."""
 _FOOTER: Final[_Fields] = {4: {1: _COLUMN}}
 """Of the FileMetaData its row groups, and their columns."""
+_NUMBER: Final = rb'[\x80-\xff]{0,9}[\x00-\x7f]'
+_BYTES: Final = b'(?:' + b'|'.join(re.escape(bytes([size])) + b'.{%d}' % size for size in range(128)) + b')'
+_USUAL: Final = re.compile(
+    b''.join((
+        rb'\x26N\x1c\x15([\x00-\x7f])\x19(?:\x15N|\x25NN|\x35NNN|\x45NNNN)\x19\x18B\x15N\x16N\x16N\x16N\x26N',
+        rb'(?:\x26N\x1c|\x3c)(?:[\x18\x28\x38\x48\x58]B|[\x16\x26\x36\x46]N|[\x11\x12\x21\x22])*\x00',
+        rb'\x19(?:\x1c(?:\x15N){3}\x00|\x2c(?:(?:\x15N){3}\x00){2}|\x3c(?:(?:\x15N){3}\x00){3}|\x4c(?:(?:\x15N){3}\x00){4})',
+        rb'(?:\x3c(?:(\x16)N\x19|\x29)\x06\x19(?=([\x06\x16\x26]))(?:\x06|\x16N|\x26NN)\x00)?\x00\x00',
+    )).replace(b'N', _NUMBER).replace(b'B', _BYTES), re.DOTALL,
+)  # fmt: skip
+"""A ColumnChunk as pyarrow writes it: its type, whether its size statistics have bytes, and the head of their list of levels."""
 _BYTE_ARRAY: Final = 6
 _FIXED: Final = {1: 1, 2: 1, 3: 1, 7: 8}
 """Bytes of flags, bytes and doubles."""
@@ -543,9 +633,19 @@ def _listed(data: bytes, at: int, wanted: _Fields | None) -> tuple[list[dict[int
         raise ValueError('its footer cannot be read')
     found = []
     for _ in range(count):
-        fields, at = _picked(data, at, wanted)
+        if wanted is _COLUMN and (usual := _USUAL.match(data, at)):
+            fields, at = _of_usual(*usual.groups()), usual.end()
+        else:
+            fields, at = _picked(data, at, wanted)
         found.append(fields)
     return found, at
+
+
+@lru_cache(maxsize=256)
+def _of_usual(kind: bytes, size: bytes | None, levels: bytes | None) -> dict[int, Any]:
+    """What ``_picked`` would have picked of it; nobody changes it."""
+    sizes = {} if levels is None else {16: {**({1: True} if size else {}), 2: 0, 3: levels[0] >> 4}}
+    return {3: {1: _zigzag(kind, 0)[0], **sizes}}
 
 
 def _list_head(data: bytes, at: int) -> tuple[int, int, int]:

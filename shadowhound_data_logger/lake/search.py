@@ -47,7 +47,7 @@ MOST_DOCUMENTS: Final = 1000
 AT_A_TIME: Final = 500
 MOST_BYTES: Final = 2 << 30
 _TRIES: Final = 5
-_VERSION: Final = 1
+_VERSION: Final = 2
 _SCHEMA: Final = f"""
 CREATE TABLE documents (
   id INTEGER PRIMARY KEY, kind TEXT NOT NULL, robot TEXT NOT NULL, run_id TEXT, mission_id TEXT, mission_type TEXT,
@@ -55,12 +55,13 @@ CREATE TABLE documents (
 );
 CREATE INDEX by_run ON documents (robot, run_id) WHERE kind = 'mission';
 CREATE INDEX by_label ON documents (robot, kind, since_ns) WHERE kind = 'label';
+CREATE TABLE updates (begun_ns INTEGER NOT NULL, waiting INTEGER NOT NULL);
 CREATE VIRTUAL TABLE words USING fts5(title, text, tokenize = "unicode61 remove_diacritics 2", prefix = '2 3');
 PRAGMA application_id = 1397246276;
 PRAGMA user_version = {_VERSION};
 """
 _FOUND: Final = (
-    'SELECT kind, robot, mission_id, run_id, mission_type, success, since_ns, until_ns, bucket, key, title,'
+    'SELECT documents.id AS id, kind, robot, mission_id, run_id, mission_type, success, since_ns, until_ns, bucket, key, title,'
     " snippet(words, -1, '', '', ' ... ', 16) AS excerpt, -bm25(words, 4.0, 1.0) AS score"
     ' FROM words JOIN documents ON documents.id = words.rowid WHERE words MATCH ?'
 )
@@ -68,6 +69,12 @@ _REACHES: Final = (
     "EXISTS (SELECT 1 FROM json_each(?) AS span WHERE ifnull(json_extract(span.value, '$[0]'), robot) = robot"
     " AND since_ns <= json_extract(span.value, '$[2]') AND until_ns >= json_extract(span.value, '$[1]'))"
 )
+_SAID: Final = (
+    "documents AS said JOIN words AS named ON named.rowid = said.id WHERE said.kind = 'label' AND said.robot = documents.robot"
+    ' AND said.since_ns <= documents.until_ns AND said.until_ns >= documents.since_ns'
+)
+"""The labels of a document's time."""
+_LABELS: Final = f'SELECT DISTINCT named.title FROM documents, {_SAID} AND documents.id = ? AND said.id != ?'  # noqa: S608 - our own
 _TERM: Final = re.compile(r'\s*(?P<not>-)?(?:"(?P<phrase>[^"]*)"|(?P<word>[^\s"]+))(?P<prefix>\*)?')
 
 
@@ -88,6 +95,7 @@ def update(path: Path, source: Bucket, findings: Findings | None = None) -> Inde
     findings = Findings() if findings is None else findings
     path.parent.mkdir(parents=True, exist_ok=True)
     is_new = not path.exists() or path.stat().st_size == 0
+    begun_ns = time.time_ns()
     with _opened(path, is_new=is_new) as db:
         added, waiting = 0, 0
         for robot in robots(source):
@@ -107,6 +115,8 @@ def update(path: Path, source: Bucket, findings: Findings | None = None) -> Inde
             db.execute("DELETE FROM words WHERE rowid IN (SELECT id FROM documents WHERE kind = 'label')")
             db.execute("DELETE FROM documents WHERE kind = 'label'")
             add(db, (_of_label(each) for each in labels.read(source, findings=findings)))
+            db.execute('DELETE FROM updates')
+            db.execute('INSERT INTO updates VALUES (?, ?)', (begun_ns, waiting))
         (count,) = db.execute('SELECT count(*) FROM documents').fetchone()
     return Indexed(added, count, waiting)
 
@@ -114,8 +124,8 @@ def update(path: Path, source: Bucket, findings: Findings | None = None) -> Inde
 def search(path: Path, text: str, asked: Wanted, *, kind: str | None = None, limit: int = 20) -> list[dict[str, Any]]:
     """The best documents, the best first.
 
-    Each has ``kind robot mission_id run_id mission_type success since_ns until_ns bucket key title excerpt score``.
-    Raises SettingError for what is no query, LakeError for a file that is no index.
+    Each has ``kind robot mission_id run_id mission_type success since_ns until_ns bucket key title excerpt score``, and as
+    ``labels`` those of its time. Raises SettingError for what is no query, LakeError for a file that is no index.
     """
     match = match_of(text)
     conditions, values = _conditions(asked, kind)
@@ -123,7 +133,20 @@ def search(path: Path, text: str, asked: Wanted, *, kind: str | None = None, lim
     with _opened(path) as db:
         db.row_factory = sqlite3.Row
         found = [dict(row) for row in db.execute(query, (match, *values, limit))]
+        for row in found:
+            number = row.pop('id')
+            row['labels'] = sorted(name for (name,) in db.execute(_LABELS, (number, number)))
     return [{**row, 'success': None if row['success'] is None else bool(row['success'])} for row in found]
+
+
+def updated(path: Path) -> tuple[int, int] | None:
+    """When the last update of an index began, by this machine's clock, and how many missions had no summary yet; None before one.
+
+    Raises LakeError.
+    """
+    with _opened(path) as db:
+        found: tuple[int, int] | None = db.execute('SELECT begun_ns, waiting FROM updates').fetchone()
+    return found
 
 
 def match_of(text: str) -> str:
@@ -172,9 +195,7 @@ def _conditions(asked: Wanted, kind: str | None) -> tuple[list[str], list[Any]]:
     for chosen in asked.chosen:
         must(_REACHES, json.dumps(chosen.spans))
     if asked.label is not None:
-        must("EXISTS (SELECT 1 FROM documents AS said JOIN words AS named ON named.rowid = said.id WHERE said.kind = 'label'"
-             ' AND said.robot = documents.robot AND said.since_ns <= documents.until_ns AND said.until_ns >= documents.since_ns'
-             ' AND named.title = ?)', asked.label)  # fmt: skip
+        must(f'EXISTS (SELECT 1 FROM {_SAID} AND named.title = ?)', asked.label)  # noqa: S608 - our own
     return conditions, values
 
 

@@ -58,6 +58,8 @@ class Wanted:
     mission_type: str | None = None
     success: bool | None = None
     """How the mission ended by its ``summary.json``; of one that goes on, neither is true."""
+    policy: str | None = None
+    """Of missions at whose beginning this policy was active, by their ``summary.json``: a name, ``NAME@7`` or an id."""
     where: str | None = None
     """SQL, such as ``battery_pct < 30``."""
     label: str | None = None
@@ -93,7 +95,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
     near: tuple[float, float, float] | str | None = None, robot: str | None = None, sensor: str | None = None,
     topic: str | None = None, mission: str | None = None, mission_type: str | None = None, success: bool | None = None,
     where: str | None = None, ranges: Sequence[Mapping[str, Any]] | None = None,
-    label: str | None = None,
+    label: str | None = None, policy: str | None = None,
 ) -> Wanted:  # fmt: skip
     """The query with these flags. Raises SettingError for an invalid one.
 
@@ -101,7 +103,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
     """
     asked = Wanted(
         robot=robot, sensor=sensor, topic=topic, mission=mission, mission_type=mission_type, success=success, where=where,
-        label=label, since_ns=None if since is None else moment('since', since, now_ns),
+        label=label, policy=policy, since_ns=None if since is None else moment('since', since, now_ns),
         until_ns=None if until is None else moment('until', until, now_ns),
         near=None if near is None else _circle(near),
     )  # fmt: skip

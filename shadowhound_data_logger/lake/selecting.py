@@ -14,7 +14,7 @@ from shadowhound_data_logger.catalogue.schema import SENSOR
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import labels, query  # first: it turns Daft's telemetry off
-from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.bucket import Bucket, default_source
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prefetch import Place
@@ -38,7 +38,7 @@ def place(source: Bucket | Path | str | None) -> tuple[Place, Bucket]:
                 remedy='fetch by a query, such as --since yesterday: a prefix alone brings no rows',
             )
         return Place(StoreSettings(), Path(source).absolute()), fetched(Path(source))
-    found = source or query.default_source()
+    found = source or default_source()
     return Place(found.settings), found
 
 

@@ -10,7 +10,6 @@ opened, and what they say counts: the answer is that of a loop over all messages
 
 from __future__ import annotations
 
-import math
 import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,7 +24,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from shadowhound_data_logger.catalogue.statistics import STATISTICS
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.conditions import COMPARISONS, NUMBER
 from shadowhound_data_logger.encode.image import of_jpeg
 from shadowhound_data_logger.encode.pointcloud import of_points
@@ -40,13 +39,14 @@ from shadowhound_data_logger.encode.statistics import (
     values_of,
 )
 from shadowhound_data_logger.errors import DataLoggerError, LakeError, ObjectRefused, SettingError
-from shadowhound_data_logger.lake import query
-from shadowhound_data_logger.lake.bucket import THREADS, Bucket
+from shadowhound_data_logger.lake import labels
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket, default_source
 from shadowhound_data_logger.lake.decode import cloud_points, extension_of, records
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import OBJECTS, newest, watermarks
-from shadowhound_data_logger.lake.reading import arrow_schema, narrow, tables
-from shadowhound_data_logger.lake.scan import folders
+from shadowhound_data_logger.lake.live_files import robots
+from shadowhound_data_logger.lake.reading import Only, narrow, tables
+from shadowhound_data_logger.lake.scan import catalogue_rows, folders, planned
 from shadowhound_data_logger.lake.select import LONGEST_BATCH_NS, TimeSpan, Wanted, wanted
 from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
 
@@ -75,11 +75,12 @@ _TINY: Final = 2.0**-140
 _SIGNS: Final = {'=': '==', '<>': '!='}
 _JSON, _JPEG, _PCD = 'json', 'jpg', 'pcd'
 _KEY: Final = ('bucket', 'key', 't_start_ns')
-_TIMES: Final = ('robot', 'topic', 't_start_ns', 't_end_ns', 'count')
-_OBJECT: Final = (*_TIMES, 'bucket', 'key')
-_WHOLE: Final = ('t_start_ns', 'field', 'count', 'nan_count')
-_STATISTIC: Final = (*_KEY, 'field', *NUMBERS)
-Bound = tuple[str, float, float]
+_SEEN: Final = ('sensor', 'topic', 't_start_ns', 't_end_ns')
+"""Columns of all rows of the catalogue, by which is chosen which objects are judged."""
+_OBJECT: Final = (*_SEEN, 'count', 'bucket', 'key')
+_STATISTIC: Final = ('t_start_ns', 'field', *NUMBERS)
+_BY_QUERY: Final = ('near', 'mission', 'mission_type', 'success', 'policy', 'where')
+"""Flags for which Daft is needed."""
 Mask = NDArray[np.bool_]
 
 
@@ -226,66 +227,223 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
     if flags.get('sensor', sensor) != sensor:
         raise SettingError('sensor', flags['sensor'], f'{sensor}, of which the condition is; leave it out')
     findings = Findings() if findings is None else findings
-    source = source or query.default_source()
+    source = source or default_source()
     flags = {**flags, 'sensor': sensor}
-    asked = query.labelled(source, wanted(time.time_ns(), **flags), findings)
-    rows, statistics, objects = _candidates(source, asked, flags, expression, findings)
-    told = _Told(rows, statistics, findings)
-    may, must, is_known = told.judged(expression)
-    to_open = np.flatnonzero(may & ~must & (is_known | scan))
-    found = [*_whole(rows, np.flatnonzero(must), sensor)]
-    unread = int(np.count_nonzero(may & ~must & ~is_known)) if not scan else 0
-    for number, some in _opened(source, rows, to_open, expression, findings):
-        if some is None:
-            unread += 1
+    asked = labels.labelled(source, wanted(time.time_ns(), **flags), findings)
+    found: list[Range] = []
+    fresh: list[Freshness] = []
+    fields: set[str] = set()
+    objects = opened = unknown = 0
+    for robot in [asked.robot] if asked.robot else robots(source):
+        of = _Question(source, replace(asked, robot=robot), {**flags, 'robot': robot}, robot, expression, findings)
+        answer = of.answer(scan=scan, join_ns=round(join_s * SECOND), pad_ns=round(pad_s * SECOND))
+        found += answer.ranges
+        fresh += answer.fresh
+        fields.update(answer.fields)
+        objects, opened, unknown = objects + answer.objects, opened + answer.opened, unknown + answer.unknown
+    return ValueAnswer(tuple(found), objects, opened, unknown, tuple(fresh), () if found or unknown else tuple(sorted(fields)))
+
+
+class _Question:
+    """A condition on the objects of one robot."""
+
+    def __init__(self, source: Bucket, asked: Wanted, flags: Mapping[str, Any], robot: str, expression: Expression,
+                 findings: Findings) -> None:  # fmt: skip
+        self._source = source
+        self._asked = asked
+        self._flags = flags
+        self._robot = robot
+        self._expression = expression
+        self._findings = findings
+        self._parts = [entry for day in folders(source, asked, findings, STATISTICS) for entry in day.entries]
+
+    def answer(self, *, scan: bool, join_ns: int, pad_ns: int) -> ValueAnswer:
+        rows, told, seen = self._candidates()
+        may, must, is_known = told.judged(self._expression)
+        to_open = np.flatnonzero(may & ~must & (is_known | scan))
+        unknown = 0 if scan else int(np.count_nonzero(may & ~must & ~is_known))
+        spans = [_whole(rows, np.flatnonzero(must))]
+        for some in _opened(self._source, rows, to_open, self._expression, self._findings):
+            if some is None:
+                unknown += 1
+            else:
+                spans.append(np.array(some, np.int64).reshape(-1, 3))
+        found = _joined_spans(np.concatenate(spans), join_ns)
+        for chosen in self._asked.chosen:
+            found = (
+                found if chosen.keys else _clipped(found, [span for span in chosen.spans if span.robot in {None, self._robot}])
+            )
+        if pad_ns:
+            found = _joined_spans(found + np.array([-pad_ns, pad_ns, 0]), 0)
+        sensor = leaves(self._expression)[0].sensor
+        return ValueAnswer(
+            tuple(Range(self._robot, sensor, *each) for each in found.tolist()), seen.objects, len(to_open), unknown,
+            tuple(self._freshness(seen)), () if len(found) or unknown else tuple(self._fields_instead(seen)),
+        )  # fmt: skip
+
+    def _candidates(self) -> tuple[pa.Table, _Told, _Sieve]:
+        """The objects that have to be judged, by their times, and what their statistics say; no other meets the condition.
+
+        The first comparisons say so of objects that have a time of their own. Keys make most of the bytes of a part: they are
+        read only of what is left.
+        """
+        wholes = self._wholes()
+        stamps = _stamps(wholes)
+        known, counts = np.unique(stamps, return_counts=True)
+        known = np.setdiff1d(known[counts == 1], stamps[_absurd(wholes)], assume_unique=True)
+        leads = list(dict.fromkeys(_leads(self._expression)))
+        left_out = stamps[_numbers(wholes, 'nan_count') > 0]
+        found = [self._lead(lead, with_exact=len(left_out) > 0) for lead in leads]
+        chosen = np.unique(np.concatenate([_stamps(table) for table, _ in found]))
+        for _, exact in found:
+            chosen = np.union1d(chosen, np.setdiff1d(left_out, exact))
+        rows, seen = self._rows(chosen, known)
+        if len(repeated := seen.repeated()):
+            rows, seen = self._rows(chosen, np.setdiff1d(known, repeated, assume_unique=True))
+        stamps = _stamps(rows)
+        if not _is_among(stamps, known).all() or len(repeated):  # by their times alone they cannot be told apart
+            statistics = self._statistics(leaves(self._expression), stamps, _KEY)
+            return rows, _Told(rows, statistics, _KEY, self._findings), seen
+        others = [leaf for leaf in leaves(self._expression) if leaf not in leads]
+        tables = [wholes.filter(pa.array(_is_among(_stamps(wholes), stamps))), *(table for table, _ in found)]
+        if others:
+            tables.append(self._statistics(others, stamps))
+        return rows, _Told(rows, pa.concat_tables(tables).combine_chunks(), _KEY[-1:], self._findings), seen
+
+    def _rows(self, chosen: NDArray[np.int64], known: NDArray[np.int64]) -> tuple[pa.Table, _Sieve]:
+        """The rows of the catalogue at the chosen times, and those that are not known."""
+        sieve = _Sieve(self._asked, chosen, known)
+        found = [narrow(_OBJECT).empty_table()]
+        if any(self._flags.get(name) is not None for name in _BY_QUERY):
+            from shadowhound_data_logger.lake import query  # noqa: PLC0415 - Daft takes half a second
+
+            with query.answering():
+                table = query.objects(self._source, findings=self._findings, **self._flags).select(*_OBJECT).to_arrow()
+            table = table.cast(narrow(_OBJECT)).combine_chunks()
+            found.append(table.filter(pa.array(sieve(table))))
         else:
-            found += [Range(rows['robot'][number].as_py(), sensor, *each) for each in some]
-    joined = _joined_ranges(found, round(join_s * SECOND))
-    for chosen in asked.chosen:
-        joined = joined if chosen.keys else _clipped(joined, chosen.spans)
-    padded = _joined_ranges((replace(each, since_ns=each.since_ns - round(pad_s * SECOND), until_ns=each.until_ns + round(
-        pad_s * SECOND)) for each in joined), 0) if pad_s else joined  # fmt: skip
-    return ValueAnswer(tuple(padded), len(objects), len(to_open), unread, tuple(_freshness(source, asked, objects, findings)),
-                  () if found or unread else tuple(_fields_instead(source, asked, expression, objects, findings)))  # fmt: skip
+            for parts in planned(self._source, self._asked, self._findings):
+                only = None if parts.once or parts.gone or self._asked.chosen else Only(_SEEN, sieve)
+                some = catalogue_rows(self._source, parts, _OBJECT, self._asked, self._findings, only)
+                found += some if only else (table.filter(pa.array(sieve(table))) for table in some)
+        return pa.concat_tables(found).sort_by('t_start_ns').combine_chunks(), sieve
+
+    def _wholes(self) -> pa.Table:
+        """The rows of the objects as a whole."""
+        columns = ('t_start_ns', 'field', 'count', 'nan_count')
+        found = [_filtered(table, kept & _are(table['field'], ALL)) for table, kept in self._read((ALL, ALL), columns)]
+        table = pa.concat_tables([narrow(columns, STATISTICS).empty_table(), *found]).combine_chunks()
+        nothing = pa.nulls(len(table), pa.float64())
+        given = [table[name] if name in columns else nothing for name in _STATISTIC]
+        return pa.table(given, schema=narrow(_STATISTIC, STATISTICS))
+
+    def _lead(self, lead: Comparison, *, with_exact: bool) -> tuple[pa.Table, NDArray[np.int64]]:
+        """The statistics by which a comparison may hold, and, if asked for, the times of all objects with this very field."""
+        first = tuple(dict.fromkeys(('field', 'min', 'max', 'count', 'nan_count', lead.function or 'min')))
+
+        def may_hold(table: pa.Table) -> Mask:
+            values = {name: _numbers(table, name) for name in table.column_names if name in NUMBERS}
+            return _by_statistics(lead, values)[0] | _contradictory(values)
+
+        def is_worth_reading(table: pa.Table) -> Mask:
+            return _named(table, [lead.field]) & (may_hold(table) | np.isnan(_numbers(table, 'min')))
+
+        found = [narrow(_STATISTIC, STATISTICS).empty_table()]
+        exact = [np.zeros(0, np.int64)]
+        for table, kept in self._of_fields([lead.field], _STATISTIC, None if with_exact else Only(first, is_worth_reading)):
+            found.append(_filtered(table, kept & may_hold(table)))
+            if with_exact:
+                exact.append(_stamps(table)[kept & _are(table['field'], lead.field)])
+        return pa.concat_tables(found), np.concatenate(exact)
+
+    def _statistics(self, of: Sequence[Comparison], stamps: NDArray[np.int64], key: Sequence[str] = ()) -> pa.Table:
+        """The rows at these times of the fields that are asked for, and with a ``key`` those of the objects as a whole, too."""
+        columns = tuple(dict.fromkeys((*key, *_STATISTIC)))
+        only = Only(('t_start_ns',), lambda table: _is_among(_stamps(table), stamps))
+        names = [*([ALL] if key else []), *sorted({each.field for each in of})]
+        found = (_filtered(table, kept) for table, kept in self._of_fields(names, columns, only))
+        return pa.concat_tables([narrow(columns, STATISTICS).empty_table(), *found]).combine_chunks()
+
+    def _of_fields(self, names: Sequence[str], columns: Sequence[str], only: Only | None = None
+                   ) -> Iterator[tuple[pa.Table, Mask]]:  # fmt: skip
+        """Rows, and which of them are of fields that are among the names, or begin with one of them."""
+        for table, kept in self._read((names[0], f'{names[-1]}.\U0010ffff'), columns, only):
+            yield table, kept & _named(table, names)
+
+    def _read(self, names: tuple[str, str], columns: Sequence[str], only: Only | None = None
+              ) -> Iterator[tuple[pa.Table, Mask]]:  # fmt: skip
+        """Rows, and which are of the sensor and the time that is asked for; of fields whose names lie between two, and others."""
+        asked = self._asked
+        narrowed = Wanted(robot=asked.robot, sensor=asked.sensor, since_ns=asked.since_ns, until_ns=asked.until_ns,
+                          bounds=(('field', *names),))  # fmt: skip
+        for table in tables(self._source, self._parts, ('sensor', *columns), self._findings, narrowed, STATISTICS, only):
+            stamps = _stamps(table)
+            kept = _are(table['sensor'], asked.sensor) & (stamps >= max(asked.since_ns or 0, 0))
+            yield table.select(columns), kept if asked.until_ns is None else kept & (stamps < asked.until_ns)
+
+    def _fields_instead(self, seen: _Sieve) -> Iterator[str]:
+        """The fields of the newest objects, where one that is asked for is not among them."""
+        found: set[str] = set()
+        for table, kept in self._read((ALL, '\U0010ffff'), ('t_start_ns', 'field')):
+            is_new = kept & (_stamps(table) >= seen.newest_ns - LONGEST_BATCH_NS)
+            found.update(pc.unique(_filtered(table, is_new)['field']).to_pylist())
+        found -= {ALL}
+        if not all(any(covers(leaf.field, name) for name in found) for leaf in leaves(self._expression)):
+            yield from found
+
+    def _freshness(self, seen: _Sieve) -> Iterator[Freshness]:
+        for topic, newest_ns in seen.ends.items():
+            told = newest(self._source, robot=self._robot, topic=topic, sink=OBJECTS, since_ns=self._asked.since_ns,
+                          findings=self._findings)  # fmt: skip
+            marks = [row['to_ns'] for row in watermarks(told.to_pylist())]
+            yield Freshness(self._robot, topic, newest_ns, max(marks, default=None))
 
 
-def _candidates(source: Bucket, asked: Wanted, flags: Mapping[str, Any], expression: Expression,
-                findings: Findings) -> tuple[pa.Table, pa.Table, pa.Table]:  # fmt: skip
-    """The objects that have to be judged, their statistics, and the times of all objects.
+class _Sieve:
+    """Sees the rows of the catalogue, some at a time, and lets through what has to be judged."""
 
-    Where every object has statistics of all its fields, those that first comparisons rule out are left out, and most row groups
-    are not even read. Keys and names make most of a part's bytes: they are read only where an object has to be told by them.
-    """
-    times = _catalogue(source, flags, _TIMES, findings)
-    whole = _read_all(source, asked, findings, (ALL, ALL), _WHOLE)
-    is_plain = len(pc.unique(times['robot'])) == 1 and not pc.any(pc.greater(whole['nan_count'], 0)).as_py()
-    stamps, told = np.sort(_stamps(times)), np.sort(_stamps(whole))
-    if is_plain and np.array_equal(stamps, told) and (np.diff(stamps) > 0).all():
-        return *_led(source, asked, expression, findings, times, whole), times
-    rows = _catalogue(source, flags, _OBJECT, findings).sort_by([('robot', 'ascending'), ('t_start_ns', 'ascending')])
-    return rows, _statistics(source, asked, leaves(expression), findings), times
+    def __init__(self, asked: Wanted, chosen: NDArray[np.int64], known: NDArray[np.int64]) -> None:
+        """Both are in order: the times of objects that are wanted whatever they are, and of those that have statistics."""
+        self._asked = asked
+        self._chosen = chosen
+        self._known = known
+        self._seen: list[NDArray[np.int64]] = []
+        self.objects = 0
+        self.newest_ns = 0
+        self.ends: dict[str, int | None] = {}
+        """By topic the end of its newest object."""
 
+    def __call__(self, table: pa.Table) -> Mask:
+        asked = self._asked
+        stamps = np.asarray(pc.fill_null(table['t_start_ns'], -1).to_numpy())
+        kept: Mask = (stamps >= max(asked.since_ns or 0, EARLIEST_SANE_NS)) & _are(table['sensor'], asked.sensor)
+        if asked.until_ns is not None:
+            kept &= stamps < asked.until_ns
+        if asked.topic is not None:
+            kept &= _are(table['topic'], asked.topic)
+        self._count(_filtered(table, kept))
+        inside = np.sort(stamps[kept])
+        self._seen.append(inside)
+        low, high = np.searchsorted(self._known, inside[[0, -1]]) if len(inside) else (0, 0)
+        if len(inside) and np.array_equal(self._known[low : high + 1], inside):
+            return kept & _is_among(stamps, self._chosen)
+        return kept & (_is_among(stamps, self._chosen) | ~_is_among(stamps, self._known))
 
-def _led(source: Bucket, asked: Wanted, expression: Expression, findings: Findings, times: pa.Table,
-         whole: pa.Table) -> tuple[pa.Table, pa.Table]:  # fmt: skip
-    """The objects for which the first comparisons may hold, each told from all others by its time, and their statistics."""
-    leads = _leads(expression)
-    of_leads = []
-    for lead in dict.fromkeys(leads):
-        first = _statistics(source, asked, [lead], findings, _bounds_of(lead))
-        told = {name: _numbers(first, name) for name in NUMBERS}
-        some, _ = _by_statistics(lead, told)
-        of_leads.append(first.filter(pa.array(some | _contradictory(told))))
-    chosen = np.unique(_stamps(pa.concat_tables(of_leads)))
-    others = [leaf for leaf in leaves(expression) if leaf not in leads]
-    found = pa.concat_tables([*of_leads, *([_only_at(_statistics(source, asked, others, findings), chosen)] if others else [])])
-    keys = found.select(['bucket', 'key', 't_start_ns']).group_by(list(_KEY)).aggregate([])
-    objects = _only_at(times, chosen).join(keys, keys='t_start_ns', join_type='inner')
-    common = _only_at(whole, chosen).join(keys, keys='t_start_ns', join_type='inner')
-    nothing = {name: pa.nulls(len(common), pa.float64()) for name in ('first', 'last', 'min', 'max', 'mean')}
-    wholes = pa.table({**{name: common[name] for name in common.column_names}, **nothing}).select(_STATISTIC)
-    objects = objects.select([name for name in _OBJECT if name in objects.column_names])
-    return objects.sort_by('t_start_ns').combine_chunks(), pa.concat_tables([found, wholes.cast(found.schema)]).combine_chunks()
+    def repeated(self) -> NDArray[np.int64]:
+        """Times that several rows have."""
+        stamps = np.sort(np.concatenate([np.zeros(0, np.int64), *self._seen]), kind='stable')
+        return np.unique(stamps[1:][np.diff(stamps) == 0])
+
+    def _count(self, table: pa.Table) -> None:
+        self.objects += len(table)
+        if not len(table):
+            return
+        self.newest_ns = max(self.newest_ns, pc.max(table['t_start_ns']).as_py())
+        for topic in pc.unique(table['topic']).to_pylist():
+            of = table['t_end_ns'] if topic is None else table['t_end_ns'].filter(pa.array(_are(table['topic'], topic)))
+            self.ends[topic] = max(
+                (each for each in (self.ends.get(topic), pc.max(of).as_py()) if each is not None), default=None
+            )
 
 
 def _leads(expression: Expression) -> list[Comparison]:
@@ -296,87 +454,45 @@ def _leads(expression: Expression) -> list[Comparison]:
     return min(found, key=len) if expression.word == 'and' else [lead for part in found for lead in part]
 
 
-def _bounds_of(leaf: Comparison) -> tuple[Bound, ...]:
-    """What a statistic must be at least and at most where the comparison may hold."""
-    name = leaf.function or {'>': 'max', '>=': 'max', '<': 'min', '<=': 'min'}.get(leaf.sign)
-    if name is None or leaf.sign in {'==', '!='} or name in {'count', 'nan_count', 'mean'}:
-        return ()
-    low, high = (leaf.number, math.inf) if leaf.sign in {'>', '>='} else (-math.inf, leaf.number)
-    return ((name, low, high),)
-
-
-def _catalogue(source: Bucket, flags: Mapping[str, Any], columns: Sequence[str], findings: Findings) -> pa.Table:
-    with query.answering():
-        found = query.objects(source, findings=findings, **flags).select(*columns, 't_start').to_arrow()
-    found = found.cast(narrow([*columns, 't_start'])).combine_chunks()
-    return found.filter(pc.is_valid(found['t_start'])).select(columns)
-
-
 def _stamps(table: pa.Table) -> NDArray[np.int64]:
-    return np.asarray(table['t_start_ns'].to_numpy())
+    """No sane row has -1."""
+    return np.asarray(pc.fill_null(table['t_start_ns'], -1).to_numpy())
 
 
-def _only_at(table: pa.Table, stamps: NDArray[np.int64]) -> pa.Table:
-    return table.filter(pc.is_in(table['t_start_ns'], value_set=pa.array(stamps)))
+def _is_among(stamps: NDArray[np.int64], of: NDArray[np.int64]) -> Mask:
+    """Whether each is among some others, which are in order."""
+    if not len(of):
+        return np.zeros(len(stamps), bool)
+    found: Mask = of[np.minimum(np.searchsorted(of, stamps), len(of) - 1)] == stamps
+    return found
 
 
-def _statistics(source: Bucket, asked: Wanted, of: Sequence[Comparison], findings: Findings,
-                bounds: tuple[Bound, ...] | None = None) -> pa.Table:  # fmt: skip
-    """The rows of the fields that are asked for; without bounds those of the objects as a whole, too."""
-    names = sorted({each.field for each in of})
-    is_wide = bounds is None
-    found = [arrow_schema(STATISTICS).empty_table().select(_STATISTIC)]
-    for table in _read(source, asked, findings, (ALL if is_wide else names[0], f'{names[-1]}.\U0010ffff'), bounds=bounds or ()):
-        kept = pc.equal(table['field'], ALL) if is_wide else pa.scalar(value=False)
-        for name in names:
-            kept = pc.or_(kept, pc.or_(pc.equal(table['field'], name), pc.starts_with(table['field'], f'{name}.')))
-        found.append(table.filter(kept).select(_STATISTIC))
-    return pa.concat_tables(found).combine_chunks()
+def _are(column: pa.ChunkedArray, value: str | None) -> Mask:
+    return np.asarray(pc.fill_null(pc.equal(column, value), fill_value=False).to_numpy())
 
 
-def _read_all(source: Bucket, asked: Wanted, findings: Findings, names: tuple[str, str], columns: Sequence[str]) -> pa.Table:
-    nothing = arrow_schema(STATISTICS).empty_table().select(columns)
-    found = (
-        table.filter(pc.equal(table['field'], ALL)).select(columns) for table in _read(source, asked, findings, names, columns)
-    )
-    return pa.concat_tables([nothing, *found]).combine_chunks()
+def _named(table: pa.Table, names: Sequence[str]) -> Mask:
+    """Which rows are of fields that are among the names, or begin with one of them."""
+    found = np.zeros(len(table), bool)
+    for name in names:
+        begins = pc.fill_null(pc.starts_with(table['field'], f'{name}.'), fill_value=False)
+        found |= _are(table['field'], name) | begins.to_numpy()
+    return found
 
 
-def _read(source: Bucket, asked: Wanted, findings: Findings, names: tuple[str, str], columns: Sequence[str] = (),
-          bounds: tuple[Bound, ...] = ()) -> Iterator[pa.Table]:  # fmt: skip
-    """The statistics of a sensor in the time that is asked for, of fields whose names lie between two."""
-    found = folders(source, asked, findings, STATISTICS)
-    entries = [entry for day in sorted(found, key=lambda day: day.robot) for entry in day.entries]
-    narrowed = Wanted(robot=asked.robot, sensor=asked.sensor, since_ns=asked.since_ns, until_ns=asked.until_ns,
-                      bounds=(('field', *names), *bounds))  # fmt: skip
-    for table in tables(source, entries, ('sensor', *(columns or _STATISTIC)), findings, narrowed, STATISTICS):
-        kept = pc.equal(table['sensor'], asked.sensor)
-        for low, keep in ((asked.since_ns, pc.greater_equal), (asked.until_ns, pc.less)):
-            if low is not None:
-                kept = pc.and_(kept, keep(table['t_start_ns'], low))
-        yield table.filter(pc.fill_null(kept, fill_value=False))
-
-
-def _fields_instead(source: Bucket, asked: Wanted, expression: Expression, objects: pa.Table, findings: Findings) -> list[str]:
-    """The fields of the newest objects, where one that is asked for is not among them."""
-    newest_ns = pc.max(objects['t_start_ns']).as_py()
-    if newest_ns is None:
-        return []
-    found: set[str] = set()
-    for table in _read(source, replace(asked, since_ns=newest_ns - LONGEST_BATCH_NS), findings, (ALL, '\U0010ffff')):
-        found.update(pc.unique(table['field']).to_pylist())
-    found -= {ALL}
-    is_there = all(any(covers(leaf.field, name) for name in found) for leaf in leaves(expression))
-    return [] if is_there else sorted(found)
+def _filtered(table: pa.Table, kept: Mask) -> pa.Table:
+    """Without a copy where all of it is kept."""
+    return table if kept.all() else table.filter(pa.array(kept))
 
 
 class _Told:
     """What the statistics say of each object, by its row."""
 
-    def __init__(self, rows: pa.Table, statistics: pa.Table, findings: Findings) -> None:
+    def __init__(self, rows: pa.Table, statistics: pa.Table, key: Sequence[str], findings: Findings) -> None:
+        """``key`` tells the rows apart, and which statistics are whose."""
         self._objects = len(rows)
-        numbered = rows.select(_KEY).append_column('_row', pa.array(np.arange(len(rows)), pa.int64()))
-        found = statistics.join(numbered, keys=list(_KEY), join_type='inner').combine_chunks()
+        numbered = rows.select(key).append_column('_row', pa.array(np.arange(len(rows)), pa.int64()))
+        found = statistics.join(numbered, keys=list(key), join_type='inner').combine_chunks()
         self._rows = _numbers(found, '_row').astype(np.int64)
         encoded = found['field'].combine_chunks().dictionary_encode()
         if isinstance(encoded, pa.ChunkedArray):
@@ -391,10 +507,10 @@ class _Told:
         self._has[self._rows[whole]] = True
         self._left_out = np.zeros(self._objects, bool)
         self._left_out[self._rows[whole]] = self._values['nan_count'][whole] > 0
-        self._false = ~whole & _contradictory(self._values)
+        self._false = np.where(whole, _absurd(found), _contradictory(self._values))
         self._has[self._rows[self._false]] = False
-        for key in pc.unique(found['key'].filter(pa.array(self._false))).to_pylist():
-            findings.add(key, 'its statistics contradict each other')
+        for number in np.unique(self._rows[self._false]):
+            findings.add(rows['key'][int(number)].as_py(), 'its statistics contradict each other')
 
     def judged(self, expression: Expression) -> tuple[Mask, Mask, Mask]:
         """Whether the condition may hold in an object; must hold in all of it; may hold by what is known alone."""
@@ -448,11 +564,26 @@ def _by_statistics(leaf: Comparison, values: Mapping[str, NDArray[np.float64]]) 
 
 
 def _contradictory(values: Mapping[str, NDArray[np.float64]]) -> Mask:
-    """Of statistics of fields: which cannot be true."""
+    """Of statistics of fields, as far as they are given: which cannot be true."""
     low, high, count = values['min'], values['max'], values['count']
-    found: Mask = (low > high) | (count < 0) | (values['nan_count'] < 0) | ((count > 0) & (np.isnan(low) | np.isnan(high)))
-    for name in ('first', 'last'):
-        found |= (values[name] < low) | (values[name] > high)
+    found: Mask = (low > high) | np.isinf(low) | np.isinf(high)
+    for name in ('count', 'nan_count'):
+        found |= ~((values[name] >= 0) & (values[name] <= MOST_OBJECT_BYTES))
+    for name in ('first', 'last', 'min', 'max'):
+        if (value := values.get(name)) is not None:
+            found |= (value < low) | (value > high) | (np.isnan(value) == (count > 0))
+    if (mean := values.get('mean')) is not None:
+        reach = MEAN_ERROR * np.maximum(np.abs(low), np.abs(high)) + _TINY
+        found |= (mean < low - reach) | (mean > high + reach)
+    return found
+
+
+def _absurd(table: pa.Table) -> Mask:
+    """Of rows of objects as a whole: which cannot be true."""
+    found: Mask = np.zeros(len(table), bool)
+    for name in ('count', 'nan_count'):
+        values = _numbers(table, name)
+        found |= ~((values >= 0) & (values <= MOST_OBJECT_BYTES))
     return found
 
 
@@ -469,7 +600,7 @@ _Run = tuple[int, int, int]
 
 
 def _opened(source: Bucket, rows: pa.Table, numbers: NDArray[np.intp], expression: Expression,
-            findings: Findings) -> Iterator[tuple[int, list[_Run] | None]]:  # fmt: skip
+            findings: Findings) -> Iterator[list[_Run] | None]:  # fmt: skip
     """The runs in each of these objects; None where it cannot be read."""
 
     def body(row: dict[str, Any]) -> bytes | DataLoggerError:
@@ -482,14 +613,14 @@ def _opened(source: Bucket, rows: pa.Table, numbers: NDArray[np.intp], expressio
         for start in range(0, len(numbers), OPENED_AT_A_TIME):
             some = [int(number) for number in numbers[start : start + OPENED_AT_A_TIME]]
             asked = rows.take(some).to_pylist()
-            for number, row, content in zip(some, asked, pool.map(body, asked), strict=True):
+            for row, content in zip(asked, pool.map(body, asked), strict=True):
                 try:
                     if isinstance(content, DataLoggerError):
                         raise content
-                    yield number, list(_runs(row, content, expression))
+                    yield list(_runs(row, content, expression))
                 except DataLoggerError as error:
                     findings.add(row['key'], str(error))
-                    yield number, None
+                    yield None
 
 
 def _runs(row: Mapping[str, Any], body: bytes, expression: Expression) -> Iterator[_Run]:
@@ -560,37 +691,32 @@ def _met_by(expression: Expression, found: Mapping[str, Statistic], points: NDAr
 # -- ranges --------------------------------------------------------------------------------------------------------------------
 
 
-def _whole(rows: pa.Table, numbers: NDArray[np.intp], sensor: str) -> Iterator[Range]:
-    some = rows.select(['robot', 't_start_ns', 't_end_ns', 'count']).take(numbers)
-    for robot, first, last, count in zip(*(each.to_pylist() for each in some.columns), strict=True):
-        yield Range(robot, sensor, first, max(first, first if last is None else last), count or 1)
+Spans = NDArray[np.int64]
+"""A row is a time: its begin, its end, and how many messages are in it."""
 
 
-def _joined_ranges(found: Iterable[Range], apart_ns: int) -> list[Range]:
-    joined: list[Range] = []
-    for each in sorted(found, key=lambda each: (each.robot, each.since_ns, each.until_ns)):
-        last = joined[-1] if joined else None
-        if last is not None and last.robot == each.robot and each.since_ns - last.until_ns <= apart_ns:
-            joined[-1] = replace(last, until_ns=max(last.until_ns, each.until_ns), messages=last.messages + each.messages)
-        else:
-            joined.append(each)
-    return joined
+def _whole(rows: pa.Table, numbers: NDArray[np.intp]) -> Spans:
+    """Of objects all of which meet the condition."""
+    some = rows.select(['t_start_ns', 't_end_ns', 'count']).take(pa.array(numbers))
+    first, last, count = (np.asarray(pc.fill_null(column, 0).to_numpy()) for column in some.columns)
+    return np.stack((first, np.maximum(first, last), np.maximum(count, 1)), axis=1)
 
 
-def _clipped(found: Iterable[Range], within: Sequence[TimeSpan]) -> list[Range]:
-    """What of them lies in the ranges that were given; messages are then those of all of a range."""
-    clipped = []
-    for each in found:
-        for span in within:
-            low, high = max(each.since_ns, span.since_ns), min(each.until_ns, span.until_ns)
-            if low <= high and span.robot in {None, each.robot}:
-                clipped.append(replace(each, since_ns=low, until_ns=high))
-    return clipped
+def _joined_spans(found: Spans, apart_ns: int) -> Spans:
+    """In the order of their times; those that are not further apart are one."""
+    if not len(found):
+        return found
+    found = found[np.lexsort((found[:, 1], found[:, 0]))]
+    ends = np.maximum.accumulate(found[:, 1])
+    first = np.flatnonzero(np.concatenate(([True], found[1:, 0] - ends[:-1] > apart_ns)))
+    last = np.maximum.reduceat(found[:, 1], first)
+    return np.stack((found[first, 0], last, np.add.reduceat(found[:, 2], first)), axis=1)
 
 
-def _freshness(source: Bucket, asked: Wanted, rows: pa.Table, findings: Findings) -> Iterator[Freshness]:
-    ends = rows.select(['robot', 'topic', 't_end_ns']).group_by(['robot', 'topic']).aggregate([('t_end_ns', 'max')])
-    for robot, topic, newest_ns in zip(*(ends[name].to_pylist() for name in ('robot', 'topic', 't_end_ns_max')), strict=True):
-        told = newest(source, robot=robot, topic=topic, sink=OBJECTS, since_ns=asked.since_ns, findings=findings)
-        marks = [row['to_ns'] for row in watermarks(told.to_pylist())]
-        yield Freshness(robot, topic, newest_ns, max(marks, default=None))
+def _clipped(found: Spans, within: Iterable[TimeSpan]) -> Spans:
+    """What of them lies in the times that were given; messages are then those of all of a range."""
+    inside = [np.stack((np.maximum(found[:, 0], span.since_ns), np.minimum(found[:, 1], span.until_ns), found[:, 2]), axis=1)
+              for span in within]  # fmt: skip
+    clipped = np.concatenate((found[:0], *inside))
+    clipped = clipped[clipped[:, 0] <= clipped[:, 1]]
+    return clipped[np.lexsort((clipped[:, 1], clipped[:, 0]))]

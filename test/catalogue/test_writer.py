@@ -14,6 +14,7 @@ from spool.making import NOON_NS, FakeClock, assert_whole, make, new_spool, put,
 
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.config import CatalogueSettings
+from shadowhound_data_logger.encode.statistics import FieldStatistics, packed
 from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.spool.spool import Spool
@@ -224,3 +225,25 @@ def test_without_a_catalogue_nothing_piles_up(spool: Spool, clock: FakeClock) ->
     assert on.parts() == []
     delivered(spool, 'b')
     assert [keys(part) for part in on.parts()] == [['b']]
+
+
+def test_statistics_go_into_parts_of_their_own_once_the_object_is_delivered(spool: Spool, catalogue: CatalogueWriter) -> None:
+    """A row for each field and one for the object; of what is evicted, and of what has none, nothing."""
+    said = {name: FieldStatistics() for name in 'ab'}
+    said['a'].add([{'x': 1.5}, {'x': None}])
+    said['b'].add([{'x': 9.0}])
+    told = {name: packed(each.told()) for name, each in said.items()}
+    first, second, third = put(spool, of('a', statistics=told['a']), of('b', statistics=told['b']), of('c'))
+    assert catalogue.parts() == []
+    spool.commit(outcomes=[Outcome(second, State.EVICTED)])
+    deliver(spool, [first, third])
+    statistics, rows, gaps = catalogue.parts()
+    assert keys(rows) == ['a', 'c']
+    assert statistics.key.startswith('thor/_stats/date=2025-10-18/')
+    assert isinstance(statistics.body, bytes)
+    found = pyarrow.parquet.read_table(io.BytesIO(statistics.body)).to_pylist()
+    assert [(row['key'], row['field'], row['max'], row['count'], row['nan_count']) for row in found] == [
+        ('a', '', None, 2, 0), ('a', 'x', 1.5, 1, 1),
+    ]  # fmt: skip
+    spool.commit([statistics, rows, gaps])
+    assert catalogue.parts() == []

@@ -6,6 +6,7 @@ import json
 import os
 import pickle
 import random
+import re
 import resource
 import shutil
 import subprocess
@@ -13,8 +14,10 @@ import sys
 from collections.abc import Callable, Collection
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner, Result
 from hostile import bad_parts
@@ -233,3 +236,32 @@ def test_large_parts_are_read_in_pieces_and_ruled_out_by_their_statistics(
     source = watched(settings)
     assert sorted(lake.objects(source).select('key').to_pydict()['key']) == keys(rows)
     assert {verb for verb, _ in source.asked} == {'folders', 'list', 'ranges'}
+
+
+@pytest.mark.parametrize('how', [
+    {}, {'use_dictionary': False}, {'write_statistics': False}, {'write_page_index': True}, {'data_page_version': '2.0'},
+    {'compression': 'none'}, {'store_schema': True},
+])  # fmt: skip
+def test_columns_as_pyarrow_writes_them_are_known_by_a_pattern(how: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it finds of a footer is what a walk through all fields finds; and it spares that walk nearly always."""
+    rows = pa.table({'number': pa.array([1, None, 3] * 100), 'text': pa.array(['x' * (each % 200) for each in range(300)]),
+                     'none': pa.nulls(300, pa.float64()), 'float': pa.array([0.5] * 300)})  # fmt: skip
+    sink = pa.BufferOutputStream()
+    pq.write_table(rows, sink, row_group_size=50, **how)
+    body = sink.getvalue().to_pybytes()
+    begin, _ = bad_parts.footer_of(body)
+    walked: list[int] = []
+    picked = reading._picked
+    monkeypatch.setattr(reading, '_picked', lambda *given: walked.append(1) or picked(*given))
+    by_pattern = reading._picked(body, begin, reading._FOOTER)
+    shorter = len(walked)
+    monkeypatch.setattr(reading, '_USUAL', re.compile(b'(?!)'))
+    assert _sizes(by_pattern[0]) == _sizes(reading._picked(body, begin, reading._FOOTER)[0])
+    assert (shorter < (len(walked) - shorter) / 2) == (not {'write_statistics', 'write_page_index'} & set(how))
+
+
+def _sizes(footer: dict[int, Any]) -> list[Any]:
+    """Of each column its type and what its size statistics are about."""
+    columns = [column for group in footer[4] for column in group[1]]
+    about = [(column[3][1], column[3].get(16, {})) for column in columns]
+    return [(kind, sizes.get(2), sizes.get(3), 1 in sizes) for kind, sizes in about] + [set(columns[0])]

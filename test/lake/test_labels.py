@@ -91,6 +91,7 @@ def test_samples_have_labels(lake: Bucket) -> None:
     dataset = MissionDataset(lake, since='2026-10-28T11:59:50', until='2026-10-28T12:01')
     found = [(stamp - NOON_NS) // SECOND for stamp, names in zip(dataset.stamps_ns, dataset.labels(), strict=True) if names]
     assert found == [0, 15]
+    assert [(stamp - NOON_NS) // SECOND for stamp in MissionDataset(lake, label='stairs').stamps_ns] == [0, 15]
     said(lake, STAIRS, is_removal=True)
     assert not any(pickle.loads(pickle.dumps(dataset)).labels())  # noqa: S301 - our own
 

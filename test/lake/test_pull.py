@@ -21,12 +21,13 @@ from shadowhound_data_logger.cli.pull import _sentence
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
 from shadowhound_data_logger.errors import LakeError, SettingError
-from shadowhound_data_logger.lake import link
+from shadowhound_data_logger.lake import labels, link
 from shadowhound_data_logger.lake import pull as lake
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.dataset import MissionDataset
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.mailbox import KeptFilter, PullRequest
 from shadowhound_data_logger.model import Outcome, State
 from shadowhound_data_logger.ship.requests import RequestServer
@@ -53,6 +54,9 @@ class Field:
         self.server = RequestServer(self.spool, self.store, KeepSettings(), 'thor', self.clock, put=self.commit,
                                     released=lambda _: None, cutter=partial(KeptCut, home),
                                     monotonic=lambda: self.now_s)  # fmt: skip
+
+    def close(self) -> None:
+        self.spool.close()
 
     def commit(self, *items: Any) -> None:
         self.spool.commit(items)
@@ -94,7 +98,7 @@ def field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Field]:
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     yield made
-    made.spool.close()
+    made.close()
 
 
 def run(*arguments: str, code: int = 0) -> Any:
@@ -168,9 +172,31 @@ def test_a_request_is_taken_back(field: Field) -> None:
     assert (answer['state'], answer['outcomes']) == ('cancelled', {'unsent': {'objects': 1, 'bytes': 1000}})
 
 
+def test_times_labels_and_sql_choose_what_is_asked_for(field: Field, tmp_path: Path) -> None:
+    """And nothing else: the robot is asked by name, and where nothing is chosen it is asked for nothing."""
+    field.records(*range(8))
+    ranges = tmp_path / 'ranges.json'
+    spans = [{'robot': 'thor', 'since_ns': NOON_NS + at * SECOND, 'until_ns': NOON_NS + at * SECOND + 1} for at in (1, 5)]
+    ranges.write_text(json.dumps(spans))
+    seen = Label(robot='thor', label='door', since_ns=NOON_NS + 6 * SECOND, until_ns=NOON_NS + 7 * SECOND).checked()
+    labels.write(field.store, 'thor', [seen], by='x')
+    none = run('pull', '--sensor', 'camera', '--where', 'x > 100')
+    assert (none['objects'], none['id']) == (0, None)
+    assert run('pull', '--sensor', 'camera', '--label', 'nothing', '--dry-run')['objects'] == 0
+    assert run('pull', '--sensor', 'camera', '--label', 'door', '--where', 'x < 7', '--dry-run')['objects'] == 1
+    assert run('pull', '--sensor', 'camera', '--ranges', str(ranges))['objects'] == 2
+    field.passes()
+    field.passes()
+    assert field.kept() == [0, 2, 3, 4, 6, 7]
+    assert run('pull', '--sensor', 'camera', '--label', 'door')['objects'] == 2
+    field.passes()
+    field.passes()
+    assert field.kept() == [0, 2, 3, 4]
+
+
 @pytest.mark.parametrize('arguments', [
     (), ('--where', 'nonsense('), ('--bag', '../x'), ('--sensor', 'camera', '--expires', '100d'), ('--cancel', 'x'),
-    ('--failed',), ('--sensor', 'camera', '--by', '../x'),
+    ('--failed',), ('--policy', 'p'), ('--sensor', 'camera', '--by', '../x'),
 ])  # fmt: skip
 def test_what_cannot_be_asked_for_is_said(field: Field, arguments: tuple[str, ...]) -> None:
     """Before anything is written."""

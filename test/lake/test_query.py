@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
+import shutil
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from faults.front import Front
 from lake.making import DAY_NS, FAILED, FINISHED, NOON_NS, Watched, add, add_part, fill, folder_store, keys, minutes, row, watched
+from policies.models import Spark
 
 from shadowhound_data_logger import lake
 from shadowhound_data_logger.catalogue import schema
@@ -161,6 +164,31 @@ def test_a_mission_without_a_summary_is_told_without_an_end(tmp_path: Path) -> N
     assert told['success'] == [None, True]
     assert told['duration_s'] == [None, 600.0]
     assert found(source, success=False) == []
+
+
+def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> None:
+    """The mission names it, and the manifest of that very hash names the data set; one with another hash is not believed."""
+    settings = folder_store(tmp_path)
+    fill(settings, tmp_path / 'tmp', days=(0,), hours=(11,))
+    packed, manifest = Spark(tmp_path / 'spark').packed(7)
+    source = Bucket(settings, schema.BUCKET)
+    for mission, policy in ((FAILED, manifest.id), (FINISHED, f'{manifest.name}@7#{16 * "0"}')):
+        key = f'thor/missions/run-{mission}/summary.json'
+        told = json.loads(source.get(key, 1 << 20)) | {'policy': policy}
+        source.delete(key)
+        with closing(open_store(settings, UploadSettings())) as store:
+            add(store, tmp_path / 'tmp', key, json.dumps(told).encode())
+    shutil.copytree(packed, settings.directory / 'lerobot' / 'policies' / 'go2' / 'go2_patrol_v7')
+    failed = lake.sql('SELECT policy, policy_dataset FROM missions WHERE NOT success', source).to_pylist()
+    assert failed == [{'policy': manifest.id, 'policy_dataset': 64 * 'd'}]
+    assert lake.missions(source).where("mission_id = 'mfinished'").to_pydict()['policy_dataset'] == [None]
+    own, every = found(source, mission=FAILED), found(source, where='mission_id IS NOT NULL')
+    for wanted, expected in (('go2_patrol', every), ('go2_patrol@7', every), (manifest.id, own), (manifest.id[:-3], own),
+                             ('go2_patrol@', []), ('go2', []), ('go2_patrol@70', []), ('other', [])):  # fmt: skip
+        assert found(source, policy=wanted) == expected, wanted
+    assert found(source, policy='go2_patrol', success=False) == own
+    with pytest.raises(LakeError, match='cannot be selected by policy'):
+        lake.sql('SELECT * FROM gaps', source, policy='go2_patrol')
 
 
 def test_what_was_delivered_before_its_mission_had_a_run_belongs_to_it(tmp_path: Path) -> None:

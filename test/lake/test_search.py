@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import time
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -84,6 +85,8 @@ def test_the_flags_of_a_query(index: Path) -> None:
     assert missions(index, 'door', robot='tachi') == []
     assert missions(index, 'up', label='stairs') == ['m2']
     assert missions(index, 'door', label='stairs') == []
+    assert [each['labels'] for each in search.search(index, 'explore', wanted(0))] == [['stairs']]
+    assert [each['labels'] for each in search.search(index, '"door handle" OR ann', wanted(0))] == [[], []]
     times = [
         {'since_ns': NOON_NS + HOUR, 'until_ns': NOON_NS + HOUR},
         *({'since_ns': at, 'until_ns': at} for at in range(0, 9999, 2)),
@@ -94,8 +97,14 @@ def test_the_flags_of_a_query(index: Path) -> None:
 
 
 def test_an_update_reads_what_is_new(lake: Bucket, index: Path, tmp_path: Path) -> None:
-    """A second one adds nothing, and the same comes of nothing."""
+    """A second one adds nothing, and the same comes of nothing; the index tells when it was last brought up to date."""
+    before = search.updated(index)
     again = search.update(index, lake, Findings(lambda _: None))
+    after = search.updated(index)
+    assert before is not None
+    assert after is not None
+    assert before < after < (time.time_ns(), 3)
+    assert after[1] == 2
     assert (again.missions, again.documents) == (0, 7)
     fresh = tmp_path / 'search.db'
     search.update(fresh, lake, Findings(lambda _: None))

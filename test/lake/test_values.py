@@ -10,6 +10,7 @@ from contextlib import closing, suppress
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import orjson
 import pyarrow as pa
@@ -25,7 +26,8 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.encode.statistics import MOST_FIELDS, FieldStatistics
 from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.lake import query, values
+from shadowhound_data_logger.lake import compact as compacting
+from shadowhound_data_logger.lake import query, reading, values
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.findings import Findings
@@ -176,11 +178,15 @@ def test_it_is_what_a_loop_over_all_messages_finds(
     root = folder / str(examples[0])
     source = filled(root, batches, told, data.draw(st.sampled_from([(), ('a', 'n')])))
     if data.draw(st.booleans()):
-        with closing(open_store(source.settings, UploadSettings())) as store:
+        rows = data.draw(st.sampled_from([1, 4096]))
+        with closing(open_store(source.settings, UploadSettings())) as store, mock.patch.multiple(
+                compacting, GROUP_ROWS=rows, STATISTICS_ROWS=3 * rows):  # fmt: skip
             assert len([*compact(source, store, now=lambda: LATER)]) <= any(told)
+    small_bytes = mock.patch.object(reading, 'SMALL_BYTES', data.draw(st.sampled_from([10, reading.SMALL_BYTES])))
     seen = [[json.loads(orjson.dumps(message)) for message in messages] for messages in batches]
     for text in conditions:
-        found = values.ranges(text, source, scan=True, join_s=0.0)
+        with small_bytes:
+            found = values.ranges(text, source, scan=True, join_s=0.0)
         assert [(each.since_ns, each.until_ns, each.messages) for each in found.ranges] == expected(text, seen), text
         assert found.unknown == 0
 
@@ -283,19 +289,48 @@ def test_statistics_are_made_again_of_the_objects(tmp_path: Path) -> None:
     assert (found.opened, found.unknown, len(found.ranges)) == (1, 1, 1)
 
 
-@pytest.mark.parametrize('lie', [{'min': 99.0}, {'max': 1.0}, {'count': -1}, {'max': None}, {'first': 1e9}])
-def test_statistics_that_contradict_themselves_are_told(tmp_path: Path, lie: dict[str, Any]) -> None:
-    """Their object is as one without statistics, and the others are judged as ever."""
-    source = filled(tmp_path, BATCHES, [True] * 10)
+LIES: list[dict[str, Any]] = [
+    {'min': 99.0}, {'max': 1.0}, {'max': None}, {'min': math.nan}, {'max': math.nan}, {'min': -math.inf}, {'max': math.inf},
+    {'min': None, 'max': None}, {'min': None, 'max': None, 'count': 0}, {'first': 1e9}, {'last': None}, {'mean': 1e9},
+    *({name: count} for name in ('count', 'nan_count') for count in (-1, 10**15)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize('small_bytes', [reading.SMALL_BYTES, 10], ids=['small', 'large'])
+def test_statistics_that_contradict_themselves_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_bytes: int
+) -> None:
+    """Their object is as one without statistics, never one without the field, and the others are judged as ever."""
+    monkeypatch.setattr(reading, 'SMALL_BYTES', small_bytes)
+    source = filled(tmp_path, [BATCHES[-1]] * (len(LIES) + 3), [True] * (len(LIES) + 3))
     first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.parquet'))
     second.unlink()
     table = pq.read_table(first)
-    rows = [{**row, **(lie if row['field'] == 'a' and row['key'].endswith('000009_s.json') else {})} for row in table.to_pylist()]
+    rows = table.to_pylist()
+    lies = {f'thor/s/20261028/{number:06d}_s.json': lie for number, lie in enumerate(LIES)}
+    rows = [{**row, **(lies.get(row['key'], {}) if row['field'] else {})} for row in rows]
+    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), first, compression='zstd', row_group_size=3)
+    left_out = Findings(lambda _: None)
+    found = values.ranges('s.a > 12', source, findings=left_out)
+    assert [one.key for one in left_out] == sorted(lies)
+    assert (len(found.ranges), found.unknown) == (3, len(LIES))
+    assert len(values.ranges('s.a > 12', source, scan=True, findings=left_out).ranges) == len(LIES) + 3
+
+
+def test_absurd_counts_of_messages_hide_nothing(tmp_path: Path) -> None:
+    """Objects whose own row cannot be true are unknown, or opened where those of their fields give a reason to."""
+    source = filled(tmp_path, [BATCHES[-1]] * 5, [True] * 5)
+    first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.parquet'))
+    second.unlink()
+    table = pq.read_table(first)
+    rows = table.to_pylist()
+    for row, lie in zip((row for row in rows if not row['field']), LIES[-4:], strict=False):
+        row.update(lie)
     pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), first, compression='zstd')
     left_out = Findings(lambda _: None)
-    found = values.ranges('s.a > 11', source, findings=left_out)
-    assert (len(found.ranges), found.unknown, [one.key for one in left_out]) == (1, 1, ['thor/s/20261028/000009_s.json'])
-    assert len(values.ranges('s.a > 11', source, scan=True, findings=left_out).ranges) == 2
+    found = values.ranges('s.a > 12', source, findings=left_out)
+    assert (len(found.ranges), found.opened, found.unknown, len(left_out)) == (5, 5, 0, 4)
+    assert values.ranges('s.b > 12', source, findings=left_out).unknown == 4
 
 
 def test_hostile_statistics_are_left_out(tmp_path: Path) -> None:
@@ -314,3 +349,21 @@ def test_hostile_statistics_are_left_out(tmp_path: Path) -> None:
     found = values.ranges('s.a > 11', source, findings=left_out)
     assert (len(found.ranges), found.unknown, len(left_out)) == (0, 10, 2)
     assert len(values.ranges('s.a > 11', source, scan=True, findings=left_out).ranges) == 2
+
+
+def test_only_questions_about_values_read_statistics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They lie in a folder of their own, which nobody else even lists."""
+    source = filled(tmp_path, BATCHES, [True] * 10)
+    asked: list[str] = []
+    for name in ('list', 'get', 'ranges', 'folders'):
+        call = getattr(Bucket, name)
+
+        def told(of: Bucket, key: str, *more: Any, call: Any = call) -> Any:
+            asked.append(key)
+            return call(of, key, *more)
+
+        monkeypatch.setattr(Bucket, name, told)
+    assert len(query.objects(source, sensor='s').to_pydict()['key']) == 10
+    assert (len(asked) > 0, [key for key in asked if '_stats' in key]) == (True, [])
+    values.ranges('s.a > 11', source)
+    assert [key for key in asked if '_stats' in key] != []
