@@ -7,7 +7,8 @@
 Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a network
 namespace where what the page sends leaves at so many Mbit/s (tc htb; needs root); with ``--video`` the viewer takes the camera as
 WebRTC and decodes it. ``--beside`` gives a second viewer that reads so many Mbit/s, and says what that does to the first.
-``--browser`` opens the page in a Chromium: how late items come and are drawn, the first frame, an outage of 10 s. ``--pairs``
+``--browser`` opens the page in a Chromium on a machine of its own (a network namespace): how late items come and are drawn, the
+first frame, outages of 10 s. ``--pairs``
 measures the node's CPU with and without viewers in turns. One line of JSON for each part.
 """
 
@@ -35,8 +36,9 @@ import aiortc
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 from domains import free_domain
-from e2e.cut_link import CutLink
-from e2e.processes import Process, Processes, until
+from e2e.live_frames import Frames
+from e2e.machines import ROBOT, Machines
+from e2e.processes import Processes, until
 
 KINDS = ('camera', 'cloud', 'imu', 'odom', 'joints', 'battery')
 
@@ -60,7 +62,7 @@ class Watcher:
             if self.takes_video:
                 video = Video(self.late_ms)
                 await ws.send_json({'watch': self.topics[1:], 'video': {'topic': self.topics[0], 'offer': await video.offer()}})
-            parts: dict[int, bytes] = {}
+            frames = Frames()
             if not reads:
                 await asyncio.sleep(3600)
             said_s = time.monotonic()
@@ -68,18 +70,15 @@ class Watcher:
                 self.bytes += len(message.data)
                 if bytes_s:
                     await asyncio.sleep(len(message.data) / bytes_s)
-                await ws.send_bytes((self.bytes & 0xFFFF_FFFF).to_bytes(4, 'little'))
-                lane, flags = message.data[:2]
-                parts[lane] = (b'' if flags & 1 else parts.get(lane, b'')) + message.data[4:]
-                if flags & 2:
-                    whole = parts.pop(lane)
-                    head = json.loads(whole[4 : 4 + int.from_bytes(whole[:4], 'little')])
+                items = frames.take(message.data)
+                if (said := frames.acknowledgement()) is not None:
+                    await ws.send_bytes(said)
+                for head, body in items:
                     if head['kind'] == 'video' and self.takes_video:
                         await video.told(head)
                     if 'at' in head and head['kind'] in KINDS:  # one machine, one monotonic clock
                         now_ms = time.monotonic() * 1e3
-                        first = 4 + int.from_bytes(whole[:4], 'little')
-                        times = struct.unpack_from(f'<{head["rows"]}d', whole, first) if 'rows' in head else (head['at'],)
+                        times = struct.unpack_from(f'<{head["rows"]}d', body) if 'rows' in head else (head['at'],)
                         self.late_ms.setdefault(head['kind'], []).extend(now_ms - at_ms for at_ms in times)
                 if time.monotonic() - said_s > 1:
                     said_s = time.monotonic()
@@ -162,26 +161,29 @@ def watched(url: str, count: int, seconds: float, pids: dict[str, int], *, deaf:
             'each': [watcher.told(took) for watcher in watchers[deaf:][:2]]}  # fmt: skip
 
 
-def in_browser(url: str, seconds: float) -> dict[str, Any]:
-    """The page in a Chromium with software GL, through a link that is cut for 10 s in the end."""
+def in_browser(url: str, token: str, machines: Machines, folder: Path, seconds: float) -> dict[str, Any]:
+    """The page in a Chromium with software GL on a machine of its own; in the end the link to it is cut for 10 s, three times."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415 - for this part alone
 
-    link = CutLink(int(url.rstrip('/').rpartition(':')[2]))
-    try:
-        with sync_playwright() as playwright:
-            flags = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox']
-            browser = playwright.chromium.launch(executable_path=shutil.which('chromium'), args=flags)
-            page = browser.new_page(viewport={'width': 1280, 'height': 800})
-            page.goto(f'http://127.0.0.1:{link.port}/')
-            until(lambda: page.evaluate('shadowhound.drawn.cloud?.length > 20'), 'clouds are drawn')
-            first_ms = page.evaluate('shadowhound.first')
-            page.evaluate('for (const late of [shadowhound.came, shadowhound.drawn]) for (const kind in late) late[kind] = []')
-            page.wait_for_timeout(seconds * 1e3)
-            late = page.evaluate('({came: shadowhound.came, drawn: shadowhound.drawn})')
-            found: dict[str, Any] = {'first_frame_ms': round(first_ms)}
-            for where, kinds in late.items():
-                found[where] = {kind: round(sorted(each)[int(len(each) * 0.95)], 1) for kind, each in kinds.items() if each}
-            link.cut()
+    with sync_playwright() as playwright:
+        program = machines.program(shutil.which('chromium') or 'chromium', folder)
+        flags = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox']
+        browser = playwright.chromium.launch(executable_path=program, args=flags)
+        page = browser.new_page(viewport={'width': 1280, 'height': 800})
+        page.goto(url)
+        page.locator('input[name=token]').fill(token)
+        page.locator('button.primary').click()
+        until(lambda: page.evaluate('shadowhound.drawn.cloud?.length > 20'), 'clouds are drawn')
+        page.reload()  # signed in: how long until there is a frame
+        until(lambda: page.evaluate('shadowhound.drawn.cloud?.length > 20'), 'clouds are drawn')
+        found: dict[str, Any] = {'first_frame_ms': round(page.evaluate('shadowhound.first'))}
+        page.evaluate('for (const late of [shadowhound.came, shadowhound.drawn]) for (const kind in late) late[kind] = []')
+        page.wait_for_timeout(seconds * 1e3)
+        for where, kinds in page.evaluate('({came: shadowhound.came, drawn: shadowhound.drawn})').items():
+            found[where] = {kind: round(sorted(each)[int(len(each) * 0.95)], 1) for kind, each in kinds.items() if each}
+        found |= {'goes_on_s': [], 'ages_wrong_p95_ms': []}
+        for _ in range(3):
+            machines.cut()
             wrong_ms, end_s = [], time.monotonic() + 10
             while time.monotonic() < end_s:
                 before_ms = time.monotonic() * 1e3
@@ -189,16 +191,16 @@ def in_browser(url: str, seconds: float) -> dict[str, Any]:
                     "[Number(document.querySelector('[data-age=imu]').dataset.ms), shadowhound.at().imu]"
                 )
                 wrong_ms.append(abs((before_ms + time.monotonic() * 1e3) / 2 - at_ms - age_ms))
+                time.sleep(0.05)
             count = page.evaluate('shadowhound.count.imu')
-            link.mend()
+            machines.mend()
             mended_s = time.monotonic()
-            until(lambda: page.evaluate('shadowhound.count.imu') > count, 'it goes on')
-            found |= {'goes_on_s': round(time.monotonic() - mended_s, 2),
-                      'ages_wrong_p95_ms': round(sorted(wrong_ms)[int(len(wrong_ms) * 0.95)])}  # fmt: skip
-            browser.close()
-            return found
-    finally:
-        link.close()
+            until(lambda count=count: page.evaluate('shadowhound.count.imu') > count, 'it goes on')
+            found['goes_on_s'].append(round(time.monotonic() - mended_s, 2))
+            found['ages_wrong_p95_ms'].append(round(sorted(wrong_ms)[int(len(wrong_ms) * 0.95)]))
+            time.sleep(3)
+        browser.close()
+        return found
 
 
 def paired(url: str, viewers: int, seconds: float, pairs: int, pids: dict[str, int]) -> dict[str, Any]:
@@ -257,33 +259,25 @@ def main() -> None:  # noqa: PLR0915 - one part after the other
     parser.add_argument('--pairs', type=int, default=0)
     parser.add_argument('--scale', type=float, default=1.0)
     given = parser.parse_args()
-    if given.link and 'LIVE_BENCH' not in os.environ:
+    if (given.link or given.browser) and 'LIVE_BENCH' not in os.environ:
         command = ['unshare', '-n', sys.executable, *sys.argv]
         sys.exit(subprocess.run(command, env={**os.environ, 'LIVE_BENCH': '1'}, check=False).returncode)
     if given.link:
         subprocess.run(['ip', 'link', 'set', 'lo', 'up'], check=True)
         subprocess.run(['ip', 'addr', 'add', '192.0.2.1/32', 'dev', 'lo'], check=True)  # aiortc's viewer takes no 127.0.0.1
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
+        machines = Machines(stack, os.getpid()) if given.browser else None
         domain = stack.enter_context(free_domain())
         processes = Processes(Path(folder), domain, f'r{secrets.token_hex(4)}')
         stack.callback(processes.end)
         node = processes.node()
         sim = processes.sim(f'rate_scale:={given.scale}')
-        environ = {**processes.environ, 'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_ROBOT': node.robot}
-
-        def serve(port: int) -> tuple[Process, str]:
-            log = Path(folder) / f'live-{time.monotonic_ns()}.log'
-            command = ['-m', 'shadowhound_data_logger.cli.main', 'live', '--json', '--port', str(port)]
-            live = Process('live', command, log, environ)
-            processes.started.append(live)
-            live.said('"problem"')
-            return live, json.loads(live.log[live.log.index('{') : live.log.rindex('}') + 1])['url']
-
-        live, url = serve(0)
+        live, url = processes.page(node, *(['--bind', ROBOT] if machines else []))
         pids = {'node': node.popen.pid, 'live': live.popen.pid}
         until(lambda: node.topic('/imu').get('received', 0) > 50, 'the robot is heard')
-        if given.browser:
-            rows = [in_browser(url, given.seconds)]
+        if machines:
+            token = (node.home / 'live' / 'viewer.token').read_text().strip()
+            rows = [in_browser(url, token, machines, Path(folder), given.seconds)]
         elif given.pairs:
             rows = [paired(url, given.viewers, given.seconds, given.pairs, pids)]
         elif given.beside:
@@ -299,7 +293,7 @@ def main() -> None:  # noqa: PLR0915 - one part after the other
         for _ in range(given.kills):
             live.signal(signal.SIGKILL)
             live.wait()
-            live, url = serve(0)
+            live, url = processes.page(node)
             watched(url, 8, 2.0, {'live': live.popen.pid})
         sim.signal(signal.SIGINT)
         sim.wait()

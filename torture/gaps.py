@@ -6,13 +6,15 @@ are damaged before they are sent, so that they are quarantined, and some are men
 room for few objects, which it evicts, and its disk is filled up. What is not in the store, between two messages that are, is a
 gap: the journal must have it from the one message to the other, within a period and after a kill within the open batch, with its
 count and its cause, and nothing else. Rows with the times of the lost messages themselves may lie further off where the publisher
-stood still, which its other topics show. All the time somebody reads the ledger, whose every commit must balance.
+stood still, which its other topics show. The timeline of the live page, read in a Chromium, is held to the same. All the time
+somebody reads the ledger, whose every commit must balance.
 """
 
 from __future__ import annotations
 
 import json
 import random
+import shutil
 import signal
 import sys
 import threading
@@ -21,6 +23,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -34,7 +37,7 @@ from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import WRONG_TYPE
 from shadowhound_data_logger.spool.control import connect
-from shadowhound_data_logger.spool.gaps import Gap
+from shadowhound_data_logger.spool.gaps import OBJECTS, Gap
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.listing import retry
 from torture._command import Bar, parser, progress, verdict, workshop
@@ -64,6 +67,8 @@ FILLED_S: Final = 3.0
 DISK_MB: Final = 96
 RETRIED: Final = 0.5
 """Share of the damaged files that are mended and retried."""
+FLAGS: Final = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox')
+IS_TODAY: Final = "document.querySelector('svg[role=slider]')?.getAttribute('aria-valuemin') % 86400000 === 0"
 KINDS: Final = ('stopped', 'killed', 'paused', 'starved', 'filled', 'damaged')
 RESTARTED_S: Final = 10.0
 """What a kill cost ends with the first message of the next start."""
@@ -116,6 +121,8 @@ class Found:
     lost: Counter[str] = field(default_factory=Counter)
     """Messages by cause."""
     gaps: int = 0
+    shown: int = 0
+    """Rows on the timeline of the live page."""
     commits: int = 0
     counts: Counter[str] = field(default_factory=Counter)
 
@@ -247,9 +254,31 @@ def together(real: Sequence[Loss], said: Sequence[Loss], near_ns: int) -> list[t
     return groups
 
 
-def audit(found: Found, node: Node, roots: Iterable[Path], who: str, still: Sequence[tuple[int, int]]) -> None:
-    """One node's journal against what it stored; ``still`` is when the publisher was."""
-    rows = ledger.journal(node.home / 'spool', ROBOT)
+def on_page(processes: Processes, node: Node) -> list[Gap] | None:
+    """What stands on the timeline of the live page today, in a Chromium; None where there is none."""
+    chromium = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
+    if chromium is None or find_spec('playwright') is None:
+        progress('there is no Chromium here: the live page is not looked at')
+        return None
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415 - for this alone
+
+    _, url = processes.page(node)
+    with sync_playwright() as playwright, closing(playwright.chromium.launch(executable_path=chromium, args=FLAGS)) as browser:
+        page = browser.new_page()
+        page.goto(url)
+        page.get_by_role('button', name='Today', exact=True).dispatch_event('click')
+        until(lambda: page.evaluate(IS_TODAY), 'the page shows today')
+        told = page.locator('rect.gap').evaluate_all('gaps => gaps.map(gap => ({...gap.dataset}))')
+    return [
+        Gap(OBJECTS, gap['topic'], None, None, gap['kind'], gap['cause'], round(float(gap['from']) * 1e6),
+            round(float(gap['to']) * 1e6), int(gap['count']), 1, '', None)
+        for gap in told
+    ]  # fmt: skip
+
+
+def audit(found: Found, node: Node, roots: Iterable[Path], who: str, still: Sequence[tuple[int, int]],
+          rows: Sequence[Gap]) -> None:  # fmt: skip
+    """One node's journal, or what the page shows of it, against what it stored; ``still`` is when the publisher was."""
     found.say('every loss has a time', f'{who}: {[row for row in rows if row.from_ns is None]}',
               holds=all(row.from_ns is not None for row in rows))  # fmt: skip
     said = journaled([row for row in rows if row.from_ns is not None])
@@ -279,6 +308,19 @@ def audit(found: Found, node: Node, roots: Iterable[Path], who: str, still: Sequ
             why = [each.what for each in found.done if each.from_ns <= end_ns and each.to_ns >= begin_ns]
             allowed = set[str]().union(*(ALLOWED[what] for what in why))
             found.say('with its cause', f'{text}, after {why}', holds=causes <= allowed)
+
+
+def _audit_both(found: Found, node: Node, roots: Sequence[Path], who: str, still: Sequence[tuple[int, int]],
+                shown: Mapping[Path, Sequence[Gap] | None]) -> None:  # fmt: skip
+    """The journal, and the timeline of the page, by the same bars."""
+    audit(found, node, roots, who, still, ledger.journal(node.home / 'spool', ROBOT))
+    on_page = shown[node.home]
+    if on_page is not None:
+        seen = Found(done=found.done)
+        audit(seen, node, roots, f'{who}, on the page,', still, on_page)
+        found.shown += len(on_page)
+        for bar, wrong in seen.wrong.items():
+            found.say(f'on the page: {bar}', '; '.join(wrong[:3]), holds=not wrong)
 
 
 @dataclass(slots=True)
@@ -449,16 +491,17 @@ def campaign(folder: Path, disturbances: int, rng: random.Random) -> Found:
             quiet((scene.node, small))
             for each in (scene.node, small):
                 each.stop()
+            shown = {each.home: on_page(processes, each) for each in (scene.node, small)}
             for reader in readers:
                 reader.close()
                 found.commits += reader.count
                 found.say('the ledger balances at every commit', '; '.join(reader.unbalanced[:3]), holds=not reader.unbalanced)
         finally:
             processes.end()
-        audit(found, scene.node, [scene.node.home / 'store' / 'sensor-data' / ROBOT], 'disturbed', still)
+        _audit_both(found, scene.node, [scene.node.home / 'store' / 'sensor-data' / ROBOT], 'disturbed', still, shown)
         own, filled = found.done, [each for each in found.done if each.what == 'filled']
         found.done = [Done('evicted', began_ns - 60 * SECOND, time.time_ns()), *filled]
-        audit(found, small, [small.home / 'spool' / 'ready' / 'sensor-data' / ROBOT], 'without room', still)
+        _audit_both(found, small, [small.home / 'spool' / 'ready' / 'sensor-data' / ROBOT], 'without room', still, shown)
         found.done = own
     found.counts = scene.counts
     for cause in ('transport', 'restart', 'paused', 'no_room', 'damaged'):
@@ -477,7 +520,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         found = campaign(shop.folder, count, random.Random(given.seed))
         shop.passed = all(bar.holds for bar in found.bars())
     figures = {'seed': given.seed, 'disturbances': Counter(each.what for each in found.done), 'gaps': found.gaps,
-               'lost': found.lost, **found.counts, 'readings': found.commits}  # fmt: skip
+               'on_the_page': found.shown, 'lost': found.lost, **found.counts, 'readings': found.commits}  # fmt: skip
     if not given.json:
         print(figures)
     return verdict(figures, found.bars(), as_json=given.json)

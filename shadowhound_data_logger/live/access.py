@@ -113,7 +113,7 @@ class Access:
 
     def sign_in(self, token: str, address: str) -> tuple[SignIn, str] | None:
         """Of whoever knows a token, with the cookie; None for a wrong one."""
-        given = token.encode()
+        given = _bytes(token)
         for role in ROLES:
             if hmac.compare_digest(given, self._token(role).encode()):
                 nonce, until = secrets.token_urlsafe(12), int(self._now()) + LASTS_S
@@ -138,7 +138,7 @@ class Access:
         parts = (cookie or '').split('.')
         if len(parts) == 4 and parts[0] in ROLES and parts[1].isdecimal() and len(parts[1]) < 12:
             role, until, nonce, signature = parts
-            is_signed = hmac.compare_digest(signature.encode(), self._sign(role, f'{role}.{until}.{nonce}').encode())
+            is_signed = hmac.compare_digest(_bytes(signature), self._sign(role, f'{role}.{until}.{nonce}').encode())
             if is_signed and int(until) > self._now() and nonce not in self._ended:
                 return self._of(role, nonce)
         return SignIn(VIEWER) if self._is_open else None
@@ -162,18 +162,18 @@ class Access:
             return None
         role, until, nonce, signature = parts
         expected = self._sign(role, f'ticket.{role}.{until}.{nonce}.{address}')
-        is_signed = hmac.compare_digest(signature.encode(), expected.encode())
+        is_signed = hmac.compare_digest(_bytes(signature), expected.encode())
         return nonce if is_signed and int(until) > self._now() and nonce not in self._ended else None
 
     def is_csrf(self, who: SignIn, given: str) -> bool:
         """Whether a request that acts comes from the page itself."""
-        return bool(who.csrf) and hmac.compare_digest(who.csrf.encode(), given.encode())
+        return bool(who.csrf) and hmac.compare_digest(who.csrf.encode(), _bytes(given))
 
     def _of(self, role: str, nonce: str) -> SignIn:
         return SignIn(role, nonce, self._sign(role, f'csrf.{nonce}'))
 
     def _sign(self, role: str, text: str) -> str:
-        return hmac.new(self._token(role).encode(), text.encode(), sha256).hexdigest()
+        return hmac.new(self._token(role).encode(), _bytes(text), sha256).hexdigest()
 
     def _token(self, role: str) -> str:
         """Read anew each time: whoever replaces the file ends all sign-ins."""
@@ -207,6 +207,11 @@ class OwnNames:
 def is_same_origin(origin: str | None, host: str, scheme: str) -> bool:
     """Whether a request's Origin header is the page itself."""
     return origin is not None and origin.lower() == f'{scheme}://{host}'.lower()
+
+
+def _bytes(text: str) -> bytes:
+    """Of what somebody sent, which may be half a surrogate pair."""
+    return text.encode(errors='surrogatepass')
 
 
 def _host(url: str) -> str:

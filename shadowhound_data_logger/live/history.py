@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import shlex
 import sys
@@ -34,6 +35,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import BagDamaged, DataLoggerError, LakeError, Rejected, SettingError
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake import decode
+from shadowhound_data_logger.live.kept import KeptSource, SpoolKept, StoreKept, offers
 from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem, clouds, frames, points_items, series, table_item
 from shadowhound_data_logger.live.past import (
     FRESH_S,
@@ -45,9 +47,11 @@ from shadowhound_data_logger.live.past import (
     StorePast,
     dates_between,
 )
+from shadowhound_data_logger.mailbox import KeptFilter
 from shadowhound_data_logger.mcap.index import McapIndex, read_index
 from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import Ranged
+from shadowhound_data_logger.model import ON_ROBOT
 from shadowhound_data_logger.options import UploadSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.untrusted import check_pixels, visible
@@ -85,8 +89,8 @@ _CLOUD, _CAMERA = 'cloud', 'camera'
 class PastReader:
     """Answers questions about the past, one at a time. Close once."""
 
-    def __init__(self, source: PastSource, prefixes: Sequence[str] = ()) -> None:
-        self._source = source
+    def __init__(self, source: PastSource, kept: KeptSource, prefixes: Sequence[str] = ()) -> None:
+        self._source, self._kept = source, kept
         self._contents = PastContents()
         self._types = MessageTypes(prefixes)
         self._pool = ThreadPoolExecutor(8, 'past')
@@ -114,15 +118,51 @@ class PastReader:
             if robot not in self._source.robots():
                 raise LabelRefused(f'there is no robot {robot!r} here')
             return {'id': self._labels.add(robot, asked)}, b''
-        raise ValueError('do is robots, days, timeline, moment or label')
+        if do == 'kept':
+            begin_ns, end_ns = _times(asked)
+            return {'kept': offers(self._kept, robot, begin_ns, end_ns)}, b''
+        if do == 'requests':
+            return self.requests(robot), b''
+        if do == 'pull':
+            return self.pull(robot, asked), b''
+        raise ValueError('do is robots, days, timeline, moment, label, kept, requests or pull')
+
+    # -- what is kept on the robot ---------------------------------------------------------------------------------
+
+    def requests(self, robot: str) -> dict[str, Any]:
+        """What is asked of a robot: ``sensor``, ``from`` and ``to`` (UTC in ms) instead of what each request wants.
+
+        Raises StoreError, LakeError, SpoolError.
+        """
+        found = []
+        for one in self._kept.requests(robot)[::-1]:
+            want = one.pop('want')
+            times = {name: want[word] / 1e6 for name, word in (('from', 'since_ns'), ('to', 'until_ns')) if word in want}
+            found.append({**one, 'by': _text(one['by']), 'state': _text(one['state']), 'why': _text(one['why']),
+                          'sensor': _text(want.get('sensor', '')), **times})  # fmt: skip
+        return {'requests': found, 'mbps': self._kept.mbps(robot)}
+
+    def pull(self, robot: str, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """Ask for a sensor's objects of a time, or take a request back. Raises as ``KeptSource.ask``, LakeError."""
+        by = re.sub(r'[^A-Za-z0-9_.-]', '_', str(asked['by']))
+        if 'cancel' in asked:
+            if all(one['id'] != asked['cancel'] for one in self._kept.requests(robot)):
+                raise PullRefused('there is no such request any more')
+            self._kept.cancel(robot, asked['cancel'], by)
+            return {'id': asked['cancel']}
+        begin_ns, end_ns = _times(asked)
+        sensor = str(asked['sensor'])
+        if not offers(self._kept, robot, begin_ns, end_ns).get(sensor, {}).get('objects'):
+            raise PullRefused(f'{robot} keeps nothing of {visible(sensor)[:MOST_TEXT]} in this time')
+        return {'id': self._kept.ask(robot, KeptFilter(sensor=sensor, since_ns=begin_ns, until_ns=end_ns), by)}
 
     # -- a time ----------------------------------------------------------------------------------------------------
 
     def timeline(self, robot: str, begin_ns: int, end_ns: int) -> dict[str, Any]:
         """What was recorded between two times, the gaps, and what happened.
 
-        ``recorded``: [topic, from, to]; ``marks``: [kind, name, from, to, text]; times are UTC in ms, the rest is as in
-        ``SpoolFigures.gaps``. Raises ValueError, DataLoggerError.
+        ``recorded``: [topic, from, to]; ``kept`` the same of what is on the robot alone; ``marks``: [kind, name, from, to, text];
+        times are UTC in ms, the rest is as in ``SpoolFigures.gaps``. Raises ValueError, DataLoggerError.
         """
         if not 0 < end_ns - begin_ns <= MOST_SPAN_NS:
             raise ValueError(f'a timeline has at most {MOST_SPAN_NS // SECOND // 3600} hours')
@@ -139,6 +179,11 @@ class PastReader:
             [kind, _text(name), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1), _text(text)]
             for kind, name, from_ns, to_ns, text in inside
         ]  # fmt: skip
+        rows = [] if self._kept.is_recorded else self._kept.rows(robot, begin_ns, end_ns)
+        kept = [(row['topic'] or row['sensor'] or '', row['t_start_ns'], row['t_end_ns'] or row['t_start_ns'])
+                for row in rows if row['where'] == ON_ROBOT]  # fmt: skip
+        found['kept'] = [[_text(name), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1)] for name, from_ns, to_ns in
+                         _spans(kept, begin_ns, end_ns)]  # fmt: skip
         found['problem'] = _text(next((day.problem for day in days if day.problem), lacking), 400)
         found['commands'] = commands(robot, begin_ns, end_ns, [mark[1] for mark in inside if mark[0] == 'bag'])
         return found
@@ -287,6 +332,12 @@ class PastReader:
         return source, read_index(source)
 
 
+class PullRefused(DataLoggerError):
+    """What nobody can be asked for."""
+
+    DEFAULT_REMEDY = 'choose another time or sensor'
+
+
 class LabelRefused(DataLoggerError):
     """What is no label."""
 
@@ -365,6 +416,29 @@ def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str]) -> lis
         for bag in [bag for bag in dict.fromkeys(bags) if is_name(bag)][:MOST_CUTS]
     ]
     return [['query', f'shadowhound-data query {span}'], ['fetch', f'shadowhound-data fetch {span} --to data'], *cuts]
+
+
+def _times(asked: Mapping[str, Any]) -> tuple[int, int]:
+    """``from`` and ``to`` in ns. Raises ValueError."""
+    begin_ns, end_ns = int(asked['from']) * 1_000_000, int(asked['to']) * 1_000_000
+    if not 0 < end_ns - begin_ns <= MOST_SPAN_NS:
+        raise ValueError(f'a time has at most {MOST_SPAN_NS // SECOND // 3600} hours')
+    return begin_ns, end_ns
+
+
+def _spans(found: Sequence[tuple[str, int, int]], begin_ns: int, end_ns: int) -> Iterator[tuple[str, int, int]]:
+    """As ``_runs``, of (topic, from, to)."""
+    grain_ns = max(RHYTHM_NS, (end_ns - begin_ns) // RUNS)
+    spans: dict[str, tuple[int, int]] = {}
+    for name, from_ns, to_ns in sorted(found, key=lambda one: one[1]):
+        known = spans.get(name)
+        if known is None and len(spans) >= MOST_TOPICS:
+            continue
+        if known is not None and from_ns - known[1] > grain_ns:
+            yield name, max(begin_ns, known[0]), min(end_ns, known[1])
+            known = None
+        spans[name] = (from_ns, to_ns) if known is None else (known[0], max(known[1], to_ns))
+    yield from ((name, max(begin_ns, from_ns), min(end_ns, to_ns)) for name, (from_ns, to_ns) in spans.items())
 
 
 def _slices(files: Sequence[PastObject], manifest: Manifest | None, at_ns: int) -> list[PastObject]:
@@ -469,11 +543,16 @@ def main() -> None:
         body = b''
         try:
             if history is None:
-                source: PastSource = SpoolPast(Path(sys.argv[1]), sys.argv[2]) if len(sys.argv) > 2 else StorePast()
-                history = PastReader(source, os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
+                source: PastSource
+                kept: KeptSource
+                if len(sys.argv) > 2:
+                    source, kept = SpoolPast(Path(sys.argv[1]), sys.argv[2]), SpoolKept(Path(sys.argv[1]), sys.argv[2])
+                else:
+                    source, kept = StorePast(), StoreKept()
+                history = PastReader(source, kept, os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
             head, body = history.answer(json.loads(line))
         except DataLoggerError as error:
-            head = {'error': visible(str(error))[:1000], 'is_wrong': isinstance(error, LabelRefused)}
+            head = {'error': visible(str(error))[:1000], 'is_wrong': isinstance(error, (LabelRefused, PullRefused))}
         except (*_BROKEN, LakeError, BagDamaged) as error:
             head = {'error': f'this cannot be read: {type(error).__name__}: {visible(str(error))[:300]}', 'is_wrong': True}
         told = json.dumps(head, separators=(',', ':')).encode()

@@ -311,7 +311,8 @@ class StorePast:
         """Raises StoreError."""
         from shadowhound_data_logger.lake.live_files import dates_of  # noqa: PLC0415
 
-        return sorted(date for date in dates_of(self._source, robot, self._findings) if date > '1970-01-01')
+        found = {date for of in (schema.OBJECTS, schema.KEPT) for date in dates_of(self._source, robot, self._findings, of)}
+        return sorted(date for date in found if date > schema.UNDATED)
 
     def day(self, robot: str, date: str) -> PastDay:
         """Raises StoreError."""

@@ -7,12 +7,14 @@ item ends the connection, which begins again. Times are made those of this machi
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import logging
 import math
+import random
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -21,16 +23,20 @@ from urllib.parse import urlsplit
 import aiohttp
 import numpy as np
 
+from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.live.access import token_of
-from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem
+from shadowhound_data_logger.live.kinds import FULL, KINDS, MOST_NAMES, LiveItem, check_jpeg
+from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, SMALL_LANE
 
 log = logging.getLogger(__name__)
 
 PING_S: Final = 1.0
-SILENT_S: Final = 5.0
+SILENT_S: Final = 3.0
 """The robot says something each second."""
-AGAIN_S: Final = 2.0
-"""After a connection ended."""
+AGAIN_S: Final = 0.7
+"""After a connection ended, and up to half as long again."""
+TRY_S: Final = 1.0, 1.0, 1.0, 4.0
+"""How long one attempt after the other to connect gets: a packet that is lost at its begin is sent again later and later."""
 PINGS: Final = 12
 MOST_MESSAGE: Final = 1 << 20
 MOST_ITEM: Final = 32 << 20
@@ -39,7 +45,7 @@ MOST_SMALL: Final = 1 << 20
 MOST_HEAD: Final = 1 << 20
 MOST_LANES: Final = 64
 _SHOWN: Final = {'topics', 'figures', 'pong', *(kind.name for kind in KINDS.values())}
-_BROKEN: Final = (asyncio.TimeoutError, OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
+_BROKEN: Final = (asyncio.TimeoutError, OSError, ValueError, LookupError, Rejected, TypeError, AttributeError, RecursionError)
 _BULK: Final = {kind.name for kind in KINDS.values() if kind.is_bulk}
 
 
@@ -54,6 +60,7 @@ class Relay:
         self._url, self._token, self._wanted, self._came = url.rstrip('/'), token, wanted, came
         parts = urlsplit(self._url)
         self._origin = f'{parts.scheme}://{parts.netloc}'
+        self._patience = itertools.cycle(TRY_S)
         self._wake = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self.problem = ''
@@ -85,11 +92,11 @@ class Relay:
                     log.warning('the page of the robot cannot be read: %s', why)
                 self.problem = f'the page of the robot cannot be read: {why}'
                 self._came(_catalogue([], self.problem))
-                await asyncio.sleep(AGAIN_S)
+                await asyncio.sleep(AGAIN_S * random.uniform(1.0, 1.5))
 
     async def _watch(self) -> None:
         """Until nobody watches any more. Raises for a connection that failed, or an answer that is none."""
-        timeout = aiohttp.ClientTimeout(total=None, connect=10.0, sock_read=30.0)
+        timeout = aiohttp.ClientTimeout(total=None, connect=10.0, sock_connect=next(self._patience), sock_read=10.0)
         jar = aiohttp.CookieJar(unsafe=True)  # an address is as good as a name
         async with aiohttp.ClientSession(headers={'Origin': self._origin}, timeout=timeout, cookie_jar=jar) as session:
             if self._token is not None:
@@ -134,7 +141,7 @@ class _Connection:
     def __init__(self, ws: Any, came: Callable[[LiveItem], None]) -> None:
         self.ws, self._came = ws, came
         self._parts: dict[int, bytearray] = {}
-        self._received = 0
+        self._received = self._told = 0
         self._pings: deque[tuple[float, float]] = deque(maxlen=PINGS)
 
     async def read(self) -> None:
@@ -145,9 +152,14 @@ class _Connection:
                     raise ValueError(f'it said {message.type.name}')
                 return
             frame = message.data
-            self._received = (self._received + len(frame)) & 0xFFFF_FFFF
-            await self.ws.send_bytes(self._received.to_bytes(4, 'little'))
+            self._received += len(frame)
+            if self._received - self._told >= ACKNOWLEDGED:
+                self._told = self._received
+                await self.ws.send_bytes((self._received & 0xFFFF_FFFF).to_bytes(4, 'little'))
             lane, flags = frame[0], frame[1]
+            if lane == SMALL_LANE:
+                self._take_several(frame)
+                continue
             if flags & 1:
                 self._parts[lane] = bytearray()
             part = self._parts[lane]
@@ -156,6 +168,15 @@ class _Connection:
                 raise ValueError('it sends more than any robot does')
             if flags & 2:
                 self._take(bytes(self._parts.pop(lane)))
+
+    def _take_several(self, frame: bytes) -> None:
+        place = 4
+        while place < len(frame):
+            end = place + 4 + int.from_bytes(frame[place : place + 4], 'little')
+            self._take(frame[place + 4 : end])
+            place = end
+        if place != len(frame):
+            raise ValueError('it sends less than it says')
 
     def _take(self, whole: bytes) -> None:
         size = int.from_bytes(whole[:4], 'little')
@@ -183,10 +204,32 @@ class _Connection:
         head['at'] = round(at, 1)
         if kind == 'figures' and not _is_figures(head['figures']):
             raise ValueError('its figures are none')
+        _check(kind, head, body)
         if kind != 'figures' and kind not in _BULK:
             rows = int(head['rows'])
             body = (np.frombuffer(body, '<f8', rows) - ahead).astype('<f8').tobytes() + body[8 * rows :]
         self._came(LiveItem(topic, kind, FULL, head, body))
+
+
+def _check(kind: str, head: Mapping[str, Any], body: bytes) -> None:
+    """Raises Rejected or ValueError for what would harm whoever shows it."""
+    if kind == 'camera':
+        check_jpeg(body)
+    elif kind == 'cloud':
+        box = [float(value) for name in ('low', 'step') for value in head[name]]
+        if (
+            len(box) != 6
+            or not all(map(math.isfinite, box))
+            or head['points'] * 6 != len(body)
+            or not isinstance(head['frame'], str)
+        ):
+            raise ValueError('its cloud is none')
+    elif kind != 'figures':
+        names = head['names']
+        if not (isinstance(names, list) and len(names) <= MOST_NAMES and all(isinstance(name, str) for name in names)):
+            raise ValueError('its figures have no names')
+        if int(head['rows']) * (8 + 4 * len(names)) != len(body):
+            raise ValueError('its figures are not as many as it says')
 
 
 def _is_figures(told: Any) -> bool:

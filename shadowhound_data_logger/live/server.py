@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from aiohttp import WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.encode.definitions import describe
@@ -82,9 +83,11 @@ DOCTOR_S: Final = 60.0
 AF41: Final = 34 << 2
 """DSCP of interactive video (RFC 4594), in the byte where IP has it."""
 NO_WEBRTC: Final = 'the robot has no WebRTC: install the extra webrtc of shadowhound_data_logger'
+REWATCH_S: Final = 0.1
+"""Between two changes of what is read, when viewers choose."""
 NARROW_S: Final = 10.0
 """A link that carried no full frames for so long is told to take video."""
-SILENT_S: Final = 15.0
+SILENT_S: Final = 8.0
 """A viewer that says nothing for so long is gone: the page says something each second."""
 ACTS: Final[Mapping[str, tuple[str, ...]]] = {
     'flush': (), 'pause': (), 'resume': (), 'bag start': (), 'bag stop': (), 'bag split': (), 'event': ('name', 'note'),
@@ -137,6 +140,8 @@ class _Connected:
     """The address of ours that it reached."""
     protocol: asyncio.BaseProtocol
     tasks: list[asyncio.Task[None]] = field(default_factory=list)
+    heard_s: float = field(default_factory=time.monotonic)
+    """When it last said something."""
     narrow_s: float | None = None
     """Since when its link carries no full frames."""
     asks: asyncio.Task[None] | None = None
@@ -167,6 +172,8 @@ class LiveServer:
         self._foxgloves: set[_Foxglove] = set()
         self._session_id = secrets.token_hex(8)
         self._wanted: dict[str, frozenset[int]] | None = None
+        self._rewatching: asyncio.TimerHandle | None = None
+        self._rewatched_s = 0.0
         self._graph: Mapping[str, str] = {}
         self._topics: Topics | None = None
         self._relay: Relay | None = None
@@ -196,10 +203,12 @@ class LiveServer:
         app.add_routes([
             web.get('/ws', self._watch), web.get('/api/session', self._session), web.post('/api/session', self._sign_in),
             web.post('/api/sign-out', self._sign_out), web.post('/api/act', self._act), web.get('/api/gaps', self._tell_gaps),
-            web.get('/api/doctor', self._tell_doctor), web.post('/api/label', self._label),
+            web.get('/api/doctor', self._tell_doctor), web.post('/api/label', self._label), web.post('/api/pull', self._pull),
             web.get('/foxglove', self._foxglove), web.get('/api/foxglove', self._tell_foxglove),
-            web.get('/api/past/{do:robots|days|timeline|moment}', self._tell_past), web.get('/{name:.*}', self._file),
+            web.get('/api/past/{do:robots|days|timeline|moment|kept|requests}', self._tell_past),
+            web.get('/{name:.*}', self._file),
         ])  # fmt: skip
+        logging.getLogger('aiohttp.server').addFilter(_is_ours)
         self._runner = web.AppRunner(app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S, lingering_time=1.0)
         await self._runner.setup()
         secure = None
@@ -300,10 +309,15 @@ class LiveServer:
         return handler
 
     def _drop_silent(self) -> None:
-        """Those whose first request does not come to its end."""
+        """Those whose first request does not come to its end, and viewers that say nothing any more."""
         before_s = time.monotonic() - REQUEST_S
         for each in [each for each, since_s in self._silent.items() if since_s < before_s]:
             self._drop(each)
+
+        for one in self._viewers:
+            if one.heard_s < time.monotonic() - SILENT_S:
+                for task in one.tasks:
+                    task.cancel()
 
     def _drop(self, handler: Any) -> None:
         self._silent.pop(handler, None)
@@ -355,8 +369,18 @@ class LiveServer:
         topics = [[topic, KINDS[name].name, name] for topic, name in self._graph.items() if name in KINDS]
         one.viewer.offer(LiveItem('', 'topics', head={'topics': topics, 'problem': self.ros_problem}))
 
+    def _rewatch_soon(self) -> None:
+        """Who chooses again and again makes no more subscriptions than others."""
+        if self._rewatching is None:
+            wait_s = max(0.0, self._rewatched_s + REWATCH_S - time.monotonic())
+            self._rewatching = self._loop.call_later(wait_s, self._rewatch)
+
     def _rewatch(self) -> None:
         """After any viewer came, went or chose."""
+        if self._rewatching is not None:
+            self._rewatching.cancel()
+            self._rewatching = None
+        self._rewatched_s = time.monotonic()
         wanted: dict[str, set[int]] = {}
         for one in self._viewers:
             for topic in one.viewer.watched:
@@ -523,13 +547,19 @@ class LiveServer:
         response.del_cookie(COOKIE)
         return response
 
-    async def _act(self, request: web.Request) -> web.StreamResponse:
-        """What an operator asks of the node, with the node's answer."""
+    def _refused(self, request: web.Request) -> web.StreamResponse | None:
+        """The answer to a request that acts and does not come from an operator at this page."""
         who = self._who(request)
         if not who.may_act:
             return _problem(403, 'only an operator may do that: sign in with the token of the operator')
         if not self._access.is_csrf(who, request.headers.get('X-CSRF-Token', '')):
             return _problem(403, 'the request does not come from this page')
+        return None
+
+    async def _act(self, request: web.Request) -> web.StreamResponse:
+        """What an operator asks of the node, with the node's answer."""
+        if (refused := self._refused(request)) is not None:
+            return refused
         if self._settings.is_of_store:
             return _problem(404, "there is no node here: the buttons are on the robot's own page")
         asked = await _body(request)
@@ -544,11 +574,8 @@ class LiveServer:
 
     async def _label(self, request: web.Request) -> web.StreamResponse:
         """A label of a time, which an operator puts into the store."""
-        who = self._who(request)
-        if not who.may_act:
-            return _problem(403, 'only an operator may do that: sign in with the token of the operator')
-        if not self._access.is_csrf(who, request.headers.get('X-CSRF-Token', '')):
-            return _problem(403, 'the request does not come from this page')
+        if (refused := self._refused(request)) is not None:
+            return refused
         asked = await _body(request)
         robot, label, note = asked.get('robot'), asked.get('label'), asked.get('note', '')
         times = [asked.get(name) for name in ('from', 'to')]
@@ -560,6 +587,25 @@ class LiveServer:
         log.info('operator at %s labels %s', address, robot)
         said = {'label': label, 'note': note, 'by': f'operator at {address}', 'from': times[0], 'to': times[1]}
         return await self._of_past('label', str(robot), said)
+
+    async def _pull(self, request: web.Request) -> web.StreamResponse:
+        """An operator asks a robot for a sensor's objects of a time, or takes a request back."""
+        if (refused := self._refused(request)) is not None:
+            return refused
+        asked = await _body(request)
+        robot, cancel, sensor = asked.get('robot'), asked.get('cancel'), asked.get('sensor')
+        times = [asked.get(name) for name in ('from', 'to')]
+        if not isinstance(robot, str) or not is_name(robot):
+            return _problem(400, 'a request names a robot')
+        said: dict[str, Any] = {'by': f'operator_{request.remote or ""}'}
+        if isinstance(cancel, str):
+            said['cancel'] = cancel
+        elif isinstance(sensor, str) and all(type(each) is int and 0 <= each < 10**14 for each in times):
+            said |= {'sensor': sensor, 'from': times[0], 'to': times[1]}
+        else:
+            return _problem(400, 'a request has a robot, a sensor, from and to, which are times in UTC, in ms; or cancel, an id')
+        log.info('operator at %s %s %s', request.remote, 'takes back what was asked of' if 'cancel' in said else 'asks', robot)
+        return await self._of_past('pull', robot, said)
 
     def _ask(self, do: str, address: str, given: Mapping[str, str]) -> dict[str, Any]:
         try:
@@ -594,7 +640,7 @@ class LiveServer:
     async def _tell_past(self, request: web.Request) -> web.StreamResponse:
         """Of a timeline JSON; of a moment its head as JSON and its items, each after a uint32 with its length."""
         do, robot = request.match_info['do'], request.query.get('robot', self._settings.robot)
-        takes = {'timeline': ('from', 'to'), 'moment': ('at',)}.get(do, ())
+        takes = {'timeline': ('from', 'to'), 'kept': ('from', 'to'), 'moment': ('at',)}.get(do, ())
         try:
             times = {name: _ms(request, name) for name in takes}
         except ValueError as error:
@@ -708,7 +754,7 @@ class LiveServer:
         async for message in ws:
             if message.type == WSMsgType.TEXT:
                 client.take(_parsed(message.data))
-                self._rewatch()
+                self._rewatch_soon()
 
     async def _send(self, ws: web.WebSocketResponse, viewer: Viewer) -> None:
         while True:
@@ -722,7 +768,8 @@ class LiveServer:
     async def _receive(self, ws: web.WebSocketResponse, one: _Connected) -> None:
         viewer = one.viewer
         while True:
-            message = await ws.receive(SILENT_S)
+            message = await ws.receive()
+            one.heard_s = time.monotonic()
             if message.type == WSMsgType.BINARY and len(message.data) == 4:
                 viewer.acknowledge(int.from_bytes(message.data, 'little'))
             elif message.type == WSMsgType.TEXT:
@@ -732,7 +779,7 @@ class LiveServer:
                     viewer.offer(LiveItem('', 'pong', head={'ping': ping, 'now': round(time.monotonic() * 1e3, 2)}))
                 if isinstance(watched, list):
                     viewer.watch(topic for topic in watched[:MOST_WATCHED] if isinstance(topic, str))
-                    self._rewatch()
+                    self._rewatch_soon()
                 if 'video' in said:
                     self._ask_video(one, said['video'])
             elif message.type in (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR):
@@ -764,6 +811,11 @@ class LiveServer:
             tell({'problem': self.no_video})
         else:
             await self._video.take(one, said, (one.at, one.address), tell)
+
+
+def _is_ours(record: logging.LogRecord) -> bool:
+    """Whether it is more than that somebody sent what is no HTTP, which could fill the log."""
+    return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
 
 
 def _describe_all(types: frozenset[str]) -> None:

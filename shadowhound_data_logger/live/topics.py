@@ -23,7 +23,7 @@ from shadowhound_data_logger.keys import printable
 from shadowhound_data_logger.live.kinds import KINDS, RAW, Kind, LiveItem, clouds, frames, series
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.ros.endpoints import Plan
-from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
+from shadowhound_data_logger.ros.reader import MAX_TAKES, PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -32,6 +32,7 @@ NODE: Final = 'shadowhound_live'
 POLL_S: Final = 1 / 30
 GRAPH_S: Final = 1.0
 BULK_DEPTH, ROWS_DEPTH = 2, 128
+"""Of bulk, and of a topic of which all messages are shown; of others only the newest is kept."""
 MOST_TOPICS: Final = 500
 """Of the graph that are told; whoever publishes more is not shown all of it."""
 _Wanted = Mapping[str, frozenset[int]]
@@ -43,23 +44,26 @@ _RAW_ALONE: Final = Kind('raw', 100.0, is_bulk=False)
 class _Watched:
     """One topic that is watched."""
 
-    def __init__(self, node: Node, topic: str, type_name: str, kind: Kind) -> None:
-        """Raises TypeUnavailable or SubscriptionRefused."""
-        self.type, self.kind = type_name, kind
-        depth = BULK_DEPTH if kind.is_bulk else ROWS_DEPTH
+    def __init__(self, node: Node, topic: str, type_name: str, kind: Kind, *, is_raw: bool) -> None:
+        """Raises TypeUnavailable or SubscriptionRefused. ``is_raw``: somebody takes each message as it came."""
+        self.type, self.kind, self.is_raw = type_name, kind, is_raw
+        self._is_each_shown = not kind.is_bulk and 1 / kind.most_hz < POLL_S
+        self.most = MAX_TAKES if kind.is_bulk or is_raw or self._is_each_shown else 1
+        depth = BULK_DEPTH if kind.is_bulk else 1 if self.most == 1 else ROWS_DEPTH
         self.reader = Reader(node, Plan(topic, type_name, reliable=False, transient_local=False, depth=depth), PolledGroup())
-        self.next_s = 0.0
+        self._next_s = 0.0
 
-    def due(self, taken: list[Taken], now_s: float) -> list[Taken]:
+    def is_due(self, now_s: float) -> bool:
+        """Whether to look: what would not be shown is left to the middleware, which keeps the newest."""
+        return self.is_raw or self._is_each_shown or now_s >= self._next_s
+
+    def shown(self, taken: list[Taken], now_s: float) -> list[Taken]:
         """Those of them that are shown."""
-        if not taken:
-            return []
-        period_s = 1 / self.kind.most_hz
-        if not self.kind.is_bulk and period_s < POLL_S:
+        if self._is_each_shown:
             return taken[-round(2 * POLL_S * self.kind.most_hz) :]
-        if now_s < self.next_s:
+        if not taken or now_s < self._next_s:
             return []
-        self.next_s = max(self.next_s + period_s, now_s - POLL_S)
+        self._next_s = max(self._next_s + 1 / self.kind.most_hz, now_s - POLL_S)
         return taken[-1:]
 
 
@@ -140,7 +144,9 @@ class Topics:
         for topic in [
             topic
             for topic, one in self._watched.items()
-            if not _is_watched(one.kind, wanted.get(topic)) or self._graph.get(topic) != one.type
+            if not _is_watched(one.kind, wanted.get(topic))
+            or self._graph.get(topic) != one.type
+            or one.is_raw is not (RAW in wanted[topic])
         ]:
             self._watched.pop(topic).reader.close()
         for topic in wanted.keys() - self._watched.keys():
@@ -149,27 +155,31 @@ class Topics:
             if not type_name or not _is_watched(kind, wanted[topic]) or self._refused.get(topic) == type_name:
                 continue
             try:
-                self._watched[topic] = _Watched(self._node, topic, type_name, kind)
+                self._watched[topic] = _Watched(self._node, topic, type_name, kind, is_raw=RAW in wanted[topic])
             except (TypeUnavailable, SubscriptionRefused) as error:
                 self._refused[topic] = type_name
                 log.warning('%s is not shown: %s', topic, error)
 
     def _drain(self, wanted: _Wanted, now_s: float) -> None:
+        items: list[LiveItem] = []
         for topic, one in self._watched.items():
-            came = one.reader.drain()
+            if not one.is_due(now_s):
+                continue
+            came = one.reader.drain(one.most)
             sizes = wanted.get(topic, frozenset())
-            if RAW in sizes and came:
-                self._came([_raw(topic, message) for message in came])
-            taken = one.due(came, now_s)
+            if one.is_raw:
+                items += [_raw(topic, message) for message in came]
+            taken = one.shown(came, now_s)
             if not taken or not sizes - {RAW} or one.kind is _RAW_ALONE:
                 continue
             try:
-                if items := self._items(topic, one, taken, sorted(sizes - {RAW})):
-                    self._came(items)
+                items += self._items(topic, one, taken, sorted(sizes - {RAW}))
             except Rejected as error:
                 self.rejected[topic] = self.rejected.get(topic, 0) + 1
                 if self.rejected[topic] == 1:
                     log.warning('%s: a message cannot be shown: %s', topic, error)
+        if items:
+            self._came(items)
 
     def _items(self, topic: str, one: _Watched, taken: list[Taken], sizes: list[int]) -> list[LiveItem]:
         # By this machine's own clocks: when it came here, as what ``time.monotonic`` will be compared with.

@@ -1,8 +1,9 @@
 """What one browser gets, in which order, and never more than it can take.
 
 A frame of the WebSocket is a byte with its lane, a byte of flags (1: an item begins, 2: it ends), two of nothing, and a part of
-an item (``kinds.LiveItem.packed``). Each browser says after each frame how many bytes of frames it has received, as a uint32 that
-wraps. No more than a window of them is under way; what waits is small, or the newest of its topic.
+an item (``kinds.LiveItem.packed``); on lane 0 it is several whole items, each after a uint32 with its length. Each browser says
+every 2 KB how many bytes of frames it has received, as a uint32 that wraps. No more than a window of them is under way; what
+waits is small, or the newest of its topic.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ from typing import Final
 
 from shadowhound_data_logger.live.kinds import FULL, HALF, SIZES, SMALLEST, LiveItem
 
-CHUNK: Final = 12 << 10
-"""Bytes of a frame, or a third of the window: on a slow link small items wait for less."""
-LEAST_WINDOW, MOST_WINDOW = 12 << 10, 64 << 10
+LEAST_WINDOW, MOST_WINDOW = 12 << 10, 128 << 10
+CHUNKS: Final = 3
+"""Frames of a window: on a slow link small items wait for a smaller one."""
+SMALL_FRAME: Final = 4 << 10
+"""Bytes of a frame with small items, from which on the next has the rest."""
 WINDOW_S: Final = 0.04
 """What may be under way lasts so long on the link, within these bounds."""
 SMALL_ROOM: Final = 8 << 10
@@ -25,6 +28,8 @@ SMALL_ROOM: Final = 8 << 10
 MOST_ROWS_WAITING: Final = 12
 """Items of a series, each of some 33 ms; older ones are left out."""
 SMALL_LANE: Final = 0
+ACKNOWLEDGED: Final = 2 << 10
+"""Bytes, after which a browser says so."""
 BEGIN, END = 1, 2
 WEIGHTS: Final[Mapping[str, float]] = {'figures': 4.0, 'camera': 4.0, 'cloud': 1.0}
 """How bulk topics share a link."""
@@ -112,10 +117,8 @@ class Viewer:
         under_way, window = self._sent - self._acked, self.window
         if under_way >= window + SMALL_ROOM:
             return None
-        for topic, rows in self._rows.items():
-            if rows:
-                self._rows[topic] = self._rows.pop(topic)  # the others have their turn first
-                return self._count(bytes((SMALL_LANE, BEGIN | END, 0, 0)) + rows.popleft().packed)
+        if self._rows:
+            return self._small()
         is_videos_turn = self.has_video and self._now() < self._bulk_s
         return self._bulk() if under_way < window and not is_videos_turn else None
 
@@ -141,6 +144,18 @@ class Viewer:
             fitting = [size for size in SIZES if self._bytes[topic] * SMALLER[size] * (UP if size < now else 1.0) <= room]
             self._sizes[topic] = min(fitting, default=SMALLEST)
 
+    def _small(self) -> bytes:
+        """Of each topic in turn what has waited longest."""
+        frame = bytearray((SMALL_LANE, BEGIN | END, 0, 0))
+        while self._rows and len(frame) < SMALL_FRAME:
+            topic = next(iter(self._rows))
+            rows = self._rows.pop(topic)
+            packed = rows.popleft().packed
+            frame += len(packed).to_bytes(4, 'little') + packed
+            if rows:
+                self._rows[topic] = rows  # the others have their turn first
+        return self._count(bytes(frame))
+
     def _bulk(self) -> bytes | None:
         waiting = {*self._slots, *self._lanes}
         if not waiting:
@@ -154,7 +169,7 @@ class Viewer:
             flags = BEGIN
             if len(body) >= LEAST_MEASURED and not self.has_video:
                 self._measured.append((self._sent + len(body), self._acked, self._now()))
-        part = lane.body[lane.at : lane.at + min(CHUNK, self.window // 3)]
+        part = lane.body[lane.at : lane.at + self.window // CHUNKS]
         lane.at += len(part)
         self._bulk_s = max(self._bulk_s, self._now()) + len(part) / (self.rate * BESIDE_VIDEO) if self.has_video else 0.0
         self._virtual = max(self._used.get(topic, 0.0), self._virtual)

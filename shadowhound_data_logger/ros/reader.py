@@ -191,12 +191,12 @@ class Reader:
                 return int(handle.get_publisher_count())
             return librcl.publisher_count(handle.pointer)  # Humble
 
-    def drain(self) -> list[Taken]:
-        """Everything that waits, oldest first."""
+    def drain(self, most: int = MAX_TAKES) -> list[Taken]:
+        """Everything that waits, oldest first, up to so many."""
         handle = self._subscription.handle
         with handle:
             waiting = self._through_rclpy(handle) if self._taker is None else self._through_librcl(handle, self._taker)
-            taken = list(islice(waiting, MAX_TAKES))
+            taken = list(islice(waiting, most))
         if self._is_stuck:
             self._renew()
         return taken

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import shlex
+import socket
 import subprocess
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 from e2e.processes import HERE
@@ -26,28 +29,60 @@ ip link set nobody up
 """
 """The robot has a second interface, with nobody on it."""
 JOIN = f'set -e; ip link set lo up; ip addr add {OTHER}/24 dev eth1; ip link set eth1 up'
+NOBODY = 'lladdr 02:00:00:00:00:99 nud permanent'
+LISTEN = """
+import array, socket, sys
+told = socket.socket(fileno=0)
+listener = socket.create_server((sys.argv[1], 0))
+told.sendmsg([b'x'], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array('i', [listener.fileno()]))])
+"""
 
 
 class Machines:
     """Two of them, in a user namespace of their own where this user is not root; both end with ``stack``."""
 
-    def __init__(self, stack: ExitStack) -> None:
-        """Skips where this user may make none."""
+    def __init__(self, stack: ExitStack, robot: int = 0) -> None:
+        """Skips where this user may make none. ``robot`` is a process in a network of its own that becomes the robot's."""
         self._stack = stack
         user = [] if os.geteuid() == 0 else ['--user', '--map-root-user']
-        self.robot = self._hold(['unshare', *user, '--net'])
+        self.robot = robot or self._hold(['unshare', *user, '--net'])
         """A process there, for ``inside``."""
-        self._other = self._hold([*inside(self.robot), 'unshare', '--net'])
-        self._run(self.robot, MAKE, str(self._other))
-        self._run(self._other, JOIN)
+        self.other = self._hold([*inside(self.robot), 'unshare', '--net'])
+        """The same of the other one."""
+        self._run(self.robot, MAKE, str(self.other))
+        self._run(self.other, JOIN)
 
     def join_networks(self) -> None:
         """From now on the other machine reaches the robot's second interface as well."""
-        self._run(self._other, f'ip route add {SECOND} via {ROBOT}')
+        self._run(self.other, f'ip route add {SECOND} via {ROBOT}')
+
+    def cut(self) -> None:
+        """From now on nothing that one of them sends reaches the other, and neither is told so."""
+        self._run(self.robot, f'ip neigh replace {OTHER} dev eth0 {NOBODY}')
+        self._run(self.other, f'ip neigh replace {ROBOT} dev eth1 {NOBODY}')
+
+    def mend(self) -> None:
+        self._run(self.robot, f'ip neigh del {OTHER} dev eth0')
+        self._run(self.other, f'ip neigh del {ROBOT} dev eth1')
+
+    def program(self, name: str, folder: Path) -> str:
+        """A file that runs that program at the other machine."""
+        path = folder / Path(name).name
+        path.write_text(f'#!/bin/sh\nexec {shlex.join([*inside(self.other), name])} "$@"\n')
+        path.chmod(0o755)
+        return str(path)
+
+    def listener(self) -> socket.socket:
+        """A socket of this process that listens at the robot, on a port that is free there."""
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            subprocess.run([*inside(self.robot), sys.executable, '-c', LISTEN, ROBOT], stdin=theirs, check=True)
+            _, (descriptor, *_), _, _ = socket.recv_fds(ours, 1, 1)
+        return socket.socket(fileno=descriptor)
 
     def start(self, *arguments: str, other: bool = False) -> subprocess.Popen[str]:
         """finding.py there; returns once it is ready."""
-        command = [*inside(self._other if other else self.robot), sys.executable, str(HERE / 'finding.py'), *arguments]
+        command = [*inside(self.other if other else self.robot), sys.executable, str(HERE / 'finding.py'), *arguments]
         path = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get('PYTHONPATH')])])
         own = ('CYCLONEDDS_', 'ROS_LOCALHOST', 'ROS_AUTO', 'ROS_STATIC', 'RMW_', 'FASTDDS_', 'FASTRTPS_')
         environ = {name: value for name, value in os.environ.items() if not name.startswith(own)} | {'PYTHONPATH': path}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import re
 import stat
 from collections.abc import AsyncIterator
@@ -66,7 +67,7 @@ class Page:
                 given['X-CSRF-Token'] = self.csrf[who]
         given |= headers or {}
         lines = [f'{method} {path} HTTP/1.1', *(f'{name}: {value}' for name, value in given.items() if value), '', '']
-        writer.write('\r\n'.join(lines).encode() + body)
+        writer.write('\r\n'.join(lines).encode(errors='surrogateescape') + body)
         await writer.drain()
         head = await asyncio.wait_for(reader.readuntil(b'\r\n\r\n'), 60.0)
         answer = {} if path == '/ws' else await asyncio.wait_for(reader.read(), 60.0)
@@ -93,8 +94,11 @@ async def serving(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '0.
 
 ACT = json.dumps({'do': 'flush'}).encode()
 LABEL = b'{"robot": "thor", "label": "x", "from": 5, "to": 5}'
+PULL = b'{"robot": "thor", "sensor": "x", "from": 5, "to": 6}'
 REBOUND = {'Host': 'evil.example:8765'}
 FOREIGN = {'Origin': 'http://evil.example'}
+CHUNKED = b'2000\r\n' + b'x' * 0x2000 + b'\r\n0\r\n\r\n'
+IN_CHUNKS = {'Content-Length': '', 'Transfer-Encoding': 'chunked'}
 TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     # method, path, what is special, and the status for a stranger, a viewer and an operator
     ('GET', '/', {}, (200, 200, 200)),
@@ -137,8 +141,29 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('POST', '/api/label', {'body': LABEL.replace(b'5', b'true')}, (401, 403, 400)),
     ('POST', '/api/label', {'body': LABEL.replace(b'x', b'x' * MOST_BODY)}, (413, 413, 413)),
     ('GET', '/api/label', {}, (401, 404, 404)),
+    ('POST', '/api/pull', {'body': PULL}, (401, 403, 503)),  # there is no spool
+    ('POST', '/api/pull', {'body': PULL, 'csrf': False}, (401, 403, 403)),
+    ('POST', '/api/pull', {'body': PULL, 'headers': FOREIGN}, (403, 403, 403)),
+    ('POST', '/api/pull', {'body': PULL.replace(b'thor', b'../x')}, (401, 403, 400)),
+    ('POST', '/api/pull', {'body': PULL.replace(b'"x"', b'5')}, (401, 403, 400)),
+    ('POST', '/api/pull', {'body': PULL.replace(b'6', b'-6')}, (401, 403, 400)),
+    ('GET', '/api/past/requests', {}, (401, 503, 503)),  # there is no spool
+    ('GET', '/api/past/kept?from=5', {}, (401, 400, 400)),
     ('POST', '/api/sign-out', {'csrf': False}, (401, 403, 403)),
     ('DELETE', '/api/session', {}, (403, 403, 403)),
+    ('POST', '/api/act', {'body': CHUNKED, 'headers': IN_CHUNKS}, (401, 403, 413)),
+    ('POST', '/api/session', {'body': CHUNKED, 'headers': IN_CHUNKS}, (413, 413, 413)),
+    # bytes that are no text
+    ('GET', '/', {'headers': {'Host': '\udcff'}}, (403, 403, 403)),
+    ('GET', '/api/session', {'headers': {'Cookie': 'shadowhound_live=viewer.9999999999.\udcff.x'}}, (401, 401, 401)),
+    ('GET', '/api/session', {'headers': {'Cookie': 'shadowhound_live=viewer.9999999999.x.\udcff'}}, (401, 401, 401)),
+    ('GET', '/foxglove?ticket=viewer.9999999999.%ed%b3%bf.x', {}, (401, 401, 401)),
+    ('GET', '/foxglove?ticket=viewer.9999999999.x.%ff', {}, (401, 401, 401)),
+    ('POST', '/api/act', {'body': ACT, 'headers': {'X-CSRF-Token': '\udcff'}}, (401, 403, 403)),
+    ('POST', '/api/act', {'body': b'\xff'}, (401, 403, 400)),
+    ('POST', '/api/act', {'body': b'{"do": "event", "name": "\\ud800"}'}, (401, 403, 200)),
+    ('POST', '/api/label', {'body': LABEL.replace(b'x', b'\\ud800')}, (401, 403, 400)),
+    ('POST', '/api/session', {'body': b'{"token": "\\ud800"}'}, (401, 401, 401)),
 )
 
 
@@ -230,6 +255,70 @@ def test_the_viewers_and_their_messages_are_bounded(tmp_path: Path, monkeypatch:
             assert b'"ping":5' in message.data
             for each in there:
                 await each.close()
+
+    asyncio.run(run())
+
+
+def test_what_is_no_http_fills_no_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """It is answered, and nobody finds it in the log."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page:
+            for nonsense in (
+                b'GET /\xff HTTP/1.1\r\n\r\n',
+                b'\x16\x03\x01\x02\x00\r\n\r\n',
+                b'GET / HTTP/1.1\r\nX: ' + b'x' * 70_000,
+            ):
+                reader, writer = await asyncio.open_connection('127.0.0.1', page.server.port)
+                writer.write(nonsense)
+                assert (await asyncio.wait_for(reader.read(), 60)).startswith(b'HTTP/1.0 400')
+                writer.close()
+        assert [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR] == []
+
+    asyncio.run(run())
+
+
+def test_a_frame_of_a_gigabyte_is_refused_by_its_head(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a WebSocket says it will send is not waited for."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch, '127.0.0.1') as page:
+            reader, writer = await asyncio.open_connection('127.0.0.1', page.server.port)
+            asked = {'Host': f'127.0.0.1:{page.server.port}', 'Origin': page.origin, **UPGRADE}
+            writer.write(
+                '\r\n'.join(['GET /ws HTTP/1.1', *(f'{name}: {value}' for name, value in asked.items()), '', '']).encode()
+            )
+            await asyncio.wait_for(reader.readuntil(b'\r\n\r\n'), 60)
+            writer.write(b'\x82\xff' + (1 << 30).to_bytes(8, 'big') + bytes(4))
+            while await asyncio.wait_for(reader.read(1 << 16), 60):
+                pass  # until it has ended the connection
+            writer.close()
+
+    asyncio.run(run())
+
+
+def test_a_viewer_that_chooses_again_and_again_changes_what_is_read_seldom(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each change makes and ends subscriptions, which the whole network of the robot hears of."""
+    monkeypatch.setattr(module, 'FIGURES_S', 3600.0)
+
+    async def run() -> None:
+        async with (
+            serving(tmp_path, monkeypatch, '127.0.0.1') as page,
+            aiohttp.ClientSession(headers={'Origin': page.origin}) as session,
+        ):
+            viewer = await session.ws_connect(f'{page.origin}/ws')
+            monkeypatch.setattr(module, 'REWATCH_S', 3600.0)
+            seen = []
+            for number in range(50):
+                await viewer.send_json({'watch': [f'/topic_{number}'], 'ping': number})
+                while f'"ping":{number},'.encode() not in (await viewer.receive_bytes(timeout=60)):
+                    pass
+                if not seen or page.server._wanted != seen[-1]:
+                    seen.append(page.server._wanted)
+            assert len(seen) <= 3  # what happens each second looks as well
+            await viewer.close()
 
     asyncio.run(run())
 

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ import pytest
 import simplejpeg
 from lake.gap_parts import lost, mark, tell
 from lake.making import NOON_NS, add, add_part, folder_store
+from lake.test_pull import Field
 from live.test_kinds import cdr, header, new
 from spool.making import FakeClock, index_of, make, new_spool, put, settle
 
@@ -27,9 +29,11 @@ from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.live import history as module
-from shadowhound_data_logger.live.history import LabelRefused, PastReader, commands
+from shadowhound_data_logger.live import kept as kept_module
+from shadowhound_data_logger.live.history import LabelRefused, PastReader, PullRefused, commands
 from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
-from shadowhound_data_logger.live.past import PastSource, SpoolPast, StorePast
+from shadowhound_data_logger.live.kept import SpoolKept, StoreKept
+from shadowhound_data_logger.live.past import SpoolPast, StorePast
 from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.model import State
@@ -80,14 +84,14 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectSto
         yield opened
 
 
-Opened = Callable[[PastSource], PastReader]
+Opened = Callable[..., PastReader]
 
 
 @pytest.fixture
 def opened(store: ObjectStore) -> Iterator[Opened]:
     """Histories that are closed in the end."""
     with ExitStack() as stack:
-        yield lambda source: stack.enter_context(closing(PastReader(source)))
+        yield lambda source, kept=None: stack.enter_context(closing(PastReader(source, kept or StoreKept())))
 
 
 def patrol(store: ObjectStore, folder: Path) -> None:
@@ -154,7 +158,7 @@ def test_the_past_of_a_spool(store: ObjectStore, opened: Opened, tmp_path: Path)
         index.clear_uncatalogued()
         with index.transaction():
             index.compact(clock.wall_ns() + 1)
-    history = opened(SpoolPast(tmp_path / 'spool', 'thor'))
+    history = opened(SpoolPast(tmp_path / 'spool', 'thor'), SpoolKept(tmp_path / 'spool', 'thor'))
     assert history.answer({'do': 'days', 'robot': 'thor'})[0] == {'days': ['2025-10-18']}
     for second, where in enumerate(('the store', 'the store', 'the spool')):
         head, body = history.moment('thor', NOON_NS_OF_SPOOL + second * SECOND + 1)
@@ -278,6 +282,68 @@ def test_labels_are_marks_and_an_operator_adds_them(store: ObjectStore, opened: 
     for wrong in ({'label': HOSTILE}, {'label': ' '}, {'label': 'x', 'to': noon}, {'label': 'x', 'robot': 'nobody'}):
         with pytest.raises(LabelRefused):
             history.answer({**given, **wrong})
+
+
+def test_what_the_robot_keeps_is_shown_and_asked_for(store: ObjectStore, opened: Opened, tmp_path: Path,
+                                                     monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """By the store: how much of a time is on the robot alone, a request for it, its states, and taking one back."""
+    monkeypatch.setattr(kept_module, 'FRESH_S', -1.0)
+    with closing(Field(tmp_path)) as field:
+        field.records(*range(6))
+        history = opened(StorePast())
+        noon = NOON_NS_OF_SPOOL // 1_000_000
+        span = {'robot': 'thor', 'from': noon + 2000, 'to': noon + 4500}
+
+        def asked(do: str, **more: Any) -> dict[str, Any]:
+            return history.answer({'do': do, **span, **more})[0]
+
+        assert asked('timeline')['kept'] == [['/camera', noon + 2000, noon + 4000]]
+        found = asked('kept')['kept']
+        assert (list(found), found['camera']['objects'], found['camera']['bytes']) == (['camera'], 3, 3000)
+        for wrong in ({'sensor': 'lidar'}, {'sensor': HOSTILE}, {'sensor': 'camera', 'to': noon + 2000}, {'robot': 'nobody'}):
+            with pytest.raises((PullRefused, ValueError, KeyError)):
+                asked('pull', by='operator_::1', **wrong)
+        name = asked('pull', sensor='camera', by='operator_::1')['id']
+        (one,) = asked('requests')['requests']
+        assert (one['id'], one['state'], one['by'], one['sensor'], one['from']) == (
+            name, 'asked', 'operator___1', 'camera', noon + 2000
+        )  # fmt: skip
+        field.passes()
+        field.passes()
+        (one,) = asked('requests')['requests']
+        assert (one['state'], one['objects'], one['sent'], one['sent_bytes']) == ('done', 3, 3, 3000)
+        assert asked('timeline')['kept'] == []
+        assert asked('kept', **{'from': noon})['kept']['camera']['objects'] == 2
+        again = asked('pull', sensor='camera', by='viewer', **{'from': noon})['id']
+        asked('pull', cancel=again, by='viewer')
+        field.passes()
+        field.passes()
+        assert [one['state'] for one in asked('requests')['requests'] if one['id'] == again] == ['cancelled']
+        with pytest.raises(PullRefused):
+            asked('pull', cancel='0' * 32, by='viewer')
+
+
+def test_what_a_spool_keeps_is_asked_of_its_node(store: ObjectStore, opened: Opened, tmp_path: Path,
+                                                 monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """On the robot the index says how much that is; the node is asked, whose request is one as any other."""
+    with closing(Field(tmp_path)) as field:
+        field.records(*range(6))
+
+        def ask(do: str, want: dict[str, Any], by: str) -> dict[str, Any]:
+            return {'ok': do == 'pull', 'id': field.server.ask(want, by)}
+
+        monkeypatch.setattr(kept_module, 'connect', lambda *_: SimpleNamespace(ask=ask, close=lambda: None))
+        history = opened(SpoolPast(tmp_path / 'spool', 'thor'), SpoolKept(tmp_path / 'spool', 'thor'))
+        noon = NOON_NS_OF_SPOOL // 1_000_000
+        span = {'robot': 'thor', 'from': noon + 2000, 'to': noon + 4500}
+        assert history.answer({'do': 'kept', **span})[0]['kept']['camera']['objects'] == 3
+        name = history.answer({'do': 'pull', 'sensor': 'camera', 'by': 'operator', **span})[0]['id']
+        field.passes()
+        field.passes()
+        (one,) = history.answer({'do': 'requests', 'robot': 'thor'})[0]['requests']
+        assert (one['id'], one['state'], one['objects'], one['sent']) == (name, 'done', 3, 3)
+        assert field.kept() == [0, 1, 5]
+        assert history.answer({'do': 'kept', **span})[0]['kept'] == {}
 
 
 def test_a_store_that_is_away_delays_no_timeline(opened: Opened, store: ObjectStore, tmp_path: Path,

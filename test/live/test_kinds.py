@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +13,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
-from shadowhound_data_logger.live.kinds import FULL, HALF, KINDS, SIZES, SMALLEST, clouds, frames, series
+from shadowhound_data_logger.live.kinds import FULL, HALF, KINDS, MOST_NAME, MOST_NAMES, SIZES, SMALLEST, clouds, frames, series
 from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 
 STORE = get_typestore(Stores.LATEST)
 TYPES = MessageTypes()
+INTERFACES = Path(__file__).parents[2] / 'interfaces'
 
 
 def new(type_name: str, /, **given: Any) -> Any:
@@ -63,6 +66,17 @@ def test_points_come_back_within_half_a_step() -> None:
     assert len(smallest.body) == 1_250 * 6
 
 
+@pytest.mark.filterwarnings('error')
+def test_points_that_are_absurdly_far_are_left_out() -> None:
+    """They would make all others one point."""
+    points = np.zeros((100, 3))
+    points[:4] = [[1e30, 0, 0], [0, -3.4e38, 3.4e38], [np.inf, -np.inf, np.nan], [5.0, 6.0, 7.0]]
+    (item,) = clouds('/points', TYPES, 0.0, cloud(points), [FULL])
+    assert item.head is not None
+    assert (item.head['points'], item.head['low']) == (97, [0.0, 0.0, 0.0])
+    assert np.frombuffer(item.body, '<u2')[:3].tolist() == [65_535] * 3
+
+
 def test_an_empty_cloud_and_one_of_a_single_point_are_shown() -> None:
     """Their box has no extent."""
     for points in (np.empty((0, 3)), np.array([[1.0, 2.0, 3.0]])):
@@ -70,7 +84,9 @@ def test_an_empty_cloud_and_one_of_a_single_point_are_shown() -> None:
         assert len(item.body) == 6 * len(points)
 
 
-@pytest.mark.parametrize('changed', [{'width': 1 << 30}, {'point_step': 8}, {'fields': []}, {'point_step': 0}])
+@pytest.mark.parametrize(
+    'changed', [{'width': 1 << 30}, {'point_step': 8}, {'fields': []}, {'point_step': 0}, {'width': 0, 'point_step': 0xFFFF_FFFF}]
+)
 def test_a_cloud_that_contradicts_itself_is_rejected(changed: dict[str, Any]) -> None:
     """Nothing is allocated for what it claims."""
     with pytest.raises(Rejected):
@@ -92,6 +108,21 @@ def test_a_compressed_image_goes_as_it_came() -> None:
     full, small = frames('/image', COMPRESSED_IMAGE, TYPES, 0.0, cdr(message, COMPRESSED_IMAGE), [FULL, SMALLEST])
     assert full.body == jpeg
     assert simplejpeg.decode_jpeg_header(small.body)[:2] == (120, 160)
+
+
+def of_too_many_pixels() -> bytes:
+    """A small JPEG whose head says 65,500 x 65,500."""
+    jpeg = bytes(simplejpeg.encode_jpeg(np.zeros((8, 8, 3), np.uint8), 80, 'BGR'))
+    at = jpeg.index(b'\xff\xc0') + 5
+    return jpeg[:at] + struct.pack('>HH', 65_500, 65_500) + jpeg[at + 4 :]
+
+
+@pytest.mark.parametrize('size', SIZES)
+def test_a_jpeg_of_too_many_pixels_is_rejected(size: int) -> None:
+    """In each size: a browser would take 17 GB for it."""
+    message = new(COMPRESSED_IMAGE, header=header(), format='jpeg', data=np.frombuffer(of_too_many_pixels(), np.uint8))
+    with pytest.raises(Rejected, match='pixels'):
+        list(frames('/image', COMPRESSED_IMAGE, TYPES, 0.0, cdr(message, COMPRESSED_IMAGE), [size]))
 
 
 @pytest.mark.parametrize('changed', [{'encoding': 'bayer'}, {'step': 1}, {'height': 1 << 20}, {'width': 0}])
@@ -128,3 +159,27 @@ def test_rows_of_figures_come_with_their_times() -> None:
     assert item.head == {'names': ['a', 'b'], 'rows': 2, 'at': 20.0}
     assert np.frombuffer(item.body[:16], '<f8').tolist() == [10.0, 20.0]
     assert np.frombuffer(item.body[16:], '<f4').tolist() == [0.5, 2.0, 1.5, 2.0]
+
+
+def test_joints_without_end_are_cut() -> None:
+    """In number and in the length of their names."""
+    name, empty = 'sensor_msgs/msg/JointState', np.array([])
+    names = [f'{place:04}' * 25 for place in range(2000)]
+    joints = cdr(new(name, header=header(), name=names, position=np.zeros(2000), velocity=empty, effort=empty), name)
+    item = series('/joints', KINDS[name], name, TYPES, [(10.0, joints)])
+    assert item.head is not None
+    assert (len(item.head['names']), max(map(len, item.head['names']))) == (MOST_NAMES, MOST_NAME)
+
+
+def test_the_imu_of_a_go2_reads_the_same_both_ways(tmp_path: Path) -> None:
+    """At once, and field by field; what is of another length or byte order goes the second way."""
+    (tmp_path / 'share').mkdir()
+    (tmp_path / 'share' / 'go2_interfaces').symlink_to(INTERFACES / 'go2_interfaces')
+    name, types = 'go2_interfaces/msg/IMU', MessageTypes([tmp_path])
+    messages = [(float(turn), b'\0\1\0\0' + struct.pack('<13fb', *np.arange(13) * turn, -5 * turn)) for turn in (1, 2)]
+    at_once = series('/imu', KINDS[name], name, types, messages)
+    by_field = series('/imu', KINDS[name]._replace(table=None), name, types, messages)
+    assert at_once.packed == by_field.packed
+    assert np.frombuffer(at_once.body[16:], '<f4')[[0, 9, 19]].tolist() == [10.0, -5.0, -10.0]
+    other = b'\0\0\0\0' + struct.pack('>13fb', *range(13), -5)
+    assert np.frombuffer(series('/imu', KINDS[name], name, types, [(1.0, other)]).body[8:], '<f4')[9] == -5.0

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import pytest
+from e2e.live_frames import Frames
 
 from shadowhound_data_logger.live.kinds import FULL, SMALLEST, LiveItem
-from shadowhound_data_logger.live.viewer import BEGIN, CHUNK, END, LEAST_WINDOW, MOST_ROWS_WAITING, MOST_WINDOW, SMALLER, Viewer
+from shadowhound_data_logger.live.viewer import (
+    CHUNKS,
+    LEAST_WINDOW,
+    MOST_ROWS_WAITING,
+    MOST_WINDOW,
+    SMALL_FRAME,
+    SMALLER,
+    Viewer,
+)
+
+CHUNK = MOST_WINDOW // CHUNKS
 
 
 class Browser:
@@ -16,9 +26,12 @@ class Browser:
 
     def __init__(self, viewer: Viewer) -> None:
         self.viewer = viewer
-        self.received = 0
         self.items: list[dict[str, Any]] = []
-        self._parts: dict[int, bytes] = {}
+        self._frames = Frames()
+
+    @property
+    def received(self) -> int:
+        return self._frames.bytes
 
     def read(self, most: int = 10_000) -> list[dict[str, Any]]:
         """What comes until nothing more may be sent."""
@@ -26,15 +39,7 @@ class Browser:
         while most and (frame := self.viewer.next_frame()) is not None:
             most -= 1
             assert len(frame) <= CHUNK + 4
-            self.received += len(frame)
-            lane, flags = frame[:2]
-            assert bool(flags & BEGIN) is (lane not in self._parts)
-            self._parts[lane] = self._parts.get(lane, b'') + frame[4:]
-            if flags & END:
-                whole = self._parts.pop(lane)
-                length = int.from_bytes(whole[:4], 'little')
-                assert (4 + length) % 8 == 0
-                self.items.append({**json.loads(whole[4 : 4 + length]), 'body': whole[4 + length :]})
+            self.items += [{**head, 'body': body} for head, body in self._frames.take(frame)]
         return self.items[before:]
 
     def acknowledge(self) -> None:
@@ -103,6 +108,21 @@ def test_small_items_go_before_what_is_left_of_a_large_one(browser: Browser) -> 
     assert [item['topic'] for item in browser.read(1)] == ['/imu']
 
 
+def test_small_items_go_together(browser: Browser) -> None:
+    """In one frame, of each topic in turn, as long as it is small; the rest in the next."""
+    for number in range(3):
+        for topic in ('/imu', '/odom'):
+            browser.viewer.offer(row(number, topic))
+    browser.viewer.offer(LiveItem('/joints', 'joints', FULL, {'number': 0}, bytes(2 * SMALL_FRAME)))
+    browser.viewer.offer(row(1, '/joints'))
+    found = [[(item['topic'], item['number']) for item in browser.read(1)] for _ in range(3)]
+    assert found == [
+        [('/imu', 0), ('/odom', 0), ('/joints', 0)],
+        [('/imu', 1), ('/odom', 1), ('/joints', 1), ('/imu', 2), ('/odom', 2)],
+        [],
+    ]
+
+
 def test_bulk_topics_share_a_link_by_weight(browser: Browser) -> None:
     """A cloud in between costs a camera a fifth, not a half; one that was silent has no claim on what it did not use."""
     for number in range(50):
@@ -110,8 +130,8 @@ def test_bulk_topics_share_a_link_by_weight(browser: Browser) -> None:
         all_of(browser)
     sizes = {'/camera': 0, '/cloud': 0}
     for number in range(400):
-        browser.viewer.offer(frame(number, 40_000))
-        browser.viewer.offer(LiveItem('/cloud', 'cloud', FULL, {}, bytes(40_000)))
+        browser.viewer.offer(frame(number, 200_000))
+        browser.viewer.offer(LiveItem('/cloud', 'cloud', FULL, {}, bytes(200_000)))
         for item in browser.read(2):
             sizes[item['topic']] += len(item['body'])
         browser.acknowledge()

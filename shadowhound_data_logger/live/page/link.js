@@ -1,11 +1,20 @@
 // The connection to the robot: frames to items, acknowledgements, the offset of its clock, and coming back after an outage.
 //
-// A frame is a byte with its lane, a byte of flags (1: an item begins, 2: it ends), two of nothing, and a part of an item. An item is a
-// uint32 with the length of its head, the head as JSON padded to eight bytes, and its body.
+// A frame is a byte with its lane, a byte of flags (1: an item begins, 2: it ends), two of nothing, and a part of an item; on lane 0
+// whole items, each after a uint32 with its length. An item is a uint32 with the length of its head, the head as JSON padded to eight
+// bytes, and its body.
 
 const SILENT_MS = 3000; // the robot says something each second
-const TRY_MS = 1500;
+const ACKNOWLEDGED = 2048; // bytes
+const TICK_MS = 250;
+const PING_MS = 500;
 const PINGS = 12;
+// How long an attempt to connect gets. A lost packet of it is sent again after 1 s, then after 2 and 4: a new attempt is sooner. One in
+// four has longer, for a link so slow that the others end too early.
+const TRY_MS = [1000, 1000, 1000, 2500];
+const MOST_TRY_MS = 5000;
+const ROUNDS = 6; // of the link, that an attempt takes at most
+const JITTER_MS = 250;
 
 export class Link {
   constructor({ onItem, onState }) {
@@ -14,14 +23,17 @@ export class Link {
     this.watched = [];
     this.isHidden = document.hidden;
     this.offset = null; // what its clock (ms) is ahead of performance.now()
-    this.rtt = null;
+    this.rtt = null; // the least of late, ms
+    this.tries = 0; // since it was connected
     this.bytes = 0;
     this.items = 0;
     document.addEventListener('visibilitychange', () => {
       this.isHidden = document.hidden;
       this.tell();
+      this.tick();
     });
-    setInterval(() => this.tick(), 500);
+    addEventListener('online', () => this.socket?.readyState !== WebSocket.OPEN && this.connect());
+    setInterval(() => this.tick(), TICK_MS);
     this.connect();
   }
 
@@ -45,14 +57,22 @@ export class Link {
   }
 
   connect() {
+    const old = this.socket;
+    this.socket = null;
+    old?.close(); // before the next one: browsers begin one at a time
     const socket = new WebSocket(`${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/ws`);
     const parts = new Map();
     let received = 0;
+    let told = 0;
     socket.binaryType = 'arraybuffer';
     this.socket = socket;
     this.triedAt = this.heardAt = performance.now();
     this.pings = [];
+    this.patience = Math.max(TRY_MS[this.tries % TRY_MS.length], Math.min(ROUNDS * (this.rtt ?? 0), MOST_TRY_MS)) + JITTER_MS * Math.random();
+    this.tries += 1;
     socket.onopen = () => {
+      if (socket !== this.socket) return;
+      this.tries = 0;
       this.onState('connected');
       this.tell();
       this.ping();
@@ -60,13 +80,14 @@ export class Link {
     socket.onmessage = ({ data }) => {
       if (socket !== this.socket) return;
       this.heardAt = performance.now();
-      received = (received + data.byteLength) >>> 0;
+      received += data.byteLength;
       this.bytes += data.byteLength;
-      const acknowledged = new DataView(new ArrayBuffer(4));
-      acknowledged.setUint32(0, received, true);
-      socket.send(acknowledged.buffer); // on receipt, not when it is drawn
+      if (received - told >= ACKNOWLEDGED) {
+        told = received;
+        socket.send(Uint32Array.of(received % 2 ** 32)); // on receipt, not when it is drawn
+      }
       const [lane, flags] = new Uint8Array(data, 0, 2);
-      if (flags === 3) return this.take(new Uint8Array(data, 4));
+      if (lane === 0) return this.takeSeveral(data);
       if (flags & 1) parts.set(lane, []);
       const known = parts.get(lane);
       if (!known) return;
@@ -89,6 +110,11 @@ export class Link {
     };
   }
 
+  takeSeveral(frame) {
+    const view = new DataView(frame);
+    for (let at = 4; at < frame.byteLength; at += 4 + view.getUint32(at, true)) this.take(new Uint8Array(frame, at + 4, view.getUint32(at, true)));
+  }
+
   take(whole) {
     const length = new DataView(whole.buffer, whole.byteOffset, 4).getUint32(0, true);
     const head = JSON.parse(new TextDecoder().decode(whole.subarray(4, 4 + length)));
@@ -98,6 +124,7 @@ export class Link {
   }
 
   ping() {
+    this.pingedAt = performance.now();
     this.say({ ping: performance.now() });
   }
 
@@ -107,21 +134,20 @@ export class Link {
     this.pings = [...this.pings, { rtt: here - ping, offset: now - (here + ping) / 2 }].slice(-PINGS);
     const best = this.pings.reduce((least, each) => (each.rtt < least.rtt ? each : least));
     this.offset = best.offset;
-    this.rtt = here - ping;
+    this.rtt = best.rtt;
   }
 
+  // A connection that is silent is given up: what TCP sends again after an outage comes later than what a new one brings.
   tick() {
     const now = performance.now();
-    if (!this.socket) {
-      if (now - this.triedAt > 700) this.connect();
-    } else if (this.socket.readyState === WebSocket.CONNECTING ? now - this.triedAt > TRY_MS : now - this.heardAt > SILENT_MS) {
-      const old = this.socket;
-      this.socket = null;
+    const isOpen = this.socket?.readyState === WebSocket.OPEN;
+    if (isOpen && now - this.heardAt <= SILENT_MS) {
+      if (now - this.pingedAt >= PING_MS) this.ping();
+    } else if (isOpen) {
       this.onState('lost');
-      old.close();
       this.connect();
-    } else {
-      this.ping();
+    } else if (now - this.triedAt > this.patience && !this.isHidden) {
+      this.connect();
     }
   }
 }

@@ -112,8 +112,8 @@ const DAY_MS = 86400000;
 export async function openDay(robot, day) {
   const from = Date.parse(`${day}T00:00:00Z`);
   await look(robot, from, from + DAY_MS);
-  const recorded = told.value?.recorded ?? [];
-  const last = recorded.reduce((most, [, , to]) => Math.max(most, to), 0);
+  const { recorded = [], kept = [] } = told.value ?? {};
+  const last = [...recorded, ...kept].reduce((most, [, , to]) => Math.max(most, to), 0);
   go(robot, last || from + DAY_MS / 2);
 }
 

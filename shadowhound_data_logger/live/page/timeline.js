@@ -1,6 +1,7 @@
 // What was recorded and what is missing, by topic and time: of today beside the live view, of any day when looking back.
 import { html, useEffect, useRef, useState } from './vendor/preact.js';
 import { busy, days, go, leave, list, look, openDay, openRobot, past, playing, problem as pastProblem, range, robots, speed, told } from './past.js';
+import { Pull } from './pull.js';
 import { CAUSES, clock, digits, hue, moment, span } from './words.js';
 
 const SPANS = [[15, '15 min'], [60, '1 h'], [360, '6 h'], [0, 'Today']];
@@ -74,10 +75,9 @@ function Transport({ robot }) {
 }
 
 // An operator says what there is to see: of this moment, or of the time since "From here".
-function LabelForm({ session, robot }) {
+function LabelForm({ session, robot, begin, setBegin }) {
   const [label, setLabel] = useState('');
   const [note, setNote] = useState('');
-  const [begin, setBegin] = useState(null);
   const [said, setSaid] = useState(['', '']);
   const at = Math.round(past.value.at);
   const [from, to] = begin === null ? [at, at] : [Math.min(begin, at), Math.max(begin, at)];
@@ -109,6 +109,7 @@ export function Timeline({ session }) {
   const [failed, setFailed] = useState('');
   const [chosen, setChosen] = useState(null);
   const [width, setWidth] = useState(800);
+  const [begin, setBegin] = useState(null); // of the time that a label or a request is for, which ends at the moment
   const box = useRef(null);
   const drags = useRef(false);
   const isPast = past.value !== null;
@@ -159,7 +160,8 @@ export function Timeline({ session }) {
   const robot = range.value?.robot ?? past.value?.robot ?? session.robot;
   const gaps = (found?.gaps ?? []).map((row) => Object.fromEntries(found.columns.map((name, place) => [name, row[place]])));
   const recorded = found?.recorded ?? [];
-  const topics = [...new Set([...(found?.known ?? []), ...recorded].map(([topic]) => topic).concat(gaps.map((gap) => gap.topic)))].sort().slice(0, 60);
+  const kept = found?.kept ?? [];
+  const topics = [...new Set([...(found?.known ?? []), ...recorded, ...kept].map(([topic]) => topic).concat(gaps.map((gap) => gap.topic)))].sort().slice(0, 60);
   const left = width < 520 ? 92 : 150;
   const { from = 0, to = 1, now = 0 } = found ?? {};
   const x = (ms) => left + ((Math.min(Math.max(ms, from), to) - from) / (to - from)) * (width - left - 8);
@@ -222,7 +224,8 @@ export function Timeline({ session }) {
       ${isPast ? session.has_live && html`<button type="button" class="primary" onClick=${leave}>Back to now</button>` : html`<button type="button" class="primary" onClick=${() => openRobot(session.robot)}>Back in time</button>`}
     </div>
     ${isPast && html`<${Transport} robot=${robot} />`}
-    ${isPast && session.role === 'operator' && html`<${LabelForm} session=${session} robot=${robot} />`}
+    ${isPast && session.role === 'operator' && html`<${LabelForm} session=${session} robot=${robot} begin=${begin} setBegin=${setBegin} />`}
+    ${isPast && html`<${Pull} session=${session} robot=${robot} begin=${begin} />`}
     <div ref=${box} class="timeline-box">
       ${problem && html`<p class="note bad" role="alert">${problem}</p>`}
       ${isPast && found?.problem && html`<p class="note watch">${found.problem}</p>`}
@@ -246,17 +249,21 @@ export function Timeline({ session }) {
             x=${x(since)} y="5" width=${Math.max(1, x(until) - x(since))} height=${ROW - 10} rx="3" />`)}
           ${recorded.filter(([name]) => name === topic).map(([, since, until]) => html`<rect class="recorded" data-topic=${topic} data-from=${since} data-to=${until}
             x=${x(since)} y=${ROW - 9} width=${Math.max(1.5, x(until) - x(since))} height="4" rx="1" />`)}
+          ${kept.filter(([name]) => name === topic).map(([, since, until]) => html`<rect class="kept" data-topic=${topic} data-from=${since} data-to=${until}
+            x=${x(since)} y=${ROW - 9} width=${Math.max(1.5, x(until) - x(since))} height="4" rx="1"><title>kept on the robot</title></rect>`)}
           ${gaps.filter((gap) => gap.topic === topic).map((gap) => html`<rect class=${`gap hue-${hue(gap.kind, gap.cause)}`} data-topic=${topic} data-kind=${gap.kind}
             data-cause=${gap.cause} data-from=${gap.from} data-to=${gap.to} data-count=${gap.count} x=${x(gap.from)} y="3"
             width=${Math.max(2.5, x(gap.to) - x(gap.from))} height=${ROW - 6} rx="1.5" onPointerEnter=${() => setChosen(gap)}>
             <title>${`${topic}: ${gap.count} ${gap.kind} (${gap.cause}), ${clock(gap.from)} for ${span((gap.to - gap.from) / 1000)}`}</title></rect>`)}
         </g>`)}
         ${now < to && now > from && html`<line class="now" x1=${x(now)} x2=${x(now)} y1="0" y2=${height - 22} />`}
+        ${isPast && begin !== null && html`<rect class="span" x=${x(Math.min(begin, past.value.at))} y="0" width=${Math.abs(x(past.value.at) - x(begin))} height=${height - 22} />`}
         ${isPast && past.value.at >= from && past.value.at <= to && html`<g class="cursor"><line x1=${x(past.value.at)} x2=${x(past.value.at)} y1="0" y2=${height - 22} /><circle cx=${x(past.value.at)} cy=${height - 22} r="5" /></g>`}
       </svg>`}
     </div>
     <div class="legend">
       ${isPast && html`<span><i class="swatch recorded"></i>recorded</span>`}
+      ${kept.length > 0 && html`<span><i class="swatch kept"></i>kept on the robot</span>`}
       <span><i class="swatch known"></i>nothing else is missing</span><span><i class="swatch unknown"></i>not known yet</span>
       ${[...seen.values()].map((each) => html`<span title=${CAUSES[each.cause] ?? ''}><i class=${`swatch hue-${hue(each.kind, each.cause)}`}></i>${each.kind}: ${each.cause.replaceAll('_', ' ')} <b>${digits(each.messages)}</b></span>`)}
       ${['mission', 'bag', 'event', 'label'].filter((kind) => marks.some((mark) => mark.kind === kind)).map((kind) => html`<span><i class=${`swatch of-${kind}`}></i>${kind}</span>`)}

@@ -1,0 +1,196 @@
+"""What a robot keeps until somebody asks for it, and what is asked of it: by its spool, or by the catalogue and its mailbox.
+
+On the robot the index of its spool knows both, and the node is asked. On another machine they are in the store, which has to let
+this one replace the mailbox.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, Protocol, TypeVar
+
+from shadowhound_data_logger.catalogue.schema import BUCKET
+from shadowhound_data_logger.clock import SECOND, SystemClock
+from shadowhound_data_logger.config import home, store_settings
+from shadowhound_data_logger.errors import LakeError, SpoolError
+from shadowhound_data_logger.mailbox import KeptFilter, offer
+from shadowhound_data_logger.model import ON_ROBOT, State
+from shadowhound_data_logger.options import UploadSettings
+from shadowhound_data_logger.spool.control import connect
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.status import read as read_status
+from shadowhound_data_logger.stores import open_store
+
+MOST_REQUESTS: Final = 20
+"""The newest ones are told."""
+FRESH_S: Final = 10.0
+"""What the store says of a time is read again after so long."""
+PACE_S: Final = 60.0
+"""The same of the pace of a robot."""
+LONGEST_SLICE_NS: Final = 3600 * SECOND
+"""A slice that began before a time may have messages of it."""
+
+
+class KeptSource(Protocol):
+    """What the page knows of what robots keep, and whom it asks for it."""
+
+    is_recorded: bool
+    """Whether what is kept is among what the past has (``live/past.py``)."""
+
+    def rows(self, robot: str, begin_ns: int, end_ns: int) -> list[Mapping[str, Any]]:
+        """Of objects that are kept or lost, with what of them is in this time: columns of ``catalogue.schema.KEPT``."""
+
+    def mbps(self, robot: str) -> float | None:
+        """The pace at which the robot uploads; None where it is not known."""
+
+    def requests(self, robot: str) -> list[dict[str, Any]]:
+        """The newest ones, the oldest of them first, each with ``id by state why want objects bytes sent sent_bytes``."""
+
+    def ask(self, robot: str, want: KeptFilter, by: str) -> str:
+        """The id of the request."""
+
+    def cancel(self, robot: str, request: str, by: str) -> None: ...
+
+
+def offers(source: KeptSource, robot: str, begin_ns: int, end_ns: int) -> dict[str, Any]:
+    """Sensor -> what a request for this time comes to, as ``mailbox.offer`` says it."""
+    want, mbps = KeptFilter(since_ns=begin_ns, until_ns=end_ns), source.mbps(robot)
+    of: dict[str, list[Mapping[str, Any]]] = {}
+    for row in source.rows(robot, begin_ns, end_ns):
+        of.setdefault(row['sensor'] or '', []).append(row)
+    return {sensor: offer(replace(want, sensor=sensor), rows, mbps) for sensor, rows in sorted(of.items()) if sensor}
+
+
+class SpoolKept:
+    """Of one robot, by the index of its spool; its node is asked."""
+
+    is_recorded = True
+
+    def __init__(self, spool: Path, robot: str) -> None:
+        self._spool, self._robot = spool, robot
+
+    def rows(self, robot: str, begin_ns: int, end_ns: int) -> list[Mapping[str, Any]]:
+        """Those that are kept. Raises SpoolError."""
+        want = KeptFilter(since_ns=begin_ns, until_ns=end_ns)
+        found = self._read(lambda index: list(index.recorded(robot, begin_ns - LONGEST_SLICE_NS, end_ns)))
+        return [
+            {'key': key, 'sensor': sensor, 'topic': topic, 'bytes': size, 't_start_ns': start_ns, 't_end_ns': last_ns,
+             'where': ON_ROBOT}
+            for _, key, state, _, sensor, topic, _, size, start_ns, last_ns, *_ in found
+            if state == State.KEPT.value and want.takes(key, sensor, topic, start_ns, last_ns, {})
+        ]  # fmt: skip
+
+    def mbps(self, robot: str) -> float | None:
+        found = read_status(self._spool, robot, SystemClock.of_this_machine()).get('requests')
+        return found.get('mbps') if isinstance(found, dict) else None
+
+    def requests(self, robot: str) -> list[dict[str, Any]]:
+        """Raises SpoolError."""
+        return self._read(_of_index) if robot == self._robot else []
+
+    def ask(self, robot: str, want: KeptFilter, by: str) -> str:
+        """Raises NodeUnavailable, LakeError."""
+        return str(self._tell(robot, want=want.to_json(), by=by)['id'])
+
+    def cancel(self, robot: str, request: str, by: str) -> None:
+        """Raises NodeUnavailable, LakeError."""
+        self._tell(robot, cancel=request, by=by)
+
+    def _tell(self, robot: str, **arguments: Any) -> dict[str, Any]:
+        with closing(connect(self._spool, robot)) as connection:
+            answer = connection.ask('pull', **arguments)
+        if not answer['ok']:
+            raise LakeError(str(answer.get('error')))
+        return answer
+
+    def _read(self, read: Callable[[Index], _Answer]) -> _Answer:
+        index = Index(self._spool / 'index.db', read_only=True)
+        try:
+            index.open()
+            with closing(index):
+                return read(index)
+        except sqlite3.Error as error:
+            raise SpoolError(f'the index of {self._spool} cannot be read: {error}') from error
+
+
+class StoreKept:
+    """Of all robots, by the store that the environment names. It needs the extra ``lake``."""
+
+    is_recorded = False
+
+    def __init__(self) -> None:
+        """Raises SettingError for settings of a store that are none."""
+        from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415 - the extra lake
+        from shadowhound_data_logger.lake.findings import Findings  # noqa: PLC0415
+
+        self._settings = store_settings(os.environ, home(os.environ))
+        self._source = Bucket(self._settings, BUCKET)
+        self._findings = Findings(lambda _: None)
+        self._rows: tuple[str, int, int, float, list[Mapping[str, Any]]] | None = None
+        self._paces: dict[str, tuple[float, float | None]] = {}
+
+    def rows(self, robot: str, begin_ns: int, end_ns: int) -> list[Mapping[str, Any]]:
+        """Raises StoreError."""
+        from shadowhound_data_logger.lake import pull  # noqa: PLC0415 - the extra lake
+
+        known, now_s = self._rows, time.monotonic()
+        is_known = known is not None and known[0] == robot and known[1] <= begin_ns and known[2] >= end_ns
+        if known is None or not is_known or now_s - known[3] > FRESH_S:
+            wide = KeptFilter(since_ns=begin_ns, until_ns=end_ns)
+            known = self._rows = robot, begin_ns, end_ns, now_s, pull.known(self._source, robot, wide, self._findings).to_pylist()
+        want = KeptFilter(since_ns=begin_ns, until_ns=end_ns)
+        return [row for row in known[4] if row['t_start_ns'] is not None and pull.takes(want, row)]
+
+    def mbps(self, robot: str) -> float | None:
+        """Raises StoreError."""
+        from shadowhound_data_logger.lake import link  # noqa: PLC0415 - the extra lake
+
+        known, now_s = self._paces.get(robot), time.monotonic()
+        if known is None or now_s - known[0] > PACE_S:
+            known = self._paces[robot] = now_s, link.pace_mbps(self._source, robot, self._findings)
+        return known[1]
+
+    def requests(self, robot: str) -> list[dict[str, Any]]:
+        """Raises StoreError, LakeError."""
+        from shadowhound_data_logger.lake import pull  # noqa: PLC0415 - the extra lake
+
+        found = []
+        for one in pull.listed(self._source, robot)[-MOST_REQUESTS:]:
+            answer = one.answer or {}
+            why = answer.get('why')
+            found.append({'id': one.id, 'by': one.by, 'state': one.state, 'why': why if isinstance(why, str) else '',
+                          'want': one.want, **pull.told_by(answer)._asdict()})  # fmt: skip
+        return found
+
+    def ask(self, robot: str, want: KeptFilter, by: str) -> str:
+        """Raises StoreError, LakeError."""
+        from shadowhound_data_logger.lake import pull  # noqa: PLC0415 - the extra lake
+
+        with closing(open_store(self._settings, UploadSettings())) as store:
+            return pull.ask(store, self._source, robot, want, by=by).id
+
+    def cancel(self, robot: str, request: str, by: str) -> None:
+        """Raises StoreError, LakeError."""
+        from shadowhound_data_logger.lake import pull  # noqa: PLC0415 - the extra lake
+
+        with closing(open_store(self._settings, UploadSettings())) as store:
+            pull.cancel(store, self._source, robot, request, by=by)
+
+
+_Answer = TypeVar('_Answer')
+
+
+def _of_index(index: Index) -> list[dict[str, Any]]:
+    found = []
+    for row in index.requests.rows()[-MOST_REQUESTS:]:
+        sent, size = index.requests.progress(row.id).outcomes.get('delivered', (0, 0))
+        found.append({'id': row.id, 'by': row.requester, 'state': row.state, 'why': row.why, 'want': json.loads(row.wanted),
+                      'objects': row.objects, 'bytes': row.bytes, 'sent': sent, 'sent_bytes': size})  # fmt: skip
+    return found
