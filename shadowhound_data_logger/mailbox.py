@@ -12,13 +12,15 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.model import LOST, ON_ROBOT
 from shadowhound_data_logger.untrusted import from_json
 
 MAILBOX_BUCKET: Final = 'sensor-data'
@@ -149,6 +151,28 @@ class PullCancel:
 
     def to_json(self) -> dict[str, Any]:
         return {'cancel': self.id, 'by': self.by, 'made_ns': self.made_ns}
+
+
+def size_of(want: KeptFilter, row: Mapping[str, Any]) -> int:
+    """About how many bytes of an object are wanted, by its row of ``catalogue.schema.KEPT``: of a slice at its ends a part."""
+    begin_ns = row['t_start_ns'] or 0
+    return want.bytes_of(row['key'], row['sensor'] or '', row['bytes'] or 0, begin_ns, row['t_end_ns'] or begin_ns, {})
+
+
+def offer(want: KeptFilter, rows: Iterable[Mapping[str, Any]], mbps: float | None) -> dict[str, Any]:
+    """What a request for these rows of ``catalogue.schema.KEPT`` comes to: all of them are wanted.
+
+    ``objects`` that the robot keeps and about how many ``bytes`` of them it would send, in how
+    many ``seconds`` at its pace, None where that is not known; and what it has ``lost``, by reason.
+    """
+    objects, size, lost = 0, 0, Counter[str]()
+    for row in rows:
+        if row['where'] == ON_ROBOT:
+            size += size_of(want, row)
+            objects += 1
+        elif row['where'] == LOST:
+            lost[row['reason'] or 'unknown'] += 1
+    return {'objects': objects, 'bytes': size, 'lost': dict(lost), 'mbps': mbps, 'seconds': 8e-6 * size / mbps if mbps else None}
 
 
 def inbox_key(robot: str) -> str:

@@ -7,23 +7,25 @@ import random
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from threading import Lock
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.lake import pull
+from shadowhound_data_logger.lake.bucket import default_source
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.query import default_source
 from shadowhound_data_logger.mailbox import BAG_SENSOR, KeptFilter
 from shadowhound_data_logger.options import UploadSettings
 from shadowhound_data_logger.stores import open_store
 
 SHORT_S = 3
+RECENT_S = 120
 
 
 def main(robot: str, output: str, name: str, count: int, threads: int, seed: int) -> None:
-    """Ask so often, each time for a few seconds of a sensor, or of all bags."""
+    """Ask so often, each time for a few seconds of a sensor, or of all bags: mostly of what is known to be kept."""
     source, lock = default_source(), Lock()
     store = open_store(source.settings, UploadSettings(read_timeout_s=5.0))
     rng = random.Random(seed)
@@ -32,16 +34,32 @@ def main(robot: str, output: str, name: str, count: int, threads: int, seed: int
         with lock, Path(output).open('a', encoding='utf-8') as file:
             file.write(json.dumps(line) + '\n')
 
+    def begins() -> dict[str, list[int]]:
+        """Sensor -> when objects begin that the store says are kept, of the last minutes; of none while it is away."""
+        found: dict[str, list[int]] = {}
+        with suppress(DataLoggerError, OSError):
+            want = KeptFilter(since_ns=time.time_ns() - RECENT_S * SECOND)
+            for row in pull.kept(source, robot, want, Findings(lambda _: None)).to_pylist():
+                found.setdefault(row['sensor'], []).append(row['t_start_ns'])
+        return found
+
+    kept = begins()
+
     def ask(number: int) -> None:
         now_ns = time.time_ns()
         with lock:
-            sensor = rng.choice(['camera', 'camera', 'lidar', 'imu', BAG_SENSOR])
-            since_ns = now_ns - rng.randrange(2 * SECOND, 25 * SECOND)
-            until_ns = since_ns + rng.randrange(SECOND, 15 * SECOND)
-            is_short, is_cancelled = rng.random() < 0.15, rng.random() < 0.1
-            priority = rng.randrange(10)
-        want = KeptFilter(sensor=sensor, since_ns=since_ns, until_ns=until_ns)
+            sensor = rng.choice(['camera', 'camera', 'lidar', 'imu', BAG_SENSOR, BAG_SENSOR])
+            early_ns, length_ns = (
+                rng.randrange(2 * SECOND, 25 * SECOND),
+                rng.randrange(SECOND, (4 if sensor == BAG_SENSOR else 15) * SECOND),
+            )
+            is_short, is_cancelled, is_blind = rng.random() < 0.15, rng.random() < 0.1, rng.random() < 0.15
+            priority, place = rng.randrange(10), rng.random()
         try:
+            since_ns = now_ns - early_ns
+            if not is_blind and (there := kept.get(sensor)):
+                since_ns = there[int(place * len(there))] - length_ns // 2
+            want = KeptFilter(sensor=sensor, since_ns=since_ns, until_ns=since_ns + length_ns)
             seen = pull.kept(source, robot, want, Findings(lambda _: None))['key'].to_pylist()
             expiry_ns = SHORT_S * SECOND if is_short else 3600 * SECOND
             asked = pull.ask(store, source, robot, want, by=f'{name}-{number % 3}', priority=priority, expiry_ns=expiry_ns)

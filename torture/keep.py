@@ -30,7 +30,7 @@ from e2e.wire import HANG, PASS, REFUSE, Wire
 
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.bags.verify import verify_remote
-from shadowhound_data_logger.catalogue.schema import KEPT, LOST, OBJECTS
+from shadowhound_data_logger.catalogue.schema import KEPT, OBJECTS
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import SpoolSettings, UploadSettings
 from shadowhound_data_logger.lake import pull
@@ -40,6 +40,7 @@ from shadowhound_data_logger.lake.reading import tables
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile, Ranged, StoredFile
+from shadowhound_data_logger.model import LOST
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Spool
@@ -54,11 +55,14 @@ UP_S: Final = (3.0, 8.0)
 AT_THE_START: Final = 0.2
 """Share of the nodes that are killed whether or not they listen yet."""
 ANSWER_S: Final = 240.0
+LEAST_SERVED: Final = 3
+"""A campaign in which fewer than one request of so many got an object has proved nothing."""
 PARAMETERS: Final[dict[str, Any]] = {
     'camera.rate_hz': 5.0, 'camera.ship': 'on_request', 'lidar.ship': 'on_request', 'imu.ship': 'on_request',
-    'bag.record': 'always', 'bag.topics': ['/odom', '/imu', '/point_cloud2'], 'bag.slice_s': 3.0, 'bag.ship': 'on_request',
+    'bag.record': 'always', 'bag.topics': ['/odom', '/imu', '/point_cloud2'], 'bag.slice_s': 5.0, 'bag.compression': 'none',
+    'bag.ship': 'on_request',
     'keep.max_bytes': 24 << 20, 'keep.poll_s': 0.5, 'catalogue.period_s': 2.0,
-    'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
+    'upload.max_mbps': 8.0, 'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
 }  # fmt: skip
 NO_ROOM: Final = {'spool.min_free_bytes': 1 << 60}
 """A reserve that no disk has: whatever may go has to."""
@@ -77,6 +81,8 @@ class Campaign:
         self._crowd: subprocess.Popen[bytes] | None = None
         self._said = folder / 'asked.jsonl'
         self.unbalanced: list[str] = []
+        self.failed = 0
+        """Times that nothing was asked for, since the store was away."""
         self.kills = Counter[str]()
         self.home = folder / HOME
         self._filler = disk.path / 'filler'
@@ -104,7 +110,7 @@ class Campaign:
             self.unbalanced += [f'after kill {number}: {line}' for line in found]
             if number % 4 == 1:
                 self._fill()
-            node = self._start(NO_ROOM if number % 4 == 3 else {})
+            node = self._start(NO_ROOM if number % 8 == 3 else {})
             if number % 5 == 0:
                 self._tower.stop_s3()
                 self.kills['Tower'] += 1
@@ -125,11 +131,13 @@ class Campaign:
     def asked(self) -> dict[str, list[dict[str, Any]]]:
         """Request -> what those wrote down who asked for it."""
         found: dict[str, list[dict[str, Any]]] = {}
+        self.failed = 0
         for line in self._said.read_text(encoding='utf-8').splitlines():
             try:
                 said = json.loads(line)
             except ValueError:  # its writer was killed
                 continue
+            self.failed += 'failed' in said
             if 'id' in said:
                 found.setdefault(said['id'], []).append(said)
         return found
@@ -172,6 +180,8 @@ class Campaign:
             self.kills['requester'] += 1
 
     def _turn_store(self) -> None:
+        if self._crowd is not None and self._crowd.poll() is None:
+            return
         if self._rng.random() < 0.5:
             self._wire.set(self._rng.choice((PASS, PASS, PASS, REFUSE, HANG)))
 
@@ -181,6 +191,7 @@ def judge(campaign: Campaign, tower: Tower) -> tuple[dict[str, Any], list[Bar]]:
     wrong: dict[str, list[str]] = {name: [] for name in (
         'unbalanced', 'unanswered or contradictory', 'seen and neither stored nor accounted for', 'not what was spooled',
         'cut out of slices and not their messages',
+        'too few requests served to prove anything',
         'twice in the catalogue', 'protected and evicted', 'quarantined or renamed', 'to be recovered after a clean stop',
     )}  # fmt: skip
     wrong['unbalanced'] += campaign.unbalanced
@@ -202,6 +213,9 @@ def judge(campaign: Campaign, tower: Tower) -> tuple[dict[str, Any], list[Bar]]:
         ]
         wrong['quarantined or renamed'] += [key for (key,) in db.execute(
             "SELECT key FROM objects WHERE state = 'quarantined' OR key GLOB '*/_answers/*_*.json'")]  # fmt: skip
+        served, requests = figures['answered']['served'], sum(figures['requests'].values())
+        if served * LEAST_SERVED < requests:
+            wrong['too few requests served to prove anything'].append(f'{served} of {requests}')
         figures['objects'] = dict(db.execute('SELECT state, sum(objects) FROM tally GROUP BY state').fetchall())
     wrong['unbalanced'] += ledger.imbalances(ledger.read(campaign.home / 'spool', ROBOT))
     spool = Spool(campaign.home / 'spool', SpoolSettings(min_free_bytes=0), SystemClock.of_this_machine(), ROBOT)
@@ -209,6 +223,7 @@ def judge(campaign: Campaign, tower: Tower) -> tuple[dict[str, Any], list[Bar]]:
     wrong['to be recovered after a clean stop'] += [spool.recovery.describe()] if spool.recovery.found_anything else []
     spool.close()
     figures['kills'] = dict(campaign.kills)
+    figures['asked in vain, for the store was away'] = campaign.failed
     bars = [Bar(f'{len(found)} {what}', not found, '; '.join(found[:3])) for what, found in wrong.items()]
     return figures, bars
 
@@ -216,6 +231,7 @@ def judge(campaign: Campaign, tower: Tower) -> tuple[dict[str, Any], list[Bar]]:
 def _answers(campaign: Campaign, source: Bucket, store: S3Store, in_store: set[str], lost: set[str],
              wrong: dict[str, list[str]]) -> dict[str, Any]:  # fmt: skip
     states, objects, cut = Counter[str](), Counter[str](), Counter[str]()
+    answered = Counter[str](served=0)
     for name, askings in campaign.asked().items():
         answer = pull.newest_answer(source, ROBOT, name)
         if answer is None or answer['state'] not in pull.FINAL:
@@ -224,6 +240,11 @@ def _answers(campaign: Campaign, source: Bucket, store: S3Store, in_store: set[s
         states[answer['state']] += 1
         outcomes = {state: each['objects'] for state, each in answer['outcomes'].items()}
         objects.update(outcomes)
+        answered.update({
+            'served': bool(outcomes.get('delivered')), 'found nothing': not answer['objects'] and not answer['gone'],
+            'found that some is gone': bool(answer['gone']) or bool(answer['lost']),
+            'expired or taken back in the middle': answer['state'] in {'expired', 'cancelled'} and 'delivered' in outcomes,
+        })  # fmt: skip
         is_over = set(outcomes) <= (
             {'delivered', 'quarantined'} if answer['state'] == 'done' else {'delivered', 'quarantined', 'unsent'}
         )
@@ -236,7 +257,7 @@ def _answers(campaign: Campaign, source: Bucket, store: S3Store, in_store: set[s
             cut.update(bags=len(answer['bags']), slices=len(slices))
             wrong['cut out of slices and not their messages'] += _miscut(campaign, store, answer, slices)
             wrong['seen and neither stored nor accounted for'] += sorted(missing)
-    return {'requests': dict(states), 'asked for': dict(objects), 'cut': dict(cut)}
+    return {'requests': dict(states), 'answered': dict(answered), 'asked for': dict(objects), 'cut': dict(cut)}
 
 
 def _miscut(campaign: Campaign, store: S3Store, answer: dict[str, Any], slices: set[str]) -> list[str]:

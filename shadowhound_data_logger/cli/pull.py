@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import re
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from shadowhound_data_logger.catalogue.schema import LOST, ON_ROBOT
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 from shadowhound_data_logger.keys import is_name
-from shadowhound_data_logger.mailbox import BAG_SENSOR, DEFAULT_PRIORITY, LONGEST_NS, MOST_KEYS, KeptFilter
+from shadowhound_data_logger.mailbox import BAG_SENSOR, DEFAULT_PRIORITY, LONGEST_NS, MOST_KEYS, KeptFilter, offer
 from shadowhound_data_logger.times import moment
 from shadowhound_data_logger.untrusted import visible
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.lake.select import Wanted
 
 _BAG: Final = re.compile(r'[A-Za-z0-9_.*?-]+')
 
@@ -35,7 +36,7 @@ _BAG: Final = re.compile(r'[A-Za-z0-9_.*?-]+')
 @click.option('--priority', type=click.IntRange(0, 9), default=DEFAULT_PRIORITY, show_default=True, help='0 is sent first.')
 @click.option('--expires', metavar='AGE', default='7d', show_default=True, help='Ask for so long, such as 2h or 30d.')
 @click.option('--by', metavar='NAME', help='Who asks  [default: the user]')
-@click.option('--wait', 'is_waiting', is_flag=True, help='Wait for the last answer.')
+@click.option('--wait', 'is_waiting', is_flag=True, help='Wait for the last answer, and until `query` knows what came.')
 @click.option('--dry-run', is_flag=True, help='Say what it would ask for.')
 @click.option('--list', 'is_listing', is_flag=True, help='Say what is asked for, and how far that is.')
 @click.option('--cancel', metavar='ID', help='Take a request back.')
@@ -51,39 +52,37 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
     with asking():
         from shadowhound_data_logger.lake import link  # noqa: PLC0415 - pyarrow takes a while
         from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
         source, left_out = default_source(the_store_settings()), quietly()
         robot = flags.get('robot') or _only_robot(source)
         name = by or lake.requester()
         if not is_name(name):
             raise BadUsage(f'--by {name!r} is not a name', 'use letters, digits, "_", "-" and "."')
+        if is_listing:
+            return _list(lake.listed(source, robot), is_json=as_json)
         with the_store() as store:
-            if is_listing:
-                return _list(lake.listed(store, source, robot), is_json=as_json)
             if cancel is not None:
                 lake.cancel(store, source, robot, cancel, by=name)
                 click.echo(f'Asked {robot} to leave request {cancel}.', err=True)
                 return ExitCode.FINE
-            want = _want(source, robot, flags, bag, left_out)
-            rows = lake.known(source, robot, want, left_out).to_pylist()
-            found = [row for row in rows if row['where'] == ON_ROBOT]
-            lost = Counter(row['reason'] or 'unknown' for row in rows if row['where'] == LOST)
-            size = sum(lake.size_of(want, row) for row in found)
-            said: dict[str, Any] = {'robot': robot, 'objects': len(found), 'bytes': size, 'lost': dict(lost),
-                                    'want': want.to_json(), 'mbps': link.pace_mbps(source, robot, left_out)}  # fmt: skip
-            said['seconds'] = 8e-6 * said['bytes'] / said['mbps'] if said['mbps'] else None
+            want, asked = _want(source, robot, flags, bag, left_out)
+            table, want = _named(lake.known(source, robot, want, left_out), want, asked)
+            rows = table.to_pylist()
+            said = {'robot': robot, 'want': want.to_json(), **offer(want, rows, link.pace_mbps(source, robot, left_out))}
             if not as_json:
                 click.echo(_found_sentence(said))
             answer: dict[str, Any] | None = None
             said['id'] = None
-            if not dry_run and found:
+            if not dry_run and said['objects']:
                 request = lake.ask(store, source, robot, want, by=name, priority=priority, expiry_ns=_expiry_ns(expires))
                 said['id'] = request.id
                 if not as_json:
                     click.echo(f'Asked for them: request {request.id}.')
                 if is_waiting:
                     answer = lake.wait(source, robot, request.id, tell=_Told(is_quiet=as_json), made_ns=request.made_ns)
+                    if answer['state'] == 'done':
+                        lake.await_rows(source, robot, want, rows, left_out)
     if as_json:
         print_json({**said, 'answer': answer})
     code = tell_left_out(left_out)
@@ -139,18 +138,20 @@ def _list(found: Sequence[Any], *, is_json: bool) -> ExitCode:
     table = plain_table('', ('request', 'by', 'priority', 'state', 'objects', 'delivered'), {'request', 'by', 'state'})
     table.title = None
     for one in found:
-        cells = (one.id, one.by, one.priority, one.state, *(lake.how_many(one.answer) if one.answer else ('-', '-')))
+        told = lake.told_by(one.answer) if one.answer else None
+        cells = (one.id, one.by, one.priority, one.state, *((told.objects, told.sent) if told else ('-', '-')))
         table.add_row(*(plain(str(cell)) for cell in cells))
     print_page(*([table] if found else ['Nothing is asked for.']))
     return ExitCode.FINE
 
 
-def _want(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, left_out: Any) -> KeptFilter:
-    """What the flags ask for, in words that a robot understands; what it does not is resolved to keys here."""
-    now_ns = time.time_ns()
-    from shadowhound_data_logger.lake.select import wanted  # noqa: PLC0415
+def _want(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, left_out: Any) -> tuple[KeptFilter, Wanted]:
+    """What the flags ask for, in words that a robot understands; and all that they say, times of labels among it."""
+    from shadowhound_data_logger.lake import labels, select  # noqa: PLC0415 - pyarrow
 
-    asked = wanted(now_ns, **{name: value for name, value in flags.items() if name not in {'where', 'success'}})
+    if not {'success', 'policy'}.isdisjoint(flags):
+        raise BadUsage('a robot does not know how missions ended, or began', 'name the --mission')
+    asked = select.wanted(time.time_ns(), **flags)
     sensor, patterns = asked.sensor, tuple[str, ...]()
     if bag is not None:
         if not _BAG.fullmatch(bag) or sensor not in {None, BAG_SENSOR}:
@@ -158,30 +159,27 @@ def _want(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, le
                 f'--bag {bag!r} is not the name of a bag, or another sensor is asked for', '`shadowhound-data bag list`'
             )
         sensor, patterns = BAG_SENSOR, (f'{robot}/rosbags/{bag}/*',)
+    asked = labels.labelled(source, asked, left_out)
     want = KeptFilter(
         sensor=sensor, topic=asked.topic, since_ns=asked.since_ns, until_ns=asked.until_ns, near=asked.near,
         mission=asked.mission, mission_type=asked.mission_type, patterns=patterns,
     )  # fmt: skip
-    if not want.to_json() and 'where' not in flags:
+    if not want.to_json() and asked.where is None:
         raise BadUsage('nothing says what to ask for', "name a --sensor, a --bag or a time; --bag '*' is all bags")
-    if 'success' in flags:
-        raise BadUsage('a robot does not know how missions ended', 'name the --mission')
-    if 'where' in flags:
-        want = replace(want, patterns=(), keys=_keys(source, robot, want, flags['where'], left_out))
-    return want
+    return want, asked
 
 
-def _keys(source: Any, robot: str, want: KeptFilter, where: str, left_out: Any) -> frozenset[str]:
-    """The keys of what SQL chooses."""
-    from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415
-    from shadowhound_data_logger.lake import query  # noqa: PLC0415
+def _named(rows: Any, want: KeptFilter, asked: Wanted) -> tuple[Any, KeptFilter]:
+    """The rows that SQL and times choose, which a robot is asked for by name."""
+    from shadowhound_data_logger.lake import query, scan  # noqa: PLC0415 - Daft
 
-    keys = query.chosen(lake.kept(source, robot, want, left_out), where)['key'].to_pylist()
-    if len(keys) > MOST_KEYS:
-        raise BadUsage(
-            f'--where chooses {len(keys):,} objects: more than {MOST_KEYS:,} cannot be asked for by name', 'ask for less'
-        )
-    return frozenset(keys)
+    if asked.where is None and not asked.chosen:
+        return rows, want
+    rows = scan.within_chosen(rows, asked)
+    rows = rows if asked.where is None else query.chosen(rows, asked.where)
+    if len(rows) > MOST_KEYS:
+        raise BadUsage(f'this chooses {len(rows):,} objects: more than {MOST_KEYS:,} cannot be asked for by name', 'ask for less')
+    return rows, replace(want, patterns=(), keys=frozenset(rows['key'].to_pylist()))
 
 
 def _expiry_ns(text: str) -> int:

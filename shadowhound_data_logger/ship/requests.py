@@ -13,7 +13,8 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -22,6 +23,8 @@ from shadowhound_data_logger.clock import SECOND, Clock, iso
 from shadowhound_data_logger.config import KeepSettings
 from shadowhound_data_logger.errors import AccessDenied, DataLoggerError, ObjectRefused, StoreError
 from shadowhound_data_logger.mailbox import (
+    DEFAULT_EXPIRY_NS,
+    DEFAULT_PRIORITY,
     LATEST_NS,
     MAILBOX_BUCKET,
     MOST_INBOX_BYTES,
@@ -32,6 +35,7 @@ from shadowhound_data_logger.mailbox import (
     decode_inbox,
     inbox_key,
     read_entry,
+    request_id,
 )
 from shadowhound_data_logger.model import DataObject, SpooledObject
 from shadowhound_data_logger.spool.request_table import (
@@ -104,6 +108,19 @@ class _Cutting(NamedTuple):
     work: Generator[None, None, list[DataObject]]
 
 
+@dataclass(frozen=True, slots=True)
+class RequestStatus:
+    """What is asked for of what the robot keeps."""
+
+    open: int = 0
+    bytes: int = 0
+    """That requests wait for and nobody has released."""
+    mbps: float | None = None
+    """The pace of the link; None before it is known."""
+    left_s: int | None = None
+    """For so long these bytes take at this pace."""
+
+
 class RequestServer:
     """Serves the requests for what a robot keeps.
 
@@ -113,9 +130,14 @@ class RequestServer:
 
     def __init__(self, spool: Spool, store: ObjectStore, settings: KeepSettings, robot: str, clock: Clock, *,  # noqa: PLR0913 - each is a neighbour
                  put: Callable[[DataObject], None], released: Callable[[Sequence[SpooledObject]], None], cutter: Cutter,
-                 mbps: Callable[[], float | None] = lambda: None,
+                 mbps: Callable[[], float | None] = lambda: None, may_send: Callable[[], bool] = lambda: True,
+                 finished: Callable[[], None] = lambda: None,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
-        """``put`` takes answers to be spooled, ``released`` hears of objects that may be shipped; ``mbps`` is the pace."""
+        """``put`` takes answers to be spooled, ``released`` hears of objects that may be shipped; ``mbps`` is the pace.
+
+        While not ``may_send``, requests are accepted and nothing is released for them. ``finished`` is called when all that a
+        request wants is in the store: somebody may wait to hear of it.
+        """
         self._spool = spool
         self._store = store
         self._settings = settings
@@ -125,6 +147,8 @@ class RequestServer:
         self._released = released
         self._cutter = cutter
         self._mbps = mbps
+        self._may_send = may_send
+        self._finished = finished
         self._monotonic = monotonic
         self._version = ''
         self._poll_at_s = self._tidy_at_s = 0.0
@@ -135,6 +159,9 @@ class RequestServer:
         self._served: dict[str, float] = {}
         """Requester -> bytes released, weighed by priority."""
         self._wakes = threading.Event()
+        self._asked_here = deque[PullRequest | PullCancel]()
+        self.status = RequestStatus()
+        """Of up to ``keep.poll_s`` ago."""
         self.refused = Counter[str]()
         """Entries and mailboxes that were refused, by reason."""
         self.worker = Worker('requests', self._round, patience_s=120.0)
@@ -163,16 +190,21 @@ class RequestServer:
         if not self._is_clear:
             self._spool.clear_requests()
             self._is_clear = True
+        with suppress(StoreError):  # which says how many answers there were; it is asked again
+            while self._asked_here:
+                self._obey([self._asked_here[0]])
+                self._asked_here.popleft()
         if now_s >= self._poll_at_s:
             self._poll_at_s = now_s + self._settings.poll_s
             self._poll()
+            self._look()
         rows = self._spool.requests()
         now_ns = self._clock.wall_ns()
         for row in rows:
             if row.is_open and row.expires_ns <= now_ns:
                 self._spool.close_request(row.id, EXPIRED)
         rows = [row for row in rows if row.is_open and row.expires_ns > now_ns]
-        is_busy = self._release(rows) | self._cut({row.id for row in rows})
+        is_busy = self._may_send() and self._release(rows) | self._cut({row.id for row in rows})
         for row in self._spool.requests():
             if row.told != row.state or row.is_open:
                 self._answer(row)
@@ -187,6 +219,31 @@ class RequestServer:
         return is_busy
 
     # -- what is asked for -----------------------------------------------------------------------------------------
+
+    def ask(self, want: Mapping[str, Any], by: str) -> str:
+        """Ask for something at the robot itself, from any thread: its id. Raises RequestRefused."""
+        now_ns = self._clock.wall_ns()
+        asked = {'id': request_id(self._robot, want), 'robot': self._robot, 'by': by, 'made_ns': now_ns,
+                 'expires_ns': now_ns + DEFAULT_EXPIRY_NS, 'priority': DEFAULT_PRIORITY, 'want': want}  # fmt: skip
+        return self._hear(asked)
+
+    def cancel(self, request: str, by: str) -> str:
+        """Take a request back that was made, wherever that was, from any thread: its id. Raises RequestRefused."""
+        return self._hear({'cancel': request, 'by': by, 'made_ns': self._clock.wall_ns()})
+
+    def _hear(self, asked: Mapping[str, Any]) -> str:
+        read = read_entry(self._robot, asked)
+        if len(self._asked_here) >= AT_A_TIME:
+            raise RequestRefused('too_many', 'too many ask at once')
+        self._asked_here.append(read)
+        self._wakes.set()
+        return read.id
+
+    def _look(self) -> None:
+        """At how much is asked for."""
+        count, size = self._spool.awaited()
+        mbps = self._mbps()
+        self.status = RequestStatus(count, size, mbps, round(8e-6 * size / mbps) if mbps else None)
 
     def _poll(self) -> None:
         """Look into the mailbox; a store that is away, or has none, is asked again."""
@@ -209,14 +266,19 @@ class RequestServer:
         except RequestRefused as error:
             self._refuse(error.reason, str(error))
             return True
-        known = {row.id: row for row in self._spool.requests()}
-        new, cancels = dict[str, PullRequest](), []
+        reads = []
         for entry in entries:
             try:
-                read = read_entry(self._robot, entry)
+                reads.append(read_entry(self._robot, entry))
             except RequestRefused as error:
                 self._refuse(error.reason, f'an entry of the mailbox is refused: {error}')
-                continue
+        return self._obey(reads)
+
+    def _obey(self, reads: Sequence[PullRequest | PullCancel]) -> bool:
+        """Whether all of it is done. Raises StoreError."""
+        known = {row.id: row for row in self._spool.requests()}
+        new, cancels = dict[str, PullRequest](), []
+        for read in reads:
             row = known.get(read.id)
             if isinstance(read, PullCancel):
                 cancels.append(read)
@@ -376,6 +438,7 @@ class RequestServer:
             return
         if row.is_open and self._spool.is_over(row.id):
             self._spool.close_request(row.id, DONE)
+            self._finished()
             row = replace(row, state=DONE)
         now_ns = self._clock.wall_ns()
         if row.told == row.state and (not row.is_open or now_ns - row.told_ns < TELL_S * SECOND):

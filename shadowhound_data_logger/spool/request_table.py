@@ -243,6 +243,13 @@ class RequestTable:
         count, size = self._db.execute(query).fetchone()
         return count, size
 
+    def awaited(self) -> tuple[int, int]:
+        """Open requests, and the bytes that they wait for and nobody has released."""
+        (count,) = self._db.execute("SELECT count(*) FROM requests WHERE state = 'active'").fetchone()
+        each = "SELECT max(requested.bytes) AS most FROM requested WHERE outcome = 'kept' GROUP BY id"
+        (size,) = self._db.execute(f'SELECT ifnull(sum(most), 0) FROM ({each})').fetchone()  # noqa: S608 - own constants only
+        return count, size
+
     def progress(self, request: str, most_lost: int = 100) -> Progress:
         """What became of what it found."""
         sums = self._db.execute(

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import simplejpeg
 
+from shadowhound_data_logger.encode.archive import ArchiveFile, pack_tar
 from shadowhound_data_logger.keys import unique
 
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
@@ -191,3 +192,18 @@ def test_equal_frames_are_packed_once(ros: Any, format_name: str) -> None:
     plain = pack(ros, COMPRESSED, *(frame(ros, data) for data in frames), format_name=format_name).object
     assert [sample['jpg'] for sample in samples(plain).values()] == frames
     assert 'repeats' not in plain.metadata
+
+
+@pytest.mark.parametrize('stamp_ns', [-1, 0, STAMP_NS, 1 << 62])
+@pytest.mark.parametrize('size', [0, 1, 511, 512, 70_000])
+def test_a_tar_is_as_the_standard_library_makes_it(stamp_ns: int, size: int) -> None:
+    """Byte for byte, whatever time and size a file has."""
+    body, name = bytes(size), f'{stamp_ns:019d}.jpg'
+    expected = io.BytesIO()
+    with tarfile.open(fileobj=expected, mode='w', format=tarfile.USTAR_FORMAT) as packed:
+        entry = tarfile.TarInfo(name)
+        entry.size, entry.mode, entry.mtime = size, 0o644, min(max(stamp_ns // 10**9, 0), 8**11 - 1)
+        packed.addfile(entry, io.BytesIO(body))
+    made = pack_tar([ArchiveFile(name, stamp_ns, body)])
+    assert made == expected.getvalue()[: len(made)]
+    assert not any(expected.getvalue()[len(made) :])

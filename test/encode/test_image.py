@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 import simplejpeg
 
+from shadowhound_data_logger.encode.statistics import ALL, unpacked_statistics
+from shadowhound_data_logger.lake.values import statistics_of
+
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 IMAGE = 'sensor_msgs/msg/Image'
 
@@ -145,3 +148,20 @@ def test_too_large_for_a_jpeg(ros: Any) -> None:
     """An image with a side that JPEG cannot express is rejected before the encoder sees it."""
     assert raw(ros, np.zeros((1, 65_501), np.uint8), encoding='mono8').rejected == {'too_large': 1}
     assert raw(ros, np.zeros((1, 65_500), np.uint8), encoding='mono8').object is not None
+
+
+def test_a_jpeg_has_brightness_and_sharpness(ros: Any) -> None:
+    """Of its grey: an even picture is as bright as it is and has no edges; whoever opens the object finds the same."""
+    board = np.kron(np.indices((6, 8)).sum(axis=0) % 2, np.ones((16, 16))) * 255
+    told = {}
+    for name, grey in (('dark', np.full((96, 128), 20)), ('board', board)):
+        picture = np.repeat(grey[:, :, None].astype(np.uint8), 3, axis=2)
+        made = compressed(ros, bytes(simplejpeg.encode_jpeg(picture, quality=95))).object
+        told[name] = unpacked_statistics(made.statistics)
+        assert told[name] == statistics_of(made.key, made.body)
+        assert (set(told[name]), told[name][ALL].count) == ({ALL, 'brightness', 'sharpness'}, 1)
+    assert told['dark']['brightness'].mean == pytest.approx(20, abs=2)
+    assert told['board']['brightness'].max == pytest.approx(127, abs=3)
+    assert told['dark']['sharpness'].max < 1
+    assert told['board']['sharpness'].max > 100
+    assert compressed(ros, jpeg(), statistics=('none',)).object.statistics == b''

@@ -12,6 +12,9 @@ from hypothesis import strategies as st
 from profiles import examples
 from pypcd4.pypcd4 import PointCloud
 
+from shadowhound_data_logger.encode.statistics import ALL, unpacked_statistics
+from shadowhound_data_logger.lake.values import statistics_of
+
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 FIELD = 'sensor_msgs/msg/PointField'
 FORMATS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
@@ -209,3 +212,14 @@ def test_any_layout(ros: Any, data: st.DataObject) -> None:
         for index, column in enumerate(names):
             assert points.pc_data[column].dtype == kind
             assert points.pc_data[column].tobytes() == expected[:, index].tobytes()
+
+
+def test_a_cloud_has_its_number_of_points_and_their_bounds(ros: Any) -> None:
+    """Field by field, with how many are not finite; whoever opens the object finds the same."""
+    points = xyzi()
+    made = ros.encode(CLOUD, cloud(ros, XYZI, points.tobytes(), width=5, point_step=16)).object
+    told = unpacked_statistics(made.statistics)
+    assert told == statistics_of(made.key, made.body)
+    assert (set(told), told['points'].max) == ({ALL, 'points', 'x', 'y', 'z', 'intensity'}, 5)
+    assert (told['x'].min, told['x'].max, told['x'].count) == (points[:, 0].min(), points[:, 0].max(), 5)
+    assert (told['z'].first, told['z'].count, told['z'].nan_count) == (points[1, 2], 4, 1)
