@@ -123,8 +123,8 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
     with _exporting():
         from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415
         from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset, upload  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
         from shadowhound_data_logger.lake.pull import bring  # noqa: PLC0415
-        from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
 
         check_name(name, 'the name of the data set')
         options = _options(how)
@@ -364,8 +364,8 @@ def _date_of(key: str) -> str | None:
 
 def _forgotten() -> Mapping[tuple[str, str], str]:
     """(bucket, key) -> the date on which it was deleted from the store on purpose."""
+    from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
     from shadowhound_data_logger.lake.forgotten import dates_of_deletion, forgotten  # noqa: PLC0415
-    from shadowhound_data_logger.lake.query import default_source  # noqa: PLC0415
 
     return dates_of_deletion(forgotten(default_source(the_store_settings()), None, quietly()))
 

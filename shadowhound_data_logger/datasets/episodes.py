@@ -7,8 +7,9 @@ is settled later (``lerobot.py``): only then it is known which missions before i
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from PIL import Image
 
 from shadowhound_data_logger.catalogue import labels as catalogue_labels
 from shadowhound_data_logger.catalogue.gaps import GAPS as STATEMENTS
@@ -54,6 +56,8 @@ ROWS, SOURCES, GAPS, LABELS, TOLD = 'rows.parquet', 'sources.parquet', 'gaps.par
 """Files of an episode's folder; beside them ``<camera>.mp4``."""
 BATCH: Final = 128
 """Rows with pictures that are written at a time."""
+AHEAD: Final = 4
+"""Pictures that are decoded before they are encoded."""
 EPISODE: Final = 'episode_mission'
 """The column that says whose row it is: statements about gaps have a ``mission_id`` of their own."""
 SOURCE_SCHEMA: Final = pa.schema([
@@ -314,15 +318,30 @@ def _write_pictures(stream: _Stream, fps: int, options: ExportOptions, folder: P
         writer = None
         if not options.is_lossless:
             writer = stack.enter_context(VideoWriter(folder / f'{stream.plan.name}.mp4', fps, size, options.codec))
-        for number, count in zip(numbers, counts, strict=True):
-            pixels = _picture(stream, int(number))
+        for (pixels, colours), count in zip(_pictures_ahead(stream, numbers.tolist()), counts.tolist(), strict=True):
             _check_size(stream, pixels, size)
-            for colour in range(3):
-                histogram[colour] += np.bincount(pixels[..., colour].ravel(), minlength=256) * int(count)
-            for _ in range(int(count) if writer else 0):
+            histogram += colours * count
+            for _ in range(count if writer else 0):
                 assert writer is not None
                 writer.add(pixels)
     return histogram.tolist(), list(size)
+
+
+def _pictures_ahead(stream: _Stream, numbers: Sequence[int]) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.int64]]]:
+    """Each picture and its histogram, (3, 256); some are decoded on a thread of their own while others are encoded."""
+
+    def decoded(number: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+        pixels = _picture(stream, number)
+        return pixels, np.array(Image.fromarray(pixels[..., :3]).histogram(), np.int64).reshape(3, 256)
+
+    waiting: deque[Future[tuple[NDArray[np.uint8], NDArray[np.int64]]]] = deque()
+    with ThreadPoolExecutor(1, 'export-decode') as pool:
+        for number in numbers:
+            waiting.append(pool.submit(decoded, number))
+            if len(waiting) > AHEAD:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 def _check_size(stream: _Stream, pixels: NDArray[np.uint8], size: tuple[int, int]) -> None:

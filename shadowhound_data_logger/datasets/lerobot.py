@@ -41,7 +41,7 @@ from shadowhound_data_logger.datasets.features import (
     ExportOptions,
     StatePart,
 )
-from shadowhound_data_logger.datasets.video import feature_info, video_frames
+from shadowhound_data_logger.datasets.video import feature_info, frames_at, video_frames
 from shadowhound_data_logger.disk import fingerprint, replacing, sync
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
@@ -118,6 +118,14 @@ class Lerobot:
             yield from (pixels for _, pixels in video_frames(self.path(VIDEO, row, f'videos/{key}', video_key=key)))
         else:
             yield from (decode.image(body) for body in self.bodies(row, key))
+
+    def pictures_at(self, row: EpisodeRow, key: str, numbers: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+        """Those of these frames, counted from 0 within the episode, in rising order. Raises LakeError."""
+        if key in self.video_keys():
+            assert self.info is not None
+            yield from frames_at(self.path(VIDEO, row, f'videos/{key}', video_key=key), self.info['fps'], numbers)
+        else:
+            yield from (decode.image(body) for number, body in enumerate(self.bodies(row, key)) if number in numbers)
 
     def bodies(self, row: EpisodeRow, key: str) -> Iterator[bytes]:
         """The pictures of a lossless data set as they were published."""

@@ -46,7 +46,7 @@ def _episode(made: Lerobot, row: EpisodeRow, sheet: Image.Image, top: int) -> No
     wanted = sorted({round(share * (row['length'] - 1)) for share in np.linspace(0, 1, FRAMES)})
     left, height = GAP, HEIGHT - 50
     for key in made.picture_keys()[:1]:
-        for pixels in (pixels for number, pixels in enumerate(made.pictures(row, key)) if number in wanted):
+        for pixels in made.pictures_at(row, key, wanted):
             picture = Image.fromarray(pixels)
             picture = picture.resize((max(1, min(170, round(picture.width * height / picture.height))), height))
             sheet.paste(picture, (left, top + 16))

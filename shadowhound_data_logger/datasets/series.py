@@ -11,7 +11,7 @@ import re
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from operator import attrgetter
 from pathlib import Path
@@ -312,7 +312,10 @@ class Recordings:
 
 
 def bags_of(store: ObjectStore, robot: str, begin_ns: int, end_ns: int) -> list[Manifest]:
-    """The bags of a robot that have messages of a time, and whose files are MCAP of ours. Raises StoreError."""
+    """The bags of a robot that have messages of a time, and whose files are MCAP of ours, with the slices that the store has.
+
+    The robot may keep the others until somebody asks for them. Raises StoreError.
+    """
     found = []
     for bag in find_bags(store, robot):
         if bag.is_archive:
@@ -323,6 +326,8 @@ def bags_of(store: ObjectStore, robot: str, begin_ns: int, end_ns: int) -> list[
             continue
         if manifest is None or (manifest.clock is not None and manifest.clock.offset_ns is None):
             continue
+        there = {file.name for file in bag.files}
+        manifest = replace(manifest, slices=tuple(each for each in manifest.slices if each.file in there))
         step = _offset_of(manifest)
         if any(each.t_start_ns + step <= end_ns and each.t_end_ns + step >= begin_ns for each in manifest.slices):
             found.append(manifest)

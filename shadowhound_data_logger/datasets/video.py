@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
@@ -100,6 +100,19 @@ def video_frames(path: Path) -> Iterator[tuple[float, NDArray[np.uint8]]]:
                 yield float(frame.pts * stream.time_base), frame.to_ndarray(format='rgb24')
     except (av.error.FFmpegError, IndexError, OSError) as error:
         raise LakeError(f'{path} is not a video that can be read: {error}') from error
+
+
+def frames_at(path: Path, fps: int, numbers: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+    """Pixels RGB of these frames, counted from 0; none but those and what they are made from is decoded. Raises LakeError."""
+    try:
+        with av.open(str(path)) as file:
+            stream = file.streams.video[0]
+            for number in numbers:
+                pts = round(number / (fps * stream.time_base))
+                file.seek(pts, stream=stream)
+                yield next(frame for frame in file.decode(stream) if frame.pts >= pts).to_ndarray(format='rgb24')
+    except (av.error.FFmpegError, IndexError, StopIteration, OSError) as error:
+        raise LakeError(f'{path} is not a video that has the frames {", ".join(map(str, numbers))}: {error}') from error
 
 
 def feature_info(codec: str, fps: int, size: tuple[int, int]) -> dict[str, Any]:

@@ -28,10 +28,8 @@ from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 
-def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
-    """The camera at its own rate of a bag, its sources the slices, and all of it proved."""
-    house = House(tmp_path)
-    mission = house.record(Mission('bagged', seconds=2, camera_hz=1.0, odom_hz=2.0, sensors=('camera', 'odom')))
+def record_bag(house: House, tmp_path: Path, *, is_there: bool = True) -> tuple[Mission, str]:
+    """A dense recording beside the objects, and the key of its slice, which a robot may keep."""
     dense = Mission('bagged', seconds=2, camera_hz=10.0, odom_hz=50.0)
     path = tmp_path / 'bagged_0.mcap'
     writer = SliceWriter(path)
@@ -43,8 +41,17 @@ def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
     key = 'thor/rosbags/bagged/bagged_0.mcap'
     manifest = Manifest('bagged', 'thor', None, COMPLETE, (), topics_of([info]), (SliceEntry.of(info, key),))
     with closing(open_store(house.settings, UploadSettings())) as store:
-        add(store, tmp_path / 'tmp', key, path.read_bytes())
+        if is_there:
+            add(store, tmp_path / 'tmp', key, path.read_bytes())
         add(store, tmp_path / 'tmp', 'thor/rosbags/bagged/manifest.json', manifest.to_json())
+    return dense, key
+
+
+def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
+    """The camera at its own rate of a bag, its sources the slices, and all of it proved."""
+    house = House(tmp_path)
+    mission = house.record(Mission('bagged', seconds=2, camera_hz=1.0, odom_hz=2.0, sensors=('camera', 'odom')))
+    dense, key = record_bag(house, tmp_path)
     tell(house.settings, tmp_path, *(
         complete('thor', 'j', 99, sink='bags', topic=TOPICS[sensor], session=1, grade='exact', received=1, skipped=0,
                  from_ns=mission.begin_ns - 2 * SECOND, to_ns=mission.end_ns + SECOND) for sensor in ('camera', 'odom')
@@ -61,3 +68,13 @@ def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
     assert set(sources['key'].to_pylist()) == {key}
     proved = verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None)
     assert (proved.wrong, proved.frames) == ([], len(table))
+
+
+def test_slices_that_a_robot_keeps_are_not_missed(tmp_path: Path) -> None:
+    """The store has the manifest of the bag alone: the data set is made of the objects."""
+    house = House(tmp_path)
+    house.record(Mission('bagged', seconds=2, camera_hz=5.0, odom_hz=5.0, sensors=('camera', 'odom')))
+    record_bag(house, tmp_path, is_there=False)
+    found = export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, ExportOptions())
+    assert (found.refused, found.waiting) == ({}, {})
+    assert {each['from'] for each in found.added[0]['streams'].values()} == {'objects'}

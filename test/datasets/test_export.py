@@ -16,11 +16,11 @@ from datasets.recorded import House, Mission, lost, x_of
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.datasets.export import Exported, drop, export, resumed, split_of
-from shadowhound_data_logger.datasets.features import AV1, ExportOptions
+from shadowhound_data_logger.datasets.features import AV1, H264, ExportOptions
 from shadowhound_data_logger.datasets.lerobot import DATA, OURS, Lerobot, matrix
 from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in, fetch_dataset, upload
 from shadowhound_data_logger.datasets.verify import seen_in_folder, seen_in_store, verify
-from shadowhound_data_logger.datasets.video import VideoWriter, video_frames
+from shadowhound_data_logger.datasets.video import VideoWriter, frames_at, video_frames
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -392,3 +392,17 @@ def test_a_video_is_no_real_time_process(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / 'a.mp4', 10, (64, 64), AV1) as video:
         video.add(np.zeros((64, 64, 3), np.uint8))
         assert {os.sched_getscheduler(int(thread.name)) for thread in Path('/proc/self/task').iterdir()} == {before}
+
+
+@pytest.mark.parametrize('codec', [AV1, H264])
+def test_single_frames_of_a_video_are_those_of_all(tmp_path: Path, codec: str) -> None:
+    path = tmp_path / 'a.mp4'
+    with VideoWriter(path, 10, (64, 64), codec) as video:
+        for number in range(21):
+            video.add(np.full((64, 64, 3), 10 * number, np.uint8))
+    every = [pixels for _, pixels in video_frames(path)]
+    wanted = [0, 1, 7, 12, 20]
+    for number, pixels in zip(wanted, frames_at(path, 10, wanted), strict=True):
+        assert np.array_equal(pixels, every[number]), number
+    with pytest.raises(LakeError, match='has the frames 3, 21'):
+        list(frames_at(path, 10, [3, 21]))
