@@ -36,6 +36,7 @@ from shadowhound_data_logger.options import (
     StoreSettings,
     UploadSettings,
 )
+from shadowhound_data_logger.rules import read_rule
 
 __all__ = [
     'DEFAULT_SENSORS',
@@ -108,6 +109,8 @@ class Settings:
         _check_fields(groups['mission'])
         _check_expressions('bag', groups['bag'], ('regex', 'exclude'))
         _check_events(groups['events'])
+        for name in ('upload', 'keep', 'events'):
+            read_rule(groups[name].when, f'{name}.when')
         if given:
             name, value = next(iter(given.items()))
             raise SettingError(name, value, f'only a known name: {_near(name, sensors)}')

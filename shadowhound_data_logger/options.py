@@ -125,6 +125,7 @@ class KeepSettings:
         1.0, 'Seconds between two small pictures of a camera that are uploaded at once; 0 makes none.', low=0.0, high=3600.0
     )
     poll_s: float = _setting(10.0, 'Seconds between two looks at what is asked for.', low=0.5, high=3600.0)
+    when: str = _setting('', 'Upload what is asked for only while this rule holds; empty: always.')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,6 +140,9 @@ class UploadSettings:
         60.0, 'Longest pause between two attempts while the store cannot be reached.', low=0.1, high=3600.0
     )
     max_mbps: float = _setting(0.0, 'Most megabits a second to an S3 server; 0 is no limit.', low=0.0, high=1e5, live=True)
+    when: str = _setting(
+        '', 'Upload only while this rule holds: \'lowstate:bms_state.soc > 30 and wifi.ssid == "lab"\'; empty: always.'
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,6 +235,7 @@ class EventSettings:
         ('',),
         'What triggers an event: "low_battery: lowstate:bms_state.soc < 20 for 5" is name, topic:field, comparison, seconds.',
     )
+    when: str = _setting('', 'Upload the bags of events only while this rule holds; empty: always, whatever upload.when says.')
 
     @property
     def enabled(self) -> bool:

@@ -18,6 +18,7 @@ from shadowhound_data_logger.capture.diagnostics import told
 from shadowhound_data_logger.capture.status import Stages, Status
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.keys import printable
+from shadowhound_data_logger.mailbox import RequestRefused
 
 log = logging.getLogger(__name__)
 
@@ -77,6 +78,7 @@ class Commands:
             'bag pause': _Command(lambda: recorder.pause(paused=True)),
             'bag resume': _Command(lambda: recorder.pause(paused=False)),
             'event': _Command(self._trigger, {'name': str, 'note': str, 'by': str}, quiet=True),
+            'pull': _Command(self._pull, {'want': dict, 'cancel': str, 'by': str}),
             'yield': _Command(self._yield, {'max_mbps': float}, quiet=True),
             'set': _Command(self._set, {'values': dict}, quiet=True),
             'get': _Command(self._get, {'names': list}, quiet=True),
@@ -158,6 +160,16 @@ class Commands:
         if by not in ASKERS:
             return False, f'an event is triggered by {" or ".join(ASKERS)}, not {by[:MOST_NAME]!r}'
         return self._stages.event_buffer.events.trigger(name, by, note)
+
+    def _pull(self, want: Mapping[str, Any] | None = None, cancel: str = '', by: str = MANUAL) -> Answer | dict[str, Any]:
+        """Ask for what is kept here, or take a request back."""
+        requests = self._stages.requests
+        if requests is None:
+            return False, 'nothing is kept here: ship of all sensors and of bag is always'
+        try:
+            return {'id': requests.cancel(cancel, by) if cancel else requests.ask(want or {}, by)}
+        except RequestRefused as error:
+            return False, str(error)
 
     def _yield(self, max_mbps: float = 0.0) -> Answer:
         """Leave the link to whoever watches the robot, for some seconds."""

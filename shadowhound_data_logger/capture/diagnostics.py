@@ -124,6 +124,13 @@ def _store(store: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> E
         return 'store', ERROR, f'{state}: {store["last_error"]}', store
     if store['state'] == 'store_down':
         return 'store', WARN, f'{state}: {store["last_error"]}', store
+    if store['waits_for']:
+        return (
+            'store',
+            OK,
+            f'{state}; ' + '; '.join(f'{name} does not hold: {why}' for name, why in store['waits_for'].items()),
+            store,
+        )
     if store['blocked_buckets']:
         return 'store', WARN, f'{state}; buckets that take nothing: {", ".join(store["blocked_buckets"])}', store
     if stall:

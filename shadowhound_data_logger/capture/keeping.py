@@ -16,7 +16,7 @@ from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import BagSettings, KeepSettings, SensorSettings
 from shadowhound_data_logger.missions.folder import safe_type
-from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.model import PREVIEWS, DataObject
 from shadowhound_data_logger.options import ON_REQUEST
 from shadowhound_data_logger.untrusted import open_image
 
@@ -29,8 +29,6 @@ PREVIEW_SIZE: Final = 192, 192
 DECODED_SIZE: Final = 160, 120
 """A JPEG is decoded at a half, a quarter or an eighth of its size, of which this still is a part: 640 x 480 at a quarter."""
 QUALITIES: Final = (60, 40, 20)
-PREVIEWS: Final = '_previews'
-"""The folder of previews; a preview's sensor has this behind its name."""
 PRIORITY: Final = 2
 """Of previews: they are what somebody chooses by."""
 _UNREADABLE: Final = (OSError, ValueError, zipfile.BadZipFile, tarfile.TarError, LookupError, NotImplementedError)
@@ -112,7 +110,7 @@ def _picture(body: bytes, content_type: str) -> bytes | None:
             name = next((name for name in archive.namelist() if name.endswith(('.jpg', '.png'))), None)
             return archive.read(name) if name else None
     if content_type == 'application/x-tar':
-        with tarfile.open(fileobj=BytesIO(body)) as files:
+        with tarfile.open(fileobj=BytesIO(body), mode='r:') as files:
             member = next((member for member in files if member.name.endswith(('.jpg', '.png'))), None)
             file = files.extractfile(member) if member else None
             return file.read() if file else None

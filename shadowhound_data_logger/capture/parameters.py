@@ -16,6 +16,7 @@ from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.config import NOT_SETTINGS, Settings, gone
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
 from shadowhound_data_logger.options import GROUPS
+from shadowhound_data_logger.rules import read_rule
 
 FIXED: Final = 'Read at the start: change the parameter file and start the node again.'
 MAX_INT: Final = (1 << 63) - 1
@@ -181,6 +182,14 @@ def _check_topics(node: Node, settings: Settings) -> None:
             _resolve(node, 'events.topics', topic, list(settings.events.topics))
     for condition in conditions(settings.events.conditions):
         _resolve(node, 'events.conditions', condition.topic, condition.text)
+    for name, text in (
+        ('upload.when', settings.upload.when),
+        ('keep.when', settings.keep.when),
+        ('events.when', settings.events.when),
+    ):
+        rule = read_rule(text, name)
+        for topic in rule.topics() if rule is not None else ():
+            _resolve(node, name, topic, text)
     for sensor in settings.sensors:
         for topic in sensor.topics:
             name = f'{sensor.name}.topics'

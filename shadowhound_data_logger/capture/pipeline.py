@@ -40,6 +40,7 @@ from shadowhound_data_logger.capture.pose_track import RobotTrack
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.capture.unheard import Unheard
+from shadowhound_data_logger.capture.upload_rules import KEEP_WHEN, UploadRules
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import SystemClock, utc
 from shadowhound_data_logger.clock_watch import ClockWatch
@@ -137,6 +138,8 @@ class Pipeline:
         queue, bag_queue = BatchQueue(settings.queue), BagQueue()
         sensors = {sensor.name: sensor for sensor in settings.sensors}
         track = RobotTrack(settings.mission, types, self._clock, node.resolve_topic_name)
+        self._rules = UploadRules(node, settings, types, self._clock, self._active_mission)
+        self.uploader.wait_for(self._rules.closed)
         self._make_request_server(track)
         keeps = self._requests is not None
         self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, self._clock, keeps=keeps)
@@ -144,7 +147,7 @@ class Pipeline:
         sampler = Sampler(sensors, accounts, types, self._clock, queue)
         accounts.oldest_open = sampler.oldest_open
         bags = BagConsumer(node, settings.bag, accounts, bag_queue)
-        consumers = (track, sampler, *self.event_buffer.consumers, bags)
+        consumers = (track, sampler, *self.event_buffer.consumers, *self._rules.consumers, bags)
         self.intake = Intake(node, sensors, accounts, types, consumers, first=[track.odometry])
         self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
@@ -247,6 +250,7 @@ class Pipeline:
             return
         self._due_s = now_s + PERIOD_S
         self._name_held()
+        self.uploader.wait_for(self._rules.look())
         self.recorder.look()
         self._spool_parts(self._catalogue.due)
         self._look_at_link()
@@ -277,6 +281,9 @@ class Pipeline:
         self.uploader.set_max_mbps(settings.upload.max_mbps)
         self.event_buffer.update(settings.events)
 
+    def _active_mission(self) -> Mapping[str, Any]:
+        return self.mission.status()
+
     def _make_request_server(self, track: RobotTrack) -> None:
         """Only where something is kept until somebody asks for it."""
         self._requests: RequestServer | None = None
@@ -289,7 +296,12 @@ class Pipeline:
         self._link = link = LinkTrack(self.uploader.status, track.marks, settings.robot, self._clock)
         self._requests = RequestServer(self.spool, self._store, settings.keep, settings.robot, self._clock,
                                        put=partial(self.writer.put, wait=False), released=self.uploader.wake,
-                                       cutter=partial(KeptCut, settings.home), mbps=lambda: link.mbps)  # fmt: skip
+                                       cutter=partial(KeptCut, settings.home), mbps=lambda: link.mbps,
+                                       may_send=lambda: KEEP_WHEN not in self._rules.closed, finished=self._hasten)  # fmt: skip
+
+    def _hasten(self) -> None:
+        """Somebody waits for what was asked for."""
+        self._catalogue.hasten()
 
     def _settled(self, ids: Collection[int]) -> None:
         self.uploader.settled(ids)

@@ -133,7 +133,8 @@ class Status:
             'spool': {'path': str(self._stages.spool.root), **asdict(usage), 'evicted': self._stages.spool.evicted,
                       'unkept': self._stages.spool.unkept,
                       **asdict(self._settings.spool)},
-            'store': self._store(upload, now_s, usage.bytes), 'clock': asdict(self._clock.state()),
+            'store': self._store(upload, now_s, usage.bytes),
+            'requests': self._requests(), 'clock': asdict(self._clock.state()),
             'consumers': {name: {'failures': count, 'last_error': text}
                           for name, (count, text) in self._stages.intake.consumer_failures().items()},
             'workers': {worker.name: asdict(worker.status()) for worker in self._stages.workers},
@@ -199,6 +200,10 @@ class Status:
         topics = {topic: asdict(totals) for topic, totals in self._stages.spool.accounts.totals(EVENT).items()}
         left_out = sum(self._stages.intake.left_out(each) for each in self._stages.event_buffer.consumers)
         return {**asdict(self._stages.event_buffer.events.status()), 'topics': topics, 'left_out': left_out}
+
+    def _requests(self) -> dict[str, Any]:
+        requests = self._stages.requests
+        return {} if requests is None else asdict(requests.status)
 
     def _store(self, upload: UploadStatus, now_s: float, waiting: int) -> dict[str, Any]:
         then_s, sent_bytes, _ = self._past[0] if self._past else (now_s, upload.sent_bytes, {})

@@ -227,8 +227,14 @@ def _add_store(grid: Table, found: Mapping[str, Any]) -> None:
     grid.add_row('store', plain(str(store['state']).replace('_', ' '), 'green' if fine else 'red'), plain(store['target']))
     left = '' if store.get('left_s') is None else f', all that waits arrives in {duration(store["left_s"])}'
     grid.add_row('', '', f'{store["delivered"]:,} delivered, {store["mbps"]:.1f}{cap} Mbit/s{left}')
+    for name, why in store['waits_for'].items():
+        grid.add_row('', '', plain(f'waits for {name}: {why}', 'yellow'))
     if store['last_error'] and (not fine or store['blocked_buckets']):
         grid.add_row('', '', plain(store['last_error'], 'yellow'))
+    asked = found.get('requests', {})
+    if asked.get('open'):
+        left = f', which arrive in {duration(asked["left_s"])}' if asked['left_s'] is not None else ''
+        grid.add_row('requests', '', f'{asked["open"]:,} open, for {volume(asked["bytes"])}{left}')
 
 
 def _add_mission(grid: Table, found: Mapping[str, Any]) -> None:

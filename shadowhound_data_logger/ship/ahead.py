@@ -134,10 +134,10 @@ class Ahead:
     def holds(self, bucket: str) -> bool:
         return any(item.bucket == bucket for queue in self._all() for item in queue.values())
 
-    def drop(self, bucket: str) -> None:
-        """Forget the objects of a bucket; a later look finds them again."""
+    def drop(self, unwanted: Callable[[SpooledObject], bool]) -> None:
+        """Forget these objects; a later look finds them again."""
         for queue in self._all():
-            for number in [item.id for item in queue.values() if item.bucket == bucket]:
+            for number in [item.id for item in queue.values() if unwanted(item)]:
                 del queue[number]
 
     def _all(self) -> tuple[dict[int, SpooledObject], ...]:

@@ -291,6 +291,6 @@ class History:
         """When the next wait is over; infinite without one."""
         return min((entry.not_before for entry in self._failures.values() if entry.not_before > now), default=float('inf'))
 
-    def buckets(self) -> set[str]:
-        """Where the objects that wait want to go."""
-        return {entry.item.bucket for entry in self._failures.values()}
+    def buckets(self, wanted: Callable[[SpooledObject], bool]) -> set[str]:
+        """Where those of the objects that wait want to go."""
+        return {entry.item.bucket for entry in self._failures.values() if wanted(entry.item)}

@@ -41,6 +41,8 @@ class Look:
 
     exclude: frozenset[int]
     without: tuple[str, ...]
+    waiting_for: frozenset[str] = frozenset()
+    """Rules that do not hold (``model.waits_for``)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,8 @@ class Snapshot:
     delivered: int
     retries: int
     last_error: str
+    waiting_for: frozenset[str]
+    """Rules that do not hold."""
 
 
 class Schedule:
@@ -94,6 +98,7 @@ class Schedule:
         self._version = 0
         self._active: bool | None = None
         self._stopped = False
+        self._waiting_for: frozenset[str] = frozenset()
         self._ahead = Ahead()
         self._breakers = Breakers(backoff_s, rng)
         self._history = History(backoff_s, rng)
@@ -115,7 +120,7 @@ class Schedule:
                 return self._rest(now)
             if self._ahead.wants_look(now, self._breakers.open_since(now)):
                 self._ahead.begin_look(now)
-                return Look(self._taken(), self._breakers.without(now))
+                return Look(self._taken(), self._breakers.without(now), self._waiting_for)
             item = self._claim(now)
             return Ship(item) if item else self._rest(now)
 
@@ -133,6 +138,7 @@ class Schedule:
             now = self._now()
             closed = self._breakers.without(now)
             self._ahead.end_look(important, oldest, taken=self._taken(), without=closed)
+            self._ahead.drop(self._waits)
             self._notify(len(self._ahead))
 
     def look_failed(self, error: BaseException) -> None:
@@ -200,7 +206,7 @@ class Schedule:
         """The spool has new objects (``new``, where they are known), or has given some up."""
         with self._changed:
             taken = self._taken()
-            self._ahead.add(item for item in new if item.id not in taken)
+            self._ahead.add(item for item in new if item.id not in taken and not self._waits(item))
             self._ahead.outdate()
             self._notify(max(len(new), 1))
 
@@ -209,6 +215,15 @@ class Schedule:
         with self._changed:
             if active is not self._active:
                 self._active = active
+                self._ahead.outdate()
+                self._notify()
+
+    def wait_for(self, rules: frozenset[str]) -> None:
+        """Send nothing that waits for these, which do not hold; what is under way goes on."""
+        with self._changed:
+            if rules != self._waiting_for:
+                self._waiting_for = rules
+                self._ahead.drop(self._waits)
                 self._ahead.outdate()
                 self._notify()
 
@@ -225,9 +240,9 @@ class Schedule:
             if self._stopped or self._active is False or (store and store.confirmed):
                 return False
             busy = self._in_flight or self._unsettled or len(self._ahead) or not self._ahead.is_known
-            waiting = any(bucket not in blocked for bucket in self._history.buckets())
+            waiting = any(bucket not in blocked for bucket in self._history.buckets(lambda item: not self._waits(item)))
             unsure = store or any(not outage.confirmed for outage in blocked.values())
-            return self._rest(now) if busy or waiting or unsure else not blocked
+            return self._rest(now) if busy or waiting or unsure else not (blocked or self._waiting_for)
 
     def snapshot(self) -> Snapshot:
         with self._changed:
@@ -237,6 +252,7 @@ class Schedule:
                 blocked={bucket: outage.error for bucket, outage in self._breakers.buckets.items()},
                 in_flight=len(self._in_flight), ready=len(self._ahead), deferred=len(self._history),
                 delivered=self._history.delivered, retries=self._retries, last_error=self._last_error,
+                waiting_for=self._waiting_for,
             )  # fmt: skip
 
     # -- under the lock --------------------------------------------------------------------------------------------
@@ -245,6 +261,10 @@ class Schedule:
         """Let so many resting threads look again, all by default. A wake for nothing costs as much as one for an object."""
         self._version += 1
         self._changed.notify(self._threads if threads is None else threads)
+
+    def _waits(self, item: SpooledObject) -> bool:
+        """Whether the rule that it waits for does not hold."""
+        return item.waits_for in self._waiting_for
 
     def _taken(self) -> frozenset[int]:
         """What the spool calls pending and we have in hand."""
@@ -260,7 +280,7 @@ class Schedule:
             self._in_flight[item.id] = item, self._history.delivered
             self._breakers.claim(item)
             if item.bucket in self._breakers.buckets:  # one probe at a time; the others would only hide what can go
-                self._ahead.drop(item.bucket)
+                self._ahead.drop(lambda other: other.bucket == item.bucket)
         return item
 
     def _take(self, now: float) -> SpooledObject | None:
@@ -279,7 +299,12 @@ class Schedule:
 
     def _may_retry(self, item: SpooledObject, now: float) -> bool:
         """Where a bucket is out, an object that failed there is its probe only if the spool has no other of that bucket."""
-        if item.id in self._in_flight or not self._breakers.lets(item.bucket, now) or not self._has_room(item):
+        if (
+            item.id in self._in_flight
+            or self._waits(item)
+            or not self._breakers.lets(item.bucket, now)
+            or not self._has_room(item)
+        ):
             return False
         outage = self._breakers.buckets.get(item.bucket)
         return not outage or (self._ahead.has_looked_since(outage.retry_at) and not self._ahead.holds(item.bucket))

@@ -14,11 +14,12 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, Protocol
 
 from shadowhound_data_logger.config import Settings, UploadSettings
 from shadowhound_data_logger.errors import StoreError
-from shadowhound_data_logger.model import Outcome, SpooledObject, State
+from shadowhound_data_logger.model import EVENTS_WHEN, UPLOAD_WHEN, Outcome, SpooledObject, State
 from shadowhound_data_logger.ship.ahead import IMPORTANT, OLDEST
 from shadowhound_data_logger.ship.failures import Notice, Verdict
 from shadowhound_data_logger.ship.schedule import Look, Rest, Schedule, Ship, Step
@@ -40,7 +41,7 @@ class Backlog(Protocol):
     """What delivery asks of the spool."""
 
     def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
-                without: Sequence[str] = ()) -> list[SpooledObject]: ...  # fmt: skip
+                without: Sequence[str] = (), waiting_for: Collection[str] = ()) -> list[SpooledObject]: ...  # fmt: skip
 
     def pending_count(self) -> int: ...
 
@@ -52,7 +53,8 @@ class UploadStatus:
     """Delivery at one instant, for the status and the progress line."""
 
     state: str
-    """``idle``, ``shipping``, ``store_down``, ``paused`` (keys, certificate, rights) or ``not_draining`` (another does)."""
+    """``idle``, ``shipping``, ``store_down``, ``paused`` (keys, certificate, rights), ``not_draining`` (another does) or
+    ``waiting`` (for a rule to hold, ``waits_for``)."""
     last_error: str
     """The newest failure of this session, with its remedy; it may be over."""
     delivered: int
@@ -71,6 +73,8 @@ class UploadStatus:
     """Payload bytes that left in this session, repeats included; it grows while a body leaves, so its slope is the rate."""
     max_mbps: float = 0.0
     """The cap that is set, megabits a second; 0 is none. It holds for an S3 server: a folder is behind no radio."""
+    waits_for: Mapping[str, str] = field(default_factory=dict)
+    """Rules that do not hold, such as ``upload.when``: why they do not."""
 
 
 class Uploader:
@@ -99,6 +103,7 @@ class Uploader:
         self._ended = threading.Event()
         self._lock = threading.Lock()  # guards the counter below
         self._quarantined: Counter[tuple[str, str]] = Counter()
+        self._waits_for: Mapping[str, str] = {}
 
     def open(self) -> None:
         """Begin to deliver."""
@@ -126,11 +131,16 @@ class Uploader:
         """Send no more than this for so long; it ends by itself. Raises ValueError for 0 and below."""
         self._store.pace.yield_to(max_mbps, seconds)
 
+    def wait_for(self, rules: Mapping[str, str]) -> None:
+        """Send nothing that waits for these rules, which do not hold (and why not); what is under way goes on."""
+        self._waits_for = rules
+        self._schedule.wait_for(frozenset(rules) & {UPLOAD_WHEN, EVENTS_WHEN})
+
     def drain(self, deadline_s: float) -> bool:
         """Wait until nothing is pending and every outcome is durable; whether that is so.
 
         False after ``deadline_s`` seconds, and at once where waiting is no use: the store is away, the credentials are
-        refused, all that is left belongs to buckets that take nothing, or another process drains.
+        refused, all that is left belongs to buckets that take nothing or waits for a rule, or another process drains.
         """
         self._schedule.wake()
         end = self._monotonic() + deadline_s
@@ -139,7 +149,7 @@ class Uploader:
             if left <= 0:
                 return False
             self._ended.wait(min(left, answer.seconds, DRAINED_EVERY_S))
-        return answer
+        return answer or (bool(self._waits_for) and not self._spool.pending_count())
 
     def close(self, deadline_s: float) -> None:
         """Begin no put any more and wait for those under way, at most ``deadline_s`` seconds; idempotent.
@@ -165,13 +175,16 @@ class Uploader:
             state = 'paused' if now.outage is Verdict.PAUSE else 'store_down'
         elif now.in_flight or now.ready:
             state = 'shipping'
+        elif now.blocked:
+            state = 'paused'
         else:
-            state = 'paused' if now.blocked else 'shipping' if now.deferred else 'idle'
+            state = 'waiting' if now.waiting_for else 'shipping' if now.deferred else 'idle'
         with self._lock:
             quarantined = self._quarantined.total()
         failures = sum(worker.failures for worker in self.workers)
+        pace = self._store.pace
         return UploadStatus(state, now.last_error, now.delivered, now.in_flight, now.deferred, now.retries, quarantined,
-                            now.blocked, failures, self._store.pace.sent_bytes, self._store.pace.max_mbps)  # fmt: skip
+                            now.blocked, failures, pace.sent_bytes, pace.max_mbps, self._waits_for)  # fmt: skip
 
     # -- the threads -----------------------------------------------------------------------------------------------
 
@@ -194,10 +207,9 @@ class Uploader:
         if isinstance(step, Rest):
             self._schedule.rest(step)
         elif isinstance(step, Look):
-            important = self._spool.pending(IMPORTANT, exclude=step.exclude, without=step.without)
-            oldest = important
-            if len(important) == IMPORTANT:
-                oldest = self._spool.pending(OLDEST, exclude=step.exclude, oldest=True, without=step.without)
+            look = partial(self._spool.pending, exclude=step.exclude, without=step.without, waiting_for=step.waiting_for)
+            important = look(IMPORTANT)
+            oldest = look(OLDEST, oldest=True) if len(important) == IMPORTANT else important
             self._schedule.found(important, sorted(oldest, key=lambda item: item.id)[:OLDEST])
         else:
             self._ship(step.item)

@@ -21,7 +21,7 @@ from typing import Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
+from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State, waits_for
 from shadowhound_data_logger.spool.binding import free_key
 from shadowhound_data_logger.spool.files import Tree, content_sha256, describe, description, facts
 from shadowhound_data_logger.spool.index import MISSING, Index
@@ -150,7 +150,7 @@ class Adding:
             self._taking.append((number, item.body.path, said if said != self._said.get(item.body.path) else None))
             path = self._tree.path(state, reason, item.bucket, key)
         added = SpooledObject(number, item.bucket, key, path, len(item.body), sha256, item.content_type, metadata, item.priority,
-                              self._now_ns)  # fmt: skip
+                              self._now_ns, waits_for(item.sensor, metadata, protected=item.protected))  # fmt: skip
         self._added.append((added, state))
 
     def take(self) -> None:

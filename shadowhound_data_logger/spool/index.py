@@ -26,6 +26,8 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.disk import sync
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import (
+    EVENTS_WHEN,
+    UPLOAD_WHEN,
     Binding,
     DataObject,
     HeldObject,
@@ -35,14 +37,17 @@ from shadowhound_data_logger.model import (
     SliceRow,
     SpooledObject,
     State,
+    waits_for,
 )
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.request_table import RequestTable
 from shadowhound_data_logger.spool.schema import (
     CATALOGUE,
+    EXEMPT,
     IMPLAUSIBLE,
     SCHEMA_VERSION,
+    WAITS_FOR,
     definitions,
     expected,
     prepare,
@@ -77,11 +82,11 @@ _COMPACT: Final = """
 SELECT compact_objects.id, bucket, path || name AS key, bytes, lower(hex(sha256)) AS sha256, '' AS content_type,
   '{}' AS metadata, 0 AS priority, settled_s * 1000000000 AS created_ns,
   CASE state WHEN 0 THEN 'delivered' WHEN 1 THEN 'deduplicated' ELSE 'evicted' END AS state,
-  CASE state WHEN 2 THEN 'no_room' END AS reason
+  CASE state WHEN 2 THEN 'no_room' END AS reason, sensor, 0 AS protected
 FROM folders JOIN compact_objects ON folder = folders.id"""
 """The columns of ``_OBJECT``, as far as they are remembered; ``created_ns`` is when it left the spool, to the second."""
 _OF_SENSOR: Final = 'bucket = ? AND sensor = ? AND key >= ? AND key < ?'
-_OBJECT: Final = 'id, bucket, key, bytes, sha256, content_type, metadata, priority, created_ns, state, reason'
+_OBJECT: Final = 'id, bucket, key, bytes, sha256, content_type, metadata, priority, created_ns, state, reason, sensor, protected'
 
 
 _SAID: Final = (words.MISSION_ID, words.MISSION_TYPE, words.POSE, words.BATTERY, words.CONTENT_KEY)
@@ -428,14 +433,20 @@ class Index:
             (state.value, key, json.dumps(dict(metadata)), binding.t_start_ns, binding.t_end_ns, created_ns, binding.id),
         )
 
-    def pending(self, limit: int, *, oldest: bool, without: Sequence[str] = ()) -> list[sqlite3.Row]:
-        """Objects to ship: most important first or oldest first, none of the buckets ``without``.
+    def pending(self, limit: int, *, oldest: bool, without: Sequence[str] = (),
+                waiting_for: Collection[str] = ()) -> list[sqlite3.Row]:  # fmt: skip
+        """Objects to ship: most important first or oldest first, not of buckets ``without``, none that waits for these rules.
 
         Each bucket is asked by itself, so that what waits for those that are left out costs nothing.
         """
         order = ('id',) if oldest else ('priority', 'id')
-        condition = f"state = 'pending' AND bucket = ? ORDER BY {', '.join(order)} LIMIT ?"
-        found = [self._rows(condition, (bucket, limit)) for bucket in self._waited_for() if bucket not in without]
+        rules = ''.join(f" AND {WAITS_FOR} <> '{setting}'" for setting in (UPLOAD_WHEN, EVENTS_WHEN) if setting in waiting_for)
+        condition = f"state = 'pending' AND bucket = ?{rules} ORDER BY {', '.join(order)} LIMIT ?"
+        table = 'objects'
+        if UPLOAD_WHEN in waiting_for:
+            self._db.execute(EXEMPT)
+            table = 'objects INDEXED BY exempt'
+        found = [self._rows(condition, (bucket, limit), table) for bucket in self._waited_for() if bucket not in without]
         return list(islice(merge(*found, key=itemgetter(*order)), limit))
 
     def _waited_for(self) -> Iterator[str]:
@@ -451,8 +462,8 @@ class Index:
         query = "SELECT count(*) FROM objects WHERE state = 'held' AND reason = ?"
         return int(self._db.execute(query, (reason,)).fetchone()[0])
 
-    def _rows(self, where: str, values: Sequence[object] = ()) -> list[sqlite3.Row]:
-        cursor = self._db.execute(f'SELECT {_OBJECT} FROM objects WHERE {where}', tuple(values))  # noqa: S608 - own constants only
+    def _rows(self, where: str, values: Sequence[object] = (), table: str = 'objects') -> list[sqlite3.Row]:
+        cursor = self._db.execute(f'SELECT {_OBJECT} FROM {table} WHERE {where}', tuple(values))  # noqa: S608 - own constants only
         cursor.row_factory = sqlite3.Row
         return cursor.fetchall()
 
@@ -841,8 +852,9 @@ def lost(path: Path) -> sqlite3.DatabaseError:
 
 def spooled(row: sqlite3.Row | Mapping[str, Any], path: Path) -> SpooledObject:
     """The object of a row."""
+    metadata = json.loads(row['metadata'])
     return SpooledObject(
         id=row['id'], bucket=row['bucket'], key=row['key'], path=path, size=row['bytes'], sha256=row['sha256'],
-        content_type=row['content_type'], metadata=json.loads(row['metadata']), priority=row['priority'],
-        created_ns=row['created_ns'],
+        content_type=row['content_type'], metadata=metadata, priority=row['priority'],
+        created_ns=row['created_ns'], waits_for=waits_for(row['sensor'], metadata, protected=bool(row['protected'])),
     )  # fmt: skip

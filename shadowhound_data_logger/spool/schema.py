@@ -9,7 +9,7 @@ from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.model import EVENTS_WHEN, PREVIEWS, UPLOAD_WHEN, State
 from shadowhound_data_logger.spool.gaps import FORGOTTEN, UNTIMED
 
 SCHEMA_VERSION: Final = 7
@@ -35,6 +35,15 @@ CREATE INDEX pending ON objects (bucket, priority, id) WHERE state = 'pending';
 CREATE INDEX waiting ON objects (bucket, id) WHERE state = 'pending';
 """
 """Each bucket in both orders: while one takes nothing, however much waits for it, the others are found as fast."""
+WAITS_FOR: Final = f"""CASE
+  WHEN substr(sensor, 1, 1) = '_' OR substr(sensor, -{len(PREVIEWS)}) = '{PREVIEWS}' THEN ''
+  WHEN NOT protected THEN '{UPLOAD_WHEN}'
+  WHEN json_valid(metadata) AND json_extract(metadata, '$.{words.EVENT}') IS NOT NULL THEN '{EVENTS_WHEN}' ELSE '' END"""
+"""``model.waits_for`` of a row."""
+EXEMPT: Final = f"""
+CREATE INDEX IF NOT EXISTS exempt ON objects (bucket, priority, id) WHERE state = 'pending' AND {WAITS_FOR} <> '{UPLOAD_WHEN}';
+"""
+"""What goes while ``upload.when`` does not hold, however much waits for it. Only spools of nodes with such a rule have it."""
 _BY_REASON: Final = "CREATE INDEX held ON objects (reason, id) WHERE state = 'held';"
 _ARRIVED: Final = f"state IN ('{State.DELIVERED.value}', '{State.DEDUPLICATED.value}')"
 _CATALOGUE: Final = f"""

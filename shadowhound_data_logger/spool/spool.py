@@ -168,13 +168,14 @@ class Spool:
         return SpoolError(f'the spool {self.root} cannot be written: {reason}', remedy='is its disk full, read-only or broken?')
 
     def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
-                without: Sequence[str] = ()) -> list[SpooledObject]:  # fmt: skip
+                without: Sequence[str] = (), waiting_for: Collection[str] = ()) -> list[SpooledObject]:  # fmt: skip
         """Up to ``limit`` objects to ship: the most important first, or the oldest first.
 
-        ``exclude`` are ids already in somebody's hands, ``without`` buckets that cannot take anything now.
+        ``exclude`` are ids already in somebody's hands, ``without`` buckets that cannot take anything now, ``waiting_for``
+        settings that do not hold (``model.waits_for``).
         """
         with self._lock:
-            rows = self._index.pending(limit + len(exclude), oldest=oldest, without=without)
+            rows = self._index.pending(limit + len(exclude), oldest=oldest, without=without, waiting_for=waiting_for)
         parts = frozenset(self._tree.incoming.iterdir())  # one question for all, because nearly none is there
         found: list[SpooledObject] = []
         for row in rows:
@@ -282,6 +283,10 @@ class Spool:
     def released(self) -> tuple[int, int]:
         """Requested objects that wait for delivery, and their bytes. Raises sqlite3.Error."""
         return self._view.requests.released()
+
+    def awaited(self) -> tuple[int, int]:
+        """Open requests, and the bytes that they wait for and nobody has released. Raises sqlite3.Error."""
+        return self._view.requests.awaited()
 
     def kept(self) -> Iterator[KeptObject]:
         """What is kept of this robot, was released and is on its way, or is lost since an hour. Waits for no commit.

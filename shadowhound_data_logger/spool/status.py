@@ -25,8 +25,8 @@ FRESH_NS: Final = 5 * SECOND
 """A node writes once a second: one that is silent for longer hangs, or is no more."""
 RUNNING, NOT_ANSWERING, NOT_RUNNING = 'running', 'not_answering', 'not_running'
 NOT_RUNNING_TEXT: Final = 'the node is not running'
-FINE_STORE: Final = frozenset({'idle', 'shipping', 'not_draining'})
-"""States of delivery that are not a finding; ``not_draining``: another process delivers."""
+FINE_STORE: Final = frozenset({'idle', 'shipping', 'not_draining', 'waiting'})
+"""States of delivery that are not a finding; ``not_draining``: another process delivers; ``waiting``: a rule says not now."""
 NAMED: Final = 3
 """Topics that a finding names; the figures of the others stand in the table."""
 _TOPIC: Final[dict[str, Any]] = {
@@ -41,7 +41,8 @@ _SECTIONS: Final[dict[str, dict[str, Any]]] = {
               'kept': 0, 'kept_bytes': 0, 'unkept': 0,
               'free_bytes': None, 'oldest_age_s': None, 'min_free_bytes': None, 'remember_days': None},
     'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
-              'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0, 'left_s': None},
+              'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0, 'waits_for': {}, 'left_s': None},
+    'requests': {'open': 0, 'bytes': 0, 'mbps': None, 'left_s': None},
     'middleware': {'rmw': '', 'robot': '', 'why': '', 'asked': '', 'network': '', 'receive_bytes': None, 'dropped_datagrams': 0,
                    'unheard': None},
     'clock': {'is_set': True, 'gave_up': False, 'unset_s': 0.0, 'steps': 0, 'last_step_s': None, 'last_step_age_s': None},

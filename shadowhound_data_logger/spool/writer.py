@@ -1,7 +1,8 @@
 """The one thread that writes the spool: it groups finished objects and outcomes of deliveries into durable commits.
 
-At most one commit every ``commit_s``; the first after a quiet time happens at once. A commit that fails (a full or
-read-only disk) is tried again with everything that was in it; meanwhile ``put`` blocks the encoders, not the intake.
+At most one commit every ``commit_s``; the first after a quiet time happens at once. Objects that stay here until somebody asks
+for them wait up to ``HEARTBEAT_S`` for others to be committed with. A commit that fails (a full or read-only disk) is tried again
+with everything that was in it; meanwhile ``put`` blocks the encoders, not the intake.
 """
 
 from __future__ import annotations
@@ -37,6 +38,11 @@ class _Unit(NamedTuple):
 
     objects: tuple[DataObject, ...]
     rows: tuple[RecordingRows, ...]
+
+    @property
+    def may_wait(self) -> bool:
+        """Whether nobody waits for any of it."""
+        return not self.rows and all(item.is_on_request for item in self.objects)
 
 
 _Group = tuple[Sequence[_Unit], Sequence[Outcome]]
@@ -166,7 +172,9 @@ class SpoolWriter:
 
     def _due(self) -> bool:
         """Whether there is something that waits for a commit; the caller holds the lock."""
-        return bool(self._units) or self._urgent or len(self._outcomes) >= (1 if self.prompt else MANY_OUTCOMES)
+        if self._urgent or len(self._outcomes) >= (1 if self.prompt else MANY_OUTCOMES):
+            return True
+        return self._bytes >= MOST_BYTES or not all(unit.may_wait for unit in self._units)
 
     def _committed(self, units: Sequence[_Unit], outcomes: Sequence[Outcome], spooled: Sequence[SpooledObject]) -> None:
         """All of it is durable: let it go and tell who waits for that."""

@@ -8,11 +8,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from spool.making import NOON_NS, FakeClock
 
 from shadowhound_data_logger.capture.commands import Commands
 from shadowhound_data_logger.capture.intake import _each
 from shadowhound_data_logger.capture.interface import SWITCHES, TRIGGERS
+from shadowhound_data_logger.config import KeepSettings
 from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.mailbox import request_id
+from shadowhound_data_logger.ship.requests import RequestServer
 
 STAGES = ['intake', 'encode pool', 'spool writer']
 
@@ -31,6 +35,7 @@ class Stages:
         self.latest: Mapping[str, Any] | None = None
         self.earlier: Mapping[str, Any] | None = None
         self.version = '1'
+        self.requests: Any = None
 
     def commands(self) -> Commands:
         stages: Any = self
@@ -291,3 +296,19 @@ def test_uploads_yield_for_some_seconds(caplog: pytest.LogCaptureFixture) -> Non
         assert ask(stages.commands(), 'yield', max_mbps=wrong)[0] is False
     assert ask(stages.commands(), 'yield', max_mbps=2)[0] is False
     assert ask(stages.commands(), 'yield')[0] is False
+
+
+def test_somebody_at_the_robot_asks_for_what_it_keeps() -> None:
+    """The answer has the id of the request; what nobody can ask for is refused, and where nothing is kept all is."""
+    stages = Stages()
+    assert ask(stages.commands(), 'pull', want={'sensor': 'camera'}) == (
+        False, 'nothing is kept here: ship of all sensors and of bag is always'
+    )  # fmt: skip
+    spool: Any = None
+    stages.requests = RequestServer(spool, spool, KeepSettings(), 'thor', FakeClock(), put=spool, released=spool, cutter=spool)
+    want = {'sensor': 'camera', 'since_ns': NOON_NS}
+    commands = stages.commands()
+    name = request_id('thor', want)
+    assert commands.answer({'do': 'pull', 'want': want, 'by': 'x'}) == {'ok': True, 'robot': 'thor', 'id': name}
+    for wrong in ({}, {'want': {}}, {'want': {'sensor': 5}}, {'want': want, 'by': '../x'}, {'cancel': '../x'}):
+        assert ask(commands, 'pull', **wrong)[0] is False

@@ -28,7 +28,7 @@ STATUS: dict[str, Any] = {
     'spool': {'path': '/s', 'pending': 3, 'held': 0, 'quarantined': 1, 'evicted': 2, 'bytes': 10, 'max_bytes': 100,
               'free_bytes': 5, 'oldest_age_s': None},
     'store': {'target': 'the S3 server', 'state': 'idle', 'last_error': 'refused', 'delivered': 5, 'in_flight': 0, 'deferred': 0,
-              'retries': 0, 'quarantined': 1, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0},
+              'retries': 0, 'quarantined': 1, 'blocked_buckets': {}, 'waits_for': {}, 'mbps': 0.0, 'max_mbps': 0.0},
     'workers': {'intake': {'failing': False, 'failures': 1, 'deaths': 0, 'last_error': 'ValueError: x'}}, 'stalls': {},
     'consumers': {'Sampler': {'failures': 1, 'last_error': 'ValueError: x'}},
     'clock': {'is_set': True, 'gave_up': False, 'unset_s': 0.0, 'steps': 2, 'last_step_s': 3.5, 'last_step_age_s': 61.0},

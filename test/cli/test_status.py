@@ -47,6 +47,7 @@ def a_status(**changes: Any) -> dict[str, Any]:
                   'max_bytes': 21_474_836_480, 'free_bytes': 50_000_000_000, 'oldest_age_s': 725.0},
         'store': {'target': 'the S3 server at http://192.168.10.20:9000', 'state': 'shipping', 'last_error': '',
                   'delivered': 1234, 'in_flight': 0, 'deferred': 0, 'retries': 0, 'quarantined': 0, 'blocked_buckets': {},
+                  'waits_for': {},
                   'mbps': 1.23, 'max_mbps': 8.0},
         'workers': {'intake': {'failing': False, 'failures': 0, 'last_error': '', 'busy_s': 0.0}}, 'stalls': {},
     }  # fmt: skip
@@ -139,6 +140,14 @@ def test_it_says_which_mission_is_active() -> None:
     assert f'MLflow run {"a" * 32}' in text
     assert 'patrol, begun before the clock was set' in text
     assert max(len(each.rstrip()) for each in text.splitlines()) <= 80
+
+
+def test_it_says_when_what_is_asked_for_will_have_arrived() -> None:
+    """Requests that wait, their bytes, and how long these take; a node that keeps nothing says nothing of it."""
+    asked = {'open': 2, 'bytes': 120_000_000, 'mbps': 3.2, 'left_s': 300}
+    assert '2 open, for 120.0 MB, which arrive in 5 min' in shown(requests=asked)
+    assert 'arrive' not in shown(requests={**asked, 'left_s': None})
+    assert 'requests' not in shown()
 
 
 @pytest.mark.parametrize('width', [52, 60])

@@ -40,10 +40,11 @@ class FakeSpool:
         return made
 
     def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
-                without: Sequence[str] = ()) -> list[SpooledObject]:  # fmt: skip
+                without: Sequence[str] = (), waiting_for: Collection[str] = ()) -> list[SpooledObject]:  # fmt: skip
         with self._lock:
             self.looks += 1
             found = [item for item in self.items.values() if item.id not in exclude and item.bucket not in without]
+        found = [item for item in found if item.waits_for not in waiting_for]
         return sorted(found, key=lambda item: item.id if oldest else (item.priority, item.id))[:limit]
 
     def pending_count(self) -> int:

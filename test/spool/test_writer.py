@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ship.fakes import until
 from spool.making import assert_whole, files, make, receive, rows
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger import worker
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
@@ -78,6 +80,25 @@ def test_objects_share_commits(opened: Callable[..., SpoolWriter], spool: Spool,
     assert writing.flush(60)
     assert sum(commits) == 51
     assert len(commits) <= 4
+
+
+def test_what_stays_here_waits_for_others(opened: Callable[..., SpoolWriter], root: Path, commits: list[int]) -> None:
+    """It is committed with the next object that does not, or by itself after a heartbeat, or once it is much."""
+    kept: dict[str, Any] = {'topic': None, 'metadata': {words.SHIP: words.ON_REQUEST}}
+    writing = opened(0.0)
+    for number in range(5):
+        writing.put(make(f'kept_{number}', **kept))
+    writing.put(make('sent', topic=None))
+    assert writing.flush(60)
+    assert sum(commits) == 6
+    assert len(commits) <= 2  # the heartbeat may come between
+    writing.put(make('alone', **kept))
+    until(lambda: sum(commits) == 7)
+    writing.put(make('large', bytes(MOST_BYTES), **kept))
+    until(lambda: sum(commits) == 8)
+    assert writing.flush(60)
+    found = assert_whole(root)['objects']
+    assert (found['kept'] + found['evicted'], found['pending']) == (7, 1)  # the limit of what is kept is small
 
 
 @pytest.mark.parametrize(('count', 'size'), [(200, 10), (20, 1 << 20)])
