@@ -262,6 +262,23 @@ def _keep(figures: Figures) -> str:
     return '\n\n'.join((_table(('oldest message to the store', 'objects', 'p50', 'p95', 'worst'), rows), said))
 
 
+def _ask(figures: Figures) -> str:
+    def took(row: Figures) -> tuple[str, str, str]:
+        command = f'{median(row["command_s"]):.2f} s' if 'command_s' in row else ''
+        return f'{1000 * median(row["s"]):.0f} ms', spread([1000 * each for each in row['s']]), command
+
+    head = ('took', 'spread, ms', 'as a command')
+    values = [(f'`{row["question"].replace("|", "")}`', *took(row), f'{row["times"]:,}',
+               f'{row["opened"]:,} of {row["objects"]:,} ({show(100 * row["opened"] / row["objects"])} %)')
+              for row in figures['values']]  # fmt: skip
+    words = [(f'`{row["question"]}`', *took(row), f'{row["found"]:,}') for row in figures['words']]
+    sizes = f'{figures["catalogue_bytes"] / 1e6:.0f} MB of catalogue, {figures["statistics_bytes"] / 1e6:.0f} MB of statistics'
+    return '\n\n'.join((
+        _table((f'by value, {figures["objects"]:,} objects', *head, 'times', 'objects opened'), values),
+        _table((f'by words, {figures["missions"]:,} missions', *head, 'documents, at most 20'), words), f'{sizes}.',
+    ))  # fmt: skip
+
+
 def _datasets(figures: Figures) -> str:
     words = {'ours': '`export lerobot`', 'lerobot': 'lerobot, by default', 'lerobot, streaming': 'lerobot, `streaming_encoding`'}
     rows = []
@@ -282,7 +299,7 @@ _PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
     'latency': ('latency', _latency), 'encode_formats': ('encode_formats', _encode), 'spool_commits': ('spool_commits', _spool),
     'index_growth': ('index_growth', _growth), 'keep': ('keep', _keep),
     'drain': ('drain', _drain), 'mission_calls': ('mission_calls', _mission_calls), 'missions': ('missions', _missions),
-    'datasets': ('datasets', _datasets),
+    'datasets': ('datasets', _datasets), 'ask': ('ask', _ask),
 }  # fmt: skip
 
 if __name__ == '__main__':
