@@ -7,9 +7,17 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from shadowhound_data_logger import metadata_words as words
+
+UPLOAD_WHEN: Final = 'upload.when'
+EVENTS_WHEN: Final = 'events.when'
+"""Settings that objects wait for (``waits_for``)."""
+ON_ROBOT, LOST = 'robot', 'lost'
+"""Where an object is that a robot kept (the column ``where`` of ``catalogue.schema.KEPT``)."""
+PREVIEWS: Final = '_previews'
+"""The folder of previews; a preview's sensor has this behind its name."""
 
 
 class Sample(NamedTuple):
@@ -133,7 +141,21 @@ class SpooledObject:
     """S3 user metadata, ``sha256`` among it."""
     priority: int
     created_ns: int
-    attempts: int = 0
+    waits_for: str = ''
+    """The rule that has to hold for it to be uploaded (``waits_for``); empty for none."""
+
+
+def waits_for(sensor: str, metadata: Mapping[str, str], *, protected: bool) -> str:
+    """The setting that says when an object is uploaded; empty for what always is.
+
+    Always: what tells of the robot and of other objects (catalogue, gaps, ledger, previews, answers), and what is never evicted
+    (endings of bags, summaries of missions, what was asked for), but for the bags of events.
+    """
+    if sensor.startswith('_') or sensor.endswith(PREVIEWS):
+        return ''
+    if not protected:
+        return UPLOAD_WHEN
+    return EVENTS_WHEN if words.EVENT in metadata else ''
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +238,7 @@ class ObjectInfo:
     metadata: Mapping[str, str] = field(default_factory=dict)
     content_type: str = ''
     etag: str = ''
-    """Of a listing: changes with the content; empty where the store has none."""
+    """Of a listing, and of content that is read: changes with the content; empty where the store has none."""
     modified: datetime | None = None
     """Of a listing."""
 

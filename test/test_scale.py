@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from shadowhound_data_logger.capture.keeping import PREVIEW_BYTES
+
 PROGRAM = Path(__file__).parents[1] / 'bench' / 'scale.py'
 
 
@@ -46,3 +48,16 @@ def test_it_is_arithmetic(scale: Any) -> None:
     row = next(iter(scale.catalogue(scale.PROFILES[0])))
     assert row[:3] == ('1', '172,800', '480')
     assert row[4] == '481'
+
+
+def test_what_keeping_everything_takes(scale: Any) -> None:
+    """The figures of a week of 8 hours a day are what its rates make."""
+    seconds, page = 7 * 8 * 3600, scale.PAGE.read_text(encoding='utf-8')
+    rate = scale.PROFILES[2].bytes_s
+    assert f'about {8e-6 * rate:.0f} Mbit/s' in page
+    assert f'{rate * seconds / 7e9:.0f} GB a day and {rate * seconds / 1e12:.1f} TB a week' in page
+    assert f'{800e9 * 7 / (rate * seconds):.0f}' == '6'
+    assert '800 GB holds six days' in page
+    assert f'{8 * PREVIEW_BYTES / 1e3:.0f} kbit/s and {PREVIEW_BYTES * seconds / 1e9:.0f} GB of that week' in page
+    assert f'{seconds // 10:,} objects' in page
+    assert f'{30 * seconds / 1e6:.0f} million' in page

@@ -16,8 +16,6 @@ from pathlib import Path
 from typing import IO, Final
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
-from rosbags.rosbag2 import Reader
-from rosbags.rosbag2.metadata import dump_qos_v8
 
 from shadowhound_data_logger.bags.description import BagPart, Description
 from shadowhound_data_logger.encode.definitions import describe
@@ -176,11 +174,15 @@ def channel_of(connection: Connection) -> Channel:
     if not encoding or not definition:
         encoding, definition, known = describe(connection.msgtype)
         type_hash = type_hash or known
+    from rosbags.rosbag2.metadata import dump_qos_v8  # noqa: PLC0415 - see _stored
+
     qos = dump_qos_v8(connection.ext.offered_qos_profiles) if isinstance(connection.ext, ConnectionExtRosbag2) else ''
     return Channel(connection.topic, connection.msgtype, encoding, definition, type_hash, qos)
 
 
 def _stored(path: Path, wanted: MessageFilter) -> Iterator[RecordedMessage]:
+    from rosbags.rosbag2 import Reader  # noqa: PLC0415 - a tenth of a second of every command, for bags of SQLite alone
+
     check_tables(path)
     try:
         with Reader(path) as reader:

@@ -20,6 +20,7 @@ from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.cli.label import label
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.cli.ledger import ledger
+from shadowhound_data_logger.cli.likeness import lake_embed
 from shadowhound_data_logger.cli.live import live
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.node import node
@@ -83,11 +84,22 @@ def cli() -> None:
 for _verb in (verb for section in SECTIONS.values() for verb in section):
     cli.add_command(_verb)
 lake.add_command(lake_index)
+lake.add_command(lake_embed)
 lake.add_command(lake_sink)
+
+
+class _WithoutPandas:
+    """Has pandas look as if it were not installed: pyarrow imports it with the first array, which takes half a second."""
+
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        if name == 'pandas':
+            raise ModuleNotFoundError(f'no command needs {name}', name=name)
 
 
 def main() -> None:
     """The console script."""
+    sys.meta_path.insert(0, _WithoutPandas())
     try:
         sys.exit(ExitCode(cli(prog_name=PROGRAM, standalone_mode=False) or 0))
     except click.exceptions.Exit as error:

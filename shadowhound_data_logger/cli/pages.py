@@ -119,6 +119,12 @@ SECTIONS: Final = (
         ('upload.max_mbps', 'upload.threads', 'upload.backoff_s', 'upload.read_timeout_s', 'shutdown.drain_s'),
     ),
     Section(
+        'Upload when it suits',
+        'Only while a rule holds, such as `lowstate:bms_state.soc > 30 and wifi.ssid == "lab"` '
+        '([thor](thor.md#upload-when-it-suits)).',
+        ('upload.when', 'events.when', 'keep.when'),
+    ),
+    Section(
         'Record bags',
         'At full rate, whatever the sensors keep ([bags](bags.md)).',
         (

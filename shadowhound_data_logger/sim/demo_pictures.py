@@ -63,7 +63,7 @@ def live_page(address: str, path: Path) -> list[Path]:
     try:
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=chromium, args=flags)
-            page = browser.new_page(viewport={'width': 1280, 'height': 1120})
+            page = browser.new_page(viewport={'width': 1280, 'height': 1382})
             page.set_default_timeout(PAGE_MS)
             page.goto(address)
             page.get_by_role('button', name='Back in time').click()
@@ -74,10 +74,14 @@ def live_page(address: str, path: Path) -> list[Path]:
             else:
                 page.get_by_role('button', name='1 min', exact=True).click()
             page.wait_for_timeout(SETTLE_MS)
-            box = page.locator('rect.recorded[data-topic="/odom"]').first.bounding_box()
+            recorded = page.locator('rect.recorded[data-topic="/odom"]').last
+            recorded.scroll_into_view_if_needed()
+            box = recorded.bounding_box()
             if box is not None:
-                page.mouse.click(box['x'] + 0.6 * box['width'], box['y'])
+                page.mouse.click(box['x'] + 0.6 * box['width'], box['y'] + 0.5 * box['height'])
             page.wait_for_timeout(SETTLE_MS)
+            page.evaluate("scrollTo({top: 0, behavior: 'instant'})")
+            page.wait_for_timeout(SETTLE_MS / 6)
             page.screenshot(path=path, type='jpeg', quality=82, timeout=PAGE_MS)
             browser.close()
     except Error as error:

@@ -267,6 +267,16 @@ class Processes:
         command = ['-m', SIM, '--ros-args', '-r', f'__ns:={namespace}', *given]
         return self._keep(Process(name, command, self.folder / f'{name}.log', self.environ, forked=self._forked))
 
+    def page(self, node: Node, *arguments: str, port: int = 0) -> tuple[Process, str]:
+        """The live page of what this node logs, and its address."""
+        name = self._name('live')
+        environ = {**self.environ, 'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_ROBOT': node.robot}
+        command = ['-m', 'shadowhound_data_logger.cli.main', 'live', '--json', '--port', str(port), *arguments]
+        page = self._keep(Process(name, command, self.folder / f'{name}.log', environ))
+        page.said('"problem"')
+        said = page.log
+        return page, json.loads(said[said.index('{') : said.rindex('}') + 1])['url']
+
     def witness(self, topics: Mapping[str, str], output: Path, *, best_effort: Iterable[str] = ()) -> Process:
         """A second listener that writes all it hears, as it came, to a file (witness.py); SIGTERM ends it."""
         order = json.dumps({topic: [type_name, topic not in best_effort] for topic, type_name in topics.items()})
