@@ -32,7 +32,7 @@ from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.disk import replacing
-from shadowhound_data_logger.ship.requests import RequestServer
+from shadowhound_data_logger.ship.requests import RequestServer, RequestStatus
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
 from shadowhound_data_logger.spool.account_rows import Totals
 from shadowhound_data_logger.spool.accounts import BAG, EVENT
@@ -203,7 +203,7 @@ class Status:
 
     def _requests(self) -> dict[str, Any]:
         requests = self._stages.requests
-        return {} if requests is None else asdict(requests.status)
+        return asdict(RequestStatus() if requests is None else requests.status)
 
     def _store(self, upload: UploadStatus, now_s: float, waiting: int) -> dict[str, Any]:
         then_s, sent_bytes, _ = self._past[0] if self._past else (now_s, upload.sent_bytes, {})

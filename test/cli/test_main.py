@@ -69,9 +69,9 @@ def parsed(arguments: Sequence[str]) -> tuple[click.Command, click.Context]:
 def test_every_verb_has_examples_that_parse(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each is of this verb, or of one of its own; no option in it is unknown, without its value, or missing."""
     monkeypatch.chdir(tmp_path)
-    for file in ('bumps.json', 'sample.npz', 'spark.key', 'other.key'):  # which some examples read
+    for file in ('bumps.json', 'sample.npz', 'spark.key', 'other.key', 'door.jpg'):  # which some examples read
         (tmp_path / file).write_text('[]')
-    for folder in ('packed', 'outputs/go2_patrol'):
+    for folder in ('packed', 'outputs/go2_patrol', 'clip-vit-base-patch32'):
         (tmp_path / folder).mkdir(parents=True)
     found = examples_of(name)
     assert found
