@@ -47,11 +47,17 @@ MAKE_WAY = os.nice(0) + 10
 """How nice the other workers are."""
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """What is started in the background of a shell ignores SIGINT, and so would the programs that tests end by it.
 
-    Nodes of the tests, in this process and in others, are among themselves.
+    Nodes of the tests, in this process and in others, are among themselves. In a fresh clone each worker begins to compile the
+    tests at another place, and finds the rest compiled; ``pytest_collection_modifyitems`` restores the order that all must have.
     """
+    if hasattr(config, 'workerinput') and config.args_source is pytest.Config.ArgsSource.TESTPATHS:
+        root = Path(__file__).parent
+        found = sorted({str(root / path.relative_to(root).parts[0]) for path in root.rglob('test_*.py')})
+        first = len(found) * int(config.workerinput['workerid'].removeprefix('gw')) // config.workerinput['workercount']
+        config.args = found[first:] + found[:first]
     os.environ.update(THIS_MACHINE)
     gc.disable()
     botocore.session.create_loader = lru_cache(create_loader)  # whose descriptions of S3 each store would read
@@ -101,6 +107,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         elif marker := item.get_closest_marker('long'):
             item.add_marker(pytest.mark.skip(reason=f'{marker.args[0]}: set SHADOWHOUND_TEST_LONG=1'))
     if hasattr(config, 'workerinput'):
+        items.sort(key=lambda item: item.nodeid.partition('::')[0])
         place = places(item.nodeid.partition('::')[0] for item in items)
         items.sort(key=lambda item: (not has_robot(item.nodeid), place[item.nodeid.partition('::')[0]]))
 

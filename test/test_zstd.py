@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
 import importlib, pkgutil, sys, types
 from backports import zstd
@@ -24,6 +26,7 @@ print(unpacked('zstd', zstd.compress(b'a chunk')))
 """
 
 
+@pytest.mark.long('a process of its own')
 def test_nothing_but_the_interpreter_is_needed_from_3_14_on() -> None:
     """Every module of mcap and bags is imported by an interpreter that says it is 3.14, without the package of before."""
     ran = subprocess.run([sys.executable, '-c', PROGRAM], capture_output=True, text=True, check=False, timeout=120)

@@ -43,6 +43,7 @@ def test_a_disk_without_room_costs_what_comes_meanwhile(tmp_path: Path) -> None:
         assert it.row()['dropped'] == {'no_room': 5}
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_the_manifest_and_what_the_store_is_told_of_gaps_agree(tmp_path: Path) -> None:
     """What was dropped for want of room: as many messages by topic and reason in both."""
     with desk(tmp_path) as it:

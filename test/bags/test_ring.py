@@ -115,6 +115,7 @@ print((rss() - before) / limit, ring.bytes / limit)
 MORE = [pytest.param(size, marks=pytest.mark.long('a process for each')) for size in (300, 921_600)]
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('size', [20, 50_000, *MORE])
 def test_memory_is_bounded_by_the_limit_of_bytes(size: int) -> None:
     """Filled four times over, the process grew by the limit and a tenth at most, whether messages are small or large."""

@@ -126,6 +126,7 @@ def ints(count: int, first: int = 0) -> list[Int32]:
     return [Int32(data=number) for number in range(first, first + count)]
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('order', ['squatter, node, robot', 'node, squatter, robot', 'robot, node, squatter'])
 @pytest.mark.parametrize('reliable', [True, False])
 def test_the_type_that_is_named_wins(

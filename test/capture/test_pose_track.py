@@ -105,6 +105,7 @@ def test_the_odometry_may_come_a_little_late() -> None:
         assert pose(found, times[-1] + 0.26) is None
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_a_node_that_starts_while_the_robot_turns() -> None:
     """What came before the odometry that was heard first has no pose, but for an instant, in which no robot turns by much."""
     patrol = Patrol.through(FloorPlan.build().patrol)

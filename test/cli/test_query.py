@@ -77,6 +77,7 @@ def test_sql_with_flags(home: Path) -> None:
     assert '2 rows' in run(home, 'SELECT sensor, count(*) AS n FROM objects GROUP BY sensor').output
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_pictures_of_the_answer(home: Path, tmp_path: Path) -> None:
     """A contact sheet of the images that can be read, and the places on the ground."""
     sheet, ground = tmp_path / 'sheet.jpg', tmp_path / 'map.png'
@@ -110,6 +111,7 @@ def test_what_is_no_question_is_bad_usage(home: Path, arguments: list[str], says
     assert says in found.output
 
 
+@pytest.mark.long('a process of its own')
 def test_a_robot_has_no_library_for_it(home: Path, tmp_path: Path) -> None:
     """Without Daft it says what to install, as bad usage."""
     (tmp_path / 'daft.py').write_text("raise ModuleNotFoundError('no', name='daft')\n", encoding='utf-8')

@@ -288,6 +288,7 @@ def test_bad_usage_is_exit_code_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert caught.value.code == 2
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('as_json', [False, True])
 def test_watch_goes_on_until_ctrl_c(tmp_path: Path, as_json: bool) -> None:
     """Into a pipe: a status each time, with --json one line each; Ctrl-C ends it with exit code 0."""
@@ -316,6 +317,7 @@ def read_heads(process: subprocess.Popen[str], count: int, as_json: bool) -> lis
     return heads
 
 
+@pytest.mark.long('a process of its own')
 def test_the_live_view_leaves_the_terminal_as_it_was(tmp_path: Path) -> None:
     """On a terminal the screen is switched and given back, and the last view stays; exit code 0."""
     write(tmp_path)

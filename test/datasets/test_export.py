@@ -127,6 +127,7 @@ def test_a_mission_with_too_large_gaps_is_refused(house: House, tmp_path: Path) 
     assert [each['mission_id'] for each in found.added] == ['gappy']
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_it_waits_until_the_robot_has_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And takes the mission then; after some time in which nothing was heard it gives up, and says for what it waited."""
     place = House(tmp_path)
@@ -199,6 +200,7 @@ def test_a_share_of_the_missions_is_for_validation() -> None:
     assert [name for name in names if split_of(name, 0.0) == 'validation'] == []
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_labels_are_a_column_and_choose_validation(tmp_path: Path) -> None:
     """Of each frame those of its time and of its picture, as they stood; who said so is in a table, and the digest covers it."""
     place = House(tmp_path)
@@ -333,6 +335,7 @@ def test_other_settings_are_another_data_set(house: House, exported: Exported, t
         ExportOptions(state=('mood',))
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_an_episode_is_taken_out(house: House, exported: Exported, tmp_path: Path) -> None:
     """Everywhere in the data set, for good; the others have the numbers that they would have had without it."""
     options = ExportOptions(max_stale=0.3)

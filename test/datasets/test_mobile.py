@@ -49,6 +49,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_what_each_recorded_is_there_at_its_own_rate(task: tuple[Path, Exported]) -> None:
     """Odometry as any reader of bags reads it, joints of both, the video of the frames."""
     folder, _ = task

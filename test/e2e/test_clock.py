@@ -96,6 +96,7 @@ def robot(processes: Processes, tmp_path: Path) -> Robot:
     return Robot(processes, folder)
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_a_clock_that_is_set_later(robot: Robot) -> None:
     """Nothing is stored under a date of 1970, all of it under the right one, and the ledger says what the clock did."""
     robot.publish()

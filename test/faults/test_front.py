@@ -173,6 +173,7 @@ def test_a_look_that_fails_for_a_moment_condemns_nobody(
     assert again(opened, item) is (Put.IDENTICAL if there else Put.CREATED)
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.filterwarnings('ignore:tzname')  # of half a date
 def test_an_answer_that_breaks_off_condemns_nobody(proved: S3Store, front: Front, spool: Spool, key: str) -> None:
     """Wherever the answer about a key that is taken ends, the object is known again, or it is tried again."""

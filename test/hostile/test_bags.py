@@ -81,6 +81,7 @@ def in_2_gb(*arguments: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_a_file_that_is_one_record_is_not_read_whole(tmp_path: Path) -> None:
     """A sparse file of three gigabytes whose only record, or whose summary, is all of it."""
     for name, summary in (('record', 0), ('summary', len(MAGIC))):

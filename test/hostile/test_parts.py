@@ -115,6 +115,7 @@ def test_a_bad_part_costs_nobody_else_an_answer(home: Path, kinds: Collection[st
     assert run(query, home, '--robot', 'tachi').return_value == 0
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('kind', [*FEW, 'of tachi', 'a dictionary bomb'])
 def test_every_command_goes_on_without_it(home: Path, tmp_path: Path, kind: str) -> None:
     """``lake verify``, ``fetch``, ``lake compact`` and ``lake reindex``: the others are verified, fetched, merged and known."""

@@ -113,6 +113,7 @@ def test_what_comes_late_is_merged_with_what_was_merged(settings: StoreSettings,
     assert answer(settings) == sorted([*before, *keys(late)])
 
 
+@pytest.mark.long('a kill')
 def test_it_may_die_anywhere(tmp_path: Path) -> None:
     """Killed after each single thing that it does, compaction leaves every answer as it was, and the next run ends it."""
     for number in range(200):

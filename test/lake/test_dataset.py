@@ -292,6 +292,7 @@ def test_content_that_is_not_what_was_stored(tmp_path: Path) -> None:
     assert dataset[1]['stamp_ns'] == NOON_NS + SECOND
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.seaweedfs
 @pytest.mark.parametrize('frames', ['jpeg', 'tar'])
 def test_from_a_real_server(tmp_path: Path, seaweed: Tower, frames: str) -> None:

@@ -138,6 +138,7 @@ def test_what_is_read_ahead_is_bounded(source: Bucket, monkeypatch: pytest.Monke
     assert len(asked) <= 5
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.seaweedfs
 @pytest.mark.parametrize('way', ['fork', 'spawn'])
 def test_a_process_that_was_started_after_reading(tmp_path: Path, seaweed: Tower, way: str) -> None:
@@ -169,6 +170,7 @@ def test_a_pickled_data_set_is_a_value(source: Bucket) -> None:
     frames.close()
 
 
+@pytest.mark.long('a process of its own')
 def test_importing_it_loads_no_torch() -> None:
     """Nor is it needed to make a data set of nothing."""
     load = 'import sys; from shadowhound_data_logger.lake import MissionDataset'

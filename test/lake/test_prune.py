@@ -209,6 +209,7 @@ def test_a_label_that_cannot_be_read_stops_it(settings: StoreSettings, tmp_path:
         _plan(settings)
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_a_bag_goes_as_a_whole_or_not_at_all(settings: StoreSettings, tmp_path: Path) -> None:
     """When its last slice is old. An event's has a rule of its own, and of one without a manifest nobody knows whose it is."""
     tmp = tmp_path / 'tmp'
@@ -247,6 +248,7 @@ def test_a_repeat_keeps_what_holds_its_content(settings: StoreSettings, tmp_path
     assert len(forgotten(_source(settings), None, Findings())) == 11
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('later_s', [600, 2 * 86_400 + 600])
 def test_a_label_of_a_repeat_protects_its_content(settings: StoreSettings, tmp_path: Path, later_s: int) -> None:
     """On the same day and on another one; without it content and repeat go together, and the repeat's messages are counted."""
@@ -327,6 +329,7 @@ def test_it_may_die_anywhere(tmp_path: Path) -> None:
     _check(settings)
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_two_at_once_delete_once(settings: StoreSettings) -> None:
     """Both find the same; each object has one row that counts, and its messages are counted once."""
     with closing(open_store(settings, UploadSettings())) as store:
@@ -352,6 +355,7 @@ def test_two_at_once_delete_once(settings: StoreSettings) -> None:
     _check(settings)
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_compaction_changes_nothing_of_it(settings: StoreSettings) -> None:
     """Whether days are merged before, between or after."""
     with closing(open_store(settings, UploadSettings())) as store:

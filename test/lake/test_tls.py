@@ -67,6 +67,7 @@ def run(*arguments: str) -> Result:
     return CliRunner().invoke(cli, arguments, standalone_mode=False)
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('compacted', [False, True])
 def test_a_private_authority_is_trusted(
     filled: Tower, authorities: dict[str, Authority], towards: Callable[[str], StoreSettings], tmp_path: Path,

@@ -50,6 +50,7 @@ def log(logger: MissionDataLogger, first: int) -> list[float]:
     return took
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_a_busy_index_delays_the_delivery_and_no_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All calls return while it is held, in the time that they take anyway; the sender waits, and goes on once it is free."""
     settings = Settings.load({'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path)})

@@ -126,6 +126,7 @@ SOME = 4
 MORE = (pytest.param(seed, marks=pytest.mark.long('more of the same')) for seed in range(SOME, 12))
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('seed', [*range(SOME), *MORE])
 def test_any_failure_changes_nothing(tmp_path: Path, seed: int) -> None:
     """Requests and answers get lost, the replayer dies in between: afterwards all is there, each thing once to effect."""

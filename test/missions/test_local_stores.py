@@ -61,6 +61,7 @@ def test_an_address_that_this_mlflow_cannot_do_with_is_waited_for(uri: str) -> N
         MlflowTracking(uri, 'thor_missions').open()
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.filterwarnings('ignore')
 def test_a_duplicate_is_closed(database: str, tmp_path: Path) -> None:
     """A run that a lost request made after all goes when the mission ends, and says whose duplicate it was."""

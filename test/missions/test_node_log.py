@@ -112,6 +112,7 @@ def test_the_floor_is_what_the_lidar_saw(mission: Active) -> None:
     assert np.load(mission.folder.floor).tolist() == [[1, 2], [4, 5]]
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_the_floor_stays_small() -> None:
     """However long the mission is; what remains is of all of it."""
     floor, rng = Floor(), np.random.default_rng(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from ship.drive import CAP_S, Drive
 from ship.fakes import FakeSpool, Time
 
@@ -113,6 +114,7 @@ def test_the_pause_grows_to_the_cap_and_no_further(drive: Drive) -> None:
     assert 50.0 < max(pauses[20:]) <= CAP_S + 0.1
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_a_long_outage_does_not_touch_ever_more_objects(drive: Drive) -> None:
     """The failures that are remembered stay few, however long it lasts."""
     drive.spool.add(1000)

@@ -122,6 +122,7 @@ def test_an_object_that_is_denied_while_its_bucket_takes_others_is_quarantined(d
     assert drive.said() == []
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.sampled
 def test_denials_that_come_and_go_quarantine_nothing(clock: Time, tmp_path: Path) -> None:
     """A store that denies everything for some seconds, again and again, gets everything all the same."""

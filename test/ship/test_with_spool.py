@@ -122,6 +122,7 @@ def test_two_on_one_spool_take_turns(draining: Draining, store: MemoryStore, tmp
         second.close()
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_a_spool_that_is_full_evicts_while_objects_wait(tmp_path: Path, store: MemoryStore) -> None:
     """What was evicted is not sent any more and not quarantined; what is left is delivered."""
     spool = Spool(tmp_path / 'spool', SpoolSettings(max_bytes=1 << 20, min_free_bytes=0), SystemClock('boot'), 'thor')

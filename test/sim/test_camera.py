@@ -32,6 +32,7 @@ def test_every_pixel_is_drawn_anew(front: Camera) -> None:
         assert np.array_equal(_frame(front, t), first[t])
 
 
+@pytest.mark.long('every pixel')
 def test_no_two_frames_are_alike(front: Camera) -> None:
     """The number in the caption tells frames apart even where the view is the same."""
     assert not np.array_equal(_frame(front, 3.0, '#000001'), _frame(front, 3.0, '#000002'))
@@ -56,6 +57,7 @@ def test_walls_stand_where_the_pinhole_puts_them(front: Camera) -> None:
     assert checked >= 5
 
 
+@pytest.mark.long('every pixel')
 def test_rooms_look_different(front: Camera) -> None:
     """Mean colours of frames from different rooms are well apart, so that a picture tells where it was taken."""
     means: dict[str, list[np.ndarray]] = {}

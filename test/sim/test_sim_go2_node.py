@@ -46,6 +46,7 @@ def finished(domain: int, *parameters: str, **more: str) -> subprocess.Completed
     return subprocess.run(command(*parameters), capture_output=True, text=True, timeout=100, check=False, env=own)
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_it_publishes_exactly_rate_times_duration(some_seconds: Run) -> None:
     """The line of JSON names every topic, resolved, with the exact number, and the exit code is 0."""
     assert some_seconds.returncode == 0
@@ -187,6 +188,7 @@ def test_an_unknown_parameter_refuses_the_start(domain: int) -> None:
     assert 'duration_s' in done.stderr
 
 
+@pytest.mark.long('a process of its own')
 def test_a_stray_argument_refuses_the_start(domain: int) -> None:
     """A parameter given without --ros-args is not silently ignored."""
     done = subprocess.run(

@@ -100,6 +100,7 @@ def test_a_truncated_write_ahead_log(opened: Open, root: Path) -> None:
     assert {row['key'] for row in rows(root) if row['state'] == 'pending'} == {'old', 'new'}
 
 
+@pytest.mark.long('which a campaign repeats')
 @pytest.mark.sampled
 def test_flipped_bits_in_the_index(opened: Open, root: Path, used: dict[str, bytes]) -> None:
     """With bits flipped anywhere in the index a start works, no file is lost, and objects can be added and delivered."""

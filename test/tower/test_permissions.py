@@ -275,6 +275,7 @@ class _Ignoring:
         return not self._makes or body.endswith(b' 0')
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize(('makes', 'says'), [(False, 'does not honour If-Match'), (True, 'MinIO')])
 def test_the_doctor_tells_a_server_that_ignores_if_match(makes: bool, says: str) -> None:
     """Or that makes what is not there."""
