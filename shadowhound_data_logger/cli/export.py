@@ -30,6 +30,7 @@ from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.stores import open_reader
 
 if TYPE_CHECKING:
+    from shadowhound_data_logger.datasets.cluster import Cluster
     from shadowhound_data_logger.datasets.export import Exported
     from shadowhound_data_logger.datasets.features import ExportOptions
     from shadowhound_data_logger.datasets.imports import Demonstration
@@ -73,6 +74,7 @@ def _missions(command: _Command) -> _Command:
         'export lerobot go2_patrol --mission-type patrol --since 30d',
         'export lerobot go2_patrol --mission-type patrol --to s3://lerobot/datasets/go2/go2_patrol --wait',
         'export lerobot go2_patrol --since yesterday --state pose,joints --dry-run',
+        'export lerobot go2_patrol --mission-type patrol --runner ray --address ray://HEAD:10001',
         'export lerobot fetch_task --mission-type fetch --arm soarm --state velocity --task',
     ),
 )
@@ -112,10 +114,16 @@ def _missions(command: _Command) -> _Command:
 @click.option('--wait', is_flag=True, help='Wait until it is known what each mission lacks.')
 @click.option('--pull', is_flag=True, help='Ask robots for what they keep of these missions, and wait until it has come.')
 @click.option('--dry-run', is_flag=True, help='Only say what would be exported.')
-@click.option('--workers', type=click.IntRange(1, 64), default=1, show_default=True, metavar='N', help='Episodes at a time.')
+@click.option('--workers', type=click.IntRange(1, 1024), metavar='N',
+              help='Episodes at a time  [default: 1; with Ray the cores of the cluster]')  # fmt: skip
+@click.option('--runner', type=click.Choice(['native', 'ray']), default='native', show_default=True,
+              help='Make episodes in processes of this machine, or on a Ray cluster.')  # fmt: skip
+@click.option('--address', metavar='ray://HEAD:10001',
+              help='Of the Ray cluster  [default: RAY_ADDRESS, else Ray on this machine]')  # fmt: skip
 @as_json
 def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task: bool, wait: bool, pull: bool,  # noqa: PLR0913
-                   dry_run: bool, workers: int, as_json: bool, **how: Any) -> ExitCode:  # fmt: skip
+                   dry_run: bool, workers: int | None, runner: str, address: str | None, as_json: bool,
+                   **how: Any) -> ExitCode:  # fmt: skip
     """Add missions to the LeRobot data set NAME (v3.0).
 
     Missions that are already in it stay as they are. Exit code 1 when a mission was refused or waits: the report says why.
@@ -128,6 +136,9 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
 
         check_name(name, 'the name of the data set')
         options = _options(how)
+        cluster = _cluster(address) if runner == 'ray' else None
+        if address and cluster is None:
+            raise BadUsage(f'--address {address} is refused', 'it is of a Ray cluster: --runner ray')
         place = DatasetPlace.of(to) if to and to.startswith(SCHEME) else None
         if task and place is not None:
             raise BadUsage(f'--task with --to {to} is refused', 'the folder of a task is made on this machine: --to DIR')
@@ -144,7 +155,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
             with _exporting():
                 bring(source, flags, say=bar.say, findings=left_out)
         result = library.export(
-            folder, source, flags, options, workers=workers, wait=wait, is_dry=dry_run,
+            folder, source, flags, options, workers=workers, cluster=cluster, wait=wait, is_dry=dry_run,
             findings=left_out, say=bar.say,
         )  # fmt: skip
         if result.digest and not dry_run:
@@ -160,6 +171,17 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
             print_lines(plain(f'{number(moved.files)} files ({volume(moved.bytes)}) uploaded to {place}.'))
     tell_left_out(left_out)
     return exit_code(finding=result.refused or result.waiting or len(left_out))
+
+
+def _cluster(address: str | None) -> Cluster:
+    """Raises BadUsage on a machine without Ray."""
+    from shadowhound_data_logger.datasets.cluster import Cluster  # noqa: PLC0415
+
+    try:
+        import ray  # noqa: F401, PLC0415
+    except ModuleNotFoundError as error:
+        raise BadUsage('ray is not installed', "pip install 'daft[ray]', the same version on the whole cluster") from error
+    return Cluster(address)
 
 
 def _options(how: Mapping[str, Any]) -> ExportOptions:

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from shutil import rmtree
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from shadowhound_data_logger.datasets import plan as planning
 from shadowhound_data_logger.datasets.episodes import TOLD, build
@@ -35,6 +35,9 @@ from shadowhound_data_logger.lake.track import Track
 from shadowhound_data_logger.lake.training import INFO
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores import open_store
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.datasets.cluster import Cluster
 
 WORK: Final = '.shadowhound'
 """What is not part of the data set, in its folder."""
@@ -74,12 +77,13 @@ Say = Callable[[str], None]
 
 
 def export(  # noqa: PLR0913 - the flags of the command
-    folder: Path, source: Bucket, flags: Mapping[str, Any], options: ExportOptions, *, workers: int = 1, wait: bool = False,
-    is_dry: bool = False, findings: Findings | None = None, say: Say = lambda _: None,
-    sleep: Callable[[float], object] = time.sleep,
+    folder: Path, source: Bucket, flags: Mapping[str, Any], options: ExportOptions, *, workers: int | None = None,
+    cluster: Cluster | None = None, wait: bool = False, is_dry: bool = False, findings: Findings | None = None,
+    say: Say = lambda _: None, sleep: Callable[[float], object] = time.sleep,
 ) -> Exported:  # fmt: skip
     """Add the missions that the flags choose to the data set in this folder, which is made where there is none.
 
+    Episodes are made here, one at a time unless ``workers`` says how many, or on a cluster, as many at a time as it has cores.
     With ``wait`` it comes back once it is known of each mission what is missing, or nothing new has been heard for an hour.
     Raises LakeError, SettingError, StoreError.
     """
@@ -111,7 +115,8 @@ def export(  # noqa: PLR0913 - the flags of the command
             result.refused = {each.mission.mission_id: f'nothing of {", ".join(each.missing)}' for each in ready if each.missing}
             return result
         settings = {**options.told(), 'fps': fps, 'action': action}
-        built = _build(ready, options, fps, source.settings, folder / WORK, settings=settings, workers=workers, say=say)
+        built = _build(ready, options, fps, source.settings, folder / WORK, settings=settings, workers=workers, cluster=cluster,
+                       say=say)  # fmt: skip
         task = task_of(folder)
 
         def recorded(plan: EpisodePlan) -> None:
@@ -241,11 +246,13 @@ Built = list[tuple[EpisodePlan, dict[str, Any], Path]]
 
 
 def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store: StoreSettings, work: Path, *,  # noqa: PLR0913
-           settings: Mapping[str, Any], workers: int, say: Say) -> Built:  # fmt: skip
+           settings: Mapping[str, Any], workers: int | None, cluster: Cluster | None, say: Say) -> Built:  # fmt: skip
     folders = [work / f'{_hashed(each.mission.mission_id)[:16]}-{_key_of(each, settings, options)}' for each in plans]
     jobs = [(each, options, fps, store, folder) for each, folder in zip(plans, folders, strict=True)]
+    if cluster is not None:
+        return [(job[0], told, job[-1]) for job, told in zip(jobs, cluster.built(jobs, workers, say), strict=True)]
     found: Built = []
-    if workers == 1 or len(jobs) < 2:
+    if workers in {None, 1} or len(jobs) < 2:
         for number, job in enumerate(jobs):
             say(f'episode {number + 1} of {len(jobs)}: {job[0].mission.mission_id}')
             found.append((job[0], build(*job), job[-1]))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import platform
+import sys
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -12,9 +14,13 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from click.testing import CliRunner
 from datasets.recorded import House, Mission, lost, x_of
 
+from shadowhound_data_logger.cli import export as verb
+from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.datasets import cluster
 from shadowhound_data_logger.datasets.export import Exported, drop, export, resumed, split_of
 from shadowhound_data_logger.datasets.features import AV1, H264, ExportOptions
 from shadowhound_data_logger.datasets.lerobot import DATA, OURS, Lerobot, matrix
@@ -409,3 +415,24 @@ def test_single_frames_of_a_video_are_those_of_all(tmp_path: Path, codec: str) -
         assert np.array_equal(pixels, every[number]), number
     with pytest.raises(LakeError, match='has the frames 3, 21'):
         list(frames_at(path, 10, [3, 21]))
+
+
+def test_a_machine_without_ray_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before anything is asked of the store; and an address of a cluster that is not used is refused."""
+    monkeypatch.setitem(sys.modules, 'ray', None)
+    with pytest.raises(BadUsage) as refused:
+        CliRunner().invoke(verb.export, ['lerobot', 'patrols', '--runner', 'ray'], standalone_mode=False, catch_exceptions=False)
+    assert refused.value.message == 'ray is not installed'
+    assert "pip install 'daft[ray]'" in refused.value.remedy
+    with pytest.raises(BadUsage) as refused:
+        CliRunner().invoke(
+            verb.export, ['lerobot', 'patrols', '--address', 'ray://head:10001'], standalone_mode=False, catch_exceptions=False
+        )
+    assert '--runner ray' in refused.value.remedy
+
+
+def test_a_worker_with_other_libraries_is_refused(tmp_path: Path) -> None:
+    """Its episodes would have other bytes; the error names what differs, and where."""
+    wanted = {**cluster.made_with(), 'av': '1.0', 'architecture': 'riscv64'}
+    with pytest.raises(LakeError, match=rf'has architecture {platform.machine()} instead of riscv64, av .* instead of 1\.0'):
+        cluster.Builder().build((), wanted)  # type: ignore[arg-type]

@@ -1,0 +1,178 @@
+"""Episodes made side by side on a Ray cluster, a mission a worker. This machine alone writes the data set.
+
+A worker reads the store itself, makes the episode in a folder of its own, and hands its files over in pieces: the machines need
+no disk in common. These are Ray's actors and not Daft's DataFrame, whose row would be a whole episode with its videos in memory;
+here each mission is made again, kept or named by itself.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from shutil import rmtree
+from tempfile import gettempdir, mkdtemp
+from typing import Any, Final
+
+import shadowhound_data_logger
+from shadowhound_data_logger.datasets.episodes import TOLD, build
+from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.datasets.plan import EpisodePlan
+from shadowhound_data_logger.disk import fingerprint, flock, lock, replacing
+from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.options import StoreSettings
+
+ATTEMPTS: Final = 3
+"""Workers that a mission may lose before the export gives it up."""
+PREFIX: Final = 'shadowhound-export-'
+PIECE_BYTES: Final = 8 << 20
+LIBRARIES: Final = ('av', 'numpy', 'pillow', 'pyarrow', 'simplejpeg')
+"""What decides which bytes an episode has."""
+
+EpisodeJob = tuple[EpisodePlan, ExportOptions, int, StoreSettings, Path]
+"""What ``build`` takes; the folder is one of this machine."""
+Files = Mapping[str, tuple[int, str]]
+"""Name -> bytes and SHA-256."""
+
+
+class Builder:
+    """Lives in a worker. For each mission: ``build``, ``read`` its files, ``close``."""
+
+    def __init__(self) -> None:
+        """Takes away what workers of this machine left when they were killed: one that lives has a lock on its folder."""
+        for left in Path(gettempdir()).glob(f'{PREFIX}*'):
+            with suppress(OSError), flock(left / 'lock', wait=False) as is_dead:
+                if is_dead:
+                    rmtree(left)
+
+    def build(self, job: tuple[EpisodePlan, ExportOptions, int, StoreSettings], wanted: Mapping[str, str]) -> Files:
+        """Raises LakeError where this machine would make other bytes, StoreError, OSError."""
+        here = made_with()
+        if other := [name for name in wanted if here[name] != wanted[name]]:
+            told = ', '.join(f'{name} {here[name]} instead of {wanted[name]}' for name in other)
+            raise LakeError(f'the worker {platform.node()} has {told}: its episodes would have other bytes',
+                            remedy='install the same versions on all machines of the cluster')  # fmt: skip
+        new = Path(mkdtemp(prefix=f'new-{PREFIX}'))
+        self._lock = (new / 'lock').open('wb')
+        lock(self._lock)
+        self._folder = new.rename(new.with_name(new.name.removeprefix('new-'))) / 'episode'
+        build(*job, self._folder)
+        return {path.name: fingerprint(path) for path in sorted(self._folder.iterdir())}
+
+    def read(self, name: str, begin: int) -> bytes:
+        """A piece of a file."""
+        with (self._folder / name).open('rb') as file:
+            file.seek(begin)
+            return file.read(PIECE_BYTES)
+
+    def close(self) -> None:
+        """The files are gone afterwards."""
+        rmtree(self._folder.parent, ignore_errors=True)
+        self._lock.close()
+
+
+def made_with() -> dict[str, str]:
+    """What has to be the same on all machines for the same bytes."""
+    return {'architecture': platform.machine(), **{name: version(name) for name in LIBRARIES}}
+
+
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """Where episodes are made."""
+
+    address: str | None = None
+    """``ray://HEAD:10001`` or ``HEAD:6379``; None: the cluster of this machine, else a Ray that is started for the export."""
+
+    def built(self, jobs: Sequence[EpisodeJob], workers: int | None, say: Callable[[str], None]) -> list[dict[str, Any]]:
+        """What ``episode.json`` says of each, in their order; the files are in the folders of the jobs.
+
+        ``workers`` episodes are made at a time, as many as there are cores in the cluster by default. A mission whose worker dies
+        is given to another one. Raises LakeError where that did not help and where there is no such cluster, StoreError, OSError.
+        """
+        todo = [job for job in jobs if not (job[-1] / TOLD).is_file()]
+        if todo:
+            with _joined(self.address) as cores, redirect_stdout(sys.stderr):  # where Ray tells of dead workers
+                _build_all(todo, workers or cores, say)
+        return [json.loads((job[-1] / TOLD).read_text(encoding='utf-8')) for job in jobs]
+
+
+@contextmanager
+def _joined(address: str | None) -> Iterator[int]:
+    """Connected to the cluster, whose workers have this package as it is here; yields how many cores it has."""
+    import ray  # noqa: PLC0415 - only here it is needed
+
+    ours = {'py_modules': [os.fspath(Path(shadowhound_data_logger.__file__).parent)]}
+    os.environ.setdefault('RAY_USAGE_STATS_ENABLED', '0')  # else it tells its makers of each run, over the network
+    try:
+        ray.init(address, log_to_driver=False, logging_level='ERROR', runtime_env=ours)
+    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+        raise LakeError(f'there is no Ray cluster at {address or "this machine"}: {error}',
+                        remedy='name its head: --address ray://HEAD:10001') from error  # fmt: skip
+    try:
+        yield max(1, int(ray.cluster_resources().get('CPU', 1)))
+    finally:
+        ray.shutdown()
+
+
+def _build_all(jobs: Sequence[EpisodeJob], workers: int, say: Callable[[str], None]) -> None:
+    import ray  # noqa: PLC0415
+    from ray.exceptions import RayError, RayTaskError  # noqa: PLC0415
+
+    new_builder = ray.remote(num_cpus=1)(Builder)
+    wanted = made_with()
+    waiting, running, idle = deque((job, 1) for job in jobs), dict[Any, tuple[Any, EpisodeJob, int]](), list[Any]()
+    failed: dict[str, str] = {}
+    done = 0
+    while waiting or running:
+        while waiting and len(running) < workers:
+            job, attempt = waiting.popleft()
+            builder = idle.pop() if idle else new_builder.remote()
+            running[builder.build.remote(job[:-1], wanted)] = builder, job, attempt
+        ready = ray.wait(list(running))[0][0]
+        builder, job, attempt = running.pop(ready)
+        mission = job[0].mission.mission_id
+        try:
+            _bring(builder, ray.get(ready), job[-1])
+        except RayTaskError as error:
+            raise error.cause from None
+        except RayError as error:
+            ray.kill(builder)
+            why = f'{mission}: its worker died ({type(error).__name__})'
+            if attempt < ATTEMPTS:
+                say(f'{why}, another one begins anew')
+                waiting.append((job, attempt + 1))
+            else:
+                failed[mission] = why
+            continue
+        if waiting:
+            idle.append(builder)
+        else:
+            ray.kill(builder)  # its core may be what another one waits for, where a machine died
+        done += 1
+        say(f'episode {done} of {len(jobs)}: {mission}')
+    if failed:
+        told = ', '.join(failed.values())
+        raise LakeError(f'{told}, {ATTEMPTS} times; nothing was added to the data set',
+                        remedy=f'run it again: the {done} episodes that were made need not be made again')  # fmt: skip
+
+
+def _bring(builder: Any, files: Files, folder: Path) -> None:
+    """All that a worker wrote, ``episode.json`` last. Raises RayError, and LakeError for other bytes than were written."""
+    import ray  # noqa: PLC0415
+
+    rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for name, written in sorted(files.items(), key=lambda each: each[0] == TOLD):
+        with replacing(folder / name, is_synced=name == TOLD) as file:
+            for begin in range(0, written[0], PIECE_BYTES):
+                file.write(ray.get(builder.read.remote(name, begin)))
+        if fingerprint(folder / name) != tuple(written):
+            raise LakeError(f'{name} of a worker came with other bytes than it was written with', remedy='run it again')
+    ray.get(builder.close.remote())
