@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 SCHEME: Final = 's3://'
 SHOWN: Final = 30
 COPIES: Final = 'exports'
-"""In SHADOWHOUND_HOME: the folders of what is exported to a store."""
+"""In SHADOWHOUND_HOME: copies of what is exported to a store."""
 TASK_SET: Final = 'synchronized/lerobot'
 NOT_ASKED: Final = {'sensor', 'topic', 'near'}
 _Command = TypeVar('_Command', bound=Callable[..., Any])
@@ -130,7 +130,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
     """
     with _exporting():
         from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415
-        from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset, upload  # noqa: PLC0415
+        from shadowhound_data_logger.datasets.transfer import DatasetPlace, catch_up, upload  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
         from shadowhound_data_logger.lake.pull import bring  # noqa: PLC0415
 
@@ -147,9 +147,9 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
     left_out, moved = quietly(), None
     with progress('looking at what there is') as bar:
         if place is not None and not dry_run:
-            with the_store() as store:
-                if not (folder / 'meta/info.json').is_file() and store.head(place.bucket, f'{place.prefix}meta/info.json'):
-                    fetch_dataset(place, folder, store, bar.say)
+            with the_store() as store, library.writing(folder):
+                library.resumed(folder)
+                catch_up(place, folder, store, bar.say)
         source = default_source(the_store_settings())
         if pull and not dry_run:
             with _exporting():
@@ -161,7 +161,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
         if result.digest and not dry_run:
             library.remember(the_home(), folder)
             if place is not None:
-                with the_store() as store:
+                with the_store() as store, library.writing(folder):
                     moved = upload(folder, place, store, bar.say)
     if as_json:
         print_json({**asdict(result), 'folder': str(folder), 'to': to or str(folder), 'uploaded': moved and asdict(moved)})
@@ -354,7 +354,7 @@ def _proof(found: Proved, place: str) -> Iterator[Text]:
 @export.command('where', epilog=examples('export where sensor-data/thor/camera/20261121/120000_front.jpg'))
 @click.argument('key')
 @click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
-              help='Search only here  [default: all that this machine exported, and the bucket lerobot]')  # fmt: skip
+              help='Search only here  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
 @as_json
 def export_where(*, key: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
     """Find the data sets and models that saw an object.
@@ -393,7 +393,7 @@ def _forgotten() -> Mapping[tuple[str, str], str]:
 
 
 def all_datasets() -> tuple[list[Path], list[DatasetPlace]]:
-    """Those that this machine exported, and those in the store, in the bucket ``lerobot``. Raises StoreError."""
+    """Those that this machine exported or fetched, and those in the store, in the bucket ``lerobot``. Raises StoreError."""
     from shadowhound_data_logger.datasets.export import known_folders  # noqa: PLC0415
     from shadowhound_data_logger.datasets.transfer import datasets_in  # noqa: PLC0415
 
@@ -401,6 +401,16 @@ def all_datasets() -> tuple[list[Path], list[DatasetPlace]]:
     with closing(open_reader(the_store_settings())) as store:
         stored = list(datasets_in(store))
     return [each for each in known_folders(the_home()) if copies not in each.parents], stored
+
+
+def _copied() -> list[DatasetPlace]:
+    """Those of which this machine has a copy, also where the upload was cut off."""
+    from shadowhound_data_logger.datasets.export import known_folders  # noqa: PLC0415
+    from shadowhound_data_logger.datasets.transfer import DatasetPlace  # noqa: PLC0415
+
+    copies = the_home() / COPIES
+    mine = [each.relative_to(copies) for each in known_folders(the_home()) if copies in each.parents]
+    return [DatasetPlace.of(f'{SCHEME}{each.as_posix()}') for each in mine]
 
 
 def _seen(key: str, places: tuple[str, ...]) -> Iterator[Seen]:
@@ -424,7 +434,7 @@ def _seen(key: str, places: tuple[str, ...]) -> Iterator[Seen]:
 @export.command('drop', epilog=examples('export drop mission_20261121_120000_ab12', 'export drop MISSION --in go2_patrol'))
 @click.argument('mission')
 @click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
-              help='Only from this data set  [default: all that this machine exported, and the bucket lerobot]')  # fmt: skip
+              help='Only from this data set  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
 @as_json
 def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
     """Take the episode of a mission out of data sets.
@@ -436,7 +446,7 @@ def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> Exit
     with _exporting():
         from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415
         from shadowhound_data_logger.datasets.lerobot import Lerobot  # noqa: PLC0415
-        from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset, upload  # noqa: PLC0415
+        from shadowhound_data_logger.datasets.transfer import DatasetPlace, catch_up, upload  # noqa: PLC0415
 
         stored = [DatasetPlace.of(each) for each in places if each.startswith(SCHEME)]
     folders = [Path(each) for each in places if not each.startswith(SCHEME)]
@@ -444,16 +454,26 @@ def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> Exit
     with progress('looking for it') as bar, the_store() as store:
         if not places:
             folders, stored = all_datasets()
+            stored += [each for each in _copied() if each not in stored]
         for folder in folders:
             if mission in Lerobot(folder).mission_ids or (folder / library.DROPPING).is_file():
                 dropped[str(folder)] = library.drop(folder, mission)
         for place in stored:
             folder = _copy_of(str(place))
             bar.say(str(place))
-            fetch_dataset(place, folder, store, bar.say)
-            if mission in Lerobot(folder).mission_ids:
+            with library.writing(folder):
+                library.resumed(folder)
+                is_there = catch_up(place, folder, store, bar.say)
+            made = Lerobot(folder)
+            if mission in made.mission_ids:
                 dropped[str(place)] = library.drop(folder, mission)
-                upload(folder, place, store, bar.say)
+            elif library.hashed(mission) not in made.dropped:
+                continue
+            if is_there:
+                with library.writing(folder):
+                    moved = upload(folder, place, store, bar.say)
+                if moved.files:  # also where a drop was killed before the store had it
+                    dropped[str(place)] = Lerobot(folder).digest
     if as_json:
         print_json(dropped)
     else:

@@ -12,7 +12,16 @@ from typing import Any, Final
 import click
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, store_hint, the_store_settings
+from shadowhound_data_logger.cli.common import (
+    BadUsage,
+    ExitCode,
+    as_json,
+    examples,
+    exit_code,
+    store_hint,
+    the_home,
+    the_store_settings,
+)
 from shadowhound_data_logger.cli.output import counted, duration, number, plain, print_json, print_lines, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
 from shadowhound_data_logger.lake.bucket import default_source
@@ -95,11 +104,13 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
 
 def _fetch_dataset(url: str, to: Path, *, is_json: bool) -> ExitCode:
     with asking():
+        from shadowhound_data_logger.datasets.export import remember  # noqa: PLC0415
         from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset  # noqa: PLC0415
 
         place = DatasetPlace.of(url)
     with closing(open_reader(the_store_settings())) as store, progress('looking at what there is') as bar:
         moved = fetch_dataset(place, to, store, bar.say)
+    remember(the_home(), to)
     if is_json:
         print_json({'to': str(to), **asdict(moved)})
     else:

@@ -43,7 +43,7 @@ WORK: Final = '.shadowhound'
 """What is not part of the data set, in its folder."""
 DROPPING: Final = f'{WORK}/dropping.json'
 KNOWN: Final = 'exports.json'
-"""In SHADOWHOUND_HOME: the folders that were exported to from this machine."""
+"""In SHADOWHOUND_HOME: the folders that were exported to, or fetched into, from this machine."""
 LOOK_S: Final = 5.0
 """Between two looks at what has arrived."""
 PATIENCE_S: Final = 3600.0
@@ -208,10 +208,11 @@ def _settled(made: Lerobot, options: ExportOptions) -> tuple[ExportOptions, int 
 def _new(made: Lerobot, missions: Sequence[ChosenMission]) -> list[ChosenMission]:
     """Those that are neither in it nor were dropped."""
     known = {*made.mission_ids}
-    return [each for each in missions if each.mission_id not in known and _hashed(each.mission_id) not in made.dropped]
+    return [each for each in missions if each.mission_id not in known and hashed(each.mission_id) not in made.dropped]
 
 
-def _hashed(mission_id: str) -> str:
+def hashed(mission_id: str) -> str:
+    """As which a data set remembers a mission that was dropped."""
     return hashlib.sha256(mission_id.encode()).hexdigest()
 
 
@@ -247,7 +248,7 @@ Built = list[tuple[EpisodePlan, dict[str, Any], Path]]
 
 def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store: StoreSettings, work: Path, *,  # noqa: PLR0913
            settings: Mapping[str, Any], workers: int | None, cluster: Cluster | None, say: Say) -> Built:  # fmt: skip
-    folders = [work / f'{_hashed(each.mission.mission_id)[:16]}-{_key_of(each, settings, options)}' for each in plans]
+    folders = [work / f'{hashed(each.mission.mission_id)[:16]}-{_key_of(each, settings, options)}' for each in plans]
     jobs = [(each, options, fps, store, folder) for each, folder in zip(plans, folders, strict=True)]
     if cluster is not None:
         return [(job[0], told, job[-1]) for job, told in zip(jobs, cluster.built(jobs, workers, say), strict=True)]
@@ -317,7 +318,7 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
 
 def split_of(mission_id: str, validation: float) -> str:
     """Whether a mission is to learn from or to check with: by its id alone, so that it stays when others are added."""
-    return VALIDATION if int(_hashed(mission_id)[:8], 16) / 0x1_0000_0000 < validation else TRAIN
+    return VALIDATION if int(hashed(mission_id)[:8], 16) / 0x1_0000_0000 < validation else TRAIN
 
 
 def _told_before(folder: Path) -> list[dict[str, Any]]:

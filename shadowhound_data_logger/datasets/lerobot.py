@@ -215,8 +215,10 @@ class Lerobot:
         return digest
 
     def _stats(self) -> dict[str, Any]:
-        """Of all frames together, not of what is known of each episode."""
+        """Of all frames together, not of what is known of each episode; of none where all were dropped."""
         assert self.info is not None
+        if not self.rows:
+            return {}
         numeric = [key for key, feature in self.info['features'].items() if feature['dtype'] not in {'video', 'image', 'string'}]
         columns: dict[str, list[NDArray[Any]]] = {key: [] for key in numeric}
         for row in self.rows:

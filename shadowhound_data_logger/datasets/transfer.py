@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import mimetypes
 import re
 import time
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeVar
 
-from shadowhound_data_logger.datasets.lerobot import FILES, Lerobot
+from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, Lerobot
 from shadowhound_data_logger.disk import fingerprint
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake.training import INFO
@@ -27,6 +28,7 @@ FOLDER: Final = 'datasets/'
 """Below which a bucket has data sets."""
 THREADS: Final = 4
 TRIES: Final = 6
+MOST_DIGEST_BYTES: Final = 1 << 28
 _Answer = TypeVar('_Answer')
 _URL: Final = re.compile(r's3://([a-z0-9][a-z0-9.-]{1,61}[a-z0-9])/([^/].*?)/*')
 
@@ -63,6 +65,8 @@ class Transferred:
 def upload(folder: Path, place: DatasetPlace, store: ObjectStore, say: Callable[[str], None] = lambda _: None) -> Transferred:
     """Make the place have what the folder has. While that goes on it has no ``info.json``: nobody takes it for whole.
 
+    First it has the digests, so that ``catch_up`` knows whose upload was cut off.
+
     Raises StoreError, LakeError for a folder that is not a data set.
     """
     made = Lerobot(folder)
@@ -86,6 +90,8 @@ def upload(folder: Path, place: DatasetPlace, store: ObjectStore, say: Callable[
             _ask(lambda: store.delete(place.bucket, place.prefix + name))
         return _put(store, place, name, path)
 
+    size = put(DIGESTS, local.pop(DIGESTS))
+    moved.files, moved.bytes = int(bool(size)), size
     with ThreadPoolExecutor(THREADS, 'export-put') as pool:
         for number, size in enumerate(pool.map(lambda each: put(*each), local.items())):
             say(f'{number + 1} of {len(local)} files')
@@ -138,6 +144,34 @@ def fetch_dataset(
     moved.files += bool(size)
     moved.bytes += size
     return moved
+
+
+def catch_up(place: DatasetPlace, folder: Path, store: ObjectStore, say: Callable[[str], None] = lambda _: None) -> bool:
+    """Make the copy in a folder what the place has, unless that is what the copy once was; whether there is anything.
+
+    Raises StoreError, and LakeError where another machine's upload to it is not at its end.
+    """
+    there = {info.key[len(place.prefix) :] for info in store.list(place.bucket, place.prefix)}
+    if not there:
+        return False
+    last = ''
+    if DIGESTS in there:
+        last = _digests(_ask(lambda: store.get(place.bucket, place.prefix + DIGESTS, MOST_DIGEST_BYTES)))[-1]
+    if (folder / INFO).is_file() and last in {'', *_digests((folder / DIGESTS).read_bytes())}:
+        return True
+    if INFO not in there:
+        raise LakeError(f'another machine began to upload {place} and has not finished',
+                        remedy='wait for it, or run its command there again')  # fmt: skip
+    fetch_dataset(place, folder, store, say)
+    return True
+
+
+def _digests(body: bytes) -> list[str]:
+    """Raises LakeError."""
+    try:
+        return [str(each['digest']) for each in json.loads(body)['digests']]
+    except (ValueError, LookupError, TypeError) as error:
+        raise LakeError(f'{DIGESTS} of a data set cannot be read: {error}') from error
 
 
 def datasets_in(store: ObjectStore, bucket: str = BUCKET) -> Iterator[DatasetPlace]:

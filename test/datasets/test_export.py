@@ -23,7 +23,7 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.datasets import cluster
 from shadowhound_data_logger.datasets.export import Exported, drop, export, resumed, split_of
 from shadowhound_data_logger.datasets.features import AV1, H264, ExportOptions
-from shadowhound_data_logger.datasets.lerobot import DATA, OURS, Lerobot, matrix
+from shadowhound_data_logger.datasets.lerobot import DATA, OURS, SOURCE_TABLE, Lerobot, matrix
 from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in, fetch_dataset, upload
 from shadowhound_data_logger.datasets.verify import seen_in_folder, seen_in_store, verify
 from shadowhound_data_logger.datasets.video import VideoWriter, frames_at, video_frames
@@ -346,6 +346,10 @@ def test_an_episode_is_taken_out(house: House, exported: Exported, tmp_path: Pat
     """Everywhere in the data set, for good; the others have the numbers that they would have had without it."""
     options = ExportOptions(max_stale=0.3)
     export(tmp_path / 'set', house.source, PATROLS, options)
+    key = pq.read_table(tmp_path / 'set' / SOURCE_TABLE)['key'][0].as_py()
+    seen = seen_in_folder(tmp_path / 'set', key)
+    assert seen is not None
+    assert seen.missions == ('whole',)
     drop(tmp_path / 'set', 'whole')
     made = resumed(tmp_path / 'set')
     assert made.mission_ids == ['gappy']
@@ -354,7 +358,7 @@ def test_an_episode_is_taken_out(house: House, exported: Exported, tmp_path: Pat
     table = pq.read_table(made.path(DATA, made.rows[0], 'data'))
     assert table['index'].to_pylist() == list(range(len(table)))
     assert set(table['episode_index'].to_pylist()) == {0}
-    assert seen_in_folder(tmp_path / 'set', 'thor/camera/20261028/120000_000_front.tar') is None
+    assert seen_in_folder(tmp_path / 'set', key) is None
     assert export(tmp_path / 'set', house.source, PATROLS, options).added == []
     store = DirectoryStore(house.settings.directory)
     store.open()
