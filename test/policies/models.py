@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import boto3
 import numpy as np
 import onnx
 import pytest
@@ -21,9 +23,21 @@ from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import MANIFEST, SIGNATURE, PolicyManifest
 from shadowhound_data_logger.policies.registry import RegisteredVersion, source_of
 from shadowhound_data_logger.policies.sync import PolicySettings, PolicySync
+from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 
 STATE, ACTION = 'observation.state', 'action'
+
+
+def bucket_of(tower: Tower) -> Any:
+    """The administrator's client of a Tower that has the bucket of policies, as one that was prepared."""
+    keys = tower.environment()
+    client = boto3.client('s3', endpoint_url=tower.endpoint_url, region_name='us-east-1',
+                          aws_access_key_id=keys['AWS_ACCESS_KEY_ID'],
+                          aws_secret_access_key=keys['AWS_SECRET_ACCESS_KEY'])  # fmt: skip
+    with suppress(client.exceptions.BucketAlreadyOwnedByYou, client.exceptions.BucketAlreadyExists):
+        client.create_bucket(Bucket='lerobot')
+    return client
 
 
 def linear(gain: float = 0.5, operator: str = 'MatMul', extra: int = 0) -> onnx.ModelProto:

@@ -12,9 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import boto3
 import pytest
-from policies.models import Aliases, Scene, Spark, linear
+from policies.models import Aliases, Scene, Spark, bucket_of, linear
 
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import PolicyRefused, StoreUnavailable
@@ -99,11 +98,7 @@ class CuttingFront:
 def spark(seaweed: Tower, tmp_path: Path) -> Iterator[Spark]:
     """Version 1 of 100 MB and version 2 of 10 MB, in the bucket."""
     spark = Spark(tmp_path / 'spark')
-    settings = seaweed.store_settings()
-    client = boto3.client('s3', endpoint_url=settings.endpoint_url, region_name='us-east-1',
-                          aws_access_key_id=settings.access_key_id, aws_secret_access_key=settings.secret_access_key)  # fmt: skip
-    with suppress(client.exceptions.BucketAlreadyOwnedByYou, client.exceptions.BucketAlreadyExists):
-        client.create_bucket(Bucket='lerobot')
+    client = bucket_of(seaweed)
     keys = []
     for version, floats in ((1, 25_000_000), (2, 2_500_000)):
         packed, _ = spark.packed(version, linear(0.1 * version, extra=floats))

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-import boto3
 import pytest
 from click.testing import CliRunner
-from policies.models import linear, trained
+from policies.models import bucket_of, linear, trained
 
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.policies import active, registry
@@ -23,12 +22,7 @@ pytestmark = [pytest.mark.seaweedfs, pytest.mark.long('an MLflow server, and a p
 def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keygen, pack, sign and publish on Spark; sync, list, show, rollback, use, pin and unpin on Thor; all by the verbs."""
     monkeypatch.setattr(registry, 'PAGE', 1)  # as many answers as there are versions
-    keys = tower.environment()
-    admin = boto3.client('s3', endpoint_url=tower.endpoint_url, region_name='us-east-1',
-                         aws_access_key_id=keys['AWS_ACCESS_KEY_ID'],
-                         aws_secret_access_key=keys['AWS_SECRET_ACCESS_KEY'])  # fmt: skip
-    if 'lerobot' not in {bucket['Name'] for bucket in admin.list_buckets()['Buckets']}:
-        admin.create_bucket(Bucket='lerobot')
+    bucket_of(tower)
     name = f'patrol_{uuid4().hex[:8]}'
     spark = tower.environment('spark') | tower.tracking('spark') | {'SHADOWHOUND_HOME': str(tmp_path / 'spark_home')}
     thor = tower.environment('thor') | tower.tracking('thor') | {'SHADOWHOUND_HOME': str(tmp_path / 'thor'),

@@ -1,0 +1,139 @@
+"""Three robots and one registry: who takes what, and who goes back; MLflow, SeaweedFS, DDS and the verbs are real."""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import pytest
+import rclpy
+from click.testing import CliRunner
+from domains import free_domain
+from e2e.processes import Process, until
+from policies.models import Spark, bucket_of, linear
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.policies import packing
+from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.ros.policy_topics import NODE
+from shadowhound_data_logger.sim.tower import Tower
+
+pytestmark = [pytest.mark.seaweedfs, pytest.mark.slow, pytest.mark.long('an MLflow server, a service, and a dozen smoke runs')]
+
+ROUNDS = 5
+"""Rollbacks that are timed: one may meet a machine that does other things."""
+
+
+class Robot:
+    """A home, and what is done there by the verbs."""
+
+    def __init__(self, name: str, home: Path, spark: Spark, environ: dict[str, str]) -> None:
+        self.environ = {**environ, 'SHADOWHOUND_HOME': str(home), 'SHADOWHOUND_ROBOT': name, 'SHADOWHOUND_POLICY': spark.name}
+        self.folder = PolicyFolder(home)
+        self.folder.make()
+        (self.folder.path / 'keys' / 'spark.pub').write_bytes(spark.public.read_bytes())
+
+    def verb(self, *arguments: str, code: int = 0) -> Any:
+        """What it prints, of JSON what that says."""
+        done = CliRunner().invoke(cli, ['policy', *arguments], env=self.environ, standalone_mode=False, catch_exceptions=False)
+        assert (done.return_value or 0) == code, done.output
+        return json.loads(done.output) if '--json' in arguments else done.output
+
+    def synced(self) -> tuple[str, str]:
+        """What a look at the registry, as from cron, comes to."""
+        told = self.verb('sync', '--json')
+        return told['done'], told['active']
+
+
+@pytest.fixture
+def speaker() -> Iterator[tuple[int, Callable[[str], object]]]:
+    """A domain, and what says something to the policy service in it."""
+    with free_domain() as domain:
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=domain)
+        node = Node('driver', context=context)
+        health = node.create_publisher(String, f'/{NODE}/health', 10)
+
+        def say(text: str) -> None:
+            until(health.get_subscription_count, 'the service listens')
+            health.publish(String(data=text))
+
+        yield domain, say
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+def test_a_canary_goes_first_and_goes_back_alone(  # noqa: PLR0915 - one story
+    tower: Tower, tmp_path: Path, speaker: tuple[int, Callable[[str], object]]
+) -> None:
+    """A version that misbehaves on the canary is out within a second, and stays out; the next one all of them follow."""
+    bucket_of(tower)
+    domain, say = speaker
+    spark = Spark(tmp_path / 'spark', f'patrol_{uuid4().hex[:8]}')
+    of_robots = tower.environment('thor') | tower.tracking('thor')
+    thor, tachi, uro = (Robot(name, tmp_path / name, spark, of_robots) for name in ('thor', 'tachi', 'uro'))
+    others = (thor, uro)
+    of_spark = Robot('spark', tmp_path / 'spark', spark, tower.environment('spark') | tower.tracking('spark'))
+    ids: dict[int, str] = {}
+
+    def publish(version: int, *arguments: str) -> None:
+        """A new version, or another alias for one that is there."""
+        if version not in ids:
+            ids[version] = spark.packed(version, linear(0.1 * version))[1].id
+        of_spark.verb('publish', str(spark.folder / f'packed_{version}'), '--alias', *arguments)
+
+    publish(1, 'champion')
+    command = ['-m', 'shadowhound_data_logger.cli.main', 'policy', 'run', '--every', '0.3']
+    environ = {**os.environ, **tachi.environ, 'ROS_DOMAIN_ID': str(domain)}
+    service = Process('policy run', command, tmp_path / 'run.log', environ)
+    try:
+        until(lambda: tachi.folder.current() == ids[1], lambda: f'the canary begins as all do: {service.log}')
+        assert {robot.synced() for robot in others} == {('activated', ids[1])}
+
+        publish(2, 'canary', '--robots', 'tachi')
+        until(lambda: tachi.folder.current() == ids[2], lambda: f'the canary goes first: {service.log}')
+        assert {robot.synced() for robot in others} == {('unchanged', ids[1])}
+
+        took_s = []
+        for _ in range(ROUNDS):
+            tachi.folder.use(ids[2])
+            began = time.monotonic()
+            say(json.dumps({'policy': ids[2], 'failures': 4, 'p99_ms': 1.0}))
+            until(lambda: tachi.folder.current() == ids[1], lambda: f'it goes back: {service.log}')
+            took_s.append(time.monotonic() - began)
+        assert statistics.median(took_s) < 1.0, took_s
+        service.said(f'{ids[2]} was taken out here: 4 steps failed')  # the registry says the same, and is not followed
+        assert tachi.folder.current() == ids[1]
+        assert {robot.synced() for robot in others} == {('unchanged', ids[1])}
+        assert [robot.folder.state().bad for robot in others] == [{}, {}]
+        assert [*tachi.folder.state().bad] == [ids[2]]
+
+        publish(3, 'canary', '--robots', 'tachi')
+        until(lambda: tachi.folder.current() == ids[3], lambda: f'the next one: {service.log}')
+        say(json.dumps({'policy': ids[3], 'failures': 3, 'p99_ms': 1.0}))
+        assert {robot.synced() for robot in others} == {('unchanged', ids[1])}
+        publish(3, 'champion')
+        assert {robot.synced() for robot in others} == {('activated', ids[3])}
+        assert tachi.folder.current() == ids[3]
+    finally:
+        service.kill()
+
+    publish(1, 'robot-thor')
+    assert uro.verb('pin') == f'pinned: {ids[3]}\n'
+    publish(1, 'champion')
+    assert [robot.synced() for robot in (thor, tachi, uro)] == [
+        ('activated', ids[1]),
+        ('unchanged', ids[3]),
+        ('pinned', ids[3]),
+    ]  # by its own alias, as the canary, by its pin
+    uro.verb('unpin')
+    assert uro.synced() == ('activated', ids[1])
+    assert packing.parse_manifest((tachi.folder.path / 'current' / 'manifest.json').read_bytes()).id == ids[3]
