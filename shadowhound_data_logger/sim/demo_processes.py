@@ -61,6 +61,7 @@ class Child:
         self.name = module.rpartition('.')[2]
         self.log = log
         self._libc = ctypes.CDLL(None)
+        self._is_asked = False
         with log.open('wb') as errors, log.with_suffix('.out').open('wb') as output:
             self._process = subprocess.Popen(
                 [sys.executable, '-m', module, *arguments], env=environ, stdin=subprocess.DEVNULL, stdout=output, stderr=errors,
@@ -94,8 +95,9 @@ class Child:
         return [line for line in lines if any(mark in line for mark in FAILURES)]
 
     def ask_to_stop(self) -> None:
-        """SIGINT; idempotent."""
-        if self.is_running:
+        """SIGINT, once: Python that ends no longer catches it, and a second one would be its exit code."""
+        if self.is_running and not self._is_asked:
+            self._is_asked = True
             self._process.send_signal(signal.SIGINT)
 
     def wait(self) -> None:

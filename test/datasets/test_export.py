@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import sys
@@ -16,11 +17,12 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
 from datasets.recorded import House, Mission, lost, x_of
+from PIL import Image, ImageColor
 
 from shadowhound_data_logger.cli import export as verb
 from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.datasets import cluster
+from shadowhound_data_logger.datasets import cluster, report
 from shadowhound_data_logger.datasets.export import Exported, drop, export, resumed, split_of
 from shadowhound_data_logger.datasets.features import AV1, H264, ExportOptions
 from shadowhound_data_logger.datasets.lerobot import DATA, OURS, SOURCE_TABLE, Lerobot, matrix
@@ -302,6 +304,43 @@ def test_two_workers_write_what_one_writes(house: House, exported: Exported, tmp
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for part in ('data', 'meta', 'videos')
             for path in sorted((folder / part).rglob('*')) if path.is_file()}  # fmt: skip
+
+
+def test_the_picture_has_stale_ticks_in_red(exported: Exported) -> None:
+    """On a line of time for each stream of each episode, and nowhere else on it."""
+    made, picture = Lerobot(exported.folder), Image.open(exported.folder / 'meta/report.png').convert('RGB')
+    assert picture.size == (report.WIDTH, len(made.rows) * (report.HEIGHT + report.GAP) + report.GAP)
+    found = []
+    for place, row in enumerate(made.rows):
+        stale = made.numbers(row, 'shadowhound.stale')
+        top, each = report.GAP + place * (report.HEIGHT + report.GAP) + report.HEIGHT - 30, max(2, 22 // stale.shape[1])
+        for tick, stream in np.ndindex(*stale.shape):
+            at = report.GAP + (report.WIDTH - 2 * report.GAP) * (tick + 0.5) / len(stale), top + stream * each + 1
+            is_red = picture.getpixel((int(at[0]), at[1])) == ImageColor.getrgb(report.RED)
+            assert is_red == bool(stale[tick, stream]), (place, tick, stream)
+            found.append(is_red)
+    assert 0 < sum(found) < len(found)
+
+
+def test_a_number_that_is_none_is_never_in_a_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A message with NaN counts as none: the value before it is held, grows old and becomes stale."""
+    place = House(tmp_path)
+    mission = Mission('odd', seconds=2, sensors=('camera', 'odom'))
+    is_odd = lambda stamp: mission.begin_ns + SECOND <= stamp < mission.begin_ns + 1.4 * SECOND  # noqa: E731
+    monkeypatch.setattr('datasets.recorded.x_of', lambda stamp: math.nan if is_odd(stamp) else x_of(stamp))
+    place.record(mission)
+    found = export(tmp_path / 'set', place.source, PATROLS, ExportOptions(allow_gaps=True))
+    assert [each['mission_id'] for each in found.added] == ['odd']
+    made = Lerobot(tmp_path / 'set')
+    stamps, state, action, age, stale = rows_of(
+        made, 'odd', 'shadowhound.stamp_ns', 'observation.state', 'action', 'shadowhound.age_s', 'shadowhound.stale'
+    )
+    assert all(np.isfinite(each).all() for each in (state, action, age))
+    published = np.array([stamp for stamp in mission.stamps('odom') if not is_odd(stamp)])
+    newest = published[np.searchsorted(published, stamps[:, 0], 'right') - 1]
+    assert state[:, 0] == pytest.approx([x_of(int(stamp)) for stamp in newest], abs=1e-4)
+    assert np.array_equal(stale[:, 1] == 1, stamps[:, 0] - newest > 0.15 * SECOND)
+    assert 2 <= stale[:, 1].sum() <= 4
 
 
 def test_statistics_are_those_of_all_frames(exported: Exported) -> None:

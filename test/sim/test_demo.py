@@ -324,6 +324,30 @@ def test_a_node_that_logged_an_error_is_told(tmp_path: Path, line: str) -> None:
         assert child.errors() == [line]
 
 
+def test_a_child_is_asked_to_stop_once(tmp_path: Path) -> None:
+    """Python that ends dies of a SIGINT, as its handler is gone: a child that did its work would seem to have failed."""
+    module = tmp_path / 'slow_to_end.py'
+    module.write_text("""
+import signal, threading
+stop = threading.Event()
+signal.signal(signal.SIGINT, lambda *_: stop.set())
+class Ends:
+    def __del__(self, sleep=__import__('time').sleep):
+        print('ends', flush=True)
+        sleep(0.3)
+left = Ends()
+print('here', flush=True)
+stop.wait()
+""")
+    environ = {**os.environ, 'PYTHONPATH': str(tmp_path)}
+    with demo_processes.Child('slow_to_end', [], environ, tmp_path / 'child.log') as child:
+        until(lambda: 'here' in child.output)
+        child.ask_to_stop()
+        until(lambda: 'ends' in child.output)
+        child.stop(20.0)
+        child.check()
+
+
 @pytest.mark.long('a whole demo')
 @pytest.mark.ros
 @pytest.mark.seaweedfs
