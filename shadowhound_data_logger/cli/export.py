@@ -26,6 +26,7 @@ from shadowhound_data_logger.cli.common import (
 )
 from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, progress, volume
 from shadowhound_data_logger.cli.question import FLAGS, NAMES, asking, quietly, tell_left_out
+from shadowhound_data_logger.errors import TrackingError
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.stores import open_reader
 
@@ -359,24 +360,32 @@ def _proof(found: Proved, place: str) -> Iterator[Text]:
 def export_where(*, key: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
     """Find the data sets and models that saw an object.
 
-    Models are found by the MLflow runs that lake.log_dataset marked.
+    Models are found by the MLflow runs that lake.log_dataset marked. Exit code 1 when MLflow cannot be asked.
     """
     with _exporting():
         from shadowhound_data_logger.lake.training import runs_trained_on  # noqa: PLC0415
     found = list(_seen(key, places))
-    runs = runs_trained_on(digest for each in found for digest in each.digests)
-    told = [{**asdict(each), 'runs': sorted({run for digest in each.digests for run in runs[digest]})} for each in found]
+    runs, unknown = dict[str, list[str]](), None
+    try:
+        runs = runs_trained_on(digest for each in found for digest in each.digests)
+    except TrackingError as error:
+        unknown = error
+        click.echo(f'Which models were trained on it is not known: {error}', err=True)
+    told = [
+        {**asdict(each), 'runs': None if unknown else sorted({run for digest in each.digests for run in runs[digest]})}
+        for each in found
+    ]
     if as_json:
         print_json(told)
-        return ExitCode.FINE
+        return exit_code(finding=unknown)
     lines = []
     if (date := _date_of(key)) is not None:
         lines.append(plain(f'It was deleted from the store on {date} (lake prune).'))
     for each in told:
         lines.append(plain(f'{each["where"]}: {number(each["frames"])} frames of {", ".join(each["missions"])}'))
-        lines += [plain(f'  trained on it: run {run}') for run in each['runs']]
+        lines += [plain(f'  trained on it: run {run}') for run in each['runs'] or ()]
     print_lines(*lines, *([] if told else [plain(f'No data set has values of {key}.')]))
-    return ExitCode.FINE
+    return exit_code(finding=unknown)
 
 
 def _date_of(key: str) -> str | None:

@@ -18,7 +18,7 @@ from shadowhound_data_logger.cli.export import export
 from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.datasets import transfer
 from shadowhound_data_logger.datasets.lerobot import REPORT, SOURCE_TABLE, Lerobot
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.errors import LakeError, TrackingUnavailable
 
 URL = 's3://lerobot/datasets/go2/patrols'
 pytestmark = pytest.mark.long('exports again and again')
@@ -160,3 +160,18 @@ def test_the_last_episode_is_taken_out(machines: tuple[Machine, Machine]) -> Non
     assert b.add('one') == []
     assert b.add('two') == ['two']
     assert a.ask('verify', URL, '--all')['wrong'] == []
+
+
+def test_data_sets_are_named_without_mlflow(machines: tuple[Machine, Machine], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which models were trained on them is not known then, which is not the same as none."""
+    a, _ = machines
+    a.add('one')
+    store = a.home / 'store/lerobot/datasets/go2/patrols'
+    key = pq.read_table(store / SOURCE_TABLE)['key'][0].as_py()
+
+    def away(_: object) -> None:
+        raise TrackingUnavailable('MLflow is away')
+
+    monkeypatch.setattr('shadowhound_data_logger.lake.training.runs_trained_on', away)
+    (found,) = a.ask('where', key, code=ExitCode.FINDING)
+    assert (found['where'], found['missions'], found['runs']) == (URL, ['one'], None)
