@@ -222,7 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _of_missions(folder: Path | None, flags: Mapping[str, Any]) -> tuple[Frames, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    frames = MissionDataset(folder, size=SIZE, **flags)
+    frames = MissionDataset(folder, size=SIZE, causal=True, **flags)
     labels = motions(frames.stamps_ns, frames.poses)
     return frames, labels, split(labels, frames.stamps_ns)
 

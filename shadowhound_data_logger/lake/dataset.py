@@ -56,11 +56,13 @@ class MissionDataset:
         """``source``: None for the store that the environment names, or a folder of ``shadowhound-data fetch``.
 
         ``align`` has sensors and how near in time they must be: seconds for the nearest message, or a ``Window``. With ``causal``
-        no message counts that is later than its frame, as a robot would not have had it yet. ``flags`` are
-        those of ``lake.objects``, for the anchor's objects. ``drop_incomplete`` leaves out objects about whose time the catalogue
-        knows nothing of an aligned sensor; a stream leaves out single messages as well. Objects without a date are not in it.
-        With ``pull`` robots are asked for what they keep of these sensors, and it waits until that has come; the log says how far
-        it is. Raises SettingError, StoreError, LakeError.
+        no aligned message counts that is later than its frame, as a robot would not have had it yet; ``pose`` and
+        ``battery_pct`` are the catalogue's all the same, for which later messages count. ``flags`` are those of ``lake.objects``,
+        for the anchor's objects. ``drop_incomplete`` leaves out objects about whose time the catalogue knows nothing of an
+        aligned sensor; a stream leaves out single messages as well. Objects without a date are not in it. With ``pull`` robots
+        are asked for what they keep of these sensors, and it waits until that has come; the log says how far it is.
+
+        Raises SettingError, StoreError, LakeError.
         """
         from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no Daft
 
