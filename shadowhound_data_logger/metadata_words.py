@@ -54,6 +54,8 @@ GAP_VERSION: Final = 'gap_version'
 SHIP: Final = 'ship'
 ON_REQUEST: Final = 'on_request'
 """The one value of ``ship``."""
+THINNED: Final = 'thinned'
+"""Of what has lost messages because room ran short: one of so many is left, of the topics with pictures and clouds."""
 PREVIEW_OF: Final = 'preview_of'
 """Of a preview: the key of the object that it is a small picture of, in the same bucket."""
 

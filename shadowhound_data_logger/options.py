@@ -25,6 +25,8 @@ RMW_AUTO, RMW_ROBOT, RMW_FASTRTPS = 'auto', 'robot', 'fastrtps'
 COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
 IMAGE: Final = 'sensor_msgs/msg/Image'
 POINT_CLOUD: Final = 'sensor_msgs/msg/PointCloud2'
+BULK: Final = frozenset({COMPRESSED_IMAGE, IMAGE, POINT_CLOUD})
+"""Types of which one message is as large as hundreds of others."""
 
 
 def _setting(default: Any, text: str, *, low: float | None = None, high: float | None = None,
@@ -120,6 +122,10 @@ class KeepSettings:
 
     max_bytes: int = _setting(500 * GIBI, 'Most bytes to keep on the robot; beyond it the oldest objects are evicted.', low=MEBI)
     days: float = _setting(14.0, 'Days to keep them.', low=0.01, high=3650.0)
+    thin_to_hz: float = _setting(
+        1.0, 'Once room runs short, old pictures and clouds are thinned to this rate before any are evicted; 0: never.', low=0.0,
+        high=1000.0
+    )  # fmt: skip
     missions: tuple[str, ...] = _setting(('',), 'Types of missions of which everything is uploaded always.')
     preview_s: float = _setting(
         1.0, 'Seconds between two small pictures of a camera that are uploaded at once; 0 makes none.', low=0.0, high=3600.0

@@ -15,6 +15,7 @@ from typing import Final
 
 from mcap.opcode import Opcode
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.contents import check_tables
 from shadowhound_data_logger.bags.description import Description, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest, Missing
@@ -144,11 +145,13 @@ def _expected(manifest: Manifest | None, described: Description | None, there: M
 def _check_remote(
     store: ObjectStore, file: RemoteFile, expected: _Expected, meter: Meter, deep: bool, told: Telling
 ) -> FileCheck:
-    if expected.size is not None and file.size != expected.size:
-        return FileCheck(file.name, f'has {file.size} bytes, {expected.size} were recorded', 'size')
     held = store.head(BUCKET, file.key)
     if held is None:
         return FileCheck(file.name, 'is not in the store', 'presence')
+    if words.THINNED in held.metadata:  # the robot ran out of room after the manifest was made; the gap journal has what went
+        expected = _Expected(expected.name, None, held.sha256, None)
+    if expected.size is not None and file.size != expected.size:
+        return FileCheck(file.name, f'has {file.size} bytes, {expected.size} were recorded', 'size')
     if held.sha256 and expected.sha256 and held.sha256 != expected.sha256:
         return FileCheck(file.name, f'has the SHA-256 {held.sha256}, {expected.sha256} was recorded', 'sha256')
     source = StoredFile(store, BUCKET, file.key, file.size, meter)

@@ -28,6 +28,7 @@ from shadowhound_data_logger.capture.control import ControlSocket
 from shadowhound_data_logger.capture.encode_pool import BatchQueue, EncodePool
 from shadowhound_data_logger.capture.events import EventBuffer
 from shadowhound_data_logger.capture.front import Front
+from shadowhound_data_logger.capture.halving import Halving
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.interface import Interface
 from shadowhound_data_logger.capture.keeping import Keeping, keeps_bag
@@ -52,6 +53,7 @@ from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.options import ON_REQUEST
 from shadowhound_data_logger.ros.reader import endpoints
 from shadowhound_data_logger.ship.requests import RequestServer
+from shadowhound_data_logger.ship.thinning import Thinner
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import SINKS
@@ -294,10 +296,13 @@ class Pipeline:
             return
         sweep(settings.home, settings.robot)
         self._link = link = LinkTrack(self.uploader.status, track.marks, settings.robot, self._clock)
+        least_hz = settings.keep.thin_to_hz
+        thinner = Thinner(self.spool, least_hz, Halving(settings.home, settings.robot, least_hz))
         self._requests = RequestServer(self.spool, self._store, settings.keep, settings.robot, self._clock,
                                        put=partial(self.writer.put, wait=False), released=self.uploader.wake,
                                        cutter=partial(KeptCut, settings.home), mbps=lambda: link.mbps,
-                                       may_send=lambda: KEEP_WHEN not in self._rules.closed, finished=self._hasten)  # fmt: skip
+                                       may_send=lambda: KEEP_WHEN not in self._rules.closed, finished=self._hasten,
+                                       thin=thinner.step)  # fmt: skip
 
     def _hasten(self) -> None:
         """Somebody waits for what was asked for."""

@@ -111,7 +111,16 @@ SECTIONS: Final = (
     Section(
         'Keep on the robot, and upload what is asked for',
         'What is `on_request` stays on the disk of the robot until somebody asks for it ([keep](keep.md)).',
-        ('SENSOR.ship', 'bag.ship', 'keep.max_bytes', 'keep.days', 'keep.missions', 'keep.preview_s', 'keep.poll_s'),
+        (
+            'SENSOR.ship',
+            'bag.ship',
+            'keep.max_bytes',
+            'keep.days',
+            'keep.thin_to_hz',
+            'keep.missions',
+            'keep.preview_s',
+            'keep.poll_s',
+        ),
     ),
     Section(
         'Upload fast, or leave the network to others',

@@ -121,7 +121,9 @@ def superseding(rows: pa.Table, stored: pa.Table | None = None) -> pa.Table:
     """
     if stored is not None and len(stored):
         rows = rows.join(stored.select(KEY), keys=list(KEY), join_type='left anti').combine_chunks().select(rows.column_names)
-    ordered = rows.sort_by([('bucket', 'ascending'), ('key', 'ascending'), ('where', 'ascending')])  # lost before robot
+    ordered = rows.sort_by(
+        [('bucket', 'ascending'), ('key', 'ascending'), ('where', 'ascending'), ('bytes', 'ascending')]
+    )  # lost before robot, thinned before whole
     numbered = ordered.append_column('_row', pa.array(range(len(ordered)), pa.int64()))
     first = numbered.group_by(list(KEY)).aggregate([('_row', 'min')])['_row_min']
     return ordered if len(first) == len(ordered) else ordered.take(first.combine_chunks().sort())

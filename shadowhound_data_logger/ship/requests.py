@@ -131,12 +131,12 @@ class RequestServer:
     def __init__(self, spool: Spool, store: ObjectStore, settings: KeepSettings, robot: str, clock: Clock, *,  # noqa: PLR0913 - each is a neighbour
                  put: Callable[[DataObject], None], released: Callable[[Sequence[SpooledObject]], None], cutter: Cutter,
                  mbps: Callable[[], float | None] = lambda: None, may_send: Callable[[], bool] = lambda: True,
-                 finished: Callable[[], None] = lambda: None,
+                 finished: Callable[[], None] = lambda: None, thin: Callable[[], bool] = lambda: False,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
         """``put`` takes answers to be spooled, ``released`` hears of objects that may be shipped; ``mbps`` is the pace.
 
         While not ``may_send``, requests are accepted and nothing is released for them. ``finished`` is called when all that a
-        request wants is in the store: somebody may wait to hear of it.
+        request wants is in the store: somebody may wait to hear of it. ``thin`` makes room for what is kept, a little at a time.
         """
         self._spool = spool
         self._store = store
@@ -149,6 +149,7 @@ class RequestServer:
         self._mbps = mbps
         self._may_send = may_send
         self._finished = finished
+        self._thin = thin
         self._monotonic = monotonic
         self._version = ''
         self._poll_at_s = self._tidy_at_s = 0.0
@@ -185,7 +186,7 @@ class RequestServer:
         self._wakes.clear()
 
     def step(self) -> bool:
-        """One look at everything; whether it released anything. Raises OSError or sqlite3.Error where the spool is of no use."""
+        """One look at everything; whether there is more to do. Raises OSError or sqlite3.Error where the spool is of no use."""
         now_s = self._monotonic()
         if not self._is_clear:
             self._spool.clear_requests()
@@ -216,7 +217,7 @@ class RequestServer:
             self._answering = {name: number for name, number in self._answering.items() if name in known}
             while self._spool.evict_old():
                 pass
-        return is_busy
+        return self._thin() | is_busy
 
     # -- what is asked for -----------------------------------------------------------------------------------------
 

@@ -68,7 +68,7 @@ def _with_file(tree: Tree, session: int, item: DataObject, body: FileBody, paths
     path = tree.new_body(session)
     paths.append(path)
     try:
-        _link_or_copy(body.path, path)
+        link_or_copy(body.path, path)
     except OSError as error:
         if error.errno not in _UNREADABLE:
             raise
@@ -77,7 +77,8 @@ def _with_file(tree: Tree, session: int, item: DataObject, body: FileBody, paths
     return replace(item, body=replace(body, path=path))
 
 
-def _link_or_copy(source: Path, target: Path) -> None:
+def link_or_copy(source: Path, target: Path) -> None:
+    """A synced file of the same content; a link where the file system has such. Raises OSError."""
     try:
         os.link(source, target)
     except OSError as error:

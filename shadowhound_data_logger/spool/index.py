@@ -30,6 +30,7 @@ from shadowhound_data_logger.model import (
     UPLOAD_WHEN,
     Binding,
     DataObject,
+    FileBody,
     HeldObject,
     MissingRow,
     ObjectInfo,
@@ -489,6 +490,52 @@ class Index:
         """What is kept and nobody asked for, the oldest first; only what was spooled before then, where that is given."""
         before = '' if before_ns is None else 'AND created_ns < ?'
         return self._rows(f'{_MAY_GO} {before} ORDER BY id LIMIT ?', (*(() if before_ns is None else (before_ns,)), limit))
+
+    def thinnable(self, after: int, limit: int) -> list[Mapping[str, Any]]:
+        """What is kept and nobody asked for, of a larger number, in their order."""
+        step = f"CASE WHEN json_valid(metadata) THEN CAST(json_extract(metadata, '$.{words.THINNED}') AS INTEGER) END AS step"
+        columns = f'id, sensor, type, samples, bytes, sha256, content_type, t_start_ns, t_end_ns, {step}, bucket, key'
+        query = f'SELECT {columns} FROM objects WHERE {_MAY_GO} AND id > ? ORDER BY id LIMIT ?'  # noqa: S608 - own constants only
+        cursor = self._db.execute(query, (after, limit))
+        names = [column[0] for column in cursor.description]
+        return [dict(zip(names, row, strict=True)) for row in cursor]
+
+    def may_thin(self, number: int, sha256: str) -> Mapping[str, Any] | None:
+        """The row of an object that is kept as it was, and that nobody asked for."""
+        return self.full_row(number) if self._rows(f'{_MAY_GO} AND id = ? AND sha256 = ?', (number, sha256)) else None
+
+    def is_told(self, number: int) -> bool:
+        """Whether a part of the table of what is kept tells of an object as it is."""
+        return self._db.execute('SELECT 1 FROM untold WHERE id = ?', (number,)).fetchone() is None
+
+    def thin(self, row: Mapping[str, Any], body: FileBody, samples: int, lost: Mapping[str, int], key: str, reason: str,
+             now_ns: int) -> None:  # fmt: skip
+        """Give a kept object less content; what is gone is an evicted object of its own, under ``key``.
+
+        ``row`` is that of ``full_row``, ``lost`` by topic where it has several. Together they have the totals that it had.
+        """
+        gone = row['samples'] - samples
+        accounts = {account: lost[topic] for account in row['counts'] if (topic := account.partition(':')[2]) in lost}
+        was = " AND topic = ? AND state IN ('spooled', 'kept')"
+        self._db.execute(f'UPDATE tally SET bytes = bytes - ?, samples = samples - ? WHERE 1{was}',  # noqa: S608 - own constants only
+                         (row['bytes'] - len(body), gone, row['topic'] or ''))  # fmt: skip
+        for account, count in accounts.items():
+            self._db.execute(f'UPDATE tally SET samples = samples - ? WHERE 1{was}', (count, account))  # noqa: S608
+            self._db.execute('UPDATE contents SET samples = samples - ? WHERE id = ? AND topic = ?', (count, row['id'], account))
+        metadata = json.loads(row['metadata'])
+        word = words.MESSAGES if words.MESSAGES in metadata else words.COUNT
+        step = 2 * int(metadata.get(words.THINNED, 1))
+        left = {**metadata, words.SHA256: body.sha256, word: str(samples), words.THINNED: str(step)}
+        self._db.execute('UPDATE objects SET bytes = ?, sha256 = ?, samples = ?, metadata = ? WHERE id = ?',
+                         (len(body), body.sha256, samples, json.dumps(left), row['id']))  # fmt: skip
+        self._db.execute("INSERT OR IGNORE INTO untold VALUES (?, 'kept')", (row['id'],))
+        gone_body = FileBody(body.path, row['bytes'] - len(body), row['sha256'])
+        item = DataObject(
+            bucket=row['bucket'], key=key, body=gone_body, sensor=row['sensor'],
+            content_type=row['content_type'], topic=row['topic'], type=row['type'], samples=gone, t_start_ns=row['t_start_ns'],
+            t_end_ns=row['t_end_ns'], priority=row['priority'], protected=False, counts=accounts,
+        )  # fmt: skip
+        self.insert(item, key, row['sha256'], State.EVICTED, reason, {**metadata, word: str(gone)}, now_ns)
 
     def kept_bytes(self) -> int:
         """Of all that stays here until somebody asks for it."""

@@ -139,6 +139,8 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
         if state in {State.PENDING, State.KEPT} and tree.is_in_place(state, row['bucket'], row['key'], row['bytes']):
             continue
         path = where = tree.path(state, row['reason'], row['bucket'], row['key'])
+        if state is State.KEPT and tree.size(tree.part(row['id'])) == row['bytes']:  # thinned, and not in its place yet
+            report.counts['renames completed'] += tree.place(tree.part(row['id']), path)
         if tree.size(path) is None:
             # Last its own place again: another process may just have moved it there.
             ready, kept = (tree.path(of, None, row['bucket'], row['key']) for of in (State.PENDING, State.KEPT))
@@ -196,11 +198,24 @@ def _settle_parts(tree: Tree, index: Index, report: Recovery, *, adopt: bool) ->
     with index.transaction():
         for number, part in tree.parts():
             if index.is_in_spool(number):
+                _remove_unthinned(tree, index, number, part, report)
                 continue
             place = place_said(tree, part) if adopt else None
             if place is None or not tree.place(part, place):
                 tree.remove(part)
                 report.counts['uncommitted parts removed'] += 1
+
+
+def _remove_unthinned(tree: Tree, index: Index, number: int, part: Path, report: Recovery) -> None:
+    """Remove a part beside the whole file of a kept object: the smaller content that it did not get."""
+    row = index.full_row(number)
+    if (
+        row is not None
+        and row['state'] == State.KEPT.value
+        and tree.is_in_place(State.KEPT, row['bucket'], row['key'], row['bytes'])
+    ):
+        tree.remove(part)
+        report.counts['uncommitted parts removed'] += 1
 
 
 def any_alive(tree: Tree) -> bool:

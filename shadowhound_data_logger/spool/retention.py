@@ -6,11 +6,11 @@ This decides what is evicted; a disk that is full at once (ENOSPC) is ``ballast.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from sqlite3 import Row
-from typing import Final
+from typing import Any, Final
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import KeepSettings, SpoolSettings
@@ -30,6 +30,8 @@ KEEP_LIMIT: Final = 'keep_limit'
 """Why a kept object is evicted where there is room on the disk: beyond ``keep.max_bytes`` the oldest go."""
 KEEP_DAYS: Final = 'keep_days'
 """The same of one that was kept for long enough."""
+THINNED: Final = 'thinned'
+"""The same where others of its time stay: room ran short, and rate goes before time."""
 TELL_EVERY_NS: Final = 60 * SECOND
 
 
@@ -117,7 +119,14 @@ def evict_old(index: Index, tree: Tree, keep: KeepSettings, now_ns: int) -> int:
     return len(rows)
 
 
-def _remove(index: Index, tree: Tree, rows: Sequence[Row], reason: str, now_ns: int) -> None:
+def thin_out(index: Index, tree: Tree, sha256_of: Mapping[int, str], now_ns: int) -> int:
+    """Evict these where they are kept as they were and nobody asked for them; returns how many. As of ``make_room``."""
+    rows = [row for number, sha256 in sha256_of.items() if (row := index.may_thin(number, sha256)) is not None]
+    _remove(index, tree, rows, THINNED, now_ns)
+    return len(rows)
+
+
+def _remove(index: Index, tree: Tree, rows: Sequence[Row | Mapping[str, Any]], reason: str, now_ns: int) -> None:
     with index.transaction():
         index.move([row['id'] for row in rows], State.EVICTED, reason, now_ns)
     for row in rows:

@@ -44,8 +44,9 @@ from shadowhound_data_logger.spool.request_table import (
     RequestTable,
     WaitingObject,
 )
-from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, evict_old, fits, make_room
+from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, evict_old, fits, make_room, thin_out
 from shadowhound_data_logger.spool.session import Session, carry
+from shadowhound_data_logger.spool.thinning import ThinnableObject, Thinned, thin
 from shadowhound_data_logger.spool.usage import SpoolUsage, usage_of
 
 log = logging.getLogger(__name__)
@@ -57,6 +58,8 @@ PUT_BACK_S: Final = 2.5
 DAY_NS: Final = 24 * 3600 * SECOND
 FULL_ROWS_NS: Final = 3600 * SECOND
 """For so long the index keeps all that it knows of an object that left the spool; then its key, size, checksum and state."""
+SHORT_PART, SHORT_BYTES = 32, 64 << 20
+"""Where less is left than such a part of the room for what is kept, or so many bytes, it runs short."""
 MOST_OBJECTS: Final = 32
 """To be committed at a time: their rows take some 5 ms, for which other processes wait."""
 KEEP: Final = KeepSettings()
@@ -361,6 +364,31 @@ class Spool:
         """Evict what was kept for long enough, some of it at a time; returns how many objects. Raises OSError, sqlite3.Error."""
         with self._lock:
             return evict_old(self._index, self._tree, self._keep, self._clock.wall_ns())
+
+    def is_short_to_keep(self) -> bool:
+        """Whether little room is left for what is kept, by its limit or by the disk: so much as to thin what is there in time."""
+        kept = self._view.kept_bytes()
+        most = min(self._keep.max_bytes, kept + self._tree.free_bytes() - self._settings.min_free_bytes)
+        return kept > 0 and kept > most - min(max(most // SHORT_PART, SHORT_BYTES), most // 4)
+
+    def thinnable(self, after: int, limit: int) -> list[ThinnableObject]:
+        """What is kept and nobody asked for, with a larger number than ``after``, in their order; waits for no commit."""
+        return [ThinnableObject.of(row, self._tree) for row in self._view.thinnable(after, limit)]
+
+    def is_told(self, item: ThinnableObject) -> bool:
+        """Whether the catalogue has been told of it as it is: a part that is on its way tells of it as it was."""
+        return self._view.is_told(item.id)
+
+    def thin(self, item: ThinnableObject, thinned: Thinned) -> ThinnableObject | None:
+        """Give a kept object less content; it, or None where it went or was asked for meanwhile. Raises as ``commit``."""
+        with flock(self.root / 'recovery.lock'), self._lock:
+            session = self._session.number if self._session else 0
+            return self._ballast.work(lambda: thin(self._index, self._tree, session, item, thinned, self._clock.wall_ns()))
+
+    def thin_out(self, items: Sequence[ThinnableObject]) -> int:
+        """Evict some of what is kept since others of its time stay; returns how many went. Raises OSError, sqlite3.Error."""
+        with self._lock:
+            return thin_out(self._index, self._tree, {item.id: item.sha256 for item in items}, self._clock.wall_ns())
 
     def pending_count(self) -> int:
         """Waits for no commit."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from bags.real_bags import NAME, stored, write_ours, write_rosbags
+from bags.real_bags import NAME, put_item, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
+from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, verify_remote
@@ -140,3 +142,19 @@ def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
     (tmp_path / 'notes.txt').write_text('x')
     with pytest.raises(BagError, match='holds no bag'):
         verify_folder(tmp_path)
+
+
+def test_a_slice_that_was_thinned_is_no_damage(folder: Path) -> None:
+    """The manifest says what was recorded; the object says itself that the robot ran out of room, and is whole as it says."""
+    (folder / FIRST).unlink()
+    (folder / f'{NAME}_1.mcap').rename(folder / FIRST)
+    store = MemoryStore()
+    stored(store, folder)
+    bag = find_bag(store, 'thor', NAME)
+    assert [check.name for check in verify_remote(store, bag).findings][:1] == [FIRST]
+    thinned = put_item(folder / FIRST, bag.slices[0].key, NAME, 9)
+    store.delete(BUCKET, bag.slices[0].key)
+    store.put(replace(thinned, metadata={**thinned.metadata, words.THINNED: '2'}))
+    for deep in (False, True):
+        found = verify_remote(store, find_bag(store, 'thor', NAME), deep=deep)
+        assert FIRST not in {check.name for check in found.findings}

@@ -6,9 +6,11 @@ import json
 import time
 from collections.abc import Iterator
 from functools import partial
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 from click.testing import CliRunner
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive
@@ -28,6 +30,7 @@ from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.dataset import MissionDataset
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.labels import Label
+from shadowhound_data_logger.lake.scan import superseding
 from shadowhound_data_logger.mailbox import KeptFilter, PullRequest
 from shadowhound_data_logger.model import Outcome, State
 from shadowhound_data_logger.ship.requests import RequestServer
@@ -125,6 +128,18 @@ def test_a_pull_from_asking_to_arrival(field: Field) -> None:
     field.passes()
     assert [row['key'][-16:-10] for row in run('query', '--sensor', 'camera')] == ['000002', '000003', '000004']
     assert_whole(field.spool.root)
+
+
+def test_what_was_thinned_is_known_as_it_is_now() -> None:
+    """The robot tells of it again, with fewer bytes, and in any order that row counts; of what is lost the row that says so."""
+    rows = [('a', 'robot', 100), ('a', 'robot', 50), ('b', 'robot', 10), ('a', 'robot', 80), ('b', 'lost', 10)]
+    for order in permutations(rows):
+        columns = zip(*order, strict=True)
+        table = pa.table(dict(zip(('key', 'where', 'bytes'), columns, strict=True))).append_column(
+            'bucket', pa.array(['x'] * len(rows))
+        )
+        found = superseding(table).select(['key', 'where', 'bytes']).to_pylist()
+        assert [tuple(row.values()) for row in found] == [('a', 'robot', 50), ('b', 'lost', 10)]
 
 
 def test_waiting_ends_with_the_last_answer(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:

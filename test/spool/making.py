@@ -41,7 +41,7 @@ ALTER TABLE publishers DROP COLUMN heard_ns;
 PRAGMA user_version = 5;
 """
 """What makes an index of version 5, the last without times of losses, of a new one."""
-IN_SPOOL = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine'}
+IN_SPOOL = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine', State.KEPT: 'kept'}
 
 
 @dataclass(slots=True)
@@ -136,7 +136,7 @@ def short_rows(root: Path) -> list[dict[str, Any]]:
 
 def files(root: Path) -> dict[str, bytes]:
     """Every payload in the spool's tree by its path."""
-    folders = ('incoming', 'ready', 'held', 'quarantine', 'foreign')
+    folders = ('incoming', 'ready', 'held', 'quarantine', 'kept', 'foreign')
     found = [path for name in folders for path in (root / name).rglob('*') if path.is_file() and not path.is_symlink()]
     return {str(path.relative_to(root)): path.read_bytes() for path in found}
 
@@ -144,7 +144,7 @@ def files(root: Path) -> dict[str, bytes]:
 def place_of(row: dict[str, Any]) -> str:
     """Where the file of a row has to be."""
     state = State(row['state'])
-    reason = '' if state is State.PENDING else f'/{row["reason"] or "unknown"}'
+    reason = '' if state in {State.PENDING, State.KEPT} else f'/{row["reason"] or "unknown"}'
     return f'{IN_SPOOL[state]}{reason}/{row["bucket"]}/{row["key"]}'
 
 

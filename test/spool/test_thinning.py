@@ -1,0 +1,311 @@
+"""Where room for what is kept runs short its rate goes before its time, and the ledger knows of each message."""
+
+from __future__ import annotations
+
+import random
+import tarfile
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+
+import orjson
+import pytest
+from spool.conftest import Moments
+from spool.making import NOON_NS, FakeClock, assert_whole, make, receive, rows
+
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags.naming import BUCKET as BAGS
+from shadowhound_data_logger.capture.halving import Halving
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import KeepSettings, SpoolSettings
+from shadowhound_data_logger.encode.archive import ArchiveFile, pack_tar, pack_zip
+from shadowhound_data_logger.mcap.index import read_index
+from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.mcap.ranges import LocalFile
+from shadowhound_data_logger.mcap.slice_info import Channel
+from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.model import DataObject, FileBody
+from shadowhound_data_logger.options import COMPRESSED_IMAGE
+from shadowhound_data_logger.ship.thinning import Thinner, may_halve
+from shadowhound_data_logger.spool.files import description_of
+from shadowhound_data_logger.spool.ledger import read as read_ledger
+from shadowhound_data_logger.spool.spool import Spool
+
+KIB = 1 << 10
+SHIP = {words.ROBOT: 'thor', words.SHIP: words.ON_REQUEST}
+CAMERA = Channel('/camera', COMPRESSED_IMAGE, '', '', '', '')
+IMU = Channel('/imu', 'sensor_msgs/msg/Imu', '', '', '', '')
+
+
+class Robot:
+    """A spool that keeps, and what thins it."""
+
+    def __init__(self, root: Path, max_bytes: int, least_hz: float = 1.0) -> None:
+        self.root = root
+        self.clock = FakeClock()
+        self.max_bytes, self.least_hz = max_bytes, least_hz
+        self.random = random.Random(0)
+        self.open()
+
+    def open(self) -> None:
+        keep = KeepSettings(max_bytes=self.max_bytes, thin_to_hz=self.least_hz)
+        self.spool = Spool(self.root, SpoolSettings(min_free_bytes=0), self.clock, 'thor', keep)
+        self.spool.open()
+        self.thinner = Thinner(self.spool, self.least_hz, Halving(self.root.parent / 'home', 'thor', self.least_hz))
+
+    def keep(self, *items: DataObject, topics: Sequence[str] = ('/camera',)) -> None:
+        for item in items:
+            for topic in topics:
+                count = item.counts.get(topic, 0) if item.counts else item.samples
+                receive(self.spool, count, topic)
+        self.spool.commit(items)
+        self.told()
+
+    def told(self) -> None:
+        """The store knows of all."""
+        with self.spool._index.transaction():  # what a part of the catalogue does when it is spooled
+            self.spool._index._db.execute('DELETE FROM untold')
+
+    def thin(self) -> int:
+        """Until there is room, or nothing to thin; how many steps that took."""
+        count = 0
+        while self.thinner.step() or self.thinner.step():  # of what the store knew nothing yet it does then
+            count += 1
+            assert count < 10_000
+            self.told()
+        return count
+
+    def kept(self) -> list[dict[str, object]]:
+        return [row for row in rows(self.root) if row['state'] == 'kept']
+
+    def body(self, size: int = KIB) -> bytes:
+        return self.random.randbytes(size)
+
+
+@pytest.fixture
+def make_robot(tmp_path: Path) -> Iterator[Callable[..., Robot]]:
+    made: list[Robot] = []
+
+    def build(max_bytes: int, least_hz: float = 1.0) -> Robot:
+        made.append(Robot(tmp_path / 'spool', max_bytes, least_hz))
+        return made[-1]
+
+    yield build
+    for robot in made:
+        robot.spool.close()
+
+
+def frame(robot: Robot, number: int, hz: float = 10.0) -> DataObject:
+    stamp_ns = NOON_NS + round(number * SECOND / hz)
+    return make(f'thor/camera/20251018/{number:06d}.jpg', robot.body(), t_start_ns=stamp_ns, t_end_ns=stamp_ns, metadata=SHIP)
+
+
+def archive(
+    robot: Robot, number: int, *, count: int = 30, pack: Callable[..., bytes] = pack_tar, repeats: bool = False
+) -> DataObject:
+    """A second of a camera; with ``repeats`` each third picture is the one before it again."""
+    members, first_ns, file = [], NOON_NS + number * SECOND, ''
+    stamps = [first_ns + place * SECOND // count for place in range(count)]
+    for place, stamp_ns in enumerate(stamps):
+        said: dict[str, object] = {'stamp_ns': stamp_ns, 'topic': '/camera'}
+        if repeats and place % 3 == 2:
+            said['repeat_of'] = file
+        else:
+            file = f'{stamp_ns:019d}.jpg'
+            members.append(ArchiveFile(file, stamp_ns, robot.body()))
+        members.append(ArchiveFile(f'{stamp_ns:019d}.json', stamp_ns, orjson.dumps(said)))
+    kind = 'application/x-tar' if pack is pack_tar else 'application/zip'
+    return make(f'thor/camera/20251018/{number:06d}.{"tar" if pack is pack_tar else "zip"}', pack(members), content_type=kind,
+                samples=count, t_start_ns=stamps[0], t_end_ns=stamps[-1], metadata=SHIP)  # fmt: skip
+
+
+def bag_slice(robot: Robot, folder: Path, number: int) -> DataObject:
+    """Five seconds: 30 pictures a second and 100 of the IMU."""
+    folder.mkdir(exist_ok=True)
+    writer = SliceWriter(folder / f'patrol_{number}.mcap')
+    begin_ns = NOON_NS + 5 * number * SECOND
+    stamps = sorted(
+        [
+            *((begin_ns + place * SECOND // 30, 0) for place in range(150)),
+            *((begin_ns + place * SECOND // 100, 1) for place in range(500)),
+        ]
+    )
+    for sequence, (stamp_ns, which) in enumerate(stamps):
+        writer.write((CAMERA, IMU)[which], stamp_ns, stamp_ns, sequence, robot.body((KIB, 64)[which]))
+    info = writer.close()
+    counts = {f'bag:{topic}': count for topic, count in info.counts.items()}
+    return DataObject(
+        bucket=BAGS, key=f'thor/patrol/bags/patrol_{number}.mcap', body=FileBody(info.path, info.bytes, info.sha256),
+        content_type='application/octet-stream', sensor='bag', topic=None, type='', samples=info.messages,
+        t_start_ns=info.t_start_ns, t_end_ns=info.t_end_ns, priority=5,
+        protected=False, metadata={**SHIP, words.MESSAGES: str(info.messages)}, counts=counts,
+    )  # fmt: skip
+
+
+def messages_of(body: bytes, content_type: str) -> dict[int, bytes]:
+    """What an archive says by its times, repeats as what they repeat."""
+    if content_type == 'application/zip':
+        with zipfile.ZipFile(BytesIO(body)) as packed:
+            files = {name: packed.read(name) for name in packed.namelist()}
+    else:
+        with tarfile.open(fileobj=BytesIO(body)) as unpacked:
+            files = {each.name: file.read() for each in unpacked if (file := unpacked.extractfile(each))}
+    said = [orjson.loads(content) for name, content in files.items() if name.endswith('.json')]
+    return {one['stamp_ns']: files[one.get('repeat_of', f'{one["stamp_ns"]:019d}.jpg')] for one in said}
+
+
+@pytest.mark.parametrize(('count', 'seconds', 'least_hz', 'expected'), [
+    (2, 2.0, 0.5, True), (2, 2.0, 1.0, False), (2, 1.0, 1.0, True), (1, 0.0, 0.1, False), (30, 1.0, 1.0, True),
+    (30, 1.0, 15.0, True), (30, 1.0, 16.0, False), (5, 0.0, 1000.0, True),
+])  # fmt: skip
+def test_no_rate_goes_below_the_least(count: int, seconds: float, least_hz: float, expected: bool) -> None:
+    """The half that stays comes as often as is asked for, or more often."""
+    assert may_halve(count, seconds * SECOND, least_hz) is expected
+
+
+def test_frames_lose_rate_before_time(make_robot: Callable[..., Robot]) -> None:
+    """Each second of the hour has its picture; what went is told as thinned, at its time, and the ledger closes."""
+    robot = make_robot(2 << 20)
+    for number in range(0, 2000, 20):
+        robot.keep(*(frame(robot, each) for each in range(number, number + 20)))
+        robot.thin()
+    kept = robot.kept()
+    stamps = sorted(int(str(row['t_start_ns'])) for row in kept)
+    assert stamps[0] == NOON_NS
+    assert max(late - early for early, late in pairwise(stamps)) <= SECOND
+    found = assert_whole(robot.root)
+    assert found['objects']['kept'] == len(kept)
+    assert found['objects']['evicted'] == 2000 - len(kept)
+    reasons = Counter(row['reason'] for row in rows(robot.root) if row['state'] == 'evicted')
+    assert set(reasons) == {'thinned'}
+    gaps = [gap for gap in robot.spool.gaps_after(0, 10_000, {})[0] if gap.cause == 'thinned']
+    assert sum(gap.count for gap in gaps) == reasons['thinned']
+
+
+@pytest.mark.parametrize('pack', [pack_tar, pack_zip])
+@pytest.mark.parametrize('repeats', [False, True])
+def test_an_archive_loses_every_second_picture(
+    make_robot: Callable[..., Robot], pack: Callable[..., bytes], repeats: bool
+) -> None:
+    """What is left is byte for byte what it was, repeats included; rows, files, descriptions and the ledger agree."""
+    robot = make_robot(400 * KIB)
+    items = [archive(robot, number, pack=pack, repeats=repeats) for number in range(40)]
+    whole = {item.key: messages_of(bytes(item.body), item.content_type) for item in items if isinstance(item.body, bytes)}
+    for item in items:
+        robot.keep(item)
+        robot.thin()
+    kept = robot.kept()
+    assert len(kept) == len(items), 'no second is gone'
+    thinned = 0
+    for row in kept:
+        path = robot.root / 'kept' / str(row['bucket']) / str(row['key'])
+        left, was = messages_of(path.read_bytes(), str(row['content_type'])), whole[str(row['key'])]
+        metadata = orjson.loads(str(row['metadata']))
+        step = int(metadata.get(words.THINNED, 1))
+        thinned += step > 1
+        expected = list(was.items())
+        for _ in range(step.bit_length() - 1):
+            expected = expected[::2]
+        assert left == dict(expected)
+        assert (row['samples'], int(metadata[words.COUNT])) == (len(left), len(left))
+        assert description_of(path)['samples'] == len(left)
+    assert thinned > len(items) / 2
+    found = assert_whole(robot.root)
+    camera = found['topics']['/camera']
+    lost = sum(int(str(row['samples'])) for row in rows(robot.root) if row['state'] == 'evicted')
+    assert camera['stored'] == 30 * len(items)
+    assert sum(int(str(row['samples'])) for row in kept) + lost == 30 * len(items)
+
+
+def test_a_slice_loses_pictures_alone(make_robot: Callable[..., Robot], tmp_path: Path) -> None:
+    """The small messages stay, all of them; the loss is told by topic."""
+    robot = make_robot(1 << 20)
+    for number in range(8):
+        robot.keep(bag_slice(robot, tmp_path / 'bag', number), topics=('bag:/camera', 'bag:/imu'))
+        robot.thin()
+    kept = robot.kept()
+    assert len(kept) == 8
+    counts = []
+    for row in kept:
+        source = LocalFile(robot.root / 'kept' / str(row['bucket']) / str(row['key']))
+        found = Counter(
+            message.channel.topic
+            for message in read_messages(source, read_index(source), MessageFilter(0, 1 << 63, lambda _: True))
+        )
+        assert found['/imu'] == 500
+        assert found['/camera'] >= 5
+        assert found.total() == row['samples'] == int(orjson.loads(str(row['metadata']))[words.MESSAGES])
+        counts.append(found['/camera'])
+    assert counts[0] < 150
+    ledger = read_ledger(robot.root, 'thor')
+    assert ledger['balanced']
+    assert_whole(robot.root)
+    lost = [row for row in rows(robot.root) if row['state'] == 'evicted']
+    assert {row['reason'] for row in lost} == {'thinned'}
+    assert sum(int(str(row['samples'])) for row in lost) == 8 * 150 - sum(counts)
+
+
+def test_what_is_asked_for_or_protected_stays_as_it_is(make_robot: Callable[..., Robot]) -> None:
+    """Thinning takes what nobody waits for, and leaves the rest whole."""
+    robot = make_robot(1 << 20)
+    robot.keep(archive(robot, 0), archive(robot, 1), archive(robot, 2))
+    with robot.spool._index.transaction():
+        robot.spool._index.protect('sensor-data', 'thor/camera/20251018/000000.tar')
+        number = robot.kept()[1]['id']
+        robot.spool._index._db.execute("INSERT INTO requested VALUES ('r', ?, 1, 'kept')", (number,))
+    robot.max_bytes = 70 * KIB
+    robot.spool.close()
+    robot.open()
+    robot.thin()
+    assert [row['samples'] for row in robot.kept()] == [30, 30, 1]
+
+
+def test_at_the_least_rate_the_oldest_goes(make_robot: Callable[..., Robot]) -> None:
+    """Rate goes first, and then time, from its beginning."""
+    robot = make_robot(1 << 20)
+    for number in range(0, 40_00, 40):
+        robot.keep(*(frame(robot, each) for each in range(number, number + 40)))
+        robot.thin()
+    reasons = Counter(row['reason'] for row in rows(robot.root) if row['state'] == 'evicted')
+    assert set(reasons) <= {'thinned', 'keep_limit'}
+    assert_whole(robot.root)
+
+
+def test_0_thins_nothing(make_robot: Callable[..., Robot]) -> None:
+    """The oldest goes as a whole."""
+    robot = make_robot(1 << 20, 0.0)
+    for number in range(40):
+        robot.keep(archive(robot, number, count=60))
+        assert robot.thin() == 0
+    assert {row['reason'] for row in rows(robot.root) if row['state'] == 'evicted'} == {'keep_limit'}
+
+
+@pytest.mark.long('a death after each step')
+def test_death_at_any_moment(root: Path, moments: Moments) -> None:
+    """An object is as it was, or thinned and its loss told once; nothing else lies there after the next start."""
+    robot = Robot(root, 1 << 20)
+    robot.keep(archive(robot, 0), archive(robot, 1))
+    robot.spool.close()
+
+    def work() -> None:
+        again = Robot(root, 66 * KIB)
+        again.thin()
+        again.spool.close()
+
+    seen = []
+    for copy in moments(work):
+        found = Robot(copy, 1 << 20)
+        assert_whole(copy)
+        kept = found.kept()
+        lost = sum(int(str(row['samples'])) for row in rows(copy) if row['state'] == 'evicted')
+        assert sum(int(str(row['samples'])) for row in kept) + lost == 60
+        for row in kept:
+            path = copy / 'kept' / str(row['bucket']) / str(row['key'])
+            assert len(messages_of(path.read_bytes(), str(row['content_type']))) == row['samples']
+        seen.append(lost)
+        found.spool.close()
+    assert seen == sorted(seen)
+    assert (seen[0], seen[-1] > 0) == (0, True)
