@@ -252,14 +252,24 @@ def _keep(figures: Figures) -> str:
     words = {'_previews': 'previews', '_kept': 'rows of what is kept'}
     rows = [(words[name], f'{late["count"]:,}', *(f'{late[each]:.1f} s' for each in ('p50', 'p95', 'max')))
             for name, late in figures['late_s'].items()]  # fmt: skip
-    cores, kept = figures['cores'], figures['bytes']['kept']
+    cores, kept, memory = figures['cores'], figures['bytes']['kept'], figures['memory_mb']
     said = (
         f'The node that keeps all: {100 * cores["kept"]:.1f} % of a core; the one beside it: {100 * cores["1 Hz"]:.1f} %.'
         f' In {figures["seconds"]:.0f} s {kept["kept"] / 1e6:,.0f} MB were kept and {kept["delivered"] / 1e6:.1f} MB delivered;'
         f' {figures["missed"]:,} messages were missed. The first second of the video was in the store'
         f' {figures["begin_s"]:.1f} s after it was asked for.'
     )
-    return '\n\n'.join((_table(('oldest message to the store', 'objects', 'p50', 'p95', 'worst'), rows), said))
+    parts = [
+        *((f'{words[name]}, p95', *(f'{late:.1f} s' for late in each)) for name, each in figures['late_p95_s'].items()),
+        *((f'memory of its own, the node that {does}', *(f'{each:.1f} MB' for each in memory[name]))
+          for name, does in (('kept', 'keeps all'), ('1 Hz', 'uploads 1 Hz'))),
+    ]  # fmt: skip
+    before, after = figures['load']
+    load = f'The load average was {before:.1f} at the beginning and {after:.1f} at the end.'
+    return '\n\n'.join((
+        _table(('oldest message to the store', 'objects', 'p50', 'p95', 'worst'), rows), said,
+        _table(('before the video is asked for', 'first third', 'second', 'last'), parts), load,
+    ))  # fmt: skip
 
 
 def _ask(figures: Figures) -> str:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from statistics import median
 from typing import Any, Final
 
+import _proc
 from _link import ShapedLinks, in_own_network
 from _report import Bar, Report, main, percentile, progress, ratio
 from _world import BUCKET, ROBOT, Program, World, until
@@ -41,6 +43,8 @@ ROUNDS: Final = 6
 ASKED_S: Final = 60
 LAST: Final = 0.75
 """Of the time, before the video is asked for."""
+THIRDS: Final = 3
+"""Of the time before the video is asked for, in which whatever grows or becomes late would show."""
 MOST_RATIO, MOST_LATE_S, MOST_BEGIN_S = 1.3, 15.0, 20.0
 
 
@@ -49,11 +53,12 @@ class Arrivals:
 
     def __init__(self, source: Bucket) -> None:
         self._source = source
-        self.late: dict[str, dict[str, float]] = {'_previews': {}, KEPT.folder: {}}
+        self.late: dict[str, dict[str, tuple[float, float] | None]] = {'_previews': {}, KEPT.folder: {}}
+        """Folder -> key -> when it came, and how late; None of what was there before."""
         self._find(lambda _key, _at: None)
 
     def look(self) -> None:
-        self._find(lambda key, at: at - self._first_ns(key) / SECOND)
+        self._find(lambda key, at: (at, at - self._first_ns(key) / SECOND))
 
     def _find(self, late: Any) -> None:
         for folder, found in self.late.items():
@@ -71,9 +76,9 @@ class Arrivals:
                 for row in table.to_pylist()]  # fmt: skip
         return min(row['t_start_ns'] for row in rows)
 
-    def seconds(self, folder: str) -> list[float]:
-        """Of those that came while it looked."""
-        return [value for value in self.late[folder].values() if value is not None]
+    def seconds(self, folder: str, begin: float = 0.0, end: float = float('inf')) -> list[float]:
+        """Of those that came while it looked, in the order of their keys, and between these times."""
+        return [late for at, late in filter(None, self.late[folder].values()) if begin <= at < end]
 
 
 def measure(options: argparse.Namespace) -> Report:
@@ -92,7 +97,9 @@ def measure(options: argparse.Namespace) -> Report:
             time.sleep(WARM_S)
             progress(f'two nodes, {options.seconds:g} s')
             arrivals = Arrivals(source)
-            used = _watch(nodes, arrivals, options.seconds * LAST)
+            load, began = _proc.load(), time.time()
+            used, memory = _watch(nodes, arrivals, options.seconds * LAST)
+            length = (time.time() - began) / THIRDS
             progress(f'{ASKED_S} s of the camera are asked for')
             begin_s, arrived_s = _pull(source, arrivals, options.seconds * (1.0 - LAST))
             found = world.ledger()
@@ -104,6 +111,11 @@ def measure(options: argparse.Namespace) -> Report:
         'cores': {name: sum(each) / options.seconds / LAST for name, each in used.items()}, 'ratio': value, 'ratios': rounds,
         'late_s': {folder: {'count': len(each), 'p50': percentile(each, 50), 'p95': percentile(each, 95), 'max': max(each)}
                    for folder, each in late.items()},
+        'late_p95_s': {folder: [percentile(arrivals.seconds(folder, began + part * length, began + (part + 1) * length), 95)
+                                for part in range(THIRDS)] for folder in late},
+        'memory_mb': {name: [median(each[part * len(each) // THIRDS : (part + 1) * len(each) // THIRDS])
+                             for part in range(THIRDS)] for name, each in memory.items()},
+        'load': [load, _proc.load()],
         'begin_s': begin_s, 'arrived_s': arrived_s, 'seconds': options.seconds, 'mbps': MBPS,
         'bytes': {'kept': found['bytes'], '1 Hz': other['bytes']}, 'balanced': found['balanced'] and other['balanced'],
         'missed': sum(row['missed'] or 0 for row in found['topics'].values()),
@@ -125,17 +137,20 @@ def _bars(figures: dict[str, Any], late: dict[str, list[float]], rounds: Sequenc
     )  # fmt: skip
 
 
-def _watch(nodes: dict[str, Program], arrivals: Arrivals, seconds: float) -> dict[str, list[float]]:
-    """CPU seconds of each node in each round."""
-    used: dict[str, list[float]] = {name: [] for name in nodes}
+def _watch(nodes: dict[str, Program], arrivals: Arrivals,
+           seconds: float) -> tuple[dict[str, list[float]], dict[str, list[float]]]:  # fmt: skip
+    """CPU seconds of each node in each round, and its own memory in MB every two seconds."""
+    used, memory = ({name: list[float]() for name in nodes} for _ in range(2))
     for _ in range(ROUNDS):
         before, end_s = {name: node.cpu_s() for name, node in nodes.items()}, time.monotonic() + seconds / ROUNDS
         while (left := end_s - time.monotonic()) > 0:
             arrivals.look()
+            for name, node in nodes.items():
+                memory[name].append(_proc.memory(node.pid).anon)
             time.sleep(min(2.0, max(left, 0.0)))
         for name, node in nodes.items():
             used[name].append(node.cpu_s() - before[name])
-    return used
+    return used, memory
 
 
 def _pull(source: Bucket, arrivals: Arrivals, seconds: float) -> tuple[float, float | None]:
