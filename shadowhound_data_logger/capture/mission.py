@@ -25,6 +25,7 @@ from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import safe_type
 from shadowhound_data_logger.missions.node_log import NodeLog
 from shadowhound_data_logger.model import Batch, DataObject
+from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -56,6 +57,7 @@ class MissionWatch:
         self._observer = observer
         self._tell = tell
         self._finder = MissionFinder(settings.home, settings.robot)
+        self._policies = PolicyFolder(settings.home)
         self._mission: Active | None = None
         self._marks: Mapping[str, str] = {}
         self._last: tuple[Active, Mapping[str, str]] | None = None
@@ -88,7 +90,7 @@ class MissionWatch:
         if mission is None:
             return {}
         return {'mission_id': mission.id, 'run_id': self._marks.get(words.RUN_ID), 'type': mission.mission_type,
-                'started': iso(mission.start_ns)}  # fmt: skip
+                'started': iso(mission.start_ns), 'policy': self._policies.current()}  # fmt: skip
 
     # -- for the encoders ------------------------------------------------------------------------------------------
 

@@ -184,7 +184,8 @@ def _verdict(found: list[dict[str, Any]], *, is_sending: bool) -> Iterator[Rende
 def _page(found: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield Text.assemble(plain(found['mission_id'], 'bold'), '  ', _result(found))
     lines = {
-        'type': found['type'], 'command': found['command'], 'robot': found['robot'], 'started': shown_iso(found['started']),
+        'type': found['type'], 'command': found['command'], 'robot': found['robot'], 'policy': found['policies'] or '-',
+        'started': shown_iso(found['started']),
         'ended': shown_iso(found['ended']) if found['ended'] else '-', 'duration': duration(found['duration_s']),
         'distance': '-' if found['distance_m'] is None else f'{found["distance_m"]:.2f} m',
         'battery used': '-' if found['battery_consumed_pct'] is None else f'{found["battery_consumed_pct"]:.1f} %',

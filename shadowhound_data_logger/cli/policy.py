@@ -242,6 +242,8 @@ def show(*, name: str | None, as_json: bool) -> ExitCode:
         print_json(told)
     else:
         for key, value in told.items():
+            if value == '':
+                continue
             click.echo(f'{key}: {", ".join(value) if isinstance(value, list) else value}')
     return ExitCode.FINDING if why else ExitCode.FINE
 
@@ -281,6 +283,7 @@ def pin() -> ExitCode:
 def unpin() -> ExitCode:
     """Follow the registry again."""
     _policies().unpin()
+    click.echo('follows the registry again')
     return ExitCode.FINE
 
 

@@ -42,7 +42,7 @@ FLAGS: Final = {
     'succeeded': click.option(
         '--succeeded', 'success', flag_value=True, type=bool, default=None, help='Only of missions that succeeded.'
     ),
-    'policy': click.option('--policy', metavar='NAME[@7]', help='Only of missions that began with this policy active.'),
+    'policy': click.option('--policy', metavar='NAME[@7]', help='Only of missions in which this policy was active.'),
     'where': click.option('--where', metavar='SQL', help="A condition, such as 'battery_pct < 30'."),
     'label': click.option('--label', metavar='NAME', help='With this label, or of a time that has it.'),
     'ranges': ranges_option,

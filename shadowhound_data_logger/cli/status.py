@@ -246,6 +246,8 @@ def _add_mission(grid: Table, found: Mapping[str, Any]) -> None:
         since = 'begun before the clock was set'
     grid.add_row('mission', Text('active', 'cyan'), plain(f'{mission["type"]}, {since}'))
     grid.add_row('', '', plain(mission['mission_id']))
+    if mission.get('policy'):
+        grid.add_row('', '', plain(f'policy {mission["policy"]}'))
     grid.add_row('', '', plain(f'MLflow run {mission["run_id"]}' if mission['run_id'] else 'no MLflow run yet'))
 
 

@@ -85,6 +85,7 @@ _SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
     'duration_s': ('duration_s', pa.float64()),
     'battery_consumed_pct': ('battery_consumed_pct', pa.float64()),
     'policy': ('policy', pa.string()),
+    'policies': ('policies', pa.string()),
 }
 """Columns of ``missions`` that come from ``summary.json``, null for a mission that has none yet: name there, type."""
 
@@ -171,17 +172,21 @@ def _objects(lake: _Asked, asked: Wanted) -> DataFrame:
 
 
 def _missions_of(lake: _Asked, asked: Wanted) -> list[str]:
-    """The missions that ended so, and at whose beginning that policy was active."""
-    found = _missions(lake, replace(asked, success=None, policy=None)).select('mission_id', 'success', 'policy').to_pydict()
-    rows = zip(found['mission_id'], found['success'], found['policy'], strict=True)
-    return [mission for mission, success, policy in rows
-            if asked.success in {None, success} and (asked.policy is None or _is_policy(policy or '', asked.policy))]  # fmt: skip
+    """The missions that ended so, and in which that policy was active."""
+    columns = ('mission_id', 'success', 'policy', 'policies')
+    found = _missions(lake, replace(asked, success=None, policy=None)).select(*columns).to_pydict()
+    return [mission for mission, success, policy, policies in zip(*(found[name] for name in columns), strict=True)
+            if asked.success in {None, success}
+            and (asked.policy is None or _has_policy(policies or policy or '', asked.policy))]  # fmt: skip
 
 
-def _is_policy(name: str, wanted: str) -> bool:
-    """Whether an id such as ``go2_patrol@7#0123456789abcdef`` is meant: by its name, with or without version, or as it begins."""
-    version = name.partition('#')[0]
-    return wanted in {name, version, version.partition('@')[0]} or ('#' in wanted and name.startswith(wanted))
+def _has_policy(names: str, wanted: str) -> bool:
+    """Whether one of ids such as ``go2_patrol@7#0123456789abcdef`` is meant: by its name, name and version, or as it begins."""
+    for name in names.split(', '):
+        version, is_one, _ = name.partition('#')
+        if is_one and (wanted in {version, version.partition('@')[0]} or ('#' in wanted and name.startswith(wanted))):
+            return True
+    return False
 
 
 def _conditions(asked: Wanted) -> Iterator[Expression]:

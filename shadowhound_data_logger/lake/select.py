@@ -59,7 +59,7 @@ class Wanted:
     success: bool | None = None
     """How the mission ended by its ``summary.json``; of one that goes on, neither is true."""
     policy: str | None = None
-    """Of missions at whose beginning this policy was active, by their ``summary.json``: a name, ``NAME@7`` or an id."""
+    """Of missions in which this policy was active, by their ``summary.json``: a name, ``NAME@7`` or an id."""
     where: str | None = None
     """SQL, such as ``battery_pct < 30``."""
     label: str | None = None

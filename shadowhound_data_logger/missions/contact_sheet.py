@@ -17,6 +17,7 @@ MOST: Final = 20
 GAP: Final = 8
 CAPTION: Final = 22
 HEAD: Final = 34
+LINE: Final = 20
 QUALITY: Final = 88
 INK: Final = '#22303c'
 PALE: Final = '#6b7884'
@@ -35,8 +36,11 @@ class _Thumb(NamedTuple):
     image: Image.Image
 
 
-def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, target: Path) -> str:
-    """Write the JPEG; what there is to say about it: '' or how many frames are not pictures. Raises ValueError for none."""
+def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, target: Path, *, below: str = '') -> str:
+    """Write the JPEG, with a line ``below`` its title; what there is to say about it: '' or how many frames are not pictures.
+
+    Raises ValueError for none.
+    """
     if not frames:
         raise ValueError('no camera frame was sampled')
     count = min(MOST, len(frames))
@@ -49,15 +53,17 @@ def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, targ
     height = max(thumb.image.height for thumb in thumbs)
     step_x, step_y = width + GAP, height + CAPTION + GAP
     rows = -(-len(thumbs) // columns)
-    sheet = Image.new('RGB', (WIDTH, HEAD + rows * step_y), 'white')
+    top = HEAD + (LINE if below else 0)
+    sheet = Image.new('RGB', (WIDTH, top + rows * step_y), 'white')
     pen = ImageDraw.Draw(sheet)
     pen.text((GAP, 9), title, fill=INK, font=_font(15))
+    pen.text((GAP, HEAD - 4), below, fill=PALE, font=_font(12))
     told = (
         f'{len(thumbs)} of {len(frames)} frames' if len(thumbs) < len(frames) else f'{len(thumbs)} frame{"s"[: len(thumbs) > 1]}'
     )
     pen.text((WIDTH - GAP - pen.textlength(told, font=_font(12)), 12), told, fill=PALE, font=_font(12))
     for place, thumb in enumerate(thumbs):
-        x, y = GAP + place % columns * step_x, HEAD + place // columns * step_y
+        x, y = GAP + place % columns * step_x, top + place // columns * step_y
         sheet.paste(thumb.image, (x, y))
         _caption(pen, (x, y + thumb.image.height + 3), width, thumb.frame, start_ns)
     sheet.save(target, 'JPEG', quality=QUALITY, optimize=True)

@@ -49,7 +49,8 @@ def overview(folder: MissionFolder) -> dict[str, Any] | None:
     sent, run, far = folder.sent(), folder.run(), report(folder)
     return {
         'mission_id': folder.mission_id, 'run_id': run.run_id if run else None, 'type': story.start['type'],
-        'command': story.start['command'], 'robot': story.start['robot'], 'started': iso(int(story.start['t'])),
+        'command': story.start['command'], 'robot': story.start['robot'], 'policies': story.policy_names or None,
+        'started': iso(int(story.start['t'])),
         'ended': iso(int(story.end['t'])) if story.end else None, 'duration_s': round(story.duration_s, 3),
         'result': story.end.get('status') or (ACTIVE if _is_locked(folder) else UNFINISHED),
         'errors': [*story.errors, *([story.end['error']] if story.end.get('error') else [])],

@@ -23,7 +23,7 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet
 from shadowhound_data_logger.missions.drawing import CHARGE, SHEET, TRAJECTORY
 from shadowhound_data_logger.missions.folder import MissionFolder, write_json
-from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE
+from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE, named
 
 log = logging.getLogger(__name__)
 
@@ -41,11 +41,15 @@ class Material:
     states: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {BATTERY: [], TEMPERATURE: []})
     """Of each metric: seconds since the start, and the value."""
     trajectory: Path | None = None
+    policies: list[str | None] = field(default_factory=list)
 
     def add(self, record: Mapping[str, Any], files: Path) -> None:
         kind, time_ns = record.get('k'), int(record.get('t', 0))
         if kind == 'start':
             self.start_ns = self.start_ns or time_ns
+            self.policies.append(record.get('policy'))
+        elif kind == 'policy':
+            self.policies.append(record.get('policy'))
         elif kind == 'frame' and record.get('artifact'):
             self.frames.append(LoggedFrame(time_ns, int(record['id']), files / record['file']))
         elif kind == 'trajectory':
@@ -75,8 +79,9 @@ def material_of(folder: MissionFolder) -> Material:
 def make(folder: MissionFolder, title: str) -> dict[str, str]:
     """Make what can be made; each name with '' or what there is to say about it."""
     material = material_of(folder)
+    frames, start_ns, below = material.frames, material.start_ns, named(material.policies)
     return {
-        SHEET: _made(folder.files / SHEET, lambda target: contact_sheet(material.frames, title, material.start_ns, target)),
+        SHEET: _made(folder.files / SHEET, lambda target: contact_sheet(frames, title, start_ns, target, below=below)),
         TRAJECTORY: _made(folder.files / TRAJECTORY, lambda target: _trajectory(material, folder.floor, title, target)),
         CHARGE: _made(folder.files / CHARGE, lambda target: _battery(material, title, target)),
     }

@@ -40,9 +40,12 @@ class Mission:
     ``_lock`` makes a record one step with what is remembered of it: that it is to be synced, and that the last one was written.
     """
 
-    def __init__(self, folder: MissionFolder, journal: Journal, frame_artifact_every_s: float, clock: Clock) -> None:
+    def __init__(self, folder: MissionFolder, journal: Journal, frame_artifact_every_s: float, clock: Clock,
+                 policy: str | None = None) -> None:  # fmt: skip
         self.folder = folder
         self._clock = clock
+        self._policies = PolicyFolder(folder.path.parents[1])
+        self._policy = policy
         self._began_ns = clock.boot_ns()
         self._journal = journal
         self._frames = copies.Spares(folder.files)
@@ -134,6 +137,7 @@ class Mission:
         stated['lost'] = self._lost
         if error:
             stated['error'] = values.text(error, values.MAX_PARAM)
+        self._note_policy()
         try:
             self._append('end', status=status or (FINISHED if stated['success'] else FAILED), **stated)
         except OSError as refused:
@@ -151,7 +155,8 @@ class Mission:
         self._frames.forget()
 
     def sync(self) -> None:
-        """Make durable what was logged before. Called by the logger's thread; never raises OSError."""
+        """Make durable what was logged before, and note another policy. Called by the logger's thread; never raises OSError."""
+        self._note_policy()
         with self._lock:
             files, self._unsynced = self._unsynced, []
             dirty, self._is_dirty = self._is_dirty, False
@@ -167,6 +172,15 @@ class Mission:
         self._frames.fill()
 
     # -- within ----------------------------------------------------------------------------------------------------
+
+    def _note_policy(self) -> None:
+        """Record that another one is active than before."""
+        now = self._policies.current()
+        with self._lock:
+            if now != self._policy and not self._ended:
+                with suppress(OSError):  # the next look tries again
+                    self._journal.append({'k': 'policy', 't': now_ns(self._clock), 'policy': now})
+                    self._policy, self._is_dirty = now, True
 
     def _log(self, metrics: Mapping[str, Any], step: Any) -> None:
         found: dict[str, float] = {}
@@ -275,7 +289,7 @@ class Beginning:
         except OSError as error:
             log.error('the mission %.80s is not logged: %s', given, error)  # noqa: TRY400 - no defect
             return None
-        return Mission(folder, journal, self.frame_artifact_every_s, self.clock)
+        return Mission(folder, journal, self.frame_artifact_every_s, self.clock, policy)
 
     def nothing(self, mission_type: str) -> Mission:
         """A mission that is over: all its calls do nothing. For a disk that takes no journal."""

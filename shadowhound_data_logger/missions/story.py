@@ -1,15 +1,16 @@
 """What a mission's journal says as a whole: its first and last values, its counts, and how the run ends.
 
 The records of a journal, by their ``k``: ``start`` (type, command, robot, policy), ``metrics`` (m: key -> value, s: step),
-``frame``, ``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``refused`` (reason), ``end`` (status, what the
-agent stated, elapsed_s: how long it took), and of the node ``poses``. Every record has ``t``, ns since 1970 UTC. ``summary_of``
-makes ``summary.json`` of it, the same in the run, in the store and in the mission's folder.
+``frame``, ``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``policy`` (another one is active from then on, or
+none), ``refused`` (reason), ``end`` (status, what the agent stated, elapsed_s: how long it took), and of the node ``poses``.
+Every record has ``t``, ns since 1970 UTC. ``summary_of`` makes ``summary.json`` of it, the same in the run, in the store and in
+the mission's folder.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any, Final, NamedTuple
@@ -25,6 +26,7 @@ MOST_ERRORS: Final = 20
 MOST_EVENTS: Final = 200
 MOST_EVENT: Final = 2000
 """Letters of an event that stands in the summary; ``events.jsonl`` in the run has all."""
+MOST_POLICIES: Final = 100
 BUCKET: Final = 'sensor-data'
 TRAJECTORIES: Final = 'trajectories'
 
@@ -48,6 +50,8 @@ class Story:
     refused: Counter[str] = field(default_factory=Counter)
     errors: list[dict[str, Any]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
+    policies: list[tuple[str | None, int]] = field(default_factory=list)
+    """The one that was active at the start and those that followed it, each with the time from which on; None: there was none."""
     first: dict[str, float] = field(default_factory=dict)
     last: dict[str, float] = field(default_factory=dict)
     steps: dict[str, int] = field(default_factory=dict)
@@ -66,6 +70,7 @@ class Story:
         self.last_ns = max(self.last_ns, time_ns)
         if kind == 'start':
             self.start = record
+            self.policies = [(record.get('policy'), time_ns)]
             return [Point(DISTANCE, 0.0, time_ns // MS, 0)]  # so that every run has one, whatever becomes of it
         if kind == 'metrics':
             step = int(record['s'])
@@ -79,6 +84,8 @@ class Story:
                     Point(FRAMES, float(self.counts['frame']), time_ns // MS, self.counts['frame'])]  # fmt: skip
         if kind == 'event':
             self._note_event(record, time_ns)
+        if kind == 'policy' and len(self.policies) < MOST_POLICIES:
+            self.policies.append((record.get('policy'), time_ns))
         if kind == 'refused':
             self.refused[str(record['reason'])] += 1
         elif kind == 'event' and record.get('name') in {'error', 'exception'}:
@@ -133,6 +140,11 @@ class Story:
     def success(self) -> bool:
         return bool(self.end.get('success'))
 
+    @property
+    def policy_names(self) -> str:
+        """Of all policies, in their order; empty where none was active at any time."""
+        return named(name for name, _ in self.policies)
+
     def params(self) -> dict[str, str]:
         """What the run begins with."""
         return {
@@ -144,7 +156,8 @@ class Story:
         }
 
     def final_params(self) -> dict[str, str]:
-        return {'duration_s': f'{self.duration_s:.3f}'}
+        changed = {'policies': self.policy_names[:MAX_PARAM]} if len(self.policies) > 1 else {}
+        return {'duration_s': f'{self.duration_s:.3f}', **changed}
 
     def _note_event(self, record: Mapping[str, Any], time_ns: int) -> None:
         """The first ones, as far as they are short."""
@@ -174,6 +187,12 @@ class Story:
         return max(self.steps.get(key, 0), self.node.steps.get(key, 0) if self.node else 0) + 1
 
 
+def named(policies: Iterable[str | None]) -> str:
+    """``go2_patrol@7#..., go2_patrol@6#...``, where none was active ``none``; empty where none ever was."""
+    names = [*policies]
+    return ', '.join(name or 'none' for name in names) if any(names) else ''
+
+
 def summary_of(story: Story, mission_id: str, run: Run, sent: MissionSent, pictures: Mapping[str, str]) -> dict[str, Any]:
     """``summary.json`` of a mission that is over and whose points and files are handed on."""
     start, end = story.start, story.end
@@ -181,7 +200,8 @@ def summary_of(story: Story, mission_id: str, run: Run, sent: MissionSent, pictu
     return {
         'mission_id': mission_id, 'run_id': run.run_id, 'run_name': stamped(start['type'], int(start['t'])),
         'robot': start['robot'], 'mission_type': start['type'], 'mission_command': start['command'],
-        'policy': start.get('policy'),
+        'policy': start.get('policy'), 'policies': story.policy_names or None,
+        'policy_changes': [{'policy': name, 'time': iso(time_ns)} for name, time_ns in story.policies[1:]],
         'start': iso(int(start['t'])), 'end': iso(int(end['t'])), 'start_ns': int(start['t']), 'end_ns': int(end['t']),
         'result': end['status'], 'success': story.success, 'ended_by': end.get('by', 'agent'),
         'errors': [*story.errors, *([end['error']] if end.get('error') else [])],

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.disk import fingerprint
-from shadowhound_data_logger.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.errors import ForeignObject, PolicyError, PolicyRefused
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.policies import signing
 from shadowhound_data_logger.policies.content import check_content, check_files
@@ -164,13 +164,20 @@ def publish(packed: Path, store: ObjectStore, registry: MlflowRegistry, aliases:
     check_files(packed, manifest)
     source = source_of(manifest.robot_types[0], manifest.name, manifest.version)
     known = registry.versions(manifest.name)
+    following = 1 + max((each.version for each in known), default=0)
+    remedy = f'pack it with --version {following}, and sign that'
     if all(each.source != source for each in known):
-        _check_number(manifest, 1 + max((each.version for each in known), default=0))
+        _check_number(manifest, following)
+        remedy = f'publish the folder whose publication was cut off, or remove {source}/, which the registry does not name'
     folder = source.removeprefix(f's3://{BUCKET}/')
     for name in (*(file.path for file in manifest.files), SIGNATURE, MANIFEST):  # the manifest last: with it, all is there
         size, sha256 = fingerprint(packed / name)
         item = _item(f'{folder}/{name}', packed / name, size, sha256)
-        steadily(lambda item=item: store.put(item))  # type: ignore[misc]
+        try:
+            steadily(lambda item=item: store.put(item))  # type: ignore[misc]
+        except ForeignObject as error:
+            text = f'another {manifest.name}@{manifest.version} is there already: {error.what}'
+            raise PolicyError(text, remedy=remedy) from error
     tags = {ID_TAG: manifest.id, 'shadowhound.dataset': manifest.dataset}
     number = registry.register(manifest.name, source, {key: value for key, value in tags.items() if value}, manifest.run)
     _check_number(manifest, number)

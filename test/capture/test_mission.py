@@ -131,6 +131,10 @@ def test_objects_of_the_missions_time_are_marked(tmp_path: Path, opened: ExitSta
     assert setting.watch.mark(thing(NOON_NS)).metadata == {'robot': 'thor'}
     mission_id = logger.start_mission('patrol', '')
     until(setting.watch.status, 'the mission is noticed')
+    assert setting.watch.status()['policy'] is None
+    (tmp_path / 'policies').mkdir()
+    (tmp_path / 'policies' / 'current').symlink_to('versions/go2_patrol@7#0123456789abcdef')
+    assert setting.watch.status()['policy'] == 'go2_patrol@7#0123456789abcdef'
     (folder,) = missions(tmp_path)
     start_ns = int(journal.first(folder.journal)['t'])
     marked = {'robot': 'thor', 'mission_id': mission_id, 'mission_type': 'patrol'}

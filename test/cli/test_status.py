@@ -136,6 +136,8 @@ def test_it_says_which_mission_is_active() -> None:
     assert line(text, 'mission') == 'mission  active      patrol, since 2026-11-21 06:36:05 UTC, 3 min'
     assert mission['mission_id'] in text
     assert 'no MLflow run yet' in text
+    assert 'policy' not in text
+    assert 'policy go2_patrol@7#0123456789abcdef' in shown(mission={**mission, 'policy': 'go2_patrol@7#0123456789abcdef'})
     text = shown(mission={**mission, 'run_id': 'a' * 32, 'started': '1970-01-01T00:02:00.000000Z'})
     assert f'MLflow run {"a" * 32}' in text
     assert 'patrol, begun before the clock was set' in text

@@ -187,6 +187,15 @@ def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> N
                              ('go2_patrol@', []), ('go2', []), ('go2_patrol@70', []), ('other', [])):  # fmt: skip
         assert found(source, policy=wanted) == expected, wanted
     assert found(source, policy='go2_patrol', success=False) == own
+    key = f'thor/missions/run-{FINISHED}/summary.json'
+    others = 'go2_patrol@7#0000000000000000, none, go2_stairs@3#1111111111111111'
+    told = json.loads(source.get(key, 1 << 20)) | {'policies': others}  # it changed in the middle
+    source.delete(key)
+    with closing(open_store(settings, UploadSettings())) as store:
+        add(store, tmp_path / 'tmp', key, json.dumps(told).encode())
+    assert lake.missions(source).sort('mission_id').to_pydict()['policies'] == [None, others]
+    assert found(source, policy='go2_stairs@3') == found(source, mission=FINISHED)
+    assert found(source, policy='none') == []
     with pytest.raises(LakeError, match='cannot be selected by policy'):
         lake.sql('SELECT * FROM gaps', source, policy='go2_patrol')
 

@@ -397,7 +397,8 @@ def told_of_names(now_ms: float) -> tuple[dict[str, Any], dict[str, Any]]:
          'rate_hz': 12345.6, 'age_s': 12345.6, 'publishers': 1, 'may_be_silent': False, **counts} for name in NAMES
     ]  # fmt: skip
     figures = {
-        'robot': 'thor', 'state': 'not_answering', 'age_s': 1.0, 'paused': False, 'mission': {'mission_id': LONG},
+        'robot': 'thor', 'state': 'not_answering', 'age_s': 1.0, 'paused': False,
+        'mission': {'mission_id': LONG, 'policy': f'go2_patrol@7#{HOSTILE}{LONG}'},
         'queue': {'messages': 123_456_789, 'bytes': 10**12, 'max_messages': 10**9}, 'findings': list(NAMES), 'balanced': False,
         'spool': {'pending': 10**9, 'bytes': 10**12, 'max_bytes': 10**13, 'free_bytes': 10**13, 'quarantined': 10**9},
         'store': {'target': LONG, 'state': LONG, 'last_error': HOSTILE + LONG, 'mbps': 1.0, 'max_mbps': 4}, 'bag': {'name': LONG},

@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from policies.models import bucket_of, linear, trained
 
 from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.errors import PolicyError
 from shadowhound_data_logger.policies import active, registry
 from shadowhound_data_logger.sim.tower import Tower
 
@@ -22,7 +23,7 @@ pytestmark = [pytest.mark.seaweedfs, pytest.mark.long('an MLflow server, and a p
 def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keygen, pack, sign and publish on Spark; sync, list, show, rollback, use, pin and unpin on Thor; all by the verbs."""
     monkeypatch.setattr(registry, 'PAGE', 1)  # as many answers as there are versions
-    bucket_of(tower)
+    client = bucket_of(tower)
     name = f'patrol_{uuid4().hex[:8]}'
     spark = tower.environment('spark') | tower.tracking('spark') | {'SHADOWHOUND_HOME': str(tmp_path / 'spark_home')}
     thor = tower.environment('thor') | tower.tracking('thor') | {'SHADOWHOUND_HOME': str(tmp_path / 'thor'),
@@ -33,14 +34,18 @@ def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.M
         assert done.exit_code == 0 or done.return_value == 0, done.output
         return json.loads(done.output) if '--json' in arguments else done.output
 
-    def publish(version: int) -> str:
-        folder = trained(tmp_path / f'trained_{version}', linear(0.1 * version))
-        packed = str(tmp_path / f'packed_{version}')
-        made = run(spark, 'pack', str(folder), '--name', name, '--smoke', f'{folder}.npz', '--p99-ms', '5000',
-                   '-o', packed, '--json')  # fmt: skip
-        run(spark, 'sign', packed, '--key', str(key))
-        run(spark, 'publish', packed, '--alias', 'champion')
+    def packed(folder: str, gain: float, *arguments: str) -> str:
+        """The id of what is in the folder then, signed."""
+        of_training = trained(tmp_path / f'trained_{folder}', linear(gain))
+        made = run(spark, 'pack', str(of_training), '--name', name, '--smoke', f'{of_training}.npz', '--p99-ms', '5000',
+                   '-o', str(tmp_path / folder), '--json', *arguments)  # fmt: skip
+        run(spark, 'sign', str(tmp_path / folder), '--key', str(key))
         return str(made['policy'])
+
+    def publish(version: int) -> str:
+        made = packed(f'packed_{version}', 0.1 * version)
+        run(spark, 'publish', str(tmp_path / f'packed_{version}'), '--alias', 'champion')
+        return made
 
     key = tmp_path / 'spark.key'
     run(spark, 'keygen', str(key))
@@ -49,6 +54,14 @@ def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.M
     run(thor, 'list', '--json')
     shutil.copy(tmp_path / 'spark.key.pub', tmp_path / 'thor' / 'policies' / 'keys')
     assert run(thor, 'sync', '--json')['done'] == 'activated'
+    of_another = {'Bucket': 'lerobot', 'Key': f'policies/go2/{name}_v2/model.onnx'}
+    client.put_object(Body=b'of a publication that was cut off', **of_another)
+    for version, remedy in (('1', '--version 2'), ('2', 'cut off')):
+        packed(f'other_{version}', 0.7, '--version', version)
+        with pytest.raises(PolicyError, match=f'another {name}@{version} is there already') as raised:
+            run(spark, 'publish', str(tmp_path / f'other_{version}'))
+        assert remedy in raised.value.remedy
+    client.delete_object(**of_another)
     with active(tmp_path / 'thor') as policy:
         assert policy.id == first
         assert [spec.names for spec in policy.manifest.inputs] == [('x', 'y', 'yaw')]
@@ -62,6 +75,6 @@ def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.M
     run(thor, 'use', f'{name}@2')
     assert run(thor, 'sync', '--json') == {'wanted': second, 'active': second, 'done': 'pinned', 'p99_ms': None,
                                            'fetched_bytes': 0, 'begun_anew': 0}  # fmt: skip
-    run(thor, 'unpin')
+    assert run(thor, 'unpin') == 'follows the registry again\n'
     run(thor, 'pin')
     assert run(thor, 'show', '--json')['policy'] == second

@@ -64,7 +64,7 @@ export function Cards({ figures }) {
       <dl><dt>of at most</dt><dd>${volume(spool?.max_bytes)}</dd><dt>disk has free</dt><dd>${volume(spool?.free_bytes)}</dd><dt>quarantined</dt><dd>${digits(spool?.quarantined)}</dd></dl></div>
     <div class="panel card"><h3>Queue</h3><p class="big">${digits(queue?.messages)} <small>messages</small></p>
       <${Bar} part=${queue?.messages ?? 0} whole=${queue?.max_messages} label="how full the queue is" />
-      <dl><dt>in memory</dt><dd>${volume(queue?.bytes)}</dd><dt>mission</dt><dd>${figures.mission?.mission_id || figures.mission?.active?.mission_id || 'none'}</dd><dt>bag</dt><dd>${figures.bag?.name || figures.bag?.bag || figures.bag?.state || 'none'}</dd></dl></div>
+      <dl><dt>in memory</dt><dd>${volume(queue?.bytes)}</dd><dt>mission</dt><dd>${figures.mission?.mission_id || figures.mission?.active?.mission_id || 'none'}</dd>${figures.mission?.policy ? html`<dt>policy</dt><dd data-field="policy">${figures.mission.policy}</dd>` : ''}<dt>bag</dt><dd>${figures.bag?.name || figures.bag?.bag || figures.bag?.state || 'none'}</dd></dl></div>
   </div>`;
 }
 
