@@ -77,9 +77,11 @@ def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], si
             raise SettingError(f'align[{name!r}]', how, 'a time of more than 0 s')
     found = _rows(query.objects(source, findings=findings, sensor=anchor, **flags))
     ends = pc.utf8_lower(pc.replace_substring_regex(found['key'], r'^.*\.([^./]*)$', r'\1'))
-    decoded = found.filter(pc.is_in(ends, value_set=pa.array(sorted(IMAGES | CLOUDS | ARCHIVES))))
-    anchors = tracks_of(_possible(decoded, findings))
+    found = _kept(found, pc.is_in(ends, value_set=pa.array(sorted(IMAGES | CLOUDS | ARCHIVES))))
+    anchors = tracks_of(_possible(found, findings))
+    del found, ends
     sides = _sides(source, list(anchors.values()), aligned, findings) if anchors else {}
+    pa.default_memory_pool().release_unused()  # of a million rows 1 GB
     return Selection(tuple(anchors.values()), dict(aligned), sides, size)
 
 
@@ -122,7 +124,12 @@ def _possible(rows: pa.Table, findings: Findings) -> pa.Table:
     is_possible = pc.and_(pc.greater_equal(counts, 0), pc.less_equal(counts, MOST_MEMBERS))
     for row in rows.filter(pc.invert(is_possible)).select(['key', 'count']).to_pylist():
         findings.add(row['key'], f'its row claims {row["count"]:,} messages', 1)
-    return rows.filter(is_possible)
+    return _kept(rows, is_possible)
+
+
+def _kept(rows: pa.Table, mask: pa.ChunkedArray) -> pa.Table:
+    """A filter copies: not where all are kept."""
+    return rows if pc.all(mask).as_py() else rows.filter(mask)
 
 
 def tracks_of(rows: pa.Table) -> dict[tuple[str, str], Track]:

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 import simplejpeg
 from lake.making import NOON_NS, folder_store
@@ -22,6 +24,7 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.fetch import Wish, fetch
 from shadowhound_data_logger.lake.fetched import keep_rows
+from shadowhound_data_logger.lake.track import Track
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
@@ -308,3 +311,21 @@ def test_from_a_real_server(tmp_path: Path, seaweed: Tower, frames: str) -> None
     assert all(same(one[number], other[number]) for number in range(len(one)))
     for each in (one, other):
         each.close()
+
+
+@pytest.mark.long('a million rows')
+def test_the_index_of_a_million_objects_is_small() -> None:
+    """Every worker of a DataLoader gets one: at most 300 MB, keys and checksums included."""
+    count = 1_000_000
+    numbers = np.arange(count)
+    names = pa.array([f'thor/camera/20261028/{number:06d}_front.jpg' for number in range(count)], pa.large_string())
+    columns = {'robot': 'thor', 'sensor': 'camera', 'type': 'sensor_msgs/msg/CompressedImage', 'bucket': 'sensor-data'}
+    rows = pa.table({
+        **{name: pa.repeat(pa.scalar(value, pa.large_string()), count) for name, value in columns.items()},
+        'key': names, 'sha256': pc.binary_join_element_wise(names, names, pa.scalar('', pa.large_string())),
+        **dict.fromkeys(('t_start_ns', 't_end_ns', 'bytes', 'clock_offset_ns'), numbers),
+        'count': np.ones(count, np.int64), **dict.fromkeys(('x', 'y', 'yaw', 'battery_pct'), numbers / 2),
+    })  # fmt: skip
+    track = Track.of(rows)
+    assert len(track) == count
+    assert len(pickle.dumps(track)) < 300e6
