@@ -12,6 +12,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
@@ -259,9 +260,16 @@ def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store
             found.append((job[0], build(*job), job[-1]))
         return found
     with ProcessPoolExecutor(workers, mp_context=get_context('spawn')) as pool:
-        for number, (job, told) in enumerate(zip(jobs, pool.map(build, *zip(*jobs, strict=True)), strict=True)):
-            say(f'episode {number + 1} of {len(jobs)}: {job[0].mission.mission_id}')
-            found.append((job[0], told, job[-1]))
+        futures = [pool.submit(build, *job) for job in jobs]
+        for number, (job, future) in enumerate(zip(jobs, futures, strict=True)):
+            mission = job[0].mission.mission_id
+            try:
+                found.append((job[0], future.result(), job[-1]))
+            except BrokenProcessPool as error:
+                raise LakeError(f'a process died while episodes were made; {mission} is not made, and nothing was added',
+                                remedy='run it again, with fewer --workers if memory ran out: '
+                                       'episodes that were made need not be made again') from error  # fmt: skip
+            say(f'episode {number + 1} of {len(jobs)}: {mission}')
     return found
 
 

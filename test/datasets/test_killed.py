@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +14,33 @@ from datasets.recorded import House, Mission
 
 from shadowhound_data_logger.datasets.export import drop, export, resumed
 from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.lake.training import INFO
 
 PATROLS = {'mission_type': 'patrol'}
 
 pytestmark = pytest.mark.long('an export for each file that it writes')
+
+
+DYING = """
+import os, signal, sys
+from pathlib import Path
+from shadowhound_data_logger.catalogue.schema import BUCKET
+from shadowhound_data_logger.datasets.export import export
+from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.options import StoreSettings
+
+folder, store, at, real, done = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), os.replace, 0
+def replace(*arguments, **more):
+    global done
+    done += 1
+    if done == at:
+        os.kill(os.getpid(), signal.SIGKILL)
+    real(*arguments, **more)
+os.replace = replace
+export(folder, Bucket(StoreSettings(directory=store), BUCKET), {'mission_type': 'patrol'}, ExportOptions())
+"""
 
 
 class Killed(BaseException):
@@ -32,6 +58,11 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> House:
     for number in range(2):
         made.record(Mission(f'm{number}', begin_s=100 * number, seconds=2, sensors=('camera', 'odom')))
     return made
+
+
+def suicide(*_: Any) -> None:
+    """In a worker."""
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def dying(patch: pytest.MonkeyPatch, at: int) -> None:
@@ -65,6 +96,31 @@ def test_an_export_that_was_killed_goes_on(house: House, tmp_path: Path) -> None
         export(folder, house.source, PATROLS, ExportOptions())
         assert contents(folder) == wanted, at
     assert at > 15
+
+
+def test_a_process_that_was_killed_is_followed_by_another(house: House, tmp_path: Path) -> None:
+    """With SIGKILL, in an episode and while the data set is written: another process goes on."""
+    export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
+    wanted = contents(tmp_path / 'whole')
+    for at in (1, 4, 12):
+        folder = tmp_path / f'set{at}'
+        arguments = [sys.executable, '-c', DYING, str(folder), str(house.settings.directory), str(at)]
+        environ = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}
+        assert subprocess.run(arguments, env=environ, check=False, timeout=120).returncode == -signal.SIGKILL
+        export(folder, house.source, PATROLS, ExportOptions())
+        assert contents(folder) == wanted, at
+
+
+def test_a_worker_that_was_killed_is_told(house: House, tmp_path: Path) -> None:
+    """Nothing was added then; the next run gives the same files."""
+    export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('shadowhound_data_logger.datasets.export.build', suicide)
+        with pytest.raises(LakeError, match='a process died while episodes were made; m0 is not made'):
+            export(tmp_path / 'set', house.source, PATROLS, ExportOptions(), workers=2)
+    assert not (tmp_path / 'set' / INFO).exists()
+    export(tmp_path / 'set', house.source, PATROLS, ExportOptions(), workers=2)
+    assert contents(tmp_path / 'set') == contents(tmp_path / 'whole')
 
 
 def test_a_drop_that_was_killed_comes_to_its_end(house: House, tmp_path: Path) -> None:
