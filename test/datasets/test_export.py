@@ -124,6 +124,55 @@ def test_a_gap_is_flagged_at_its_ticks_and_nowhere_else(exported: Exported) -> N
     assert row[f'{OURS}images.front/stale_share'] == pytest.approx(6 / len(stamps), abs=1e-6)
 
 
+def seeded_gaps(seed: int) -> tuple[Mission, dict[str, list[tuple[float, float, str]]]]:
+    """A mission that loses something of every sensor eight times; and of each loss from when, to when, its cause."""
+    rng = np.random.default_rng(seed)
+    mission = Mission(f'lossy{seed}', begin_s=1000 + 100 * seed, seconds=30)
+    injected: dict[str, list[tuple[float, float, str]]] = {}
+    for sensor in mission.sensors:
+        begins = 1.5 + 3.5 * np.arange(8) + rng.uniform(0, 1.2, 8)
+        causes = rng.choice(['transport', 'restart', ''], 8)
+        ends = begins + rng.uniform(0.1, 2.0, 8)
+        injected[sensor] = list(zip(begins.tolist(), ends.tolist(), causes.tolist(), strict=True))
+        mission.has[sensor] = lambda _, stamp, gaps=injected[sensor]: not any(
+            first < (stamp - mission.begin_ns) / SECOND < last for first, last, _ in gaps
+        )  # fmt: skip
+    told = [(sensor, *gap) for sensor, gaps in injected.items() for gap in gaps if gap[2]]
+    mission.gaps = [lost(mission, sensor, first, last, cause) for sensor, first, last, cause in told]
+    return mission, injected
+
+
+@pytest.mark.long('a second of CPU or more')
+@pytest.mark.parametrize('seed', range(3))
+def test_injected_gaps_are_flagged_at_exactly_their_ticks(tmp_path: Path, seed: int) -> None:
+    """Of every stream, with the cause of the gap that covers the tick, and nothing else is flagged."""
+    place = House(tmp_path)
+    mission, injected = seeded_gaps(seed)
+    place.record(mission)
+    options = ExportOptions(state=('pose', 'imu', 'joints'), allow_gaps=True)
+    export(tmp_path / 'set', place.source, PATROLS, options)
+    made = Lerobot(tmp_path / 'set')
+    (ticks,), (stale,) = (rows_of(made, mission.name, name) for name in ('shadowhound.stamp_ns', 'shadowhound.stale'))
+    streams = made.info['features']['shadowhound.stale']['names'] if made.info else []
+    causes = pq.read_table(made.path(DATA, made.rows[0], 'data'))['shadowhound.cause'].to_pylist()
+    said = [dict(pair.split('=') for pair in cause.split(';') if pair) for cause in causes]
+    flagged = 0
+    for sensor, stream in (('camera', 'images.front'), ('odom', 'state.pose'), ('imu', 'state.imu'), ('joints', 'state.joints')):
+        published = np.array(mission.stamps(sensor))
+        newest = published[np.searchsorted(published, ticks[:, 0], 'right') - 1]
+        expected = ticks[:, 0] - newest > 1.5 * SECOND / 10
+        assert np.array_equal(stale[:, streams.index(stream)] == 1, expected), stream
+        flagged += int(expected.sum())
+        for number, tick in enumerate(ticks[:, 0]):
+            if not expected[number]:
+                assert stream not in said[number]
+                continue
+            at = (int(tick) - mission.begin_ns) / SECOND
+            (cause,) = (cause for first, last, cause in injected[sensor] if first < at < last + 0.1)
+            assert said[number][stream] == (cause or 'not_published'), (stream, at)
+    assert flagged > 100
+
+
 def test_a_mission_with_too_large_gaps_is_refused(house: House, tmp_path: Path) -> None:
     """With the reason, on the screen and in the report; ``allow_gaps`` takes it with its flags."""
     options = ExportOptions(max_stale=0.05)
