@@ -63,7 +63,7 @@ def main(robot: str, output: str, name: str, count: int, threads: int, seed: int
             seen = pull.kept(source, robot, want, Findings(lambda _: None))['key'].to_pylist()
             expiry_ns = SHORT_S * SECOND if is_short else 3600 * SECOND
             asked = pull.ask(store, source, robot, want, by=f'{name}-{number % 3}', priority=priority, expiry_ns=expiry_ns)
-            write({'id': asked.id, 'made_ns': asked.made_ns, 'keys': seen, 'short': is_short, 'cancelled': is_cancelled})
+            write({'id': asked.id, 'by': asked.by, 'made_ns': asked.made_ns, 'keys': seen})
             if is_cancelled:
                 pull.cancel(store, source, robot, asked.id, by=name)
         except (DataLoggerError, OSError) as error:  # the store is away, or the mailbox full: nothing was asked for

@@ -2,8 +2,10 @@
 
 A node keeps pictures, clouds, batches and slices, more than keep.max_bytes lets it, on a small disk that somebody else fills at
 times. Requesters ask for random seconds of it, some for a moment only, some take it back, a hundred at once; any of the others
-may be killed. Afterwards every request has its last answer, everything that was seen at the asking is in the store, verified, or
-accounted for, of slices the messages of the time that was asked for, and the ledger closes.
+may be killed. What happens next depends on what was answered, never on the time: a slow machine makes the campaign longer, not
+easier. Afterwards every request has its last answer, everything that was seen at the asking is in the store, verified, or
+accounted for, of slices the messages of the time that was asked for, and the ledger closes. A campaign that served few, or in
+which some kind of fault never fell while requests were open, has failed.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, Final
@@ -31,12 +33,13 @@ from e2e.wire import HANG, PASS, REFUSE, Wire
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.bags.verify import verify_remote
 from shadowhound_data_logger.catalogue.schema import KEPT, OBJECTS
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import SpoolSettings, UploadSettings
 from shadowhound_data_logger.lake import pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.reading import tables
+from shadowhound_data_logger.mailbox import KeptFilter
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile, Ranged, StoredFile
@@ -51,23 +54,42 @@ from torture._disks import Disk, NotAllowed, inside, small_disk
 ROBOT: Final = 'thor'
 KILLS, SHORT_KILLS = 30, 5
 AT_ONCE: Final = 100
-UP_S: Final = (3.0, 8.0)
+COUNT: Final = 10
+"""Requests of one requester, who is followed by another one when few are open."""
+FEW: Final = 6
+ANSWERED: Final = 5
+"""Requests that get an object between a fault and the next kill."""
+SERVED_A_KILL, SERVED_SHARE = 3, 1 / 3
+"""At the least: a campaign in which fewer requests got an object has proved nothing."""
 AT_THE_START: Final = 0.2
-"""Share of the nodes that are killed whether or not they listen yet."""
-ANSWER_S: Final = 240.0
-LEAST_SERVED: Final = 3
-"""A campaign in which fewer than one request of so many got an object has proved nothing."""
+"""Share of the nodes that are killed once more before they listen."""
+ABOVE: Final = 20
+"""Objects that are spooled, or evicted, while a store is away, or the disk full."""
+FULL_S: Final = 60.0
+"""With a full disk not even an eviction may be written down: then the kill comes after this."""
+WAIT_S: Final = 900.0
+"""Longer than anything takes that works, on a machine that is busy with much else."""
+EXPIRY_S: Final = 15.0
+"""Of a request that is to expire in the middle; longer when nothing was sent by then."""
+MUCH: Final = 100
+"""Kept objects, more than are released at once."""
+TRIES: Final = 5
 PARAMETERS: Final[dict[str, Any]] = {
     'camera.rate_hz': 5.0, 'camera.ship': 'on_request', 'lidar.ship': 'on_request', 'imu.ship': 'on_request',
     'bag.record': 'always', 'bag.topics': ['/odom', '/imu', '/point_cloud2'], 'bag.slice_s': 5.0, 'bag.compression': 'none',
     'bag.ship': 'on_request',
-    'keep.max_bytes': 24 << 20, 'keep.poll_s': 0.5, 'catalogue.period_s': 2.0,
+    'keep.max_bytes': 64 << 20, 'keep.poll_s': 0.5, 'catalogue.period_s': 2.0,
     'upload.max_mbps': 8.0, 'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
 }  # fmt: skip
 NO_ROOM: Final = {'spool.min_free_bytes': 1 << 60}
 """A reserve that no disk has: whatever may go has to."""
-DISK_MB: Final = 160
+DISK_MB: Final = 256
 HOME: Final = 'disk/home'
+KILL, REQUESTER, TOWER, REFUSED, HUNG, FULL, EXPIRY, CROWD, EVICTION = KINDS = (
+    'kill of the robot', 'kill of a requester', 'kill of Tower', 'outage', 'outage that hangs', 'full disk',
+    'expiry in the middle of a pull', f'{AT_ONCE} requests at once', 'eviction of what was asked for',
+)  # fmt: skip
+"""Each has to fall while requests are open."""
 
 
 class Campaign:
@@ -78,60 +100,155 @@ class Campaign:
         self._folder, self._tower, self._wire, self._processes, self._rng = folder, tower, wire, processes, rng
         self._environ = tower.environment() | {'AWS_ENDPOINT_URL': wire.url}
         self._requesters: list[subprocess.Popen[bytes]] = []
-        self._crowd: subprocess.Popen[bytes] | None = None
         self._said = folder / 'asked.jsonl'
+        self._source = Bucket(tower.store_settings(), 'sensor-data')
+        self._node: Node
         self.unbalanced: list[str] = []
         self.failed = 0
         """Times that nothing was asked for, since the store was away."""
-        self.kills = Counter[str]()
+        self.exercised = Counter[str]()
+        """Kind of fault -> how often it fell while requests were open."""
         self.home = folder / HOME
         self._filler = disk.path / 'filler'
 
     def run(self, kills: int) -> None:
         """Everything but the judgement; the node has stopped then."""
-        node = self._start()
-        node.said('logging ')
-        sim = self._processes.sim('rate_scale:=0.5', 'image_raw:=false')
-        until(lambda: node.ledger()['objects']['kept'] > 20, 'something is kept')
-        for number in range(1, kills + 1):
-            self._turn_store()
-            self._ask(threads=1, count=4)
-            if number == kills // 2:
-                self._wire.set(PASS)
-                self._crowd = self._ask(threads=20, count=AT_ONCE)
-            if self._rng.random() > AT_THE_START:
-                node.said('logging ')
-            time.sleep(self._rng.uniform(*UP_S))  # the moment of death, not a wait for anything
-            self._kill_requester()
-            node.kill()
-            self.kills['robot'] += 1
+        self._start()
+        sim = self._processes.sim('rate_scale:=0.2', 'image_raw:=false')
+        self._await(lambda: self._objects('kept') > ABOVE, 'something is kept')
+        plan = self._plan(kills)
+        for number, kinds in enumerate(plan, 1):
+            for kind in kinds:
+                self._fault(kind)
+            if FULL in kinds:  # on which it may not write down any more that something was delivered
+                self._kill_robot()
+                self.exercised[KILL] += self._open() > 0
+            else:
+                self._await_served(ANSWERED)
+                self._exercise(KILL, self._kill_robot)
             self._filler.unlink(missing_ok=True)
-            found = ledger.imbalances(ledger.read(self.home / 'spool', ROBOT))
-            self.unbalanced += [f'after kill {number}: {line}' for line in found]
-            if number % 4 == 1:
-                self._fill()
-            node = self._start(NO_ROOM if number % 8 == 3 else {})
-            if number % 5 == 0:
-                self._tower.stop_s3()
-                self.kills['Tower'] += 1
-                self._tower.start_s3()
-                progress(f'{number} kills')
-        node.kill()
-        node = self._start()
-        self._wire.set(PASS)
-        node.said('logging ')
+            self._wire.set(PASS)
+            if self._rng.random() < AT_THE_START:
+                self._node = self._new_node()
+                time.sleep(self._rng.uniform(0.0, 2.0))  # the moment of death, not a wait for anything
+                self._kill_robot()
+            self._start()
+            progress(f'{number} kills, {self._served()} requests served, {self._open()} open: {", ".join(kinds)}')
         for requester in self._requesters:
-            requester.wait(240)
+            requester.wait(WAIT_S)
         sim.signal(signal.SIGINT)
+        self._await_last_answers()
         progress('all requests are answered')
-        self._await_answers(node)
-        node.delivered(1, ANSWER_S)
-        node.stop(seconds=60.0)
+        self._node.delivered(1, WAIT_S)
+        self._node.stop(seconds=WAIT_S)
+
+    def _plan(self, kills: int) -> list[list[str]]:
+        """What happens before each kill: every kind, about equally often, but one crowd; a full disk comes last."""
+        others = [kind for kind in KINDS if kind not in {KILL, CROWD}]
+        deck: list[str] = []
+        while len(deck) < max(kills, len(others)):
+            deck += self._rng.sample(others, len(others))
+        deck.insert(len(deck) // 2, CROWD)
+        return [sorted(deck[number::kills], key=FULL.__eq__) for number in range(kills)]
+
+    # -- faults ----------------------------------------------------------------------------------------------------
+
+    def _fault(self, kind: str) -> None:
+        if kind == REQUESTER:
+            requester = self._make_requester()
+            self._exercise(kind, requester.kill)
+        elif kind == TOWER:
+            self._exercise(kind, self._tower.stop_s3)
+            self._go_on('spooled')
+            self._tower.start_s3()
+        elif kind in {REFUSED, HUNG}:
+            self._exercise(kind, lambda: self._wire.set(REFUSE if kind == REFUSED else HANG))
+            self._go_on('spooled')
+            self._wire.set(PASS)
+        elif kind == FULL:
+            self._exercise(kind, self._fill)
+            with suppress(AssertionError):
+                self._go_on('evicted', FULL_S)
+        elif kind == EXPIRY:
+            self._expire()
+        elif kind == CROWD:
+            before = len(self.asked())
+            self._ask(threads=20, count=AT_ONCE)
+            self._await(lambda: len(self.asked()) >= before + AT_ONCE // 2, 'many ask at once')
+            self._exercise(kind, lambda: None)
+        else:
+            self._evict()
+
+    def _exercise(self, kind: str, fault: Callable[[], object]) -> None:
+        """The fault, at a moment when requests are open: those that are so after it count."""
+        target = self._objects('delivered') + self._rng.randrange(12)
+        self._await(lambda: self._objects('delivered') >= target and self._open() > 1, f'requests are open: {kind}')
+        fault()
+        self.exercised[kind] += self._open() > 0
+
+    def _kill_robot(self) -> None:
+        self._node.kill()
+        found = ledger.imbalances(ledger.read(self.home / 'spool', ROBOT))
+        self.unbalanced += [f'after kill {self.exercised[KILL]}: {line}' for line in found]
+
+    def _make_requester(self) -> subprocess.Popen[bytes]:
+        """One that has made a request, and goes on to make more."""
+        name, requester = f'r{len(self._requesters)}-', self._ask(threads=1, count=1000)
+        self._await(lambda: any(each['by'].startswith(name) for said in self.asked().values() for each in said), 'one asks')
+        return requester
+
+    def _fill(self) -> None:
+        """Take all that is left of the disk, until the next kill."""
+        with suppress(OSError), self._filler.open('wb', buffering=0) as file:
+            while file.write(bytes(64 << 10)):
+                pass
+
+    def _expire(self) -> None:
+        """Ask for everything, and cut the wire when some of them have come, until the request is over."""
+        for attempt in range(TRIES):
+            self._await(lambda: self._objects('kept') > MUCH, 'much is kept')
+            name = self._ask_here(round(EXPIRY_S * (attempt + 1) * SECOND))
+            self._await(lambda name=name: self._has(name, 'delivered') or self._is_over(name), 'some of it has come')
+            self._wire.set(REFUSE)
+            self._await(lambda name=name: self._is_over(name), 'the request is over')
+            is_cut = self._has(name, 'delivered') and (self._has(name, 'kept') or self._has(name, 'unsent'))
+            self._wire.set(PASS)
+            if is_cut:
+                self.exercised[EXPIRY] += 1
+                return
+
+    def _evict(self) -> None:
+        """Ask a robot that does not hear it, and has to let things go before it does."""
+        for _ in range(TRIES):
+            self._await(lambda: self._objects('kept') > ABOVE and self._open() > 0, 'something is kept')
+            self._wire.set(REFUSE)
+            self._kill_robot()
+            name = self._ask_here(3600 * SECOND)
+            self._start(NO_ROOM)
+            self._go_on('evicted')
+            is_open = self._open() > 0
+            self._wire.set(PASS)
+            self._await(lambda name=name: self._is_over(name), 'what is gone is answered')
+            found = self._rows("SELECT gone FROM requests WHERE id = ? AND gone <> '{}'", name)
+            self._kill_robot()
+            self._start()
+            if is_open and found:
+                self.exercised[EVICTION] += 1
+                return
+
+    def _go_on(self, state: str, seconds: float = WAIT_S) -> None:
+        """Until so many more objects are in that state."""
+        target = self._objects(state) + ABOVE
+        self._await(lambda: self._objects(state) >= target, f'more are {state}', seconds)
+
+    # -- what is asked for, and what the robot says of it ----------------------------------------------------------
 
     def asked(self) -> dict[str, list[dict[str, Any]]]:
         """Request -> what those wrote down who asked for it."""
         found: dict[str, list[dict[str, Any]]] = {}
         self.failed = 0
+        if not self._said.exists():
+            return found
         for line in self._said.read_text(encoding='utf-8').splitlines():
             try:
                 said = json.loads(line)
@@ -142,56 +259,94 @@ class Campaign:
                 found.setdefault(said['id'], []).append(said)
         return found
 
-    def _await_answers(self, node: Node) -> None:
-        source, ids = Bucket(self._tower.store_settings(), 'sensor-data'), set(self.asked())
-
-        def are_answered() -> bool:
-            for name in list(ids):
-                answer = pull.newest_answer(source, ROBOT, name)
-                made_ns = max(each['made_ns'] for each in self.asked()[name])
-                if answer is not None and answer['state'] in pull.FINAL and answer['made_ns'] >= made_ns:
-                    ids.discard(name)
-            return not ids
-
-        until(are_answered, lambda: f'{len(ids)} requests are answered: {sorted(ids)[:3]} {node.log[-2000:]}', ANSWER_S)
-
-    def _start(self, more: dict[str, Any] | None = None) -> Node:
-        return self._processes.node(self._environ, {**PARAMETERS, **(more or {})}, ready=False, home=HOME)
-
     def _ask(self, *, threads: int, count: int) -> subprocess.Popen[bytes]:
+        """One in three feels the outages of the robot."""
         command = [sys.executable, '-m', 'torture._requester', ROBOT, str(self._said), f'r{len(self._requesters)}', str(count),
                    str(threads), str(self._rng.randrange(1 << 30))]  # fmt: skip
-        environ = {**os.environ, **self._environ}
+        environ = {**os.environ, **(self._environ if self._rng.random() < 1 / 3 else self._tower.environment())}
         with (self._folder / 'requesters.log').open('ab') as log:
             self._requesters.append(subprocess.Popen(command, env=environ, stdout=log, stderr=log))
         return self._requesters[-1]
 
-    def _fill(self) -> None:
-        """Take all that is left of the disk, until the next kill."""
-        self.kills['of these on a full disk'] += 1
-        with suppress(OSError), self._filler.open('wb', buffering=0) as file:
-            while file.write(bytes(64 << 10)):
-                pass
+    def _ask_here(self, expiry_ns: int) -> str:
+        """For all that is kept."""
+        now_ns = time.time_ns()
+        want = KeptFilter(since_ns=now_ns - 3600 * SECOND, until_ns=now_ns)
+        seen = pull.kept(self._source, ROBOT, want, Findings(lambda _: None))['key'].to_pylist()
+        with closing(S3Store(self._tower.store_settings(), UploadSettings())) as store:
+            store.open()
+            asked = pull.ask(store, self._source, ROBOT, want, by='here', priority=0, expiry_ns=expiry_ns)
+        with self._said.open('a', encoding='utf-8') as file:
+            file.write(json.dumps({'id': asked.id, 'by': 'here', 'made_ns': asked.made_ns, 'keys': seen}) + '\n')
+        return asked.id
 
-    def _kill_requester(self) -> None:
-        living = [each for each in self._requesters if each.poll() is None and each is not self._crowd]
-        if living and self._rng.random() < 0.5:
-            self._rng.choice(living).kill()
-            self.kills['requester'] += 1
+    def _await(self, condition: Callable[[], bool], what: str, seconds: float = WAIT_S) -> None:
+        """Meanwhile others ask, so that requests are open."""
 
-    def _turn_store(self) -> None:
-        if self._crowd is not None and self._crowd.poll() is None:
-            return
-        if self._rng.random() < 0.5:
-            self._wire.set(self._rng.choice((PASS, PASS, PASS, REFUSE, HANG)))
+        def looked() -> bool:
+            time.sleep(0.1)
+            if self._open() < FEW and all(each.poll() is not None for each in self._requesters):
+                self._ask(threads=3, count=COUNT)
+            return condition()
+
+        until(looked, lambda: f'{what}; of the node: {self._node.log[-2000:]}', seconds)
+
+    def _await_served(self, count: int) -> None:
+        target = self._served() + count
+        self._await(lambda: self._served() >= target, f'{count} more requests are served')
+
+    def _rows(self, query: str, *values: str) -> list[tuple[Any, ...]]:
+        """Of the robot's index, which is left as it is, whether the robot lives or not."""
+        with closing(sqlite3.connect(f'file:{self.home}/spool/index.db?mode=ro', uri=True, timeout=60.0)) as db:
+            return db.execute(query, values).fetchall()
+
+    def _open(self) -> int:
+        return int(self._rows("SELECT count(*) FROM requests WHERE state = 'active'")[0][0])
+
+    def _served(self) -> int:
+        """Requests that have their last answer, and got an object."""
+        got = "SELECT * FROM requested WHERE request = requests.id AND outcome = 'delivered'"
+        query = f"SELECT count(*) FROM requests WHERE state <> 'active' AND told = state AND EXISTS ({got})"  # noqa: S608 - own text
+        return int(self._rows(query)[0][0])
+
+    def _is_over(self, request: str) -> bool:
+        return bool(self._rows("SELECT * FROM requests WHERE id = ? AND state <> 'active'", request))
+
+    def _has(self, request: str, outcome: str) -> bool:
+        """Whether that became of any object of a request."""
+        return bool(self._rows('SELECT * FROM requested WHERE request = ? AND outcome = ? LIMIT 1', request, outcome))
+
+    def _objects(self, state: str) -> int:
+        return int(self._rows('SELECT ifnull(sum(objects), 0) FROM tally WHERE state = ?', state)[0][0])
+
+    # -- the robot -------------------------------------------------------------------------------------------------
+
+    def _new_node(self, more: dict[str, Any] | None = None) -> Node:
+        return self._processes.node(self._environ, {**PARAMETERS, **(more or {})}, ready=False, home=HOME)
+
+    def _start(self, more: dict[str, Any] | None = None) -> None:
+        self._node = self._new_node(more)
+        self._node.said('logging ', WAIT_S)
+
+    def _await_last_answers(self) -> None:
+        made = {name: max(each['made_ns'] for each in said) for name, said in self.asked().items()}
+
+        def are_answered() -> bool:
+            for name, made_ns in list(made.items()):
+                answer = pull.newest_answer(self._source, ROBOT, name)
+                if answer is not None and answer['state'] in pull.FINAL and answer['made_ns'] >= made_ns:
+                    del made[name]
+            return not made
+
+        until(are_answered, lambda: f'{len(made)} requests are answered: {sorted(made)[:3]} {self._node.log[-2000:]}', WAIT_S)
 
 
-def judge(campaign: Campaign, tower: Tower) -> tuple[dict[str, Any], list[Bar]]:
+def judge(campaign: Campaign, tower: Tower, kills: int) -> tuple[dict[str, Any], list[Bar]]:
     """What was found."""
     wrong: dict[str, list[str]] = {name: [] for name in (
         'unbalanced', 'unanswered or contradictory', 'seen and neither stored nor accounted for', 'not what was spooled',
         'cut out of slices and not their messages',
-        'too few requests served to prove anything',
+        'too few requests served to prove anything', 'kinds of fault that never fell while requests were open',
         'twice in the catalogue', 'protected and evicted', 'quarantined or renamed', 'to be recovered after a clean stop',
     )}  # fmt: skip
     wrong['unbalanced'] += campaign.unbalanced
@@ -214,15 +369,18 @@ def judge(campaign: Campaign, tower: Tower) -> tuple[dict[str, Any], list[Bar]]:
         wrong['quarantined or renamed'] += [key for (key,) in db.execute(
             "SELECT key FROM objects WHERE state = 'quarantined' OR key GLOB '*/_answers/*_*.json'")]  # fmt: skip
         served, requests = figures['answered']['served'], sum(figures['requests'].values())
-        if served * LEAST_SERVED < requests:
+        if served < max(SERVED_A_KILL * kills, SERVED_SHARE * requests):
             wrong['too few requests served to prove anything'].append(f'{served} of {requests}')
+        wrong['kinds of fault that never fell while requests were open'] += [
+            kind for kind in KINDS if not campaign.exercised[kind]
+        ]
         figures['objects'] = dict(db.execute('SELECT state, sum(objects) FROM tally GROUP BY state').fetchall())
     wrong['unbalanced'] += ledger.imbalances(ledger.read(campaign.home / 'spool', ROBOT))
     spool = Spool(campaign.home / 'spool', SpoolSettings(min_free_bytes=0), SystemClock.of_this_machine(), ROBOT)
     spool.open()
     wrong['to be recovered after a clean stop'] += [spool.recovery.describe()] if spool.recovery.found_anything else []
     spool.close()
-    figures['kills'] = dict(campaign.kills)
+    figures['faults while requests were open'] = dict(campaign.exercised)
     figures['asked in vain, for the store was away'] = campaign.failed
     bars = [Bar(f'{len(found)} {what}', not found, '; '.join(found[:3])) for what, found in wrong.items()]
     return figures, bars
@@ -245,10 +403,10 @@ def _answers(campaign: Campaign, source: Bucket, store: S3Store, in_store: set[s
             'found that some is gone': bool(answer['gone']) or bool(answer['lost']),
             'expired or taken back in the middle': answer['state'] in {'expired', 'cancelled'} and 'delivered' in outcomes,
         })  # fmt: skip
-        is_over = set(outcomes) <= (
-            {'delivered', 'quarantined'} if answer['state'] == 'done' else {'delivered', 'quarantined', 'unsent'}
-        )
-        if not is_over or sum(outcomes.values()) != answer['objects']:
+        # What a request that is over did not get may go from then on, before the last answer can be made.
+        is_over = set(outcomes) <= {'delivered', 'quarantined', *(() if answer['state'] == 'done' else ('unsent', 'evicted'))}
+        went_early = answer['state'] == 'expired' and any(each['when'] < answer['expires'] for each in answer['lost'])
+        if not is_over or went_early or sum(outcomes.values()) != answer['objects']:
             wrong['unanswered or contradictory'].append(f'{name} {answer["state"]} {answer["objects"]} {outcomes}')
         if answer['state'] == 'done':
             missing = {key for each in askings for key in each['keys']} - in_store - lost
@@ -311,7 +469,7 @@ def _run(given: argparse.Namespace) -> int:
                     campaign.run(given.kills)
                 finally:
                     processes.end()
-            figures, bars = judge(campaign, tower)
+            figures, bars = judge(campaign, tower, given.kills)
         if not given.json:
             print(json.dumps(figures, indent=1))
         code = verdict(figures, bars, as_json=given.json)
