@@ -18,8 +18,8 @@ SAMPLE_S: Final = 5.0
 """Of uploading without a pause, for one sample: shorter ones would measure single objects."""
 MOST_SAMPLES: Final = 120
 """In one object: ten minutes of uploading."""
-LONGEST_S: Final = 900.0
-"""From the first sample of an object to its end."""
+FIRST_S, LONGEST_S = 60.0, 900.0
+"""From the first sample of an object to its end: of the first object, so that a pace is known soon, and of any other."""
 RECENT: Final = 24
 """Samples that the pace is the median of: two minutes of uploading."""
 LINK: Final = '_wifi'
@@ -42,6 +42,7 @@ class LinkTrack:
         self._monotonic = monotonic
         self._began: tuple[float, int] | None = None
         self._samples: list[dict[str, Any]] = []
+        self._longest_s = FIRST_S
         self._recent = deque[float](maxlen=RECENT)
 
     @property
@@ -63,7 +64,7 @@ class LinkTrack:
         if not self._samples:
             return None
         age_s = (self._clock.wall_ns() - self._samples[0]['stamp_ns']) / SECOND
-        return self._object() if is_last or len(self._samples) >= MOST_SAMPLES or age_s >= LONGEST_S else None
+        return self._object() if is_last or len(self._samples) >= MOST_SAMPLES or age_s >= self._longest_s else None
 
     def _sample(self, mbps: float, *, is_away: bool) -> None:
         stamp_ns = self._clock.wall_ns()
@@ -76,6 +77,7 @@ class LinkTrack:
 
     def _object(self) -> DataObject:
         samples, self._samples = self._samples, []
+        self._longest_s = LONGEST_S
         start_ns, end_ns = samples[0]['stamp_ns'], samples[-1]['stamp_ns']
         body = json.dumps({'robot': self._robot, 'sensor': LINK, 'samples': samples}).encode()
         return DataObject(

@@ -95,7 +95,9 @@ def _found_sentence(said: Mapping[str, Any]) -> str:
     if said['lost']:
         reasons = ', '.join(f'{reason} {count:,}' for reason, count in said['lost'].items())
         text += f'; {sum(said["lost"].values()):,} are lost ({visible(reasons)})'
-    if said['seconds'] is not None and said['objects']:
+    if said['objects'] and said['seconds'] is None:
+        text += '. How long that takes is not known: it has told no pace of its uploads yet'
+    elif said['objects']:
         text += f'. At its pace, {said["mbps"]:.1f} Mbit/s, that takes {duration(said["seconds"])}'
     return f'{text}.'
 

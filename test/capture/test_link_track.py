@@ -59,9 +59,14 @@ def test_a_sample_is_five_seconds_without_a_pause() -> None:
     assert link.track.mbps == 4.0
 
 
-def test_samples_are_objects_of_ten_minutes() -> None:
-    """And nothing is made where nothing was sent."""
+def test_the_first_object_comes_after_a_minute_and_others_after_ten() -> None:
+    """So that a pace is known soon; and nothing is made where nothing was sent."""
     link = Link()
     assert link.track.look(is_last=True) is None
-    link.send(5 * MOST_SAMPLES + 2, 1000)
-    assert [(one.sensor, one.key) for one in link.made] == [('_wifi', 'thor/_wifi/20251018/120006_wifi.json')]
+    link.send(65, 1000)
+    assert link.made == []
+    link.send(1, 1000)
+    link.send(5 * MOST_SAMPLES, 1000)
+    assert [(one.sensor, one.key) for one in link.made] == [
+        ('_wifi', 'thor/_wifi/20251018/120006_wifi.json'), ('_wifi', 'thor/_wifi/20251018/120111_wifi.json'),
+    ]  # fmt: skip
