@@ -41,6 +41,13 @@ def test_what_it_starts_is_there(service: dict[str, str]) -> None:
     assert all((UNIT.parent / name).is_file() for name in named)
 
 
+def test_the_smoke_run_of_policies_has_a_place_to_work() -> None:
+    """``ProtectSystem=strict`` leaves nothing to write in but home and /data."""
+    text = UNIT.with_name('shadowhound-policy.service').read_text(encoding='utf-8')
+    assert 'ProtectSystem=strict' in text
+    assert 'PrivateTmp=true' in text
+
+
 def test_refused_settings_are_not_tried_again(service: dict[str, str]) -> None:
     """A crash starts it again, exit code 2 does not; it has time to close before it is killed."""
     assert service['Restart'] == 'on-failure'

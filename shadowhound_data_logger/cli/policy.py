@@ -7,9 +7,9 @@ import os
 import random
 import signal
 import sys
-import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -184,12 +184,11 @@ def run(*, every: float, **given: Any) -> ExitCode:
     active version as ~/policy (std_msgs/String, latched), and takes word of its health on ~/health.
     """
     logging.basicConfig(level=logging.INFO, format='%(message)s')
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    for number in (signal.SIGINT, signal.SIGTERM):  # also in the middle of a download: whatever is cut off is done again
+        signal.signal(number, signal.default_int_handler)
     said = ''
-    with _syncing(given) as one, _telling():
-        while not stop.is_set():
+    with suppress(KeyboardInterrupt), _syncing(given) as one, _telling():
+        while True:
             try:
                 text = _sentence(one.run(again=False))
             except (DataLoggerError, OSError) as error:
@@ -197,7 +196,7 @@ def run(*, every: float, **given: Any) -> ExitCode:
             if text != said:
                 print(text, file=sys.stderr, flush=True)
                 said = text
-            stop.wait(every * random.uniform(1.0 - JITTER, 1.0 + JITTER))
+            time.sleep(every * random.uniform(1.0 - JITTER, 1.0 + JITTER))
     return ExitCode.FINE
 
 

@@ -38,7 +38,7 @@ from shadowhound_data_logger.policies.manifest import (
 )
 from shadowhound_data_logger.untrusted import from_strict_json
 
-MOST_STATE_BYTES: Final = 1 << 20
+MOST_STATE_BYTES: Final = 4 << 20
 MOST_REMEMBERED: Final = 1000
 """Versions of which a robot knows that they were verified here, or misbehaved."""
 BY_HAND: Final = 'rolled back by hand'
@@ -171,12 +171,15 @@ class PolicyFolder:
         os.replace(place, self.versions / name)
         disk.sync(self.versions)
 
-    def activate(self, name: str) -> None:
-        """Make this version the active one. Raises PolicyRefused, OSError."""
+    def activate(self, name: str) -> str | None:
+        """Make this version the active one, unless another one was pinned meanwhile; its id. Raises PolicyRefused, OSError."""
         with disk.flock(self.path / 'lock'):
             state = self.state()
+            if state.pin not in {None, name}:
+                return state.pin
             manifest = self.check(name, state, hashes=False)
             self._activate(state, manifest)
+            return None
 
     def use(self, name: str) -> None:
         """Activate and pin a version, also one that misbehaved. Raises PolicyRefused, OSError."""

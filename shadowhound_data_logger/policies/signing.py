@@ -10,6 +10,7 @@ import base64
 import hashlib
 import json
 import os
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -26,6 +27,7 @@ MOST_SIGNATURE_BYTES: Final = 4 << 10
 MOST_REVOCATION_BYTES: Final = 64 << 10
 MOST_KEYS: Final = 64
 KEY_BYTES: Final = 32
+_KEY_ID: Final = re.compile(r'[0-9a-f]{16}')
 REMEDY: Final = "install the extra: pip install 'shadowhound_data_logger[policies]'"
 
 Trusted = Mapping[str, 'Ed25519PublicKey']
@@ -108,7 +110,16 @@ def check_signature(content: bytes, signature: bytes, purpose: bytes, keys: Trus
 
 
 def revocation(key: Ed25519PrivateKey, number: int, keys: Collection[str]) -> bytes:
-    """A list of revoked keys, signed: the ``number``-th, of 1, 2, ..."""
+    """A list of revoked keys, signed: the ``number``-th, of 1, 2, ... Raises PolicyError for one that counts for nothing."""
+    for name in keys:
+        if not _KEY_ID.fullmatch(name):
+            raise PolicyError(f'{name[:100]!r} is no id of a key', remedy='policy keygen said it, and policy sign says it again')
+    if key_id(key.public_key().public_bytes_raw()) in keys:
+        raise PolicyError(
+            'robots take no list by a key that it revokes itself', remedy='sign it with another key that they trust'
+        )
+    if len(keys) > MOST_KEYS:
+        raise PolicyError(f'robots take no list of more than {MOST_KEYS} keys', remedy='make two lists of it')
     body = json.dumps({'format': 1, 'number': number, 'revoked': sorted(keys)})
     return json.dumps({'list': body, 'signature': sign(key, FOR_REVOCATION, body.encode()).decode()}).encode()
 
@@ -123,7 +134,7 @@ def read_revocation(content: bytes, number: int, keys: Trusted, revoked: Collect
         body, signature = str(told['list']).encode(), str(told['signature']).encode()
         said = from_strict_json(body, MOST_REVOCATION_BYTES)
         found = frozenset(map(str, said['revoked']))
-        is_right = said['number'] == number and len(found) <= MOST_KEYS
+        is_right = said['number'] == number and len(found) <= MOST_KEYS and all(map(_KEY_ID.fullmatch, found))
     except (ValueError, KeyError, TypeError) as error:
         raise PolicyRefused('revocation', f'the list {number} of revoked keys is damaged') from error
     check_signature(body, signature, FOR_REVOCATION, keys, {*revoked, *found})

@@ -55,7 +55,7 @@ def run_smoke(folder: Path, manifest: PolicyManifest, *, limit_s: float = SMOKE_
     try:
         answer = from_json(told, MOST_ANSWER_BYTES)
         reason, text, p99_ms = str(answer['reason']), str(answer['text'])[:300], float(answer['p99_ms'])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         what = f'signal {-code}' if code < 0 else f'exit code {code}'
         raise PolicyRefused('smoke', f'the smoke run of {manifest.id} ended with {what}') from error
     if reason == 'runtime':

@@ -153,7 +153,8 @@ class PolicySync:
             self.folder.install(name)
         if not self.may_activate():
             return SyncResult(name, self.folder.current(), 'waiting', p99_ms, traffic.fetched_bytes, traffic.begun_anew)
-        self.folder.activate(name)
+        if pinned := self.folder.activate(name):
+            return SyncResult(pinned, self.folder.current(), 'pinned', p99_ms, traffic.fetched_bytes, traffic.begun_anew)
         log.info('the policy %s is active', name)
         self.folder.clean(self.settings.keep)
         return SyncResult(name, name, 'activated', p99_ms, traffic.fetched_bytes, traffic.begun_anew)

@@ -9,7 +9,6 @@ manifest is rolled back. So whoever is on the robot's ROS network can send a pol
 from __future__ import annotations
 
 import logging
-import math
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -34,6 +33,8 @@ NODE: Final = 'shadowhound_policy'
 LOOK_S: Final = 0.1
 """How late a change of the active version is published."""
 MOST_HEALTH_BYTES: Final = 4096
+MOST_VALUE: Final = 1e9
+"""Failures, and ms."""
 END_S: Final = 5.0
 
 
@@ -74,12 +75,9 @@ class PolicyTopics:
             name, failures, p99_ms = told['policy'], told.get('failures', 0), told.get('p99_ms', 0.0)
         except (ValueError, KeyError, TypeError, AttributeError):
             return 'json'
-        if (
-            type(failures) is not int
-            or type(p99_ms) not in {int, float}
-            or not math.isfinite(p99_ms)
-            or min(failures, p99_ms) < 0
-        ):
+        if type(failures) is not int or type(p99_ms) not in {int, float}:
+            return 'values'
+        if not (0 <= failures <= MOST_VALUE and 0 <= p99_ms <= MOST_VALUE):
             return 'values'
         if not name or name != self._folder.current():
             return 'other'

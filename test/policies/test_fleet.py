@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -69,6 +70,30 @@ def speaker() -> Iterator[tuple[int, Callable[[str], object]]]:
         yield domain, say
         node.destroy_node()
         rclpy.try_shutdown(context=context)
+
+
+def test_a_service_ends_at_once_also_while_it_downloads(tower: Tower, tmp_path: Path) -> None:
+    """Of a download of minutes nothing is waited for, and what had come is there when it goes on."""
+    bucket_of(tower)
+    spark = Spark(tmp_path / 'spark', f'patrol_{uuid4().hex[:8]}')
+    thor = Robot('thor', tmp_path / 'thor', spark, tower.environment('thor') | tower.tracking('thor'))
+    of_spark = Robot('spark', tmp_path / 'spark', spark, tower.environment('spark') | tower.tracking('spark'))
+    spark.packed(1, linear(extra=5_000_000))
+    of_spark.verb('publish', str(spark.folder / 'packed_1'), '--alias', 'champion')
+    command = ['-m', 'shadowhound_data_logger.cli.main', 'policy', 'run', '--max-mbps', '1']
+    for number in (signal.SIGTERM, signal.SIGINT):
+        service = Process('policy run', command, tmp_path / 'run.log', {**os.environ, **thor.environ})
+        try:
+            before = sum(path.stat().st_size for path in thor.folder.incoming.rglob('*.onnx*'))
+            until(
+                lambda before=before: sum(path.stat().st_size for path in thor.folder.incoming.rglob('*.onnx*')) > before,
+                lambda service=service: f'it downloads: {service.log}',
+            )
+            service.signal(number)
+            assert service.wait(60.0) == 0, service.log
+        finally:
+            service.kill()
+    assert thor.folder.current() is None
 
 
 def test_a_canary_goes_first_and_goes_back_alone(  # noqa: PLR0915 - one story

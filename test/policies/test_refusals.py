@@ -25,7 +25,7 @@ from policies.models import ACTION, STATE, Scene, Spark, linear, trained
 
 from shadowhound_data_logger import disk
 from shadowhound_data_logger.errors import PolicyError, PolicyRefused
-from shadowhound_data_logger.policies import active, packing, smoke, sync
+from shadowhound_data_logger.policies import active, packing, signing, smoke, sync
 from shadowhound_data_logger.policies.content import check_content, check_files
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import MANIFEST, SIGNATURE, parse_manifest
@@ -104,7 +104,11 @@ def test_a_revoked_key(second: Scene) -> None:
     shutil.copy(other.public, second.folder.path / 'keys' / 'other.pub')
     second.sign(2, (second.place(2) / MANIFEST).read_bytes(), other.key)
     assert second.robot.run().done == 'activated'
-    packing.revoke(other.key, [other.key_id], second.store)
+    body = json.dumps({'format': 1, 'number': 1, 'revoked': [other.key_id]})
+    signature = signing.sign(signing.load_key(other.key), signing.FOR_REVOCATION, body.encode()).decode()
+    path = second.path / 'store' / 'lerobot' / packing.revocation_key(1)
+    path.parent.mkdir()
+    path.write_text(json.dumps({'list': body, 'signature': signature}))
     assert second.robot.run().done == 'unchanged'
     packing.revoke(second.spark.key, [other.key_id], second.store)
     result = second.robot.run()
@@ -113,6 +117,14 @@ def test_a_revoked_key(second: Scene) -> None:
     packing.revoke(other.key, [second.spark.key_id], second.store)
     assert second.refused() == 'revoked'
     assert second.folder.state().revoked == [other.key_id]
+
+
+@pytest.mark.parametrize('keys', [['spark.key'], ['0123456789ABCDEF'], ['own'], [f'{number:016x}' for number in range(65)]])
+def test_a_list_of_revoked_keys_that_robots_would_not_take_is_not_published(second: Scene, keys: list[str]) -> None:
+    """Names of files, the key that signs it, and too many: whoever revokes one learns it at once, and no number is used up."""
+    with pytest.raises(PolicyError):
+        packing.revoke(second.spark.key, [key.replace('own', second.spark.key_id) for key in keys], second.store)
+    assert second.store.head('lerobot', packing.revocation_key(1)) is None
 
 
 def test_lists_of_revoked_keys_that_are_none_cost_little(second: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -413,6 +425,23 @@ def test_no_mission_is_disturbed_and_no_version_in_use_removed(second: Scene) ->
         assert policy.model.is_file()
         assert len(second.folder.installed()) == 3
     assert second.folder.clean(1) == [first]
+
+
+@pytest.mark.parametrize('verb', ['pin', 'use'])
+def test_a_pin_holds_though_another_version_was_on_its_way(second: Scene, monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
+    """Who pins within a download finds that version active after it, and not for one look the other one."""
+    first = str(second.folder.current())
+
+    def pins(*_: object) -> float:
+        second.folder.pin() if verb == 'pin' else second.folder.use(first)
+        return 1.0
+
+    monkeypatch.setattr(sync, 'run_smoke', pins)
+    result = second.robot.run()
+    assert (result.done, result.wanted, result.active) == ('pinned', first, first)
+    assert second.folder.current() == first
+    second.folder.unpin()
+    assert second.robot.run().done == 'activated'
 
 
 def test_what_is_there_is_not_fetched_again(second: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,7 +76,9 @@ def test_a_policy_is_told_judged_and_sent_out(scene: Scene, listener: Listener) 
         bad: list[tuple[str, Any]] = [
             ('size', 'x' * (MOST_HEALTH_BYTES + 1)), ('json', '{'), ('json', []), ('json', {'failures': 9}),
             ('values', {'policy': second, 'failures': -1}), ('values', {'policy': second, 'failures': True}),
-            ('values', f'{{"policy": "{second}", "p99_ms": 1e999}}'), ('values', {'policy': second, 'p99_ms': 'slow'}),
+            ('values', f'{{"policy": "{second}", "p99_ms": 1e999}}'), ('values', f'{{"policy": "{second}", "p99_ms": NaN}}'),
+            ('values', {'policy': second, 'p99_ms': 10**400}), ('values', {'policy': second, 'failures': 10**400}),
+            ('json', f'{{"policy": "{second}", "failures": 1{"0" * 3900}'), ('values', {'policy': second, 'p99_ms': 'slow'}),
             ('other', {'policy': first, 'failures': 99}), ('other', {'policy': '../../etc', 'failures': 99}),
             ('json', '[' * 4000),
         ]  # fmt: skip
