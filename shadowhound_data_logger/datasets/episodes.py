@@ -250,7 +250,7 @@ def _causes(stream: _Stream, ticks: NDArray[np.int64], arm: ArmPlan | None) -> d
     if arm is not None and arm.clock is not None and _is_of_arm(stream.plan):
         stamps, ticks = arm.clock.other_ns(stamps), arm.clock.other_ns(ticks)
     return {
-        int(tick): cause_of(stream.plan.known, stream.plan.thinned, int(stamps[tick]), int(ticks[tick]))
+        int(tick): cause_of(stream.plan.known, stream.plan.downsampled, int(stamps[tick]), int(ticks[tick]))
         for tick in np.flatnonzero(stream.sampled.stale)
     }
 

@@ -37,7 +37,7 @@ from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.gaps import OBJECTS, Known, newest, of_rows, thinned_times, watermarks
+from shadowhound_data_logger.lake.gaps import OBJECTS, Known, downsampled_times, newest, of_rows, watermarks
 from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.reading import narrow
@@ -83,7 +83,7 @@ class StreamPlan:
     """None for a camera."""
     recording: RecordedSensor
     known: Known
-    thinned: tuple[tuple[int, int], ...]
+    downsampled: tuple[tuple[int, int], ...]
     complete_ns: int
     """Up to here the robot has said what is missing; 0 where it has said nothing."""
     is_final: bool = False
@@ -323,7 +323,7 @@ def _stream(name: str, part: StatePart | None, recording: RecordedSensor, missio
     known = of_rows(mission.robot, recording.sink, recording.topic, begin, end, mine)
     marks = watermarks(mine)
     complete = [row['to_ns'] for row in marks if row['from_ns'] <= mission.end_ns and row['grade'] in {'exact', 'estimated'}]
-    plan = StreamPlan(name, part, recording, known, tuple(thinned_times(mine)), max(complete, default=0))
+    plan = StreamPlan(name, part, recording, known, tuple(downsampled_times(mine)), max(complete, default=0))
     arrived = last_ns + END_SLACK_NS >= mission.end_ns
     sessions = {row['session'] for row in watermarks(rows) if row['from_ns'] <= mission.end_ns <= row['to_ns'] + END_SLACK_NS}
     is_uncounted = arrived and bool(sessions) and not any(row['session'] in sessions for row in marks)

@@ -288,7 +288,7 @@ class Coverage:
 
     Where several causes hold at a time, it counts for the first of them by name.
     """
-    thinned: tuple[tuple[int, int], ...]
+    downsampled: tuple[tuple[int, int], ...]
     """Times from which messages were left out on purpose, since the rate of the topic is set lower than it comes."""
 
 
@@ -304,12 +304,12 @@ def coverage(since_ns: int, until_ns: int, *, robot: str | None = None, topic: s
     covered = []
     for (name, of), rows in sorted(grouped.items()):
         each = of_rows(name, sink, of, since_ns, until_ns, rows)
-        thinned = tuple(thinned_times(rows))
-        covered.append(Coverage(each, tuple(_hours(each, thinned)), thinned))
+        downsampled = tuple(downsampled_times(rows))
+        covered.append(Coverage(each, tuple(_hours(each, downsampled)), downsampled))
     return covered
 
 
-def thinned_times(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, int]]:
+def downsampled_times(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, int]]:
     """Between two watermarks of a session by which more messages were skipped."""
     sessions: defaultdict[tuple[Any, ...], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
@@ -323,20 +323,20 @@ def thinned_times(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, int]
             at_ns, skipped = row['to_ns'], row['skipped'] or 0
 
 
-def _hours(of: Known, thinned: Sequence[tuple[int, int]]) -> Iterator[tuple[int, Mapping[str, float]]]:
+def _hours(of: Known, downsampled: Sequence[tuple[int, int]]) -> Iterator[tuple[int, Mapping[str, float]]]:
     hours: dict[int, Counter[str]] = {}
     for begin_ns in range(of.begin_ns // HOUR_NS * HOUR_NS, of.end_ns, HOUR_NS):
         hours[begin_ns] = Counter()
-    for begin_ns, end_ns, word in named(of, thinned):
+    for begin_ns, end_ns, word in named(of, downsampled):
         for hour in range(begin_ns // HOUR_NS * HOUR_NS, end_ns, HOUR_NS):
             hours[hour][word] += min(end_ns, hour + HOUR_NS) - max(begin_ns, hour)
     for hour, spent in hours.items():
         yield hour, {word: spent_ns / SECOND for word, spent_ns in sorted(spent.items())}
 
 
-def named(of: Known, thinned: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, str]]:
+def named(of: Known, downsampled: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, str]]:
     """(begin, end, word) of all of the time: ``stored``, ``downsampled``, ``not known yet`` or the cause of a gap."""
-    marks = sorted(thinned)
+    marks = sorted(downsampled)
     for each in of.stretches:
         if not each.is_whole:
             yield each.begin_ns, each.end_ns, each.causes[0] if each.causes else NOT_KNOWN

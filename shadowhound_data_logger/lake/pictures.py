@@ -137,7 +137,7 @@ def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
         raise LakeError(f'{len(found):,} topics do not fit into a picture', remedy='select with --robot or --topic')
     spans: dict[str, dict[int, list[tuple[int, int]]]] = {STORED: {}, DOWNSAMPLED: {}}
     for line, each in enumerate(found):
-        for begin_ns, end_ns, word in named(each.known, each.thinned):
+        for begin_ns, end_ns, word in named(each.known, each.downsampled):
             spans.setdefault(word, {}).setdefault(line, []).append((begin_ns, end_ns))
     open_ = spans.pop(NOT_KNOWN, {})
     causes = sorted(spans.keys() - {STORED, DOWNSAMPLED})
