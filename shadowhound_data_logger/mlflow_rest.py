@@ -125,8 +125,11 @@ class MlflowRest:
 
 
 def _refused(url: str, error: HTTPError) -> TrackingError:
-    with error:
-        text = error.read(MOST_ANSWER_BYTES).decode(errors='replace')
+    try:
+        with error:
+            text = error.read(MOST_ANSWER_BYTES).decode(errors='replace')
+    except (OSError, http.client.HTTPException, ValueError):  # it breaks off
+        text = ''
     try:
         said = from_json(text.encode())
         code, message = str(said['error_code']), str(said.get('message', ''))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.errors import TrackingRefused
+from shadowhound_data_logger.errors import TrackingError, TrackingRefused
 from shadowhound_data_logger.mlflow_rest import MlflowRest
 
 LOGIN = {'MLFLOW_TRACKING_USERNAME': 'thor', 'MLFLOW_TRACKING_PASSWORD': 'secret'}
@@ -52,6 +52,15 @@ def test_a_redirect_is_not_followed(tmp_path: Path) -> None:
         with pytest.raises(TrackingRefused, match='302'):
             MlflowRest(url, LOGIN, tmp_path).json('GET', 'runs/get')
         assert shown == []
+
+
+@pytest.mark.parametrize('status', [200, 400, 503])
+@pytest.mark.parametrize('broken', [b'zz\r\n', b'5\r\n{', b'-5\r\n', b''])
+def test_an_answer_that_breaks_off(tmp_path: Path, status: int, broken: bytes) -> None:
+    """Is one of ours as well, whether it was to be an error or not."""
+    chunked = {'Transfer-Encoding': 'chunked', 'Connection': 'close'}
+    with answering(status, broken, chunked) as (url, _), pytest.raises(TrackingError):
+        MlflowRest(url, LOGIN, tmp_path).json('GET', 'runs/get')
 
 
 @pytest.mark.parametrize('body', [b'[' * 200_000, b'[]', b'\xff', b'{"error_code": 5}'])

@@ -9,18 +9,24 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import pytest
 import yaml
+from test_borders import ROS
 
 ROOT = Path(__file__).resolve().parents[1]
 REQUIREMENTS = ROOT / 'requirements'
 PROFILE = ROOT / 'launch_configs' / 'fastdds_shm.xml'
 INTERFACES = ROOT / 'interfaces' / 'go2_interfaces'
 MEBI = 1 << 20
+PACKAGES = {'PIL': 'pillow', 'backports': 'backports-zstd', 'gi': 'python3-gi', 'mlflow': 'mlflow-skinny',
+            'ruamel': 'ruamel-yaml', 'yaml': 'pyyaml'}  # fmt: skip
+"""Names in imports -> those of the packages, where they differ."""
+IMPORT = re.compile(r'^ *(?:import (?=[\w.]+(?: as \w+)?(?:  #.*)?$)|from (?=[\w.]+ import ))(\w+)', re.MULTILINE)
 
 
 def setup_arguments() -> dict[str, Any]:
@@ -91,6 +97,29 @@ def test_every_dependency_has_its_reason(name: str) -> None:
     wanted = {package.split('[')[0] for package in requirements(name)}
     assert wanted, name
     assert not wanted - page
+
+
+def imported() -> set[str]:
+    """The packages that the library's modules import, by the names that pip (for gi apt) knows; ROS and types aside."""
+    found: set[str] = set()
+    for path in (ROOT / 'shadowhound_data_logger').rglob('*.py'):
+        text = re.sub(r'^if TYPE_CHECKING:\n(?: .*\n|\n)*', '', path.read_text(), flags=re.MULTILINE)
+        found.update(IMPORT.findall(text))
+    stdlib = {*sys.stdlib_module_names, 'compression'}  # the latter from 3.14 on
+    return {PACKAGES.get(name, name) for name in found - stdlib - ROS - {'shadowhound_data_logger'}}
+
+
+def test_what_is_imported_is_asked_for_or_comes_with_what_is() -> None:
+    """By setup.py, or by what docs/dependencies.md says of it; and that names nothing that is not imported."""
+    told = setup_arguments()
+    asked = [*told['install_requires'], *(each for extra in told['extras_require'].values() for each in extra)]
+    names = {re.split(r'[^A-Za-z0-9_-]', each)[0].lower() for each in asked}
+    page = (ROOT / 'docs' / 'dependencies.md').read_text()
+    section = page.partition('### Imported, and brought by something else')[2].partition('\n## ')[0]
+    brought = {name for row in re.findall(r'^\| ([^|]+) \|', section, re.MULTILINE)[1:] for name in row.split(', ')}
+    found = imported()
+    assert brought == found - names
+    assert found & names <= set(re.findall(r'[a-z0-9_.-]+', page.lower()))
 
 
 @pytest.mark.parametrize(
