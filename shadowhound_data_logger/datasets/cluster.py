@@ -112,7 +112,7 @@ def _joined(address: str | None) -> Iterator[int]:
     os.environ.setdefault('RAY_USAGE_STATS_ENABLED', '0')  # else it tells its makers of each run, over the network
     try:
         ray.init(address, log_to_driver=False, logging_level='ERROR', runtime_env=ours)
-    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+    except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         raise LakeError(f'there is no Ray cluster at {address or "this machine"}: {error}',
                         remedy='name its head: --address ray://HEAD:10001') from error  # fmt: skip
     try:

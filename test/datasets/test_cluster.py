@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 import pytest
@@ -23,6 +24,8 @@ PYTHON: Final = Path(os.environ.get('SHADOWHOUND_RAY', '~/.cache/shadowhound/ray
 MAIN: Final = [str(PYTHON), '-m', 'shadowhound_data_logger.cli.main']
 PATROLS: Final = ['export', 'lerobot', 'patrols', '--mission-type', 'patrol']
 ON_RAY: Final = ['--runner', 'ray', '--workers', '2']
+SHORT: Final = TemporaryDirectory(prefix='ray', ignore_cleanup_errors=True)
+"""Ray's sockets need a short path."""
 BUILDS: Final = b'ray::Builder.build'
 """The title of a worker while it makes an episode."""
 
@@ -37,7 +40,8 @@ pytestmark = [
 
 def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     environ = {name: value for name, value in os.environ.items() if not name.startswith(('AWS_', 'RAY_', 'MLFLOW_'))}
-    environ |= {'SHADOWHOUND_HOME': str(folder), 'PYTHONPATH': str(ROOT), 'TMPDIR': str(folder), 'RAY_ADDRESS': 'local'}
+    environ |= {'SHADOWHOUND_HOME': str(folder), 'PYTHONPATH': str(ROOT), 'TMPDIR': str(folder)}
+    environ |= {'RAY_ADDRESS': 'local', 'RAY_TMPDIR': SHORT.name}
     command = [*MAIN, *PATROLS, *arguments]
     return subprocess.Popen(command, env=environ, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
