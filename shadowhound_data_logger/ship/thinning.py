@@ -57,15 +57,17 @@ class Thinner:
         return bool(self._least_hz) and self._spool.is_short_to_keep() and next(self._work)
 
     def _all(self) -> Iterator[bool]:
-        after = 0
+        after = told_ns = 0
         while True:
             window = self._window(after)
             if not window:
                 yield False
                 continue
             after = window[-1].id
-            log.info('room for what is kept runs short: pictures and clouds of the hour from %s on are thinned, to %g Hz',
-                     iso(window[0].t_start_ns), self._least_hz)  # fmt: skip
+            if window[0].t_start_ns >= told_ns:  # what is new comes in small windows
+                told_ns = window[0].t_start_ns + HOUR_NS
+                log.info('room for what is kept runs short: pictures and clouds of the hour from %s on are thinned, to %g Hz',
+                         iso(window[0].t_start_ns), self._least_hz)  # fmt: skip
             while window:
                 left: list[ThinnableObject] = []
                 frames = defaultdict[str, list[ThinnableObject]](list)

@@ -263,6 +263,19 @@ def test_what_is_asked_for_or_protected_stays_as_it_is(make_robot: Callable[...,
     assert [row['samples'] for row in robot.kept()] == [30, 30, 1]
 
 
+def test_an_hour_is_told_once(make_robot: Callable[..., Robot], caplog: pytest.LogCaptureFixture) -> None:
+    """Where room is always short, what is new is thinned every few seconds, and the log does not say so each time."""
+    caplog.set_level('INFO', 'shadowhound_data_logger')
+    robot = make_robot(1 << 18)
+    for hour in range(2):
+        for number in range(hour * 36_000, hour * 36_000 + 400, 40):
+            robot.keep(*(frame(robot, each) for each in range(number, number + 40)))
+            robot.thin()
+    assert [line.getMessage().partition(' of the hour from ')[2][:16] for line in caplog.records if 'short' in line.msg] == [
+        '2025-10-18T12:00', '2025-10-18T13:00',
+    ]  # fmt: skip
+
+
 def test_at_the_least_rate_the_oldest_goes(make_robot: Callable[..., Robot]) -> None:
     """Rate goes first, and then time, from its beginning."""
     robot = make_robot(1 << 20)
