@@ -167,7 +167,7 @@ def lake_prune(
         made = library.plan(source, keep, exported=_exported(bar.say), findings=left_out, tell=bar.say, **how)
     if not as_json:
         print_page(*_planned(made, dry_run=dry_run))
-    if dry_run or not made.going:
+    if dry_run or not (made.going or made.unfinished):
         if as_json:
             print_json(_prune_told(made))
         return exit_code(finding=made.over_bytes or tell_left_out(left_out))
@@ -209,7 +209,8 @@ def _prune_told(made: PrunePlan) -> dict[str, Any]:
     sensors = [{'sensor': each.sensor, 'rule': each.rule, 'objects': each.objects, 'bytes': each.bytes, 'going': each.going,
                 'going_bytes': each.going_bytes, 'protected': dict(each.protected), 'referrers': sorted(each.referrers)}
                for each in made.sensors.values()]  # fmt: skip
-    return {'sensors': sensors, 'going': made.going, 'going_bytes': made.going_bytes, 'over_bytes': made.over_bytes}
+    return {'sensors': sensors, 'going': made.going, 'going_bytes': made.going_bytes, 'over_bytes': made.over_bytes,
+            'unfinished': made.unfinished}  # fmt: skip
 
 
 def _planned(made: PrunePlan, *, dry_run: bool) -> Iterator[RenderableType]:
@@ -226,8 +227,11 @@ def _planned(made: PrunePlan, *, dry_run: bool) -> Iterator[RenderableType]:
         if not each.objects:
             yield plain(f'There are no objects of {each.sensor}.', 'yellow')
     will = 'would be' if dry_run else 'will be'
-    yield plain(f'{number(made.going)} objects ({volume(made.going_bytes)}) {will} deleted.' if made.going
-                else 'There is nothing to delete.')  # fmt: skip
+    if made.going or not made.unfinished:
+        yield plain(f'{number(made.going)} objects ({volume(made.going_bytes)}) {will} deleted.' if made.going
+                    else 'There is nothing to delete.')  # fmt: skip
+    if made.unfinished:
+        yield plain(f'What an earlier run had begun to delete and did not come to {will} deleted, too.', 'yellow')
     if made.over_bytes:
         yield plain(f'{volume(made.over_bytes)} more than --max-bytes stays: no rule lets it go.', 'yellow')
 

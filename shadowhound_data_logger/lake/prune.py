@@ -195,6 +195,8 @@ class PrunePlan:
     """Because of the size, what ended before goes as well, of sensors that a rule does not keep forever."""
     over_bytes: int = 0
     """So much is left beyond the size that was asked for."""
+    unfinished: int = 0
+    """Parts with rows of forgotten objects that an earlier run put there, and of which it may not have deleted all."""
     groups: dict[str, _Group] = field(repr=False, default_factory=dict)
 
     @property
@@ -280,6 +282,7 @@ def plan(source: Bucket, rules: Sequence[RetentionRule], *, robot: str | None = 
         counts.add(group.sensor, group.objects, group.bytes, group.end_ns, lambda group=group: group.why)  # type: ignore[misc]
     if most_bytes is not None:
         counts.cut(most_bytes)
+    made.unfinished = sum(len(_begun(source, name)[1]) for name in named)
     return made
 
 
@@ -482,10 +485,7 @@ def _digest(rows: Iterable[Row]) -> str:
 
 def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, tell: Callable[[str], None]) -> int:
     """Delete what has a row and is not marked as deleted yet; how many objects that were."""
-    listed = source.list(FORGOTTEN.prefix(robot))
-    marks = {entry.key for entry in listed if entry.key.endswith(DELETED)}
-    entries = [entry for entry in listed if entry.key.endswith('.parquet')]
-    pending = [entry for entry in entries if entry.key + DELETED not in marks]
+    entries, pending = _begun(source, robot)
     for _, of_date in groupby(pending, _folder):
         folder = _folder(next(of_date))
         _state(store, robot, source, [entry for entry in entries if _folder(entry) == folder], findings)
@@ -500,6 +500,14 @@ def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, 
                 done += 1
             put_part(store, entry.key + DELETED, robot, b'{}\n', len(keys))
     return done
+
+
+def _begun(source: Bucket, robot: str) -> tuple[list[ObjectInfo], list[ObjectInfo]]:
+    """The parts that name what is forgotten, and those of them of which not all is known to be deleted."""
+    listed = source.list(FORGOTTEN.prefix(robot))
+    marks = {entry.key for entry in listed if entry.key.endswith(DELETED)}
+    entries = [entry for entry in listed if entry.key.endswith('.parquet')]
+    return entries, [entry for entry in entries if entry.key + DELETED not in marks]
 
 
 def _folder(entry: ObjectInfo) -> str:
