@@ -7,9 +7,9 @@ import random
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import DataLoggerError
@@ -34,16 +34,10 @@ def main(robot: str, output: str, name: str, count: int, threads: int, seed: int
         with lock, Path(output).open('a', encoding='utf-8') as file:
             file.write(json.dumps(line) + '\n')
 
-    def begins() -> dict[str, list[int]]:
-        """Sensor -> when objects begin that the store says are kept, of the last minutes; of none while it is away."""
-        found: dict[str, list[int]] = {}
-        with suppress(DataLoggerError, OSError):
-            want = KeptFilter(since_ns=time.time_ns() - RECENT_S * SECOND)
-            for row in pull.kept(source, robot, want, Findings(lambda _: None)).to_pylist():
-                found.setdefault(row['sensor'], []).append(row['t_start_ns'])
-        return found
-
-    kept = begins()
+    def recent() -> list[dict[str, Any]]:
+        """What the store says is kept, of the last minutes: what was so a minute ago may be gone."""
+        want = KeptFilter(since_ns=time.time_ns() - RECENT_S * SECOND)
+        return pull.kept(source, robot, want, Findings(lambda _: None)).to_pylist()
 
     def ask(number: int) -> None:
         now_ns = time.time_ns()
@@ -57,10 +51,12 @@ def main(robot: str, output: str, name: str, count: int, threads: int, seed: int
             priority, place = rng.randrange(10), rng.random()
         try:
             since_ns = now_ns - early_ns
-            if not is_blind and (there := kept.get(sensor)):
+            kept = recent()
+            there = [row['t_start_ns'] for row in kept if row['sensor'] == sensor]
+            if there and not is_blind:
                 since_ns = there[int(place * len(there))] - length_ns // 2
             want = KeptFilter(sensor=sensor, since_ns=since_ns, until_ns=since_ns + length_ns)
-            seen = pull.kept(source, robot, want, Findings(lambda _: None))['key'].to_pylist()
+            seen = [row['key'] for row in kept if pull.takes(want, row)]
             expiry_ns = SHORT_S * SECOND if is_short else 3600 * SECOND
             asked = pull.ask(store, source, robot, want, by=f'{name}-{number % 3}', priority=priority, expiry_ns=expiry_ns)
             write({'id': asked.id, 'by': asked.by, 'made_ns': asked.made_ns, 'keys': seen})
