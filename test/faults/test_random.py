@@ -25,7 +25,6 @@ def check(summary: Summary, first: int, days: int) -> None:
     assert summary.days == days, '\n'.join((f'seeds {first} to {first + days - 1}', *summary.lines()))
 
 
-@pytest.mark.long('which a campaign repeats')
 @pytest.mark.timeout(1800)
 def test_simulated_days() -> None:
     """With the clock, the pauses and the network simulated, and all else real."""

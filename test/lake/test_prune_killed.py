@@ -68,6 +68,7 @@ def ended(processes: Sequence[subprocess.Popen[str]]) -> list[str]:
 
 
 @pytest.mark.seaweedfs
+@pytest.mark.slow
 @pytest.mark.long('kills')
 def test_killed_beside_readers_a_compaction_and_another_prune(seaweed: Tower, tmp_path: Path) -> None:
     """In the end exactly what the rule names is gone, with one row each; who reads the rest meanwhile gets all of it."""
