@@ -36,7 +36,6 @@ SOON_S: Final = 5.0
 """After a mission: until then its last objects are usually delivered."""
 KEPT_S: Final = 5.0
 """Between two parts of what is kept: somebody may ask for it as soon as it is known."""
-_WHERE: Final = {'kept': ON_ROBOT, 'lost': LOST}
 PRIORITY: Final = 1
 """As a mission's summary: a part has what the store holds already."""
 
@@ -123,8 +122,8 @@ class CatalogueWriter:
         handed = frozenset[tuple[int, str]]().union(*self._told)
         new = [each for each in listed if (each[2].id, each[0]) not in handed]
         rows = [
-            (place, {**row_of(item.bucket, item.key, item.size, item.content_type, item.metadata), 'where': _WHERE[state],
-                     'reason': reason if _WHERE[state] == LOST else None})
+            (place, {**row_of(item.bucket, item.key, item.size, item.content_type, item.metadata),
+                     'where': LOST if state == LOST else ON_ROBOT, 'reason': reason if state == LOST else None})
             for place, (state, reason, item) in enumerate(new)
         ]  # fmt: skip
         made = []

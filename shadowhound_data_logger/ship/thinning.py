@@ -71,22 +71,15 @@ class Thinner:
             while window:
                 left: list[ThinnableObject] = []
                 frames = defaultdict[str, list[ThinnableObject]](list)
-                is_waiting = True
                 for item in window:
                     if item.samples == 1 and item.type in BULK:
                         frames[item.sensor].append(item)
-                    elif not self._spool.is_told(item):
-                        left.append(item)
                     elif (smaller := self._halved(item)) is not None:
                         left.append(smaller)
-                        is_waiting = False
                         yield True
                 for of_sensor in frames.values():
                     left += self._halve_frames(of_sensor)
-                    is_waiting = False
                     yield True
-                if is_waiting and left:
-                    yield False
                 window = sorted(left, key=lambda item: item.id)
 
     def _window(self, after: int) -> list[ThinnableObject]:

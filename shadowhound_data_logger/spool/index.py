@@ -504,10 +504,6 @@ class Index:
         """The row of an object that is kept as it was, and that nobody asked for."""
         return self.full_row(number) if self._rows(f'{_MAY_GO} AND id = ? AND sha256 = ?', (number, sha256)) else None
 
-    def is_told(self, number: int) -> bool:
-        """Whether a part of the table of what is kept tells of an object as it is."""
-        return self._db.execute('SELECT 1 FROM untold WHERE id = ?', (number,)).fetchone() is None
-
     def thin(self, row: Mapping[str, Any], body: FileBody, samples: int, lost: Mapping[str, int], key: str, reason: str,
              now_ns: int) -> None:  # fmt: skip
         """Give a kept object less content; what is gone is an evicted object of its own, under ``key``.
@@ -528,7 +524,8 @@ class Index:
         left = {**metadata, words.SHA256: body.sha256, word: str(samples), words.THINNED: str(step)}
         self._db.execute('UPDATE objects SET bytes = ?, sha256 = ?, samples = ?, metadata = ? WHERE id = ?',
                          (len(body), body.sha256, samples, json.dumps(left), row['id']))  # fmt: skip
-        self._db.execute("INSERT OR IGNORE INTO untold VALUES (?, 'kept')", (row['id'],))
+        # A state of its own: a part that is on its way tells of the object as it was, and takes the row of that.
+        self._db.execute('INSERT INTO untold VALUES (?, ?)', (row['id'], f'{reason} {step}'))
         gone_body = FileBody(body.path, row['bytes'] - len(body), row['sha256'])
         item = DataObject(
             bucket=row['bucket'], key=key, body=gone_body, sensor=row['sensor'],

@@ -178,7 +178,7 @@ END;
 """  # noqa: S608 - own constants only
 """What stays on the robot until somebody asks for it, and who asked (request_table.py).
 
-``untold`` are the rows that the table of what is kept in the store lacks: (id, ``kept`` or ``lost``).
+``untold`` are the rows that the table of what is kept in the store lacks: (id, ``kept``, ``thinned`` and the step, or ``lost``).
 """
 _KEPT_IS_A_STATE: Final = f"""
 PRAGMA writable_schema = ON;

@@ -375,10 +375,6 @@ class Spool:
         """What is kept and nobody asked for, with a larger number than ``after``, in their order; waits for no commit."""
         return [ThinnableObject.of(row, self._tree) for row in self._view.thinnable(after, limit)]
 
-    def is_told(self, item: ThinnableObject) -> bool:
-        """Whether the catalogue has been told of it as it is: a part that is on its way tells of it as it was."""
-        return self._view.is_told(item.id)
-
     def thin(self, item: ThinnableObject, thinned: Thinned) -> ThinnableObject | None:
         """Give a kept object less content; it, or None where it went or was asked for meanwhile. Raises as ``commit``."""
         with flock(self.root / 'recovery.lock'), self._lock:

@@ -12,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import orjson
+import pyarrow.parquet as pq
 import pytest
 from spool.conftest import Moments
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive, rows
@@ -19,8 +20,9 @@ from spool.making import NOON_NS, FakeClock, assert_whole, make, receive, rows
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.naming import BUCKET as BAGS
 from shadowhound_data_logger.capture.halving import Halving
+from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import KeepSettings, SpoolSettings
+from shadowhound_data_logger.config import CatalogueSettings, KeepSettings, SpoolSettings
 from shadowhound_data_logger.encode.archive import ArchiveFile, pack_tar, pack_zip
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
@@ -72,7 +74,7 @@ class Robot:
     def thin(self) -> int:
         """Until there is room, or nothing to thin; how many steps that took."""
         count = 0
-        while self.thinner.step() or self.thinner.step():  # of what the store knew nothing yet it does then
+        while self.thinner.step():
             count += 1
             assert count < 10_000
             self.told()
@@ -285,6 +287,38 @@ def test_at_the_least_rate_the_oldest_goes(make_robot: Callable[..., Robot]) -> 
     reasons = Counter(row['reason'] for row in rows(robot.root) if row['state'] == 'evicted')
     assert set(reasons) <= {'thinned', 'keep_limit'}
     assert_whole(robot.root)
+
+
+def test_the_catalogue_is_told_of_each_step(make_robot: Callable[..., Robot]) -> None:
+    """Also of an object that a part told of alone: it is told of again, with what is left of it."""
+    robot, now_s = make_robot(1 << 20), [0.0]
+    catalogue = CatalogueWriter(robot.root, CatalogueSettings(), 'thor', robot.clock, lambda: now_s[0], keeps=True)
+
+    def told() -> list[int]:
+        """The messages of each row of a part that is spooled now."""
+        now_s[0] += 3600.0
+        made = catalogue.due()
+        robot.spool.commit(made)
+        return [item.samples for item in made] and [
+            count
+            for part in made
+            if part.tells
+            for count in pq.read_table(BytesIO(bytes(part.body)))['count'].to_pylist()  # type: ignore[arg-type]
+        ]
+
+    item = archive(robot, 0)
+    receive(robot.spool, 30)
+    robot.spool.commit([item])
+    assert told() == [30]
+    assert told() == []
+    robot.spool.close()
+    robot.max_bytes = 4 * KIB
+    robot.open()
+    for left in (15, 8, 4):
+        assert robot.thinner.step()
+        assert left in told()
+        assert told() == []
+        assert robot.kept()[0]['samples'] == left
 
 
 def test_0_thins_nothing(make_robot: Callable[..., Robot]) -> None:
