@@ -75,6 +75,8 @@ _UNSEEN_OF_LABELS: Final = {'what', 'made', 'format_version'}
 _WATERMARK_COLUMNS: Final = [name for name in GAPS.columns if name in _OF_WATERMARKS]
 LONGEST_NS: Final = 24 * 3600 * SECOND
 """For so long after a time that is asked for a mission may go on before one of its objects knows its run."""
+PIECE_BYTES: Final = 4 << 20
+"""Of parts that are one frame of several; some 50,000 compacted rows."""
 _SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
     'command': ('mission_command', pa.string()),
     'started': ('start', pa.string()),
@@ -110,6 +112,19 @@ def objects(source: Bucket | None = None, *, findings: Findings | None = None, *
     the frame is computed, in this process; without it the log warns. Raises SettingError, LakeError for what is not a question.
     """
     return _objects(_Asked.of(source, findings), wanted(time.time_ns(), **flags))
+
+
+def objects_in_pieces(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> Iterator[DataFrame]:
+    """The rows of ``objects`` in several frames: Daft holds all that one has in memory, and more than once."""
+    lake = _Asked.of(source, findings)
+    asked, condition = _understood(lake, wanted(time.time_ns(), **flags))
+    piece: list[PartGroup] = []
+    for parts in (*planned(lake.source, asked, lake.findings), None):
+        if parts is not None:
+            piece.append(parts)
+        if piece and (parts is None or sum(entry.size for each in piece for entry in each.entries) > PIECE_BYTES):
+            yield _Catalogue(lake.source, asked, lake.findings, piece).read().where(condition)
+            piece = []
 
 
 def missions(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
@@ -157,8 +172,13 @@ def answering() -> Iterator[None]:
 
 
 def _objects(lake: _Asked, asked: Wanted) -> DataFrame:
+    asked, condition = _understood(lake, asked)
+    return _Catalogue(lake.source, asked, lake.findings).read().where(condition)
+
+
+def _understood(lake: _Asked, asked: Wanted) -> tuple[Wanted, Expression]:
+    """What is asked for as the catalogue can tell it, and the condition for a row."""
     asked = labels.labelled(lake.source, asked, lake.findings)
-    rows = _Catalogue(lake.source, asked, lake.findings).read()
     with answering():
         conditions = list(_conditions(asked))
         if asked.mission is not None:
@@ -168,7 +188,7 @@ def _objects(lake: _Asked, asked: Wanted) -> DataFrame:
         if asked.success is not None or asked.policy is not None:
             ids = _missions_of(lake, asked)
             conditions.append(col('mission_id').is_in(ids) if ids else lit(False))
-        return rows.where(reduce(and_, conditions)) if conditions else rows
+    return asked, reduce(and_, conditions, lit(True))
 
 
 def _missions_of(lake: _Asked, asked: Wanted) -> list[str]:
@@ -344,10 +364,14 @@ class _Catalogue(DataSource):
     Stateless, except for what it leaves out: each run lists anew.
     """
 
-    def __init__(self, source: Bucket, wanted: Wanted, findings: Findings) -> None:
+    def __init__(
+        self, source: Bucket, wanted: Wanted, findings: Findings, parts: Sequence[PartGroup] | None = None,
+    ) -> None:  # fmt: skip
+        """``parts``: those to read, where they are known already."""
         self._source = source
         self._wanted = wanted
         self._findings = findings
+        self._planned = parts
         self._schema = daft.Schema.from_pyarrow_schema(arrow_schema())
 
     @property
@@ -360,7 +384,10 @@ class _Catalogue(DataSource):
 
     async def get_tasks(self, pushdowns: Pushdowns) -> AsyncIterator[DataSourceTask]:
         columns = _columns(pushdowns)
-        for parts in await _apart(lambda: list(planned(self._source, self._wanted, self._findings))):
+        every = self._planned
+        if every is None:
+            every = await _apart(lambda: list(planned(self._source, self._wanted, self._findings)))
+        for parts in every:
             yield _Parts(self._source, parts, columns, self._wanted, self._findings)
 
 

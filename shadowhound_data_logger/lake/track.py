@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 NEEDED: Final = ('robot', 'sensor', 'type', 'bucket', 'key', 'bytes', 'sha256', 't_start', 't_start_ns', 't_end_ns', 'count',
                  'x', 'y', 'yaw', 'battery_pct', 'clock_offset_ns')  # fmt: skip
 """Columns of the catalogue."""
+_WORDS: Final = ('robot', 'sensor', 'type', 'bucket')
+"""Those of which many rows have the same text."""
+_DIGEST: Final = pa.binary(32)
 
 
 class Object(NamedTuple):
@@ -39,15 +42,17 @@ class Track:
     sensor: str
     kind: str
     bucket: pa.Array
-    """Text by a dictionary, as key and sha256 are text."""
+    """Text by a dictionary."""
     key: pa.Array
-    size: NDArray[np.int64]
+    """Text."""
+    size: NDArray[np.signedinteger[Any]]
     sha256: pa.Array
-    """Empty where it is not known."""
+    """32 bytes, or null where it is not known."""
     start_ns: NDArray[np.int64]
     end_ns: NDArray[np.int64]
-    count: NDArray[np.int64]
-    offset_ns: NDArray[np.int64]
+    """The same array as ``start_ns`` where all objects are of one message, and so is ``latest_ns``."""
+    count: NDArray[np.signedinteger[Any]]
+    offset_ns: NDArray[np.signedinteger[Any]]
     """To be added to the times in the content."""
     pose: NDArray[np.float64]
     """(n, 3): x y yaw in the middle of the object's time; NaN where it is not known."""
@@ -58,28 +63,32 @@ class Track:
     @classmethod
     def of(cls, rows: pa.Table) -> Track:
         """Of rows of one robot and sensor, at least one, each once even where it is in two parts; the columns are ``NEEDED``."""
-        order = pc.sort_indices(rows, sort_keys=[(name, 'ascending') for name in ('t_start_ns', 'key', 'bucket')])
-        order = order.filter(_is_first(rows, order))
+        if rows.schema.field('sha256').type != _DIGEST:
+            rows = packed(rows)
+        order = _order(rows)
+
+        def taken(name: str) -> pa.Array:
+            return _taken(rows, name, order)
 
         def numbers(name: str, missing: int = 0) -> NDArray[np.int64]:
-            return np.asarray(pc.fill_null(_taken(rows, name, order), missing).to_numpy(zero_copy_only=False), np.int64)
+            return np.array(pc.fill_null(taken(name), missing).to_numpy(zero_copy_only=False), np.int64)
 
         def real(name: str) -> NDArray[np.float64]:
-            return np.asarray(_taken(rows, name, order).to_numpy(zero_copy_only=False), np.float64)
+            return np.array(taken(name).to_numpy(zero_copy_only=False), np.float64)
 
         def word(name: str) -> str:
             return str(rows[name][0].as_py() or '')
 
         start = numbers('t_start_ns')
-        known = pc.coalesce(_taken(rows, 't_end_ns', order), _taken(rows, 't_start_ns', order))
-        end = np.maximum(start, np.asarray(known.to_numpy(zero_copy_only=False), np.int64))
+        known = pc.coalesce(taken('t_end_ns'), taken('t_start_ns'))
+        end = _shared(np.maximum(start, np.asarray(known.to_numpy(zero_copy_only=False), np.int64)), start)
         return cls(
             robot=word('robot'), sensor=word('sensor'), kind=word('type'),
-            bucket=_taken(rows, 'bucket', order).dictionary_encode(), key=_taken(rows, 'key', order), size=numbers('bytes'),
-            sha256=pc.fill_null(_taken(rows, 'sha256', order), ''), start_ns=start, end_ns=end,
-            count=np.maximum(numbers('count', 1), 1), offset_ns=numbers('clock_offset_ns'),
+            bucket=taken('bucket'), key=taken('key'), size=_narrow(numbers('bytes')), sha256=taken('sha256'),
+            start_ns=start, end_ns=end, count=_narrow(np.maximum(numbers('count', 1), 1)),
+            offset_ns=_narrow(numbers('clock_offset_ns')),
             pose=np.column_stack([real(name) for name in ('x', 'y', 'yaw')]), battery_pct=real('battery_pct'),
-            latest_ns=np.maximum.accumulate(end),
+            latest_ns=_shared(np.maximum.accumulate(end), end),
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -90,7 +99,8 @@ class Track:
         columns = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in {'robot', 'sensor', 'kind'}}
         kept = {name: column.take(pa.array(numbers)) if isinstance(column, pa.Array) else column[numbers]
                 for name, column in columns.items()}  # fmt: skip
-        kept['latest_ns'] = np.maximum.accumulate(kept['end_ns'])
+        kept['end_ns'] = _shared(kept['end_ns'], kept['start_ns'])
+        kept['latest_ns'] = _shared(np.maximum.accumulate(kept['end_ns']), kept['end_ns'])
         return replace(self, **kept)
 
     def object(self, number: int) -> Object:
@@ -98,7 +108,7 @@ class Track:
             self.bucket[int(number)].as_py(),
             self.key[int(number)].as_py(),
             int(self.size[number]),
-            self.sha256[int(number)].as_py(),
+            (self.sha256[int(number)].as_py() or b'').hex(),
         )
 
     def stamps_ns(self, number: int) -> NDArray[np.int64]:
@@ -135,10 +145,64 @@ class Track:
         return np.asarray(own + (stamp_ns - here) / (there - here) * change)
 
 
-def _taken(rows: pa.Table, name: str, order: pa.Array) -> pa.Array:
+def packed(rows: pa.Table) -> pa.Table:
+    """A copy in half of the memory: words by a dictionary, checksums as bytes.
+
+    All columns are copied, because what comes from Daft stays in memory as a whole as long as one column of it is used.
+    """
+    made = {}
+    for name in rows.column_names:
+        column = rows[name].combine_chunks()
+        if name == 'sha256':
+            made[name] = pa.array(map(_digest, column.to_pylist()), _DIGEST)
+        elif name in _WORDS:
+            made[name] = column.cast(pa.large_string()).dictionary_encode()
+        elif name != 't_start':  # it only says that there is a date
+            plain = column.cast(pa.large_string()) if name == 'key' else column
+            made[name] = pa.concat_arrays([plain, plain[:0]])
+    return pa.table(made)
+
+
+def _digest(text: str | None) -> bytes | None:
+    """None where it is not known; zeros, which no content has, for what is not a SHA-256 in hex."""
+    if not text:
+        return None
+    try:
+        found = bytes.fromhex(text)
+    except ValueError:
+        return bytes(32)
+    return found if len(found) == 32 and found.hex() == text else bytes(32)
+
+
+def _order(rows: pa.Table) -> pa.Array | None:
+    """The places of the rows by time, each object and time once; None where they lie so, as in a compacted catalogue."""
+    start = rows['t_start_ns'].to_numpy()
+    if (start[1:] > start[:-1]).all():
+        return None
+    names = ('t_start_ns', 'key', 'bucket')
+    plain = rows.select(names).set_column(2, 'bucket', rows['bucket'].cast(pa.large_string()))
+    order = pc.sort_indices(plain, sort_keys=[(name, 'ascending') for name in names])
+    return order.filter(_is_first(plain, order))
+
+
+def _taken(rows: pa.Table, name: str, order: pa.Array | None) -> pa.Array:
     """One column in an order."""
-    found = rows[name].combine_chunks().take(order)
+    found = rows[name].unify_dictionaries().combine_chunks()
+    if order is not None:
+        found = found.take(order)
     return found.combine_chunks() if isinstance(found, pa.ChunkedArray) else found
+
+
+def _narrow(numbers: NDArray[np.int64]) -> NDArray[np.signedinteger[Any]]:
+    """In the smallest type that holds them all."""
+    least, most = int(numbers.min()), int(numbers.max())
+    kinds = (np.int8, np.int16, np.int32, np.int64)
+    return numbers.astype(next(kind for kind in kinds if np.iinfo(kind).min <= least and most <= np.iinfo(kind).max))
+
+
+def _shared(numbers: NDArray[np.int64], like: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The other array where they are equal: then there is only one, also in a pickle."""
+    return like if np.array_equal(numbers, like) else numbers
 
 
 def _is_first(rows: pa.Table, order: pa.Array) -> pa.Array:

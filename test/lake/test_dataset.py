@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pytest
 import simplejpeg
 from lake.making import NOON_NS, folder_store
@@ -24,7 +23,8 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.fetch import Wish, fetch
 from shadowhound_data_logger.lake.fetched import keep_rows
-from shadowhound_data_logger.lake.track import Track
+from shadowhound_data_logger.lake.reading import narrow
+from shadowhound_data_logger.lake.track import NEEDED, Track, packed
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
@@ -315,17 +315,49 @@ def test_from_a_real_server(tmp_path: Path, seaweed: Tower, frames: str) -> None
 
 @pytest.mark.long('a million rows')
 def test_the_index_of_a_million_objects_is_small() -> None:
-    """Every worker of a DataLoader gets one: at most 300 MB, keys and checksums included."""
+    """Every worker of a DataLoader gets one: at most 150 MB, keys and checksums included."""
     count = 1_000_000
     numbers = np.arange(count)
     names = pa.array([f'thor/camera/20261028/{number:06d}_front.jpg' for number in range(count)], pa.large_string())
     columns = {'robot': 'thor', 'sensor': 'camera', 'type': 'sensor_msgs/msg/CompressedImage', 'bucket': 'sensor-data'}
     rows = pa.table({
         **{name: pa.repeat(pa.scalar(value, pa.large_string()), count) for name, value in columns.items()},
-        'key': names, 'sha256': pc.binary_join_element_wise(names, names, pa.scalar('', pa.large_string())),
+        'key': names, 'sha256': pa.array([f'{number:064x}' for number in range(count)], pa.large_string()),
         **dict.fromkeys(('t_start_ns', 't_end_ns', 'bytes', 'clock_offset_ns'), numbers),
         'count': np.ones(count, np.int64), **dict.fromkeys(('x', 'y', 'yaw', 'battery_pct'), numbers / 2),
     })  # fmt: skip
     track = Track.of(rows)
     assert len(track) == count
-    assert len(pickle.dumps(track)) < 300e6
+    assert track.object(count - 1).sha256 == f'{count - 1:064x}'
+    assert len(pickle.dumps(track)) < 150e6
+
+
+@pytest.mark.parametrize(
+    ('told', 'kept'),
+    [('0123456789abcdef' * 4, '0123456789abcdef' * 4), (None, ''), ('', ''), ('AB' * 32, '00' * 32), ('ab' * 31, '00' * 32),
+     ('no hex', '00' * 32), ('ab ' * 32, '00' * 32)],
+)  # fmt: skip
+def test_a_checksum_that_is_none_fits_no_content(told: str | None, kept: str) -> None:
+    """It is kept as 32 bytes: only what is not known at all is not compared."""
+    row = {**dict.fromkeys(NEEDED), 'robot': 'thor', 'sensor': 'camera', 'key': 'thor/camera/1.jpg', 'bucket': BUCKET, 'bytes': 9,
+           'sha256': told, 't_start_ns': NOON_NS}  # fmt: skip
+    assert Track.of(pa.Table.from_pylist([row], schema=narrow(NEEDED))).object(0).sha256 == kept
+
+
+def test_rows_of_several_frames_are_one_track_in_order() -> None:
+    """The same object from two frames is there once, and words have one dictionary."""
+
+    def frame(*numbers: int) -> pa.Table:
+        same = {**dict.fromkeys(NEEDED), 'robot': 'thor', 'sensor': 'camera', 'bytes': 9}
+        return packed(pa.Table.from_pylist(
+            [{**same, 'bucket': f'bucket-{number % 2}', 'key': f'{number}.jpg', 't_start_ns': number, 't_end_ns': number + 5}
+             for number in numbers], schema=narrow(NEEDED),
+        ))  # fmt: skip
+
+    track = Track.of(pa.concat_tables([frame(4, 1), frame(3, 4), frame(2)]))
+    assert [track.object(number)[:2] for number in range(len(track))] == [
+        ('bucket-1', '1.jpg'), ('bucket-0', '2.jpg'), ('bucket-1', '3.jpg'), ('bucket-0', '4.jpg'),
+    ]  # fmt: skip
+    assert track.end_ns.tolist() == track.latest_ns.tolist() == [6, 7, 8, 9]
+    some = track.only(np.array([1, 3]))
+    assert [some.object(number).key for number in range(2)] == ['2.jpg', '4.jpg']
