@@ -3,6 +3,18 @@ import { uPlot } from './vendor/uplot.js';
 
 const MOST = 3600;
 
+// Lines are drawn where the processor is: a browser without a graphics card is otherwise kept so busy by them that all that comes
+// is late. uPlot asks for its canvas itself.
+function inMemory(make) {
+  const { getContext } = HTMLCanvasElement.prototype;
+  HTMLCanvasElement.prototype.getContext = function (kind) { return getContext.call(this, kind, { willReadFrequently: true }); };
+  try {
+    return make();
+  } finally {
+    HTMLCanvasElement.prototype.getContext = getContext;
+  }
+}
+
 export class Ring {
   constructor(seconds) {
     this.seconds = seconds;
@@ -65,7 +77,7 @@ export class Plot {
     const colour = (name) => style.getPropertyValue(name).trim();
     const many = lines.length > COLOURS.length;
     this.made = lines.length;
-    this.plot = new uPlot(
+    this.plot = inMemory(() => new uPlot(
       {
         width, height, padding: [8, 8, 0, 0], legend: { show: false }, cursor: { show: false }, pxAlign: true,
         scales: { x: { time: false, range: (_, low, high) => [high - this.seconds, high] }, y: this.range ? { range: this.range } : {} },
@@ -81,7 +93,7 @@ export class Plot {
         }))],
       },
       this.data(lines), this.box,
-    );
+    ));
   }
 
   data(lines) {

@@ -247,7 +247,7 @@ export class FloorPlan {
     this.canvas.width = width * ratio;
     this.canvas.height = height * ratio;
     const style = getComputedStyle(this.canvas);
-    const to = this.canvas.getContext('2d');
+    const to = this.canvas.getContext('2d', { willReadFrequently: true }); // drawn by the processor, as the plots are
     to.fillStyle = style.getPropertyValue('--stage');
     to.fillRect(0, 0, this.canvas.width, this.canvas.height);
     if (!this.bounds) return;
