@@ -55,6 +55,7 @@ STEPS: Final = (
     Step('lake', quick=('--days', '2', '--objects', '500')),
     Step('ask', quick=('--objects', '50000', '--missions', '5000')),
     Step('datasets', ('--frames', '300'), quick=None),
+    Step('dataset_index', quick=('--rows', '36000', '--rounds', '1')),
     Step('likeness', quick=('--vectors', '8640')),
     Step('encode_formats'),
     Step('spool_commits', quick=None),
