@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import socket
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ from pathlib import Path
 from shutil import rmtree
 from tempfile import gettempdir, mkdtemp
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 import shadowhound_data_logger
 from shadowhound_data_logger.datasets.episodes import TOLD, build
@@ -32,6 +34,7 @@ from shadowhound_data_logger.options import StoreSettings
 ATTEMPTS: Final = 3
 """Workers that a mission may lose before the export gives it up."""
 PREFIX: Final = 'shadowhound-export-'
+REACH_S: Final = 10.0
 PIECE_BYTES: Final = 8 << 20
 LIBRARIES: Final = ('av', 'numpy', 'pillow', 'pyarrow', 'simplejpeg')
 """What decides which bytes an episode has."""
@@ -106,6 +109,7 @@ class Cluster:
 @contextmanager
 def _joined(address: str | None) -> Iterator[int]:
     """Connected to the cluster, whose workers have this package as it is here; yields how many cores it has."""
+    _reach(address or os.environ.get('RAY_ADDRESS', ''))
     import ray  # noqa: PLC0415 - only here it is needed
 
     ours = {'py_modules': [os.fspath(Path(shadowhound_data_logger.__file__).parent)]}
@@ -113,12 +117,25 @@ def _joined(address: str | None) -> Iterator[int]:
     try:
         ray.init(address, log_to_driver=False, logging_level='ERROR', runtime_env=ours)
     except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
-        raise LakeError(f'there is no Ray cluster at {address or "this machine"}: {error}',
-                        remedy='name its head: --address ray://HEAD:10001') from error  # fmt: skip
+        raise _no_cluster(address or 'this machine', error) from error
     try:
         yield max(1, int(ray.cluster_resources().get('CPU', 1)))
     finally:
         ray.shutdown()
+
+
+def _reach(address: str) -> None:
+    """Ray itself tries for minutes where nothing answers. Raises LakeError."""
+    try:
+        place = urlsplit(address if '//' in address else f'//{address}')
+        if place.hostname and place.port:
+            socket.create_connection((place.hostname, place.port), REACH_S).close()
+    except (OSError, ValueError) as error:
+        raise _no_cluster(address, error) from error
+
+
+def _no_cluster(place: str, error: Exception) -> LakeError:
+    return LakeError(f'there is no Ray cluster at {place}: {error}', remedy='name its head: --address ray://HEAD:10001')
 
 
 def _build_all(jobs: Sequence[EpisodeJob], workers: int, say: Callable[[str], None]) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import platform
+import socket
 import sys
 from contextlib import closing
 from dataclasses import replace
@@ -521,6 +522,17 @@ def test_a_machine_without_ray_says_what_to_install(monkeypatch: pytest.MonkeyPa
             verb.export, ['lerobot', 'patrols', '--address', 'ray://head:10001'], standalone_mode=False, catch_exceptions=False
         )
     assert '--runner ray' in refused.value.remedy
+
+
+def test_an_address_where_nothing_answers_is_told_at_once(tmp_path: Path) -> None:
+    """Also where there is no ray to try it with."""
+    job: Any = (None, None, 0, None, tmp_path)
+    with closing(socket.socket()) as taken:
+        taken.bind(('127.0.0.1', 0))  # and listens not
+        port = taken.getsockname()[1]
+        for address in (f'127.0.0.1:{port}', f'ray://127.0.0.1:{port}', 'ray://127.0.0.1:99999'):
+            with pytest.raises(LakeError, match=f'no Ray cluster at {address}'):
+                cluster.Cluster(address).built([job], None, print)
 
 
 def test_a_worker_with_other_libraries_is_refused(tmp_path: Path) -> None:
