@@ -29,6 +29,7 @@ from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.ros.reader import FAST_DDS
+from shadowhound_data_logger.ros.shared_memory import FOLDER
 from shadowhound_data_logger.spool.accounts import EXACT, Accounts
 
 pytestmark = pytest.mark.ros
@@ -71,7 +72,8 @@ class Listening:
         self._accounts, self._batches = Accounts(), Batches()
         installed, queue = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':')), self._batches
         sampler = Sampler(sensors, self._accounts, installed, SystemClock.of_this_machine(), queue)  # type: ignore[arg-type]
-        self._intake = Intake(self.join('logger').node, sensors, self._accounts, installed, [sampler])
+        self.logger = self.join('logger')
+        self._intake = Intake(self.logger.node, sensors, self._accounts, installed, [sampler])
         self._intake.open()
         stack.callback(self._intake.close, WAIT_S)
         self.late = self.join('late')
@@ -81,6 +83,13 @@ class Listening:
         self._stack.callback(one.end)
         return one
 
+    def _graphs(self) -> str:
+        """Whom each participant sees, and which ports of shared memory there are; killed processes leave theirs."""
+        seen = [f'{one.name} sees {sorted(one.node.get_node_names())}' for one in (self.early, self.logger, self.late)]
+        ports = range(*(7400 + 250 * number for number in (self._domain, self._domain + 1)))
+        left = [path.name for path in FOLDER.glob('fast*_port*') if int(''.join(filter(str.isdigit, path.name))) in ports]
+        return f'in domain {self._domain} {", ".join(seen)}; {sorted(left)}'
+
     def received(self, topic: str, count: int) -> None:
         """Wait until the intake took so many messages of the topic."""
         until(
@@ -89,7 +98,7 @@ class Listening:
 
     def heard(self, publisher: Participant, topic: str, message: Any = WARM_UP) -> None:
         """Publish the message until the intake took it, so that whatever follows comes after the match."""
-        until(lambda: publisher.matched(topic), lambda: f'{topic} is matched')
+        until(lambda: publisher.matched(topic), lambda: f'{topic} is matched: {self._graphs()}')
         before = self._count(topic)
 
         def is_heard() -> bool:
