@@ -32,8 +32,8 @@ SERVERS = ('process_request_thread', '_server_entry')
 """Threads of the stand-in servers (http.server, moto), which end with their clients or the session."""
 ENGINE = ('DaftBackgroundEventLoop', 'Dummy-')
 """Daft's own, of which a process keeps one set; the latter is what Python calls threads of another language."""
-MOST_WORKERS = 6
-"""Each starts servers of its own; beyond that the longest group of tests decides how long all takes."""
+MOST_WORKERS = 6 if profiles.LONG else 4
+"""Each collects all tests and loads all libraries, some 15 s of CPU; long tests mostly wait."""
 ONE_ROBOT_AT_A_TIME = (
     'test/e2e/test_bag.py', 'test/e2e/test_catalogue.py', 'test/e2e/test_go2_profile.py', 'test/e2e/test_killed.py',
     'test/e2e/test_raw_camera.py', 'test/sim/test_demo.py', 'test/sim/test_sim_go2_node.py',
@@ -68,7 +68,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)  # pytest-xdist's, which need not be there
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Three for each core, because most tests wait; none for files by name, which are there sooner without."""
+    """Several for each core, because most tests wait; none for files by name, which are there sooner without."""
     names = [Path(argument.partition('::')[0]) for argument in config.args]
     if config.args_source is pytest.Config.ArgsSource.ARGS and all(name.is_file() for name in names):
         return 0
