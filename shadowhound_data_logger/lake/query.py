@@ -123,7 +123,9 @@ def objects_in_pieces(source: Bucket | None = None, *, findings: Findings | None
         if parts is not None:
             piece.append(parts)
         if piece and (parts is None or sum(entry.size for each in piece for entry in each.entries) > PIECE_BYTES):
-            yield _Catalogue(lake.source, asked, lake.findings, piece).read().where(condition)
+            with answering():
+                frame = _Catalogue(lake.source, asked, lake.findings, piece).read().where(condition)
+            yield frame
             piece = []
 
 
@@ -173,7 +175,8 @@ def answering() -> Iterator[None]:
 
 def _objects(lake: _Asked, asked: Wanted) -> DataFrame:
     asked, condition = _understood(lake, asked)
-    return _Catalogue(lake.source, asked, lake.findings).read().where(condition)
+    with answering():
+        return _Catalogue(lake.source, asked, lake.findings).read().where(condition)
 
 
 def _understood(lake: _Asked, asked: Wanted) -> tuple[Wanted, Expression]:
