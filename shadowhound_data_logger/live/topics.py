@@ -82,6 +82,7 @@ class Topics:
         self._graph: dict[str, str] = {}
         self._graph_s = self._next_s = 0.0
         self._watched: dict[str, _Watched] = {}
+        self._followed: _Wanted | None = None  # the server replaces it when somebody chooses
         self._refused: dict[str, str] = {}
         self._wake = threading.Event()
         self.worker = Worker('topics', self._step)
@@ -120,11 +121,15 @@ class Topics:
         self._next_s = now_s + POLL_S
         if wanted is None:
             self._follow({})
+            self._followed = None
             return
         if now_s - self._graph_s >= GRAPH_S:
             self._graph_s = now_s
             self._look()
-        self._follow(wanted)
+            self._followed = None
+        if wanted is not self._followed:
+            self._follow(wanted)
+            self._followed = wanted
         self._drain(wanted, now_s)
 
     def _look(self) -> None:
