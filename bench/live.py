@@ -1,15 +1,16 @@
 #!/usr/bin/env python3
 """What the live page costs and how late it is: CPU of node and page without viewers and with some, and links that are slow.
 
-    scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8 [--video] | --beside 0.5 | --browser | --pairs 7]
-        [--kills 2]
+    scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8 [--video] | --beside 0.5 | --browser | --pairs 7
+        | --minutes 60] [--kills 2]
 
 Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a network
 namespace where what the page sends leaves at so many Mbit/s (tc htb; needs root); with ``--video`` the viewer takes the camera as
 WebRTC and decodes it. ``--beside`` gives a second viewer that reads so many Mbit/s, and says what that does to the first.
 ``--browser`` opens the page in a Chromium on a machine of its own (a network namespace): how late items come and are drawn, the
 first frame, outages of 10 s. ``--pairs``
-measures the node's CPU with and without viewers in turns. One line of JSON for each part.
+measures the node's CPU with and without viewers in turns, ``--minutes`` what the page holds while viewers come and go. One line
+of JSON for each part.
 """
 
 from __future__ import annotations
@@ -213,6 +214,18 @@ def paired(url: str, viewers: int, seconds: float, pairs: int, pids: dict[str, i
             'median': statistics.median(more)}  # fmt: skip
 
 
+def lasting(url: str, viewers: int, minutes: int, pid: int) -> dict[str, Any]:
+    """What the page holds at the end of each minute, in which other viewers have come and gone."""
+    held = []
+    for _ in range(minutes):
+        row = watched(url, viewers, 52.0, {'live': pid})
+        folder = Path(f'/proc/{pid}')
+        held.append((row['private_mb'], len(list((folder / 'fd').iterdir())), len(list((folder / 'task').iterdir()))))
+        time.sleep(2)
+    found = {name: [minute[place] for minute in held] for place, name in enumerate(('private_mb', 'descriptors', 'threads'))}
+    return {'viewers': viewers, **found}
+
+
 def beside(url: str, seconds: float, slow_mbps: float) -> dict[str, Any]:
     """What a viewer on a slow link does to one beside it: p95 of the fast one alone, and with the slow one."""
     topics = ['/camera/compressed', '/point_cloud2', '/imu', '/odom', '/joint_states', '/lowstate']
@@ -257,6 +270,7 @@ def main() -> None:  # noqa: PLR0915 - one part after the other
     parser.add_argument('--beside', type=float, default=0.0)
     parser.add_argument('--browser', action='store_true')
     parser.add_argument('--pairs', type=int, default=0)
+    parser.add_argument('--minutes', type=int, default=0)
     parser.add_argument('--scale', type=float, default=1.0)
     given = parser.parse_args()
     if (given.link or given.browser) and 'LIVE_BENCH' not in os.environ:
@@ -280,6 +294,8 @@ def main() -> None:  # noqa: PLR0915 - one part after the other
             rows = [in_browser(url, token, machines, Path(folder), given.seconds)]
         elif given.pairs:
             rows = [paired(url, given.viewers, given.seconds, given.pairs, pids)]
+        elif given.minutes:
+            rows = [lasting(url, given.viewers, given.minutes, live.popen.pid)]
         elif given.beside:
             rows = [beside(url, given.seconds, given.beside)]
         elif given.link:

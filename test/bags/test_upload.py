@@ -114,6 +114,7 @@ def test_an_archive_is_the_guides(settings: Settings, store: DirectoryStore, tmp
     assert send(settings, tmp_path / NAME, is_archive=True).is_delivered
 
 
+@pytest.mark.long('an outage of some seconds')
 def test_an_away_tower_is_no_failure(tmp_path: Path, seaweed: Tower) -> None:
     """The bag waits in the spool, whatever becomes of its folder, and the next process delivers it."""
     settings = Settings.load({'robot': 'thor', 'spool.min_free_bytes': 0},

@@ -111,6 +111,7 @@ def test_a_data_set_of_the_arm(house: House, tmp_path: Path, times: Path, versio
     assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), is_read=True).wrong == []
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_a_data_set_without_a_unit(house: House, tmp_path: Path, times: Path) -> None:
     """The numbers stay as they are, and no unit is claimed."""
     store = open_store(house.settings, UploadSettings())
@@ -121,6 +122,7 @@ def test_a_data_set_without_a_unit(house: House, tmp_path: Path, times: Path) ->
     assert np.abs(made.numbers(made.rows[0], 'observation.state')[:, :6]).max() > 4
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_demonstrations_in_hdf5(house: House, tmp_path: Path, times: Path) -> None:
     """In the layout of ACT and ALOHA: qpos and action."""
     h5py = pytest.importorskip('h5py')

@@ -71,6 +71,7 @@ def test_what_each_recorded_is_there_at_its_own_rate(task: tuple[Path, Exported]
     assert len(list(video_frames(folder / 'go2/fetch1/camera_front.mp4'))) == made.rows[1]['length']
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_the_frames_are_told_in_a_table(task: tuple[Path, Exported]) -> None:
     """A row each, with the messages that it was made of, by their own clocks, and the offset."""
     folder, found = task

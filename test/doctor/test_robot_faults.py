@@ -382,6 +382,7 @@ def small_disk(scene: Scene) -> Path:
     return scene.home
 
 
+@pytest.mark.long('a disk of its own')
 def test_a_full_disk(scene: Scene, small_disk: Path) -> None:
     """It is said before the node has to evict, and when nothing at all is free."""
     scene.parameters['spool.min_free_bytes'] = 4 * MEBI

@@ -127,6 +127,7 @@ def test_no_driver(examined: Examined) -> None:
     expect(findings(examined.nowhere), 'ros.topics', 'go2_driver', 'robot.launch.py', 'ROS_DOMAIN_ID')
 
 
+@pytest.mark.long('a robot of its own')
 def test_no_go2_interfaces(scene: Scene, domain: int, tmp_path: Path) -> None:
     """In the doctor's own process for ROS, with a workspace that was not sourced."""
     (tmp_path / 'go2_interfaces').mkdir()

@@ -234,6 +234,7 @@ def test_the_status_file_tells_what_the_ledger_tells(operated: Operated) -> None
 # -- several robots ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long('robots of their own')
 def test_two_robots_on_one_machine(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
     """Two nodes in namespaces of their own share a spool: both log, one of them delivers for both, both accounts balance."""
     robots = [f'{processes.robot}_{number}' for number in range(2)]

@@ -225,6 +225,7 @@ def test_the_front_tells_of_missions(nodes: dict[str, Node], stations: dict[str,
         station.node.destroy_subscription(subscription)
 
 
+@pytest.mark.long('kills')
 def test_a_front_that_dies_is_started_again(shared: Processes, nodes: dict[str, Node], stations: dict[str, Station]) -> None:
     """The node goes on meanwhile, loses nothing, and says what happened."""
     node, publisher = nodes[BESIDE], shared.publisher()

@@ -79,6 +79,7 @@ def test_what_is_left_is_delivered_by_the_next_start(
     assert stored(processes.robot).numbers('talk') == list(range(COUNT))
 
 
+@pytest.mark.long('a node of its own that hangs')
 def test_a_second_signal_ends_it_at_once(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
     """While it drains to a hung server, a second signal a second later ends it, and what is spooled is delivered later."""
     with Wire(seaweed.endpoint_url) as wire:

@@ -47,6 +47,7 @@ def listening(shared: Processes, seaweed: Tower, stored: Callable[..., Objects])
     return Listening(shared, shared.node(seaweed.environment(), parameters), stored)
 
 
+@pytest.mark.long('kills')
 def test_a_publisher_that_is_killed_and_starts_again(listening: Listening) -> None:
     """The messages of both of its lives are stored once."""
     for life in range(2):

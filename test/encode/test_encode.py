@@ -178,6 +178,7 @@ def test_hostile_bytes(ros: Any, type_name: str, data: st.DataObject) -> None:
         assert encoding.details.keys() == encoding.rejected.keys()
 
 
+@pytest.mark.long('more than a hundred types')
 def test_any_standard_type(ros: Any) -> None:
     """A message of every type of a ROS distribution can be logged as JSON without a line of code for it."""
     names = [name for name in get_typestore(Stores.ROS2_KILTED).types if '/msg/' in name]

@@ -11,7 +11,7 @@ from profiles import examples
 
 from shadowhound_data_logger.encode.types import header_frame_id, header_stamp_ns
 
-ROUNDS = 1500
+ROUNDS = examples(1500)
 
 
 def test_hostile_messages(ros: Any) -> None:

@@ -16,7 +16,7 @@ from faults.simulated_day import Day
 
 from shadowhound_data_logger.sim.tower import Tower
 
-SIMULATED = 1000 if is_long() else 20
+SIMULATED = 1000 if is_long() else 10
 LIVE = 5
 
 

@@ -76,7 +76,7 @@ except LakeError as error:
 """
 
 
-@pytest.mark.parametrize('make', [png, jpeg, tiff])
+@pytest.mark.parametrize('make', [png, *(pytest.param(each, marks=pytest.mark.long('as for png')) for each in (jpeg, tiff))])
 def test_a_picture_that_is_too_large_is_refused_by_its_header(tmp_path: Path, make: object) -> None:
     """In a process that could not even hold a half of it, and by the contact sheet, too."""
     body = make(SIDE)  # type: ignore[operator]

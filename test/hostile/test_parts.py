@@ -101,7 +101,10 @@ def run(command: Callable[..., object], home: Path, *arguments: str) -> Result:
     return found
 
 
-@pytest.mark.parametrize('kinds', [BAD, *([kind] for kind in FEW)], ids=['all', *FEW])
+ALONE = [pytest.param([kind], marks=pytest.mark.long('alone')) for kind in FEW]
+
+
+@pytest.mark.parametrize('kinds', [BAD, *ALONE], ids=['all', *FEW])
 def test_a_bad_part_costs_nobody_else_an_answer(home: Path, kinds: Collection[str]) -> None:
     """``query`` answers with all other rows, names each such part, and its exit code says that there is one."""
     before = good(home)

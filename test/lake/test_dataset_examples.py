@@ -65,6 +65,7 @@ def test_frames_are_judged_by_several_processes(tmp_path: Path, seaweed: Tower) 
     assert environ['AWS_SECRET_ACCESS_KEY'] not in ran.stdout + ran.stderr
 
 
+@pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('example', ['train_navigation_policy.py', 'fleet_frames.py'])
 def test_each_says_how_it_is_used(example: str) -> None:
     """``--help`` names what it needs."""

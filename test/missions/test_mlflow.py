@@ -152,6 +152,7 @@ def test_a_killed_agent_s_mission(server: Server, home: Path, tmp_path: Path) ->
     assert server.keys(prefix) == {f'{prefix}frame_{number:06d}.jpg': 1 for number in frames}
 
 
+@pytest.mark.long('an outage of some seconds')
 def test_a_wrong_password_costs_no_mission(server: Server, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The mission waits and it is said why; once the right one is in ~/.mlflow/credentials it is sent, without a restart."""
     user, password = (os.environ[name] for name in ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD'))

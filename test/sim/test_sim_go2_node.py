@@ -53,6 +53,7 @@ def test_it_publishes_exactly_rate_times_duration(some_seconds: Run) -> None:
     assert some_seconds.published == {f'/tachi/{name}': SECONDS * rate for name, rate in RATES.items()}
 
 
+@pytest.mark.long('a robot at full rate')
 @pytest.mark.parametrize('name', sorted(set(RATES) - BEST_EFFORT))
 def test_reliable_topics_arrive_without_a_gap(some_seconds: Run, name: str) -> None:
     """From the first message taken to the very last one published, none is missing."""

@@ -143,6 +143,7 @@ def test_death_at_any_moment_of_a_start(root: Path, moments: Moments, index: str
         assert settled(copy) == expected, copy.name
 
 
+@pytest.mark.long('kills')
 @pytest.mark.sampled
 def test_death_at_any_time(opened: Open, root: Path) -> None:
     """Killed at random moments again and again: what was told as durable is there, whole, once, and the ledger closes."""

@@ -218,6 +218,7 @@ def test_preparing_again_does_no_harm(server: Tower, as_user: Connect, monkeypat
     assert {rule['ID'] for rule in rules} == {'unfinished-uploads', 'old-versions'}
 
 
+@pytest.mark.long('servers of its own')
 def test_a_mailbox_is_read_by_its_robot_and_written_by_spark(server: Tower, as_user: Connect,
                                                              monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     """The robot may neither write nor delete its own, nor read another one's; Spark may not delete, and loses no race."""

@@ -255,6 +255,7 @@ def _becomes_administrator(target: Running) -> bool:
     return True
 
 
+@pytest.mark.long('a Tower of its own')
 def test_attacks_succeed_where_there_are_no_keys(opened: Running) -> None:
     """SeaweedFS as it starts by itself answers each of them, and with it whoever asks is its administrator."""
     told = _attack(opened, (HOST, ''), *ATTACKS)
