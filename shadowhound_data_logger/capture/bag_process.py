@@ -24,6 +24,7 @@ from typing import Any, Final
 import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import get_default_context
 
 from shadowhound_data_logger.bags.local import RECORDS, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
@@ -42,6 +43,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import BagError, DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.model import DataObject, RecordingRows
+from shadowhound_data_logger.ros.shared_memory import avoid_dead_ports
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -113,6 +115,7 @@ def main() -> int:
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     stop = StopSignals()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    avoid_dead_ports(get_default_context().get_domain_id())
     node = Node(NODE)
     try:
         said = _record(node, given, stop)

@@ -19,14 +19,14 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
+from rclpy.utilities import get_default_context, remove_ros_args
 
 from shadowhound_data_logger.capture.front import Front
 from shadowhound_data_logger.capture.middleware import SETTING, Middleware
 from shadowhound_data_logger.capture.parameters import Parameters
 from shadowhound_data_logger.capture.pipeline import Pipeline, Ros
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
-from shadowhound_data_logger.ros.shared_memory import orphans
+from shadowhound_data_logger.ros.shared_memory import avoid_dead_ports, orphans
 from shadowhound_data_logger.ros_arguments import NODE, rules_for
 
 log = logging.getLogger(__name__)
@@ -163,10 +163,15 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
         print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201
         return 2
     stop = StopSignals()
+    avoided = avoid_dead_ports(get_default_context().get_domain_id())
     with middleware.profiled(os.environ):
         node, name = make_node(arguments, is_public=not middleware.is_foreign)
     logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
     free_shared_memory()
+    if avoided:
+        log.info(
+            'not listening at %d ports in shared memory of processes that were killed: others may still write there', len(avoided)
+        )
     node.get_logger().info(f'listening by {middleware.describe()}')
     if '--params-file' in arguments and not Parameters(node).given():  # which is not an error to rcl
         node.get_logger().warning(UNHEARD.format(name=name))

@@ -16,6 +16,7 @@ from typing import Final
 import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import get_default_context
 
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
@@ -24,6 +25,7 @@ from shadowhound_data_logger.live.kinds import KINDS, RAW, Kind, LiveItem, cloud
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import MAX_TAKES, PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
+from shadowhound_data_logger.ros.shared_memory import avoid_dead_ports
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -91,6 +93,7 @@ class Topics:
 
     def open(self) -> None:
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        avoid_dead_ports(get_default_context().get_domain_id())
         self._node = Node(NODE, start_parameter_services=False, enable_rosout=False)
         self.worker.start()
 

@@ -2,9 +2,11 @@
 
 The owner of a segment ``fastdds_X`` (Fast DDS 3) or ``fastrtps_X`` (Fast DDS 2), where X is 16 random hex digits, holds a flock
 on the file ``..._X_el`` beside it for as long as it lives, in whatever container; a segment whose lock can be had has no owner.
-Source: RobustExclusiveLock.hpp and SharedMemManager.hpp of Fast DDS 2.6, 2.14 and 3.6. Not freed are ``..._portN``, which are
-small and taken over by the next process of the same domain, and ``fast_datasharing_...``, of which nothing tells whether
-somebody lives.
+Source: RobustExclusiveLock.hpp and SharedMemManager.hpp of Fast DDS 2.6, 2.14 and 3.6. Not freed are ``fast_datasharing_...``,
+of which nothing tells whether somebody lives, and ``..._portN``, which are small and taken over by the next process of the same
+domain. That one may hear nothing of processes that wrote to the dead one: they go on with the segment that it replaced. Fast DDS
+mends that within a second, but not where the listener died between waiting for a message and processing it (SharedMemGlobal.hpp,
+``update_status_all_listeners``; Fast-DDS pull request 4737). ``avoid_dead_ports`` is for that.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import os
 import re
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +26,9 @@ from shadowhound_data_logger.disk import lock
 FOLDER: Final = Path('/dev/shm')  # noqa: S108 - where Fast DDS has its segments
 STARTING_S: Final = 5.0
 """A process that starts has its file before it has its lock."""
+MOST_DEAD_PORTS: Final = 50
+"""Fast DDS tries a hundred."""
+_PORT: Final = re.compile(r'((?:fastdds|fastrtps)_port(\d{4,5}))_el')
 _LOCK: Final = re.compile(r'(?:fastdds|fastrtps)_[0-9a-f]{16}_el')
 
 
@@ -52,12 +57,59 @@ def orphans(folder: Path = FOLDER, *, is_freed: bool = False) -> list[Orphan]:
     return found
 
 
-def _locks(folder: Path) -> Iterator[Path]:
+def avoid_dead_ports(domain: int, folder: Path = FOLDER, processes: Path = Path('/proc')) -> list[str]:
+    """Let the participants that this process makes from now on take other ports than those of killed ones.
+
+    Only where a living process may still write to their segment; the others can be taken over. Fast DDS passes over a port whose
+    lock somebody has, so this process keeps those locks until it ends. The names of the ports, those that died last first.
+    """
+    first = 7400 + 250 * domain  # RTPS 2.2, 9.6.1.1; participants have another one each from 7000 on, whatever their domain
+    ours = (*range(7000, 7400), *range(first, first + 250))
+    dead = {}
+    for path in _entries(folder):
+        if (found := _PORT.fullmatch(path.name)) is not None and int(found[2]) in ours:
+            with suppress(OSError):  # a lock without a segment is of no use to Fast DDS
+                dead[found[1]] = path.with_name(found[1]).lstat().st_mtime_ns
+    written = sorted(_mapped(processes, dead), key=lambda name: (-dead[name], name))
+    return [name for name in written[:MOST_DEAD_PORTS] if _keep_lock(folder / f'{name}_el')]
+
+
+def _keep_lock(path: Path) -> bool:
+    """Have the lock until this process ends; whether it was to be had."""
     try:
-        paths = sorted(folder.iterdir())
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:  # gone meanwhile, or not for us
+        return False
+    was_had = lock(descriptor, wait=False)
+    if not was_had:  # its owner lives
+        os.close(descriptor)
+    return was_had
+
+
+def _mapped(processes: Path, ports: Iterable[str]) -> set[str]:
+    """Those of them that a process has in its memory; all of them where one cannot be looked at."""
+    ports = set(ports)
+    found = set[str]()
+    for process in processes.glob('[0-9]*/maps') if ports else ():
+        try:
+            maps = process.read_text(errors='replace')
+        except PermissionError:
+            return ports
+        except OSError:  # it ended
+            continue
+        found |= {name for name in ports - found if f'/{name}\n' in maps or f'/{name} (deleted)' in maps}
+    return found
+
+
+def _locks(folder: Path) -> Iterator[Path]:
+    return (path for path in _entries(folder) if _LOCK.fullmatch(path.name))
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir())
     except OSError:
-        return
-    yield from (path for path in paths if _LOCK.fullmatch(path.name))
+        return []
 
 
 @contextmanager

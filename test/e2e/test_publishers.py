@@ -5,6 +5,7 @@ Publishers of every kind, in the test's own process, are in test/capture/test_pu
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -70,3 +71,18 @@ def test_two_publishers_on_a_topic(listening: Listening) -> None:
         halves = [texts(range(COUNT)), texts(range(COUNT, 2 * COUNT))]
         list(pool.map(lambda pair: pair[0].publish('/mixed', pair[1]), zip(both, halves, strict=True)))
     assert listening.numbers('mixed', 2 * COUNT + 2) == list(range(2 * COUNT))
+
+
+def test_a_node_stays_off_the_port_of_a_killed_one(processes: Processes, seaweed: Tower) -> None:
+    """Who still writes there may never notice that another one listens; at its own port it hears what is published."""
+    parameters = {'sensors': ['killed'], 'killed.topics': ['killed'], 'killed.rate_hz': 0.0}
+    node = processes.node(seaweed.environment(), parameters)
+    publisher = processes.publisher()
+    publisher.create('/killed', STRING)
+    publisher.heard('/killed', node, WARM_UP)
+    node.kill()
+    publisher.signal(signal.SIGSTOP)  # so that it does not notice first
+    again = processes.node(seaweed.environment(), parameters)
+    again.said('of processes that were killed: others may still write there')
+    publisher.signal(signal.SIGCONT)
+    publisher.heard('/killed', again, WARM_UP)

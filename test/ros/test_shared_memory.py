@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from shadowhound_data_logger.disk import flock
-from shadowhound_data_logger.ros.shared_memory import Orphan, orphans
+from shadowhound_data_logger.ros.shared_memory import MOST_DEAD_PORTS, Orphan, avoid_dead_ports, orphans
 
 DEAD, ALIVE, YOUNG = 'fastrtps_0123456789abcdef', 'fastdds_00000000000000aa', 'fastdds_00000000000000bb'
 OTHERS = ('fastrtps_port7411', 'fastrtps_port7411_el', 'fast_datasharing_01.0f.78.fd.2f.45.bd.0f.00.00.00.00_0.0.6.3',
@@ -70,3 +70,58 @@ def test_a_lock_that_is_none_is_left_alone(shm: Path, tmp_path_factory: pytest.T
 def test_a_machine_without_such_a_folder(tmp_path: Path) -> None:
     """Nothing is freed, and nothing fails."""
     assert orphans(tmp_path / 'none', is_freed=True) == []
+
+
+def ports(shm: Path, *numbers: int) -> list[str]:
+    """Ports of Fast DDS with their locks, which nobody has."""
+    names = [f'fastrtps_port{number}' for number in numbers]
+    for name in names:
+        (shm / name).write_bytes(b'x')
+        (shm / f'{name}_el').touch()
+    return names
+
+
+def process(proc: Path, number: int, *mapped: str) -> Path:
+    """One that has these files in its memory."""
+    maps = proc / f'{number}' / 'maps'
+    maps.parent.mkdir(parents=True)
+    maps.write_text(''.join(f'7f00-7f01 rw-s 00000000 00:18 12 /dev/shm/{name}\n' for name in mapped))
+    return maps
+
+
+def is_locked(shm: Path, name: str) -> bool:
+    with flock(shm / f'{name}_el', wait=False) as was_had:
+        return not was_had
+
+
+def test_a_port_of_a_killed_process_that_somebody_writes_to_is_avoided(tmp_path: Path) -> None:
+    """In this domain, also where the segment was replaced; not one that lives, and none that nobody has in memory."""
+    shm = tmp_path / 'shm'
+    shm.mkdir()
+    written, replaced, alive, forgotten, other = ports(shm, 7413, 7001, 7415, 7417, 7663)
+    process(tmp_path / 'proc', 1, written, f'{replaced} (deleted)', alive, other, 'fastrtps_port74170')
+    os.utime(shm / written, (0, 0))
+    with flock(shm / f'{alive}_el'):
+        assert avoid_dead_ports(0, shm, tmp_path / 'proc') == [replaced, written]
+    assert [is_locked(shm, name) for name in (written, replaced, alive, forgotten, other)] == [True, True, False, False, False]
+    assert avoid_dead_ports(1, shm, tmp_path / 'proc') == [other], 'those that are avoided already have an owner now'
+
+
+def test_where_one_cannot_look_all_are_avoided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But so few that Fast DDS finds another one, and those that died last."""
+    shm = tmp_path / 'shm'
+    shm.mkdir()
+    dead = ports(shm, *range(7411, 7651, 2))
+    for when, name in enumerate(dead):
+        os.utime(shm / name, (when, when))
+    maps = process(tmp_path / 'proc', 1)
+    read = Path.read_text
+
+    def refuse(path: Path, *more: object, **words: object) -> str:
+        if path == maps:
+            raise PermissionError
+        return read(path, *more, **words)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Path, 'read_text', refuse)
+    assert avoid_dead_ports(0, shm, tmp_path / 'proc') == dead[: -MOST_DEAD_PORTS - 1 : -1]
+    assert avoid_dead_ports(0, tmp_path / 'none', tmp_path / 'proc') == []
