@@ -130,9 +130,9 @@ class RequestTable:
     def add(self, request: str, chosen: Sequence[tuple[int, int]]) -> None:
         """Some (id, bytes) of what a request chose, as far as they are here still; its row comes after all of them."""
         self._db.executemany(
-            "INSERT OR REPLACE INTO requested SELECT ?1, id, CASE state WHEN 'kept' THEN min(bytes, ?3) ELSE bytes END, state"  # noqa: S608 - own constants only
-            f' FROM objects WHERE id = ?2 AND state IN {_HERE}',
-            ((request, number, size) for number, size in chosen),
+            "INSERT OR REPLACE INTO requested SELECT ?, id, CASE state WHEN 'kept' THEN min(bytes, ?) ELSE bytes END, state"  # noqa: S608 - own constants only
+            f' FROM objects WHERE id = ? AND state IN {_HERE}',
+            ((request, size, number) for number, size in chosen),
         )
 
     def accept(self, row: RequestRow) -> RequestRow:
@@ -156,14 +156,15 @@ class RequestTable:
             ' ifnull(settled_ns, 0)'
         )
         is_on_request = f"CASE WHEN json_valid(metadata) THEN json_extract(metadata, '$.{words.SHIP}') = '{words.ON_REQUEST}' END"
+        of_robot = 'key >= :first AND key < :after'
         query = (
-            f"SELECT {columns} FROM objects WHERE state = 'kept' AND key >= ?1 AND key < ?2 UNION SELECT {columns} FROM objects"  # noqa: S608
-            " WHERE state = 'pending' AND id IN (SELECT id FROM requested WHERE outcome = 'pending') AND key >= ?1 AND key < ?2"
+            f"SELECT {columns} FROM objects WHERE state = 'kept' AND {of_robot} UNION SELECT {columns} FROM objects"  # noqa: S608
+            f" WHERE state = 'pending' AND id IN (SELECT id FROM requested WHERE outcome = 'pending') AND {of_robot}"
             f" UNION SELECT {columns} FROM objects WHERE state IN ('evicted', 'quarantined') AND {is_on_request}"
-            ' AND key >= ?1 AND key < ?2 ORDER BY id'
+            f' AND {of_robot} ORDER BY id'
         )
         for (number, bucket, key, size, sensor, topic, start_ns, end_ns, said, state, reason,
-             settled_ns) in self._db.execute(query, (f'{robot}/', f'{robot}0')):  # fmt: skip
+             settled_ns) in self._db.execute(query, {'first': f'{robot}/', 'after': f'{robot}0'}):  # fmt: skip
             metadata = json.loads(said)
             yield KeptObject(
                 number, bucket, key, size, sensor, topic, start_ns, end_ns, metadata, state, reason, settled_ns
@@ -175,15 +176,15 @@ class RequestTable:
 
     def let_go(self, request: str) -> bool:
         """Of a request that is over: some of what it has not released is nobody's any more; whether there may be more."""
-        some = "SELECT id FROM requested WHERE request = ?1 AND outcome = 'kept' LIMIT ?2"
-        query = f"UPDATE requested SET outcome = 'unsent' WHERE request = ?1 AND id IN ({some})"  # noqa: S608 - own constants only
-        return self._db.execute(query, (request, PIECE)).rowcount == PIECE
+        some = "SELECT id FROM requested WHERE request = :request AND outcome = 'kept' LIMIT :most"
+        query = f"UPDATE requested SET outcome = 'unsent' WHERE request = :request AND id IN ({some})"  # noqa: S608 - own constants only
+        return self._db.execute(query, {'request': request, 'most': PIECE}).rowcount == PIECE
 
     def clear(self, request: str) -> bool:
         """Drop some of what a request chose when it was made before; whether there may be more."""
-        some = 'SELECT id FROM requested WHERE request = ?1 LIMIT ?2'
-        query = f'DELETE FROM requested WHERE request = ?1 AND id IN ({some})'  # noqa: S608 - own constants only
-        return self._db.execute(query, (request, PIECE)).rowcount == PIECE
+        some = 'SELECT id FROM requested WHERE request = :request LIMIT :most'
+        query = f'DELETE FROM requested WHERE request = :request AND id IN ({some})'  # noqa: S608 - own constants only
+        return self._db.execute(query, {'request': request, 'most': PIECE}).rowcount == PIECE
 
     def clear_unfinished(self) -> bool:
         """Drop some of what was added to a request that has no row, or was added again to one that is over; as ``clear``.
@@ -216,8 +217,8 @@ class RequestTable:
         self._recount(request)
 
     def _recount(self, request: str) -> None:
-        sums = 'SELECT count(*), ifnull(sum(bytes), 0) FROM requested WHERE request = ?1'
-        self._db.execute(f'UPDATE requests SET (objects, bytes) = ({sums}) WHERE id = ?1', (request,))  # noqa: S608
+        sums = 'SELECT count(*), ifnull(sum(bytes), 0) FROM requested WHERE request = :request'
+        self._db.execute(f'UPDATE requests SET (objects, bytes) = ({sums}) WHERE id = :request', {'request': request})  # noqa: S608
 
     def take_answer(self, request: str, number: int, told: str, now_ns: int) -> bool:
         """Whether this answer is the next one; it is given then, and tells this state."""
