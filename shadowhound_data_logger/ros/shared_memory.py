@@ -63,7 +63,7 @@ def avoid_dead_ports(domain: int, folder: Path = FOLDER, processes: Path = Path(
     Only where a living process may still write to their segment; the others can be taken over. Fast DDS passes over a port whose
     lock somebody has, so this process keeps those locks until it ends. The names of the ports, those that died last first.
     """
-    first = 7400 + 250 * domain  # RTPS 2.2, 9.6.1.1; participants have another one each from 7000 on, whatever their domain
+    first = 7400 + 250 * domain  # RTPS 2.2, 9.6.1.1; from 7000 on are readers with a network flow of their own, of any domain
     ours = (*range(7000, 7400), *range(first, first + 250))
     dead = {}
     for path in _entries(folder):
