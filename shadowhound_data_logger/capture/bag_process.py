@@ -43,7 +43,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import BagError, DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.model import DataObject, RecordingRows
-from shadowhound_data_logger.ros.shared_memory import avoid_dead_ports
+from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -115,8 +115,8 @@ def main() -> int:
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     stop = StopSignals()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    avoid_dead_ports(get_default_context().get_domain_id())
-    node = Node(NODE)
+    with dead_ports_avoided(get_default_context().get_domain_id()):
+        node = Node(NODE)
     try:
         said = _record(node, given, stop)
     except DataLoggerError as error:

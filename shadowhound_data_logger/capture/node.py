@@ -26,7 +26,7 @@ from shadowhound_data_logger.capture.middleware import SETTING, Middleware
 from shadowhound_data_logger.capture.parameters import Parameters
 from shadowhound_data_logger.capture.pipeline import Pipeline, Ros
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
-from shadowhound_data_logger.ros.shared_memory import avoid_dead_ports, orphans
+from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided, orphans
 from shadowhound_data_logger.ros_arguments import NODE, rules_for
 
 log = logging.getLogger(__name__)
@@ -163,8 +163,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
         print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201
         return 2
     stop = StopSignals()
-    avoided = avoid_dead_ports(get_default_context().get_domain_id())
-    with middleware.profiled(os.environ):
+    with middleware.profiled(os.environ), dead_ports_avoided(get_default_context().get_domain_id()) as avoided:
         node, name = make_node(arguments, is_public=not middleware.is_foreign)
     logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
     free_shared_memory()

@@ -25,7 +25,7 @@ from shadowhound_data_logger.live.kinds import KINDS, RAW, Kind, LiveItem, cloud
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import MAX_TAKES, PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
-from shadowhound_data_logger.ros.shared_memory import avoid_dead_ports
+from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -93,8 +93,8 @@ class Topics:
 
     def open(self) -> None:
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        avoid_dead_ports(get_default_context().get_domain_id())
-        self._node = Node(NODE, start_parameter_services=False, enable_rosout=False)
+        with dead_ports_avoided(get_default_context().get_domain_id()):
+            self._node = Node(NODE, start_parameter_services=False, enable_rosout=False)
         self.worker.start()
 
     def wake(self) -> None:

@@ -25,7 +25,7 @@ from std_msgs.msg import String
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.running import judge
-from shadowhound_data_logger.ros.shared_memory import avoid_dead_ports
+from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
 from shadowhound_data_logger.untrusted import from_json
 
 log = logging.getLogger(__name__)
@@ -98,9 +98,9 @@ def telling(folder: PolicyFolder) -> Iterator[PolicyTopics]:
     """Serve the topics meanwhile, on a thread of their own."""
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    avoid_dead_ports(context.get_domain_id())
     try:
-        node = Node(NODE, context=context)
+        with dead_ports_avoided(context.get_domain_id()):
+            node = Node(NODE, context=context)
         topics = PolicyTopics(node, folder)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)

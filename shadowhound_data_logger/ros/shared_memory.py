@@ -6,7 +6,7 @@ Source: RobustExclusiveLock.hpp and SharedMemManager.hpp of Fast DDS 2.6, 2.14 a
 of which nothing tells whether somebody lives, and ``..._portN``, which are small and taken over by the next process of the same
 domain. That one may hear nothing of processes that wrote to the dead one: they go on with the segment that it replaced. Fast DDS
 mends that within a second, but not where the listener died between waiting for a message and processing it (SharedMemGlobal.hpp,
-``update_status_all_listeners``; Fast-DDS pull request 4737). ``avoid_dead_ports`` is for that.
+``update_status_all_listeners``; Fast-DDS pull request 4737). ``dead_ports_avoided`` is for that.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import re
 import stat
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -57,11 +57,12 @@ def orphans(folder: Path = FOLDER, *, is_freed: bool = False) -> list[Orphan]:
     return found
 
 
-def avoid_dead_ports(domain: int, folder: Path = FOLDER, processes: Path = Path('/proc')) -> list[str]:
-    """Let the participants that this process makes from now on take other ports than those of killed ones.
+@contextmanager
+def dead_ports_avoided(domain: int, folder: Path = FOLDER, processes: Path = Path('/proc')) -> Iterator[list[str]]:
+    """Participants that are made meanwhile take other ports than those of killed ones; yields the names of these.
 
     Only where a living process may still write to their segment; the others can be taken over. Fast DDS passes over a port whose
-    lock somebody has, so this process keeps those locks until it ends. The names of the ports, those that died last first.
+    lock somebody has.
     """
     first = 7400 + 250 * domain  # RTPS 2.2, 9.6.1.1; from 7000 on are readers with a network flow of their own, of any domain
     ours = (*range(7000, 7400), *range(first, first + 250))
@@ -70,20 +71,19 @@ def avoid_dead_ports(domain: int, folder: Path = FOLDER, processes: Path = Path(
         if (found := _PORT.fullmatch(path.name)) is not None and int(found[2]) in ours:
             with suppress(OSError):  # a lock without a segment is of no use to Fast DDS
                 dead[found[1]] = path.with_name(found[1]).lstat().st_mtime_ns
-    written = sorted(_mapped(processes, dead), key=lambda name: (-dead[name], name))
-    return [name for name in written[:MOST_DEAD_PORTS] if _keep_lock(folder / f'{name}_el')]
+    written = sorted(_mapped(processes, dead), key=lambda name: (-dead[name], name))  # those that died last first
+    with ExitStack() as held:
+        yield [name for name in written[:MOST_DEAD_PORTS] if _has_lock(folder / f'{name}_el', held)]
 
 
-def _keep_lock(path: Path) -> bool:
-    """Have the lock until this process ends; whether it was to be had."""
+def _has_lock(path: Path, held: ExitStack) -> bool:
+    """Whether the lock was to be had; it is let go with the stack."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:  # gone meanwhile, or not for us
         return False
-    was_had = lock(descriptor, wait=False)
-    if not was_had:  # its owner lives
-        os.close(descriptor)
-    return was_had
+    held.callback(os.close, descriptor)
+    return lock(descriptor, wait=False)  # else its owner lives
 
 
 def _mapped(processes: Path, ports: Iterable[str]) -> set[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from shadowhound_data_logger.disk import flock
-from shadowhound_data_logger.ros.shared_memory import MOST_DEAD_PORTS, Orphan, avoid_dead_ports, orphans
+from shadowhound_data_logger.ros.shared_memory import MOST_DEAD_PORTS, Orphan, dead_ports_avoided, orphans
 
 DEAD, ALIVE, YOUNG = 'fastrtps_0123456789abcdef', 'fastdds_00000000000000aa', 'fastdds_00000000000000bb'
 OTHERS = ('fastrtps_port7411', 'fastrtps_port7411_el', 'fast_datasharing_01.0f.78.fd.2f.45.bd.0f.00.00.00.00_0.0.6.3',
@@ -101,10 +101,13 @@ def test_a_port_of_a_killed_process_that_somebody_writes_to_is_avoided(tmp_path:
     written, replaced, alive, forgotten, other = ports(shm, 7413, 7001, 7415, 7417, 7663)
     process(tmp_path / 'proc', 1, written, f'{replaced} (deleted)', alive, other, 'fastrtps_port74170')
     os.utime(shm / written, (0, 0))
-    with flock(shm / f'{alive}_el'):
-        assert avoid_dead_ports(0, shm, tmp_path / 'proc') == [replaced, written]
-    assert [is_locked(shm, name) for name in (written, replaced, alive, forgotten, other)] == [True, True, False, False, False]
-    assert avoid_dead_ports(1, shm, tmp_path / 'proc') == [other], 'those that are avoided already have an owner now'
+    proc = tmp_path / 'proc'
+    with flock(shm / f'{alive}_el'), dead_ports_avoided(0, shm, proc) as avoided:
+        assert avoided == [replaced, written]
+        assert [is_locked(shm, name) for name in (written, replaced, forgotten, other)] == [True, True, False, False]
+    assert not any(is_locked(shm, name) for name in (written, replaced, alive))
+    with dead_ports_avoided(1, shm, proc) as avoided:
+        assert set(avoided) == {replaced, other}, 'those from 7000 on are of all domains'
 
 
 def test_where_one_cannot_look_all_are_avoided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,5 +126,7 @@ def test_where_one_cannot_look_all_are_avoided(tmp_path: Path, monkeypatch: pyte
         return read(path, *more, **words)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Path, 'read_text', refuse)
-    assert avoid_dead_ports(0, shm, tmp_path / 'proc') == dead[: -MOST_DEAD_PORTS - 1 : -1]
-    assert avoid_dead_ports(0, tmp_path / 'none', tmp_path / 'proc') == []
+    with dead_ports_avoided(0, shm, tmp_path / 'proc') as avoided:
+        assert avoided == dead[: -MOST_DEAD_PORTS - 1 : -1]
+    with dead_ports_avoided(0, tmp_path / 'none', tmp_path / 'proc') as avoided:
+        assert avoided == []
