@@ -17,6 +17,7 @@ from rclpy.qos import QoSCompatibility, qos_check_compatible
 
 from shadowhound_data_logger.ros.endpoints import Endpoint, HistoryDepth, logged_type, plans
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
+from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
 
 NODE: Final = 'shadowhound_doctor'
 DISCOVER_S: Final = 3.0
@@ -63,7 +64,8 @@ def node(domain: int | None = None, namespace: str = '/') -> Iterator[Node]:
     """In the domain of this process's environment, or another one."""
     context = rclpy.Context()
     rclpy.init(args=[], context=context, domain_id=domain)
-    made = Node(NODE, context=context, namespace=namespace, start_parameter_services=False, enable_rosout=False)
+    with dead_ports_avoided(context.get_domain_id()):
+        made = Node(NODE, context=context, namespace=namespace, start_parameter_services=False, enable_rosout=False)
     try:
         yield made
     finally:
