@@ -24,6 +24,8 @@ from typing import Any, Final
 
 from hostile.rounds import KINDS, Shop, watch_writes
 
+from torture._command import progress
+
 LIMIT_BYTES: Final = 2 << 30
 HANG_S: Final = 60.0
 """A round takes some milliseconds; of one that takes a minute its reader does not end by itself."""
@@ -81,6 +83,7 @@ def _watch(kind: str, seed: int, seconds: float, folder: Path, told: Told) -> No
                 told.peak_bytes = max(told.peak_bytes, said['peak'])
             elif 'wrong' in said:
                 told.wrong.append(f'seed {said["seed"]}: {said["wrong"]}')
+                progress(told.wrong[-1])
             else:
                 told.rounds += 1
                 told.found[said['found']] += 1
@@ -90,6 +93,7 @@ def _watch(kind: str, seed: int, seconds: float, folder: Path, told: Told) -> No
             errors.seek(0)
             tail = errors.read()[-2000:].decode(errors='replace')
             told.wrong.append(f'seed {seed + told.rounds}: the process ended with {code}: {tail}')
+            progress(told.wrong[-1])
             told.rounds += 1
 
 

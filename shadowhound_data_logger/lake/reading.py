@@ -555,8 +555,8 @@ def _may_hold(group: Any, places: Mapping[str, int], bounds: Sequence[_Bound]) -
 _Fields = Mapping[int, Any]
 _COLUMN: Final[_Fields] = {3: {1: None, 16: {1: None, 2: None, 3: None}}, 8: None, 9: None}
 """Of a ColumnChunk: its metadata (type, size statistics), crypto metadata, encrypted metadata."""
-_FOOTER: Final[_Fields] = {4: {1: _COLUMN}}
-"""Of the FileMetaData its row groups, and their columns."""
+_FOOTER: Final[_Fields] = {4: [{1: [_COLUMN]}]}
+"""Of the FileMetaData its row groups, and their columns; what is a list stands in one."""
 _NUMBER: Final = rb'[\x80-\xff]{0,9}[\x00-\x7f]'
 _BYTES: Final = b'(?:' + b'|'.join(re.escape(bytes([size])) + b'.{%d}' % size for size in range(128)) + b')'
 _USUAL: Final = re.compile(
@@ -609,12 +609,12 @@ def _picked(data: bytes, at: int, wanted: _Fields) -> tuple[dict[int, Any], int]
             at = at if kind <= 2 else _skipped(data, at, kind)
         elif number in fields:
             raise ValueError('its footer has a field twice')
-        elif (inner := wanted[number]) is not None and kind == 12:
-            fields[number], at = _picked(data, at, inner)
-        elif kind == 9 and (inner is not None or data[at] & 15 == 6):
-            fields[number], at = _listed(data, at, inner)
-        elif inner is not None:
-            raise ValueError('its footer cannot be read')
+        elif (inner := wanted[number]) is not None:
+            if kind != (9 if isinstance(inner, list) else 12):
+                raise ValueError('its footer cannot be read')
+            fields[number], at = _listed(data, at, inner[0]) if isinstance(inner, list) else _picked(data, at, inner)
+        elif kind == 9 and data[at] & 15 == 6:
+            fields[number], at = _listed(data, at, None)
         elif kind in {5, 6}:
             fields[number], at = _zigzag(data, at)
         else:

@@ -55,6 +55,7 @@ BAD: dict[str, Callable[[], bytes]] = {
     'a size below nothing': lambda: parts.encode([{**each, 'bytes': -5} for each in ROWS]),
     'a dictionary bomb': lambda: bad_parts.dictionary_bomb(ROWS[0], 20_000),
     'a histogram of another column': lambda: bad_parts.unfit_histogram(ROWS),
+    'size statistics that are a list': lambda: bad_parts.listed_sizes(ROWS),
     'an encrypted column': lambda: bad_parts.encrypted(ROWS),
     'a bomb of zeros': lambda: bad_parts.zeros_bomb(ROWS, 1 << 23),
     'a page that claims 2 GB': lambda: bad_parts.lying_page(ROWS),
