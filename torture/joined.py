@@ -47,6 +47,8 @@ AGENT_PERIOD_S: Final = 0.02
 DELIVER_S: Final = 600.0
 NOTICED_NS: Final = 2 * SECOND
 """So late may a node on a machine that is loaded notice that a mission began or ended."""
+LAST_NS: Final = SECOND
+"""What is published so shortly before the agent is killed may reach the node after it knows of the end."""
 PARAMETERS: Final[dict[str, Any]] = {
     'mission.frame_every_s': 1.0, 'lowstate.batch_s': 1.0,
     'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
@@ -210,7 +212,10 @@ def judge_files(found: Found, server: Server, flight: Flight, run_id: str, objec
 
 
 def judge_marks(found: Found, flights: Sequence[Flight], objects: Mapping[str, ObjectInfo]) -> None:
-    """Of the sensors' objects: no folder of those begins with ``_``. At both ends the node may be as late as ``NOTICED_NS``."""
+    """Of the sensors' objects: no folder of those begins with ``_``. At both ends the node may be as late as ``NOTICED_NS``.
+
+    Of the last ``LAST_NS`` of a mission some may be of none.
+    """
     spans = {flight.folder.mission_id: flight.span_ns for flight in flights}
     runs = {flight.folder.mission_id: run.run_id for flight in flights if (run := flight.folder.run())}
     for key, info in objects.items():
@@ -219,7 +224,7 @@ def judge_marks(found: Found, flights: Sequence[Flight], objects: Mapping[str, O
             continue
         at_ns, said = int(info.metadata['t_start_ns']), info.metadata.get('mission_id')
         found.looked['marked' if said else 'unmarked'] += 1
-        inside = {name for name, (start, end) in spans.items() if start + NOTICED_NS <= at_ns <= end}
+        inside = {name for name, (start, end) in spans.items() if start + NOTICED_NS <= at_ns <= end - LAST_NS}
         near = {name for name, (start, end) in spans.items() if start <= at_ns <= end + NOTICED_NS}
         is_right = said in near if said else not inside
         if not is_right or (said and info.metadata.get('run_id', runs.get(said)) != runs.get(said)):

@@ -81,6 +81,7 @@ class Killer:
             self._live()
             self._kill()
             self._start()
+            _publishes(sim, recording)
             if number % 10 == 0:
                 progress(f'{number} kills in {time.monotonic() - began:.0f} s')
         self._wire.set(PASS)
@@ -126,6 +127,13 @@ class Killer:
     def _turn_store(self) -> None:
         if self._rng.random() < STORE_CHANGES:
             self._wire.set(self._rng.choice((PASS, PASS, REFUSE, HANG)))
+
+
+def _publishes(sim: Process, recording: Path) -> None:
+    """Wait until the witness hears more of the robot: else the nodes to come would have nothing to lose."""
+    before = recording.stat().st_size
+    until(lambda: recording.stat().st_size > before,
+          lambda: f'the witness hears the robot, whose exit code is {sim.popen.poll()}')  # fmt: skip
 
 
 def _ready(node: Node) -> float:
