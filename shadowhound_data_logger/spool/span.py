@@ -152,11 +152,13 @@ class Span:
         """Count messages after the inherited ``last``, whose numbers are not known.
 
         Of a publisher that is ``alone`` they are the next ones; a death before its next message then does not count them again.
+        That is a guess: where one of these numbers comes after all, it is a message as any other.
         """
         if count:
             self.received += count
             self.published += count
             if alone and self.inherited and self.last is not None:
+                self._holes.append(self.last + 1, self.last + 1 + count, '')
                 self.last += count
             elif self.inherited:
                 self._late += count

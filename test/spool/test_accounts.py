@@ -127,6 +127,14 @@ def test_a_late_number_of_a_restart_fills_its_hole() -> None:
     assert figures(span) == (3, 2, {'restart': 1})
 
 
+def test_a_guessed_number_that_comes_is_no_repeat() -> None:
+    """Which numbers those had that turned up in a file is a guess: no message is left out for it, and none of them is missed."""
+    span = Span(first=1, last=10, inherited=True)
+    span.late(5, alone=True)
+    assert taken(span, 12, 12, 18) == [True, False, True]
+    assert figures(span) == (9, 7, {'restart': 2})
+
+
 def test_after_a_rebase_the_gap_is_not_missed() -> None:
     """What was published while nobody listened on purpose is not published for the ledger."""
     span = Span()
