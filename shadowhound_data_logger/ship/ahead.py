@@ -17,8 +17,8 @@ IMPORTANT: Final = 128
 """Objects asked for by importance at a time."""
 FEW: Final = 32
 """From here on more are asked for: a look waits for the disk behind a commit, and meanwhile the others have these."""
-OLDEST: Final = 32
-"""Objects asked for by age at a time; a fourth, as they are claimed."""
+OLDEST: Final = 43
+"""Objects asked for by age at a time: as many as leave beside the important ones, lest one of the two wait for a slow look."""
 LIVE: Final = 64
 """Objects remembered that have just been spooled, ten seconds of the default profile; older ones are backlog."""
 OLDEST_OF_BACKLOG: Final = 4
