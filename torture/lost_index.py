@@ -84,7 +84,10 @@ PARAMETERS: Final[dict[str, Any]] = {
 
 
 class Death(NamedTuple):
-    """When a process could do no more, and when the one after it did its work again, ns since 1970."""
+    """Since when a process may have recorded in vain, and when the one after it did its work again, ns since 1970.
+
+    Where it was ended after a damage, that is since the damage: the index holds what it did in the meantime.
+    """
 
     at_ns: int
     ready_ns: int
@@ -136,6 +139,7 @@ class Robot(joined.Killer):
             what = self._damage()
             progress(f'{number}: {what}, {self._disturb()}')
         self._goes_on(time.time_ns())
+        self._damaged_ns = 0
         for stream in STREAMS:
             self._happened.published[stream.topic] = publisher.halt_numbered(stream.topic)
 
@@ -194,8 +198,12 @@ class Robot(joined.Killer):
                 self._kill({AGENT: joined.AGENT, SENDER: joined.SENDER}[name])
         return ', '.join(said)
 
+    def _doubtful_ns(self) -> int:
+        """Since when a death that is found now counts."""
+        return self._damaged_ns or time.time_ns()
+
     def _restart_node(self, number: int) -> None:
-        at_ns = time.time_ns()
+        at_ns = self._doubtful_ns()
         _end(self.node, number)
         self._node_died(at_ns)
 
@@ -204,7 +212,7 @@ class Robot(joined.Killer):
         self._happened.deaths[NODE].append(Death(at_ns, 0))
 
     def _restart_recorder(self, number: int) -> None:
-        at_ns, recorder = time.time_ns(), self._recorder
+        at_ns, recorder = self._doubtful_ns(), self._recorder
         assert recorder is not None
         _end(recorder, number)
         self._recorder_died(at_ns)
@@ -232,12 +240,12 @@ class Robot(joined.Killer):
         """Start again what ended by itself."""
         if self.node.popen.poll() is not None:
             self._happened.ended_by_itself[f'node, exit code {self.node.popen.returncode}'] += 1
-            self._node_died(self._damaged_ns or time.time_ns())
+            self._node_died(self._doubtful_ns())
         recorder = self._recorder
         assert recorder is not None
         if recorder.popen.poll() is not None:
             self._happened.ended_by_itself[f'recorder, exit code {recorder.popen.returncode}'] += 1
-            self._recorder_died(self._damaged_ns or time.time_ns())
+            self._recorder_died(self._doubtful_ns())
         assert self._agent is not None
         if self._agent.poll() is not None:
             self._happened.ended_by_itself['agent'] += 1
