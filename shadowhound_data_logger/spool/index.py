@@ -820,9 +820,9 @@ class Index:
         condition = 'NOT NULL' if ended else 'NULL'
         return [row[0] for row in self._db.execute(f'SELECT id FROM sessions WHERE ended_ns IS {condition} ORDER BY id')]  # noqa: S608
 
-    def topics(self, session: int | None = None) -> list[TopicRow]:
-        """Accounts of one session, or of all in the order of the sessions."""
-        where, values = ('WHERE session = ?', (session,)) if session is not None else ('', ())
+    def topics(self, session: int | None = None, *, robot: str | None = None) -> list[TopicRow]:
+        """Accounts of one session, of those that a robot goes on with, or of all in the order of the sessions."""
+        where, values = ('WHERE session = ?', (session,)) if session is not None else _going_on(robot)
         columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, rejected, dropped, ifnull(estimated, 0),'
                    " ifnull(unknown, 0), ifnull(missed, '{}'), first_ns, heard_ns, complete_ns")  # fmt: skip
         query = f'SELECT {columns} FROM accounts LEFT JOIN estimates USING (session, topic) {where} ORDER BY session'  # noqa: S608
@@ -833,10 +833,14 @@ class Index:
             first_ns, heard_ns, complete_ns in self._db.execute(query, values)
         ]  # fmt: skip
 
-    def publishers(self) -> list[PublisherRow]:
-        """All spans in the order of the sessions: the last row of a publisher says where its numbers stand."""
+    def publishers(self, *, robot: str | None = None) -> list[PublisherRow]:
+        """All spans, or those that a robot goes on with, in the order of the sessions.
+
+        The last row of a publisher says where its numbers stand.
+        """
+        where, values = _going_on(robot)
         columns = 'topic, publisher, first, last, published, received, missed, heard_ns'
-        rows = self._db.execute(f'SELECT {columns} FROM publishers ORDER BY session')  # noqa: S608
+        rows = self._db.execute(f'SELECT {columns} FROM publishers {where} ORDER BY session', values)  # noqa: S608
         return [
             PublisherRow(topic, publisher, first, last, published, received, json.loads(missed), heard_ns)
             for topic, publisher, first, last, published, received, missed, heard_ns in rows
@@ -864,6 +868,16 @@ class Index:
     def tally(self) -> list[tuple[str, str, int, int, int]]:
         """(topic or '', state or 'spooled', objects, bytes, samples)."""
         return self._db.execute('SELECT topic, state, objects, bytes, samples FROM tally').fetchall()
+
+
+def _going_on(robot: str | None) -> tuple[str, tuple[str | int, ...]]:
+    """Which accounts a new session goes on with: those of the topics, and of bags and events those of its own robot.
+
+    ``bag record`` is a robot of its own here: beside a node, the same numbers are taken twice, and each loses others.
+    """
+    if robot is None:
+        return '', ()
+    return "WHERE topic GLOB '/*' OR session IN (SELECT id FROM sessions WHERE robot = ?)", (robot,)
 
 
 def _after(prefix: str) -> str:

@@ -468,7 +468,7 @@ class Spool:
                 self._index = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
                 self._view.open()
                 self._session = Session.begin(self._index, self._tree, self._robot, self._clock)
-                self.accounts = _continued(self._index, self._clock)
+                self.accounts = _continued(self._index, self._robot, self._clock)
         except (OSError, sqlite3.Error):
             self._index.close()
             self._view.close()
@@ -551,16 +551,16 @@ class Spool:
             self._forgot_ns = now_ns if done else 0
 
 
-def _continued(index: Index, clock: Clock) -> Accounts:
+def _continued(index: Index, robot: str, clock: Clock) -> Accounts:
     """Accounts of a session that goes on where the earlier ones ended."""
     last: dict[tuple[str, str], PublisherRow] = {}
-    for row in index.publishers():
+    for row in index.publishers(robot=robot):
         last.pop((row.topic, row.publisher), None)  # so that the newest are the last
         last[row.topic, row.publisher] = row
     kept: dict[str, int] = {}
     grades: dict[str, str] = {}
     heard: dict[str, int] = {}
-    for account in index.topics():
+    for account in index.topics(robot=robot):
         kept[account.topic] = max(kept.get(account.topic, 0), account.last_kept_ns)
         heard[account.topic] = account.heard_ns or account.last_kept_ns or heard.get(account.topic, 0)
         if account.received:

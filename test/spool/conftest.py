@@ -41,8 +41,8 @@ def opened(root: Path, clock: FakeClock) -> Iterator[Open]:
     """Opens spools on ``root`` (several: those of other processes) and closes what is left open."""
     spools: list[Spool] = []
 
-    def open_one(**settings: float) -> Spool:
-        spool = new_spool(root, clock, **settings)
+    def open_one(robot: str = 'thor', **settings: float) -> Spool:
+        spool = new_spool(root, clock, robot, **settings)
         spools.append(spool)
         spool.open()
         return spool

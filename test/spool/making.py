@@ -58,9 +58,9 @@ class FakeClock:
         return self.now_ns
 
 
-def new_spool(root: Path, clock: FakeClock | None = None, **settings: float) -> Spool:
+def new_spool(root: Path, clock: FakeClock | None = None, robot: str = 'thor', **settings: float) -> Spool:
     """A spool that is not open yet, without a lower limit on free space."""
-    return Spool(root, SpoolSettings(**{'min_free_bytes': 0, **settings}), clock or FakeClock(), 'thor')
+    return Spool(root, SpoolSettings(**{'min_free_bytes': 0, **settings}), clock or FakeClock(), robot)
 
 
 def make(key: str = KEY, body: bytes = b'content', **fields: Any) -> DataObject:

@@ -25,10 +25,12 @@ from spool.making import (
     short_rows,
 )
 
+from shadowhound_data_logger.bags.local import RECORDS
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.keys import MAX_SEGMENT_BYTES
 from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.spool import Outcome, Spool
 
 DAY_NS = 24 * 3600 * SECOND
@@ -219,6 +221,32 @@ def test_numbers_go_on_after_a_stop(opened: Open, root: Path) -> None:
     spool.commit([make()])
     topic = assert_whole(root)['topics']['/camera']
     assert (topic['published'], topic['received'], topic['missed_by']) == (5, 2, {'restart': 3})
+
+
+@pytest.mark.parametrize('ends', [False, True])
+def test_numbers_go_on_apart_from_those_of_bag_record(opened: Open, *, ends: bool) -> None:
+    """What it took beside a node, before it ended or while it goes on, is neither missed by the node's bags nor theirs."""
+
+    def took(spool: Spool, *numbers: int) -> None:
+        for account in ('/camera', f'{BAG}/camera'):
+            with spool.accounts.entry(account) as entry:
+                assert all(entry.receive('p', number) for number in numbers)
+        spool.commit([make(f'thor/camera/20251018/{numbers[0]}.jpg')])
+
+    node = opened()
+    took(node, 1, 2)
+    recorder = opened(f'thor {RECORDS}')
+    with recorder.accounts.entry(f'{BAG}/camera') as entry:
+        assert all(entry.receive('p', number) for number in range(2, 7))
+    recorder.commit([])
+    if ends:
+        recorder.close()
+        took(node, 3, 4, 5, 6, 7, 8)
+    node.close()
+    again = opened()
+    took(again, 10)
+    missed = {sink: again.accounts.totals(sink)['/camera'].missed for sink in ('', BAG)}
+    assert missed == dict.fromkeys(('', BAG), 1 if ends else 7)
 
 
 def test_one_process_drains(opened: Open) -> None:
