@@ -16,6 +16,7 @@ import pytest
 from bags.real_bags import NAME, by_rosbags, messages_of, put_item, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
+from shadowhound_data_logger import retry
 from shadowhound_data_logger.bags.fetch import Told, fetch
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
@@ -91,7 +92,7 @@ def test_a_second_run_downloads_nothing(store: Counting, tmp_path: Path) -> None
 
 def test_it_goes_on_where_it_broke_off(store: Counting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over the runs each byte comes once."""
-    monkeypatch.setattr(time, 'sleep', lambda _: None)
+    monkeypatch.setattr(retry, 'BASE_S', 0.0)
     bag = find_bag(store, 'thor', NAME)
     store.limit = bag.size // 2
     with pytest.raises(StoreUnavailable):
