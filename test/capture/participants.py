@@ -9,6 +9,8 @@ import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
+
 
 class Participant:
     """A node with publishers, one a topic; ``end`` leaves as a program does that ends. A participant has one type for a topic.
@@ -19,8 +21,9 @@ class Participant:
     def __init__(self, name: str, domain: int) -> None:
         self.name = f'/{name}'
         self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context, domain_id=domain)
-        self.node = Node(name, context=self._context, start_parameter_services=False, enable_rosout=False)
+        with dead_ports_avoided(domain):  # as each of our programs: other tests kill nodes meanwhile
+            rclpy.init(args=[], context=self._context, domain_id=domain)
+            self.node = Node(name, context=self._context, start_parameter_services=False, enable_rosout=False)
         self._publishers: dict[str, Any] = {}
 
     def create(self, message_class: type, topic: str, *, reliable: bool = True, latched: bool = False) -> None:
