@@ -24,6 +24,11 @@ class Bar:
     found: str = ''
 
 
+def some(lines: Sequence[str]) -> str:
+    """How many, and the first of them; nothing where there are none."""
+    return f'{len(lines)}: ' + '; '.join(lines[:30]) if lines else ''
+
+
 @dataclass(slots=True)
 class Workshop:
     """Where a campaign works."""

@@ -27,7 +27,7 @@ from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
-from torture._kill_audit import CALIBRATION, CLOUDS, Audit, Heard, Kill, audit
+from torture._kill_audit import BEST_EFFORT, Audit, Heard, Kill, audit
 
 KILLS: Final = 100
 SHORT_KILLS: Final = 5
@@ -72,7 +72,7 @@ class Killer:
     def run(self, kills: int) -> Run:
         recording = self._processes.folder / 'witness'
         self._start().said('logging ')
-        witness = self._processes.witness(TYPES, recording, best_effort=(CLOUDS, CALIBRATION))
+        witness = self._processes.witness(TYPES, recording, best_effort=BEST_EFFORT)
         sim = self._processes.sim('image_raw:=false')
         until(lambda: self._nodes[0].topic('/imu').get('received'), 'the first messages are received')
         began = time.monotonic()

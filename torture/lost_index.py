@@ -48,7 +48,7 @@ from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture import joined
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Bar, parser, progress, some, verdict, workshop
 from torture._kill_audit import DISCOVERY_S, LOSS_S, SLACK_S
 from torture.gaps import STRING, Loss, Stream, together
 from torture.kills import ROBOT, running
@@ -584,7 +584,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     began = time.monotonic()
     with workshop(given) as shop:
         found, happened = campaign(shop.folder, rounds, given.seed)
-        bars = [Bar(text, not found.wrong[name], _some(found.wrong[name])) for name, text in WHAT.items()]
+        bars = [Bar(text, not found.wrong[name], some(found.wrong[name])) for name, text in WHAT.items()]
         shop.passed = all(bar.holds for bar in bars)
     figures = {
         'seed': given.seed, 'seconds': round(time.monotonic() - began), 'damages': Counter(what for what, _ in happened.damages),
@@ -596,10 +596,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         for name, value in figures.items():
             print(f'{name}: {value if not isinstance(value, Counter) else dict(value)}')
     return verdict(figures, bars, as_json=given.json)
-
-
-def _some(lines: Sequence[str]) -> str:
-    return f'{len(lines)}: ' + '; '.join(lines[:30]) if lines else ''
 
 
 if __name__ == '__main__':
