@@ -225,7 +225,7 @@ def test_numbers_go_on_after_a_stop(opened: Open, root: Path) -> None:
 
 @pytest.mark.parametrize('ends', [False, True])
 def test_numbers_go_on_apart_from_those_of_bag_record(opened: Open, *, ends: bool) -> None:
-    """What it took beside a node, before it ended or while it goes on, is neither missed by the node's bags nor theirs."""
+    """What ``bag record`` hears beside a node, ended by now or not, counts neither for nor against the node's own bags."""
 
     def took(spool: Spool, *numbers: int) -> None:
         for account in ('/camera', f'{BAG}/camera'):
