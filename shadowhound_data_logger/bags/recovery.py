@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Final
 
@@ -30,11 +30,14 @@ from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.state import LINES, RECORD, BagState
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, is_name
-from shadowhound_data_logger.mcap.index import read_metadata
+from shadowhound_data_logger.mcap.index import read_index, read_metadata
+from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.mcap.recovery import read_info, recover
 from shadowhound_data_logger.mcap.writer import OPEN
 from shadowhound_data_logger.model import RecordingRows
 from shadowhound_data_logger.spool.files import content_sha256
+from shadowhound_data_logger.spool.span import MAX_RANGES, Run
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -256,7 +259,7 @@ class BagRecovery:
             path.unlink(missing_ok=True)
             return
         if state.folder not in self._own:
-            self._place.spool.accounts.find(item.counts)
+            self._place.spool.accounts.find(item.counts, {f'{state.sink}{topic}': runs for topic, runs in _runs(path).items()})
         self._handed.add(item.key)
         self._place.writer.put(item, rows=[rows], wait=False)
 
@@ -266,6 +269,24 @@ class BagRecovery:
         target.mkdir(parents=True, exist_ok=True)
         names = (f'{path.name}.{number}' if number else path.name for number in count())
         path.rename(next(target / name for name in names if not os.path.lexists(target / name)))
+
+
+def _runs(path: Path) -> dict[str, list[Run]]:
+    """The numbers of a slice's messages, by topic; none of a topic where they do not rise, since several publishers have it."""
+    found: dict[str, list[Run]] = {}
+    with suppress(BagDamaged, OSError):  # then it is not known; the spool compares the file with its checksum
+        source = LocalFile(path)
+        for message in read_messages(source, read_index(source), MessageFilter(0, 1 << 64, lambda _: True)):
+            number, stamp_ns = message.sequence, message.publish_ns
+            runs = found.setdefault(message.channel.topic, [])
+            if runs and number == runs[-1].stop:
+                runs[-1] = runs[-1]._replace(stop=number + 1, to_ns=stamp_ns)
+            elif len(runs) <= MAX_RANGES:
+                runs.append(Run(number, number + 1, stamp_ns, stamp_ns))
+    return {
+        topic: runs for topic, runs in found.items()
+        if len(runs) <= MAX_RANGES and all(one.stop < two.start for one, two in pairwise(runs))
+    }  # fmt: skip
 
 
 def _rows(place: BagPlace) -> dict[str, RecordingRows]:

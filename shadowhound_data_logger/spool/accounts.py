@@ -16,7 +16,7 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS, MAX_AGE_NS, Clock
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, LATELY_NS, MISSED, REJECTED, Figures, TopicGaps, latest
-from shadowhound_data_logger.spool.span import Span
+from shadowhound_data_logger.spool.span import Run, Span
 
 PAUSED: Final = 'paused'
 """Why messages are dropped that come during a pause."""
@@ -194,16 +194,21 @@ class TopicAccount:
                 self._estimate_lost(lost, self.gaps.heard_ns, newest_ns)
                 self.missed_estimated = +self.missed_estimated
 
-    def find(self, count: int) -> None:
-        """Messages of the session before, of which its accounts did not know yet, turned up in a file of it."""
+    def find(self, count: int, runs: Sequence[Run] = ()) -> None:
+        """Messages of the session before, of which its accounts did not know yet, turned up in a file of it.
+
+        ``runs`` are the numbers of all that the file has of the topic, empty where they are not known.
+        """
         self.received += count
         spans = list(self.publishers.values())
         if not spans or (self.accounting or self.before) in {ESTIMATED, RECEIVED_ONLY}:
             self.unknown += count
             return
+        if len(spans) == 1 and spans[0].recall(runs, count):
+            return
         for span in spans:
             count -= span.find(count)
-        spans[-1].late(count, alone=len(spans) == 1)
+        spans[-1].late(count)
 
     def rebase(self) -> None:
         """What is published until the next message was not listened to on purpose: it is not missed."""
@@ -405,14 +410,14 @@ class Accounts:
                 self._carried[row.topic] += row.received
                 self._carried_ns[row.topic] = row.last_kept_ns or row.heard_ns, row.heard_ns
 
-    def find(self, counts: Mapping[str, int]) -> None:
-        """Messages of an earlier session turned up in a file that is about to be spooled."""
+    def find(self, counts: Mapping[str, int], runs: Mapping[str, Sequence[Run]]) -> None:
+        """Messages of an earlier session turned up in a file that is about to be spooled; ``runs`` as in ``TopicAccount``."""
         with self._lock:
             for topic, count in counts.items():
                 known = min(count, self._carried[topic])
                 self._carried[topic] -= known
                 if count > known:
-                    self._account(topic).find(count - known)
+                    self._account(topic).find(count - known, runs.get(topic, ()))
                     self._dirty = True
 
     def drop_carried(self, reason: str) -> int:

@@ -185,10 +185,10 @@ class TopicGaps:
         self._change(GapRow('', key, start_ns, end_ns, messages, 1))
         return key
 
-    def fill(self, key: GapKey, merged: int) -> None:
-        """One message of a gap came after all; ``merged`` is the change of how many gaps there are."""
+    def fill(self, key: GapKey, messages: int, merged: int) -> None:
+        """Messages of a gap came after all; ``merged`` is the change of how many gaps there are."""
         self.count += merged
-        self._change(GapRow('', key, None, None, -1, merged))
+        self._change(GapRow('', key, None, None, -messages, merged))
 
     def settle(self, topic: str, figures: Figures) -> tuple[list[GapRow], list[TakenBack]]:
         """What a commit with these figures has to change in the journal; ``undo`` if it fails."""

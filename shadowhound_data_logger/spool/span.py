@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 from shadowhound_data_logger.spool.gaps import MISSED, GapKey, TopicGaps
 
@@ -15,6 +16,18 @@ MAX_RANGES: Final = 512
 
 MAX_MISSED: Final = 1 << 40
 """More than anybody publishes. Numbers that leap further lie, and that is believed to be no loss: sums stay within SQLite."""
+
+
+class Run(NamedTuple):
+    """Messages of one publisher whose numbers follow one another, in a file that has the low 32 bits of these."""
+
+    start: int
+    stop: int
+    """Of the first one that is not in it."""
+    from_ns: int
+    """Stamp of its first message."""
+    to_ns: int
+    """Stamp of its last message."""
 
 
 class Ranges:
@@ -36,16 +49,25 @@ class Ranges:
         self._rows.append((start, stop, word))
         del self._rows[:-MAX_RANGES]
 
-    def take(self, number: int) -> GapKey | str | None:
-        """Take the number out; the word of its range, None where it is in none."""
-        at = self._find(number)
-        if at is None:
-            return None
-        start, stop, word = self._rows[at]
-        rest = [(start, number, word), (number + 1, stop, word)]
+    def within(self, start: int, stop: int) -> list[tuple[int, int, GapKey | str]]:
+        """What of the ranges lies from ``start`` on and before ``stop``."""
+        at = max(bisect_right(self._rows, (start + 1,)) - 1, 0)
+        found = []
+        while at < len(self._rows) and self._rows[at][0] < stop:
+            low, high, word = self._rows[at]
+            if high > start:
+                found.append((max(low, start), min(high, stop), word))
+            at += 1
+        return found
+
+    def cut(self, start: int, stop: int) -> None:
+        """Take out numbers that are all in one range."""
+        at = self._find(start)
+        assert at is not None
+        low, high, word = self._rows[at]
+        rest = [(low, start, word), (stop, high, word)]
         self._rows[at : at + 1] = [row for row in rest if row[0] < row[1]]
         del self._rows[:-MAX_RANGES]
-        return word
 
     def add(self, number: int) -> bool:
         """Put in one number that is not in it; False where that would be a range too many."""
@@ -95,7 +117,7 @@ class Span:
     changed: bool = False
     """Since the last snapshot."""
     _late: int = 0
-    """Messages after the inherited ``last`` that are counted already: they are not part of the gap that follows."""
+    """Messages after the inherited ``last`` that are counted already: they are not part of the gap before the next one."""
 
     def __post_init__(self) -> None:
         self._base = self.first
@@ -112,12 +134,9 @@ class Span:
             self.last = number
             self.heard_ns = stamp_ns
             self.inherited = self._rebased = False
-        elif (hole := self._take_hole(number)) is not None:
-            key, more = hole
-            if isinstance(key, GapKey) and self.missed[key.cause] > 0:
-                self.missed[key.cause] -= 1
-                self.published -= 1
-                self.gaps.fill(key, more)
+            self._late = 0
+        elif holes := self._holes.within(number, number + 1):
+            self.published -= self._fill(holes)
         elif number < self._base and number not in self._early:
             # TRANSIENT_LOCAL delivers history from before the first number taken.
             if not self._early.add(number):
@@ -148,21 +167,57 @@ class Span:
         self.changed = self.changed or bool(found)
         return found
 
-    def late(self, count: int, *, alone: bool = False) -> None:
-        """Count messages after the inherited ``last``, whose numbers are not known.
-
-        Of a publisher that is ``alone`` they are the next ones; a death before its next message then does not count them again.
-        That is a guess: where one of these numbers comes after all, it is a message as any other.
-        """
+    def late(self, count: int) -> None:
+        """Count messages after the inherited ``last``, whose numbers are not known."""
         if count:
             self.received += count
             self.published += count
-            if alone and self.inherited and self.last is not None:
-                self._holes.append(self.last + 1, self.last + 1 + count, '')
-                self.last += count
-            elif self.inherited:
+            if self.inherited:
                 self._late += count
             self.changed = True
+
+    def recall(self, runs: Sequence[Run], count: int) -> bool:
+        """Count messages of the session before that turned up in a file, ``count`` of them for the first time.
+
+        ``runs`` are all that the file has of the topic. False, and nothing is changed, where they do not show that these
+        messages are this publisher's: they begin with the number after its last, or have that one with its stamp.
+        """
+        if self.last is None or not runs:
+            return False
+        more = (self.last - runs[0].start + (1 << 31)) >> 32 << 32
+        runs = [run._replace(start=run.start + more, stop=run.stop + more) for run in runs]
+        return self._go_on(runs, count) if self.inherited else self._fill_in(runs, count)
+
+    def _go_on(self, runs: Sequence[Run], count: int) -> bool:
+        """As ``recall``, before the first message of this session."""
+        last = self.last
+        assert last is not None
+        is_own = any(
+            run.start == last + 1 or (run.start <= last < run.stop and run.from_ns <= self.heard_ns <= run.to_ns) for run in runs
+        )
+        fresh = [run._replace(start=max(run.start, last + 1)) for run in runs if run.stop > last + 1]
+        if not is_own or sum(run.stop - run.start for run in fresh) != count:
+            return False
+        for run in fresh:
+            if run.start > last + 1:
+                self._skip(last + 1, run.start, run.from_ns)
+            self.last = last = run.stop - 1
+            self.heard_ns = run.to_ns
+        self.received += count
+        self.published += count
+        self.changed = True
+        return True
+
+    def _fill_in(self, runs: Iterable[Run], count: int) -> bool:
+        """As ``recall``, after the gap of the restart was counted."""
+        holes = [hole for run in runs for hole in self._holes.within(run.start, run.stop)
+                 if isinstance(hole[2], GapKey) and hole[2].cause == 'restart']  # fmt: skip
+        if sum(stop - start for start, stop, _ in holes) != count or self.missed['restart'] < count:
+            return False
+        self._fill(holes)
+        self.received += count
+        self.changed = True
+        return True
 
     def absorb(self, other: Span) -> None:
         """Take over the counts of a publisher that is not followed any more; their numbers are nobody's then."""
@@ -177,11 +232,17 @@ class Span:
         """What is published until the next new message was not listened to on purpose: that gap is not missed."""
         self._rebased = True
 
-    def _take_hole(self, number: int) -> tuple[GapKey | str, int] | None:
-        """The hole that the number was in, and how many holes more there are now; None where it was in none."""
-        before = len(self._holes)
-        hole = self._holes.take(number)
-        return None if hole is None else (hole, len(self._holes) - before)
+    def _fill(self, holes: Iterable[tuple[int, int, GapKey | str]]) -> int:
+        """Numbers of holes came after all; how many of them were missed until now."""
+        filled = 0
+        for start, stop, key in holes:
+            before = len(self._holes)
+            self._holes.cut(start, stop)
+            if isinstance(key, GapKey) and (count := min(stop - start, self.missed[key.cause])) > 0:
+                self.missed[key.cause] -= count
+                self.gaps.fill(key, count, len(self._holes) - before)
+                filled += count
+        return filled
 
     def _skip(self, start: int, stop: int, stamp_ns: int) -> None:
         """Count the numbers of a gap as missed, unless nobody listened, and remember them: they may come late."""

@@ -108,8 +108,9 @@ def killed(home: Path, it: Buffer) -> Path:
     return kill(home)
 
 
-def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path) -> None:
+def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What reached the disk is in the event's bag, which says that the rest is missing; the ledger closes."""
+    monkeypatch.setattr('shadowhound_data_logger.bags.events.SYNC_S', 3600.0)  # the second trigger syncs
     home = tmp_path / 'home'
     with buffer(home) as it:
         it.hear(range(10), size=2000)

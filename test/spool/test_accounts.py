@@ -27,7 +27,7 @@ from shadowhound_data_logger.spool.accounts import (
     Accounts,
     TopicAccount,
 )
-from shadowhound_data_logger.spool.span import Ranges, Span
+from shadowhound_data_logger.spool.span import Ranges, Run, Span
 
 
 def taken(span: Span, *numbers: int) -> list[bool]:
@@ -127,12 +127,50 @@ def test_a_late_number_of_a_restart_fills_its_hole() -> None:
     assert figures(span) == (3, 2, {'restart': 1})
 
 
-def test_a_guessed_number_that_comes_is_no_repeat() -> None:
-    """Which numbers those had that turned up in a file is a guess: no message is left out for it, and none of them is missed."""
-    span = Span(first=1, last=10, inherited=True)
-    span.late(5, alone=True)
-    assert taken(span, 12, 12, 18) == [True, False, True]
-    assert figures(span) == (9, 7, {'restart': 2})
+def test_what_a_file_has_of_the_session_before_is_counted_by_its_numbers() -> None:
+    """They come again as repeats; what is missing between them and after them is missed by the restart."""
+    span = Span(first=1, last=10, inherited=True, heard_ns=100)
+    assert span.recall([Run(7, 13, 70, 120), Run(15, 18, 150, 170)], 5)
+    assert taken(span, 12, 17, 20) == [False, False, True]
+    assert figures(span) == (10, 6, {'restart': 4})
+
+
+def test_a_file_that_begins_with_the_next_number_has_the_same_publisher() -> None:
+    """Though the message before it is in none."""
+    span = Span(first=1, last=10, inherited=True, heard_ns=100)
+    assert span.recall([Run(11, 13, 110, 120)], 2)
+    assert taken(span, 13) == [True]
+    assert figures(span) == (3, 3, {})
+
+
+@pytest.mark.parametrize(('runs', 'count'), [
+    ([Run(1, 6, 101, 150)], 5), ([Run(12, 17, 120, 160)], 5), ([Run(10, 13, 500, 520)], 5), ([Run(10, 16, 101, 150)], 5), ([], 5),
+])  # fmt: skip
+def test_numbers_that_may_be_of_another_publisher_are_not_believed(runs: list[Run], count: int) -> None:
+    """Then so many messages are counted, and whatever number comes next is a message as any other."""
+    span = Span(first=1, last=10, inherited=True, heard_ns=100)
+    assert not span.recall(runs, count)
+    span.late(count)
+    assert taken(span, 11, 12, 12, 18) == [True, True, False, True]
+    assert figures(span) == (13, 8, {'transport': 5})
+
+
+def test_a_gap_that_was_counted_already_is_filled_by_what_a_file_has() -> None:
+    """Where the next message came before the file was read; what it lacks stays missed, and may still come."""
+    span = Span(first=1, last=10, inherited=True, heard_ns=100)
+    assert taken(span, 20) == [True]
+    assert span.recall([Run(5, 13, 50, 120), Run(14, 16, 140, 150)], 4)
+    assert taken(span, 12, 13, 14, 17) == [False, True, False, True]
+    assert figures(span) == (10, 7, {'restart': 3})
+
+
+def test_numbers_in_a_file_are_the_low_32_bits() -> None:
+    """As MCAP has them: those of the publisher's last number are added."""
+    span = Span(first=1, last=(1 << 32) - 2, inherited=True, heard_ns=100)
+    assert span.recall([Run((1 << 32) - 2, 1 << 32, 100, 110)], 1)
+    assert span.recall([Run(0, 2, 120, 130)], 2)
+    assert taken(span, (1 << 32) + 1, (1 << 32) + 2) == [False, True]
+    assert figures(span) == (4, 4, {})
 
 
 def test_after_a_rebase_the_gap_is_not_missed() -> None:
@@ -172,8 +210,13 @@ def test_ranges_are_sets_of_numbers(steps: list[tuple[str, int]]) -> None:
             ranges.append(start, start + number % 5 + 1, '')
             numbers |= set(range(start, start + number % 5 + 1))
         elif what == 't':
-            assert (ranges.take(number) is not None) == (number in numbers)
-            numbers.discard(number)
+            found = ranges.within(number, number + 3)
+            assert [each for start, stop, _ in found for each in range(start, stop)] == sorted(
+                numbers & set(range(number, number + 3))
+            )
+            for start, stop, _ in found[:1]:
+                ranges.cut(start, stop)
+                numbers -= set(range(start, stop))
         elif number not in numbers:
             assert ranges.add(number)
             numbers.add(number)

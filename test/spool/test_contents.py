@@ -14,6 +14,7 @@ from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import DataObject, State
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import BAG
+from shadowhound_data_logger.spool.span import Run
 from shadowhound_data_logger.spool.spool import Spool
 
 ODOM, IMU = f'{BAG}/odom', f'{BAG}/imu'
@@ -50,8 +51,13 @@ def started(root: Path, clock: FakeClock) -> Spool:
 
 def find(spool: Spool, item: DataObject) -> None:
     """What recovery does with a slice that was left behind."""
-    spool.accounts.find(item.counts)
+    spool.accounts.find(item.counts, runs(item))
     spool.commit([item])
+
+
+def runs(item: DataObject) -> dict[str, list[Run]]:
+    """The numbers of a slice's messages, where it has all of the publisher."""
+    return {topic: [Run(1, 1 + count, 0, 0)] for topic, count in item.counts.items()}
 
 
 def die(spool: Spool, root: Path) -> Path:
@@ -189,17 +195,20 @@ def test_what_is_found_is_counted_once_whatever_dies_next(opened: Open, root: Pa
 
 
 @pytest.mark.parametrize('found_first', [True, False])
-def test_a_recorded_message_is_not_missed_as_well(opened: Open, root: Path, clock: FakeClock, found_first: bool) -> None:
+@pytest.mark.parametrize('is_told', [True, False])
+def test_a_recorded_message_is_not_missed_as_well(
+    opened: Open, root: Path, clock: FakeClock, found_first: bool, is_told: bool
+) -> None:
     """Numbers that the accounts of the dead session did not reach are in its file: the gap before the next one is shorter."""
     left = killed(opened(), root)
     after = started(left, clock)
     item = a_slice(0, imu=14)
     if found_first:
-        after.accounts.find(item.counts)
+        after.accounts.find(item.counts, runs(item) if is_told else {})
     with after.accounts.entry(IMU) as account:
         assert account.receive('p', 31)
     if not found_first:
-        after.accounts.find(item.counts)
+        after.accounts.find(item.counts, runs(item) if is_told else {})
     after.commit([item])
     after.close()
     found = ledger.read(left, 'thor')
