@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import os
 import signal
@@ -45,6 +46,10 @@ WAITING = ('test/doctor/', 'test/e2e/', 'test/missions/', 'test/sim/', 'test/tow
 """Folders whose tests mostly wait for other processes."""
 MAKE_WAY = os.nice(0) + 10
 """How nice the other workers are."""
+HUNG_S = 60.0
+"""After the time of a test is over, for it to end: one that waits in a library for a lock that nobody has ends no other way."""
+STDERR = pytest.StashKey[int]()
+"""While a test runs, what it writes to file 2 is kept for its report."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -58,6 +63,7 @@ def pytest_configure(config: pytest.Config) -> None:
         found = sorted({str(root / path.relative_to(root).parts[0]) for path in root.rglob('test_*.py')})
         first = len(found) * int(config.workerinput['workerid'].removeprefix('gw')) // config.workerinput['workercount']
         config.args = found[first:] + found[:first]
+    config.stash[STDERR] = os.dup(2)
     os.environ.update(THIS_MACHINE)
     gc.disable()
     botocore.session.create_loader = lru_cache(create_loader)  # whose descriptions of S3 each store would read
@@ -85,6 +91,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
             if nodeid.startswith(ONE_SENDER):
                 return 'sender'
             return 'robots' if has_robot(nodeid) else str(super()._split_scope(nodeid))
+
+        def remove_node(self, node: Any) -> str | None:
+            """The test that ended a worker is not tried again: it would end one after the other."""
+            units = self.assigned_work[node].values()
+            crashed = next(((unit, test) for unit in units for test, is_done in unit.items() if not is_done), None)
+            if crashed is not None:
+                crashed[0][crashed[1]] = True
+            super().remove_node(node)
+            return crashed[1] if crashed is not None else None
 
     return Scheduling(config, log)
 
@@ -126,6 +141,21 @@ def pytest_collection_finish() -> None:
     """Four thousand tests and what they import stay for good: looking through all of it again and again takes seconds."""
     gc.enable()
     gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """pytest-timeout interrupts Python; where that does not help, the process tells where each thread is, and ends.
+
+    The others go on: pytest-xdist starts another worker, and the test has failed.
+    """
+    marker = item.get_closest_marker('timeout')
+    seconds = float(marker.args[0] if marker else item.config.getini('timeout'))
+    faulthandler.dump_traceback_later(seconds + HUNG_S, exit=True, file=item.config.stash[STDERR])
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
