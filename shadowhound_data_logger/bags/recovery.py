@@ -37,7 +37,7 @@ from shadowhound_data_logger.mcap.recovery import read_info, recover
 from shadowhound_data_logger.mcap.writer import OPEN
 from shadowhound_data_logger.model import RecordingRows
 from shadowhound_data_logger.spool.files import content_sha256
-from shadowhound_data_logger.spool.span import MAX_RANGES, Run
+from shadowhound_data_logger.spool.span import MAX_RANGES, NumberRun
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -271,9 +271,9 @@ class BagRecovery:
         path.rename(next(target / name for name in names if not os.path.lexists(target / name)))
 
 
-def _runs(path: Path) -> dict[str, list[Run]]:
+def _runs(path: Path) -> dict[str, list[NumberRun]]:
     """The numbers of a slice's messages, by topic; none of a topic where they do not rise, since several publishers have it."""
-    found: dict[str, list[Run]] = {}
+    found: dict[str, list[NumberRun]] = {}
     with suppress(BagDamaged, OSError):  # then it is not known; the spool compares the file with its checksum
         source = LocalFile(path)
         for message in read_messages(source, read_index(source), MessageFilter(0, 1 << 64, lambda _: True)):
@@ -282,7 +282,7 @@ def _runs(path: Path) -> dict[str, list[Run]]:
             if runs and number == runs[-1].stop:
                 runs[-1] = runs[-1]._replace(stop=number + 1, to_ns=stamp_ns)
             elif len(runs) <= MAX_RANGES:
-                runs.append(Run(number, number + 1, stamp_ns, stamp_ns))
+                runs.append(NumberRun(number, number + 1, stamp_ns, stamp_ns))
     return {
         topic: runs for topic, runs in found.items()
         if len(runs) <= MAX_RANGES and all(one.stop < two.start for one, two in pairwise(runs))

@@ -16,7 +16,7 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS, MAX_AGE_NS, Clock
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, LATELY_NS, MISSED, REJECTED, Figures, TopicGaps, latest
-from shadowhound_data_logger.spool.span import Run, Span
+from shadowhound_data_logger.spool.span import NumberRun, Span
 
 PAUSED: Final = 'paused'
 """Why messages are dropped that come during a pause."""
@@ -194,7 +194,7 @@ class TopicAccount:
                 self._estimate_lost(lost, self.gaps.heard_ns, newest_ns)
                 self.missed_estimated = +self.missed_estimated
 
-    def find(self, count: int, runs: Sequence[Run] = ()) -> None:
+    def find(self, count: int, runs: Sequence[NumberRun] = ()) -> None:
         """Messages of the session before, of which its accounts did not know yet, turned up in a file of it.
 
         ``runs`` are the numbers of all that the file has of the topic, empty where they are not known.
@@ -410,7 +410,7 @@ class Accounts:
                 self._carried[row.topic] += row.received
                 self._carried_ns[row.topic] = row.last_kept_ns or row.heard_ns, row.heard_ns
 
-    def find(self, counts: Mapping[str, int], runs: Mapping[str, Sequence[Run]]) -> None:
+    def find(self, counts: Mapping[str, int], runs: Mapping[str, Sequence[NumberRun]]) -> None:
         """Messages of an earlier session turned up in a file that is about to be spooled; ``runs`` as in ``TopicAccount``."""
         with self._lock:
             for topic, count in counts.items():

@@ -18,7 +18,7 @@ MAX_MISSED: Final = 1 << 40
 """More than anybody publishes. Numbers that leap further lie, and that is believed to be no loss: sums stay within SQLite."""
 
 
-class Run(NamedTuple):
+class NumberRun(NamedTuple):
     """Messages of one publisher whose numbers follow one another, in a file that has the low 32 bits of these."""
 
     start: int
@@ -176,7 +176,7 @@ class Span:
                 self._late += count
             self.changed = True
 
-    def recall(self, runs: Sequence[Run], count: int) -> bool:
+    def recall(self, runs: Sequence[NumberRun], count: int) -> bool:
         """Count messages of the session before that turned up in a file, ``count`` of them for the first time.
 
         ``runs`` are all that the file has of the topic. False, and nothing is changed, where they do not show that these
@@ -188,7 +188,7 @@ class Span:
         runs = [run._replace(start=run.start + more, stop=run.stop + more) for run in runs]
         return self._go_on(runs, count) if self.inherited else self._fill_in(runs, count)
 
-    def _go_on(self, runs: Sequence[Run], count: int) -> bool:
+    def _go_on(self, runs: Sequence[NumberRun], count: int) -> bool:
         """As ``recall``, before the first message of this session."""
         last = self.last
         assert last is not None
@@ -208,7 +208,7 @@ class Span:
         self.changed = True
         return True
 
-    def _fill_in(self, runs: Iterable[Run], count: int) -> bool:
+    def _fill_in(self, runs: Iterable[NumberRun], count: int) -> bool:
         """As ``recall``, after the gap of the restart was counted."""
         holes = [hole for run in runs for hole in self._holes.within(run.start, run.stop)
                  if isinstance(hole[2], GapKey) and hole[2].cause == 'restart']  # fmt: skip

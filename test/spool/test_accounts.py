@@ -27,7 +27,7 @@ from shadowhound_data_logger.spool.accounts import (
     Accounts,
     TopicAccount,
 )
-from shadowhound_data_logger.spool.span import Ranges, Run, Span
+from shadowhound_data_logger.spool.span import NumberRun, Ranges, Span
 
 
 def taken(span: Span, *numbers: int) -> list[bool]:
@@ -130,7 +130,7 @@ def test_a_late_number_of_a_restart_fills_its_hole() -> None:
 def test_what_a_file_has_of_the_session_before_is_counted_by_its_numbers() -> None:
     """They come again as repeats; what is missing between them and after them is missed by the restart."""
     span = Span(first=1, last=10, inherited=True, heard_ns=100)
-    assert span.recall([Run(7, 13, 70, 120), Run(15, 18, 150, 170)], 5)
+    assert span.recall([NumberRun(7, 13, 70, 120), NumberRun(15, 18, 150, 170)], 5)
     assert taken(span, 12, 17, 20) == [False, False, True]
     assert figures(span) == (10, 6, {'restart': 4})
 
@@ -138,19 +138,19 @@ def test_what_a_file_has_of_the_session_before_is_counted_by_its_numbers() -> No
 def test_a_file_that_begins_with_the_next_number_has_the_same_publisher() -> None:
     """Though the message before it is in none."""
     span = Span(first=1, last=10, inherited=True, heard_ns=100)
-    assert span.recall([Run(11, 13, 110, 120)], 2)
+    assert span.recall([NumberRun(11, 13, 110, 120)], 2)
     assert taken(span, 13) == [True]
     assert figures(span) == (3, 3, {})
 
 
-@pytest.mark.parametrize(('runs', 'count'), [
-    ([Run(1, 6, 101, 150)], 5), ([Run(12, 17, 120, 160)], 5), ([Run(10, 13, 500, 520)], 5), ([Run(10, 16, 101, 150)], 5), ([], 5),
+@pytest.mark.parametrize('runs', [
+    [NumberRun(1, 6, 101, 150)], [NumberRun(12, 17, 120, 160)], [NumberRun(10, 13, 500, 520)], [NumberRun(10, 16, 101, 150)], [],
 ])  # fmt: skip
-def test_numbers_that_may_be_of_another_publisher_are_not_believed(runs: list[Run], count: int) -> None:
+def test_numbers_that_may_be_of_another_publisher_are_not_believed(runs: list[NumberRun]) -> None:
     """Then so many messages are counted, and whatever number comes next is a message as any other."""
     span = Span(first=1, last=10, inherited=True, heard_ns=100)
-    assert not span.recall(runs, count)
-    span.late(count)
+    assert not span.recall(runs, 5)
+    span.late(5)
     assert taken(span, 11, 12, 12, 18) == [True, True, False, True]
     assert figures(span) == (13, 8, {'transport': 5})
 
@@ -159,7 +159,7 @@ def test_a_gap_that_was_counted_already_is_filled_by_what_a_file_has() -> None:
     """Where the next message came before the file was read; what it lacks stays missed, and may still come."""
     span = Span(first=1, last=10, inherited=True, heard_ns=100)
     assert taken(span, 20) == [True]
-    assert span.recall([Run(5, 13, 50, 120), Run(14, 16, 140, 150)], 4)
+    assert span.recall([NumberRun(5, 13, 50, 120), NumberRun(14, 16, 140, 150)], 4)
     assert taken(span, 12, 13, 14, 17) == [False, True, False, True]
     assert figures(span) == (10, 7, {'restart': 3})
 
@@ -167,8 +167,8 @@ def test_a_gap_that_was_counted_already_is_filled_by_what_a_file_has() -> None:
 def test_numbers_in_a_file_are_the_low_32_bits() -> None:
     """As MCAP has them: those of the publisher's last number are added."""
     span = Span(first=1, last=(1 << 32) - 2, inherited=True, heard_ns=100)
-    assert span.recall([Run((1 << 32) - 2, 1 << 32, 100, 110)], 1)
-    assert span.recall([Run(0, 2, 120, 130)], 2)
+    assert span.recall([NumberRun((1 << 32) - 2, 1 << 32, 100, 110)], 1)
+    assert span.recall([NumberRun(0, 2, 120, 130)], 2)
     assert taken(span, (1 << 32) + 1, (1 << 32) + 2) == [False, True]
     assert figures(span) == (4, 4, {})
 

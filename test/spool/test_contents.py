@@ -14,7 +14,7 @@ from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import DataObject, State
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import BAG
-from shadowhound_data_logger.spool.span import Run
+from shadowhound_data_logger.spool.span import NumberRun
 from shadowhound_data_logger.spool.spool import Spool
 
 ODOM, IMU = f'{BAG}/odom', f'{BAG}/imu'
@@ -55,9 +55,9 @@ def find(spool: Spool, item: DataObject) -> None:
     spool.commit([item])
 
 
-def runs(item: DataObject) -> dict[str, list[Run]]:
+def runs(item: DataObject) -> dict[str, list[NumberRun]]:
     """The numbers of a slice's messages, where it has all of the publisher."""
-    return {topic: [Run(1, 1 + count, 0, 0)] for topic, count in item.counts.items()}
+    return {topic: [NumberRun(1, 1 + count, 0, 0)] for topic, count in item.counts.items()}
 
 
 def die(spool: Spool, root: Path) -> Path:
