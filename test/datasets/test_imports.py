@@ -95,7 +95,7 @@ def assert_is_as_recorded(made: Lerobot) -> None:
         assert made.numbers(row, 'observation.state')[sure, :6] == pytest.approx(positions(number)[newest[sure]], abs=1e-4)
 
 
-@pytest.mark.parametrize('version', ['v2.1', 'v3.0'])
+@pytest.mark.parametrize('version', [pytest.param('v2.1', marks=pytest.mark.long('as for v3.0')), 'v3.0'])
 def test_a_data_set_of_the_arm(house: House, tmp_path: Path, times: Path, version: str) -> None:
     """As it is, joints in degrees: stored once, in the catalogue, and each value traced to the object and the file."""
     arm, source = f'arm{version[1]}', lerobot_set(tmp_path / 'theirs', version)

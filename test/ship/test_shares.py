@@ -12,6 +12,7 @@ LIVE = (3, 3, 4, 6, 7)
 """Priorities of the objects that are made each second, all at one instant."""
 SECONDS = 90
 IDS = ('more important', 'less important', 'alike')
+LONG = pytest.mark.long('a second of CPU or more')
 
 
 @dataclass(slots=True)
@@ -49,7 +50,7 @@ def share(drive: Drive, backlog: tuple[int, ...], per_s: float) -> Shared:
     return found
 
 
-@pytest.mark.parametrize('backlog', [(3,), (9,), (3, 4, 6, 7, 9)], ids=IDS)
+@pytest.mark.parametrize('backlog', [pytest.param((3,), marks=LONG), pytest.param((9,), marks=LONG), (3, 4, 6, 7, 9)], ids=IDS)
 def test_a_store_of_twice_the_rate_keeps_up_with_what_is_live(drive: Drive, backlog: tuple[int, ...]) -> None:
     """Whatever lies in the backlog, all that is made meanwhile is there within two seconds, and the rest is the backlog's."""
     found = share(drive, backlog, per_s=2 * len(LIVE))
@@ -58,7 +59,9 @@ def test_a_store_of_twice_the_rate_keeps_up_with_what_is_live(drive: Drive, back
     assert len(found.old) >= len(LIVE) * (SECONDS - 1)
 
 
-@pytest.mark.parametrize(('backlog', 'least'), [((3,), 1 / 2), ((9,), 1 / 8), ((3, 4, 6, 7, 9), 1 / 2)], ids=IDS)
+@pytest.mark.parametrize(('backlog', 'least'), [
+    pytest.param((3,), 1 / 2, marks=LONG), ((9,), 1 / 8), pytest.param((3, 4, 6, 7, 9), 1 / 2, marks=LONG),
+], ids=IDS)  # fmt: skip
 def test_a_store_that_is_too_slow_is_shared_evenly(drive: Drive, backlog: tuple[int, ...], least: float) -> None:
     """Every second turn is that of the live ones, of which no priority goes without; the oldest of the backlog go on leaving.
 

@@ -187,7 +187,7 @@ def test_frames_lose_rate_before_time(make_robot: Callable[..., Robot]) -> None:
     assert sum(gap.count for gap in gaps) == reasons['thinned']
 
 
-@pytest.mark.parametrize('pack', [pack_tar, pack_zip])
+@pytest.mark.parametrize('pack', [pack_tar, pytest.param(pack_zip, marks=pytest.mark.long('as for tar'))])
 @pytest.mark.parametrize('repeats', [True, pytest.param(False, marks=pytest.mark.long('without repeats'))])
 def test_an_archive_loses_every_second_picture(
     make_robot: Callable[..., Robot], pack: Callable[..., bytes], repeats: bool

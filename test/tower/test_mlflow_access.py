@@ -291,7 +291,7 @@ PLACES = ['file:///etc', '/etc', 'file:/etc', 'FILE:///etc', 'sftp://localhost/e
           '../..', ' file:///etc']  # fmt: skip
 
 
-@pytest.mark.parametrize('user', ['spark', 'tower'])
+@pytest.mark.parametrize('user', ['spark', pytest.param('tower', marks=pytest.mark.long('as for spark'))])
 def test_nobody_chooses_where_artifacts_go(users: dict[str, User], user: str) -> None:
     """Neither by the field's name in the protocol nor by that in JSON, on none of the paths, and nothing is made."""
     bodies = [{'name': f'{user}-{number}', field: place} for number, place in enumerate(PLACES)
