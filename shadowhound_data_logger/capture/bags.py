@@ -29,7 +29,7 @@ class BagConsumer(Consumer):
     wants_latched = True
 
     def __init__(self, node: Node, settings: BagSettings, accounts: Accounts, queue: BagQueue) -> None:
-        self.choice = TopicChoice(settings, [node.resolve_topic_name(topic) for topic in settings.topics if topic])
+        self.wanted_topics = TopicChoice(settings, [node.resolve_topic_name(topic) for topic in settings.topics if topic])
         self._before: dict[str, dict[str, int]] = {}
         self._again: set[tuple[str, str, int]] = set()
         self._node = node

@@ -77,24 +77,24 @@ class Consumer(Protocol):
     ``choose`` or ``take`` does not get these messages; the others do, and ``failures`` counts it.
     """
 
-    choice: TopicChoice | None = None
+    wanted_topics: TopicChoice | None = None
     """Which topics it wants; None for those that the sensors have."""
     topics: frozenset[str] = frozenset()
-    """With a choice: those that it gets now, by their full names. The intake sets them."""
+    """Of these, those that it gets now, by their full names. The intake sets them."""
     from_start: bool = True
-    """With a choice: whether it listens as soon as the intake is open, or once ``Intake.listen`` says so."""
+    """Whether it listens to these as soon as the intake is open, or once ``Intake.listen`` says so."""
     wants_latched: bool = False
-    """With a choice: whether it begins with what latched publishers sent before, with subscriptions of its own for that."""
+    """Whether it begins with what latched publishers of these sent before, with subscriptions of its own for that."""
     failures: int = 0
     """How often it failed to take messages."""
     last_error: str = ''
 
     def enter(self, topic: str, type_name: str, sensor: str) -> None:  # noqa: ARG002
-        """Without a choice: messages of a sensor's topic begin here, of this type."""
+        """Of sensors: messages of a sensor's topic begin here, of this type."""
         return
 
     def choose(self, drained: Drained, account: TopicAccount) -> None:  # noqa: ARG002
-        """Without a choice, before ``take``: count in the topic's account what is not stored.
+        """Of sensors, before ``take``: count in the topic's account what is not stored.
 
         The lock of the accounts has been held since the messages were received, so that no commit sees the one without the
         other: nothing but that is done here.

@@ -41,7 +41,7 @@ class EventConsumer(Consumer):
         watched = [(node.resolve_topic_name(each.topic), each) for each in conditions(settings.conditions)]
         named = [node.resolve_topic_name(topic) for topic in settings.topics if topic]
         self.inbox = Inbox(watched)
-        self.choice = TopicChoice(settings, [*named, *self.inbox.conditions])
+        self.wanted_topics = TopicChoice(settings, [*named, *self.inbox.conditions])
         kept = TopicChoice(settings, named).wanted((), self.inbox.conditions)
         self._unkept = frozenset(self.inbox.conditions) - kept
         self._node = node

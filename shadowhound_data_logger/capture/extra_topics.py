@@ -43,8 +43,8 @@ class ExtraTopics:
 
         ``types`` are those that sensors name for topics, also for such as they do not take now.
         """
-        assert consumers[0].choice is not None
-        self.consumer, self._choice = consumers[0], consumers[0].choice
+        assert consumers[0].wanted_topics is not None
+        self.consumer, self._choice = consumers[0], consumers[0].wanted_topics
         self._consumers = consumers
         self._around = around
         self._node = around.node

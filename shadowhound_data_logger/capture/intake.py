@@ -55,7 +55,7 @@ class Intake:
         named = {node.resolve_topic_name(topic): type_name for sensor in sensors.values()
                  for topic, type_name in zip(sensor.topics, sensor.types, strict=False) if type_name}  # fmt: skip
         self._extra = [ExtraTopics(around, consumers[place:], named)
-                       for place, consumer in enumerate(consumers) if consumer.choice is not None]  # fmt: skip
+                       for place, consumer in enumerate(consumers) if consumer.wanted_topics is not None]  # fmt: skip
         self._listening = [extra for extra in self._extra if extra.consumer.from_start]
         self._requests: deque[Callable[[], None]] = deque()
         self._wake = threading.Event()

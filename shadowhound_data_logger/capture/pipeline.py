@@ -66,9 +66,9 @@ from shadowhound_data_logger.stores import open_store
 log = logging.getLogger(__name__)
 
 CLOSE_S = 5.0
+"""Time for what is in memory to become durable at a stop; it takes a fraction of that unless the disk hangs."""
 DAMAGED_S = 0.5
 """The same where the spool takes nothing any more."""
-"""Time for what is in memory to become durable at a stop; it takes a fraction of that unless the disk hangs."""
 LEDGER_BUCKET = 'sensor-data'
 
 
@@ -155,7 +155,7 @@ class Pipeline:
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
         self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)
         keeping = Keeping(settings.keep, sensors, settings.robot)
-        marks = self.mission.mark, track.mark, keeping.mark, self._redating.date
+        marks = self.mission.mark, track.mark, keeping.mark, self._redating.mark
         self.pool = EncodePool(settings.robot, queue, sensors, types, self.writer, marks, self.mission.observe,
                                preview=keeping.preview)  # fmt: skip
         self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
@@ -343,7 +343,7 @@ class Pipeline:
     def _ship_ledger(self) -> None:
         """A ledger that cannot be read now is not worth the node: the next one holds all that this one would."""
         try:
-            self.writer.put(self._redating.date(self._ledger()), wait=False)
+            self.writer.put(self._redating.mark(self._ledger()), wait=False)
         except DataLoggerError as error:
             log.warning('the ledger was not shipped: %s', error)
 

@@ -169,8 +169,8 @@ class SensorStream:
         self._type = type_name
         self._entry = accounts.entry(topic)
         self._consumers = consumers
-        self._choosing = [consumer for consumer in consumers if consumer.choice is None]
-        self._by_choice = [consumer for consumer in consumers if consumer.choice is not None]
+        self._of_sensors = [consumer for consumer in consumers if consumer.wanted_topics is None]
+        self._of_own_topics = [consumer for consumer in consumers if consumer.wanted_topics is not None]
         self._recent = RecentMessages()
         self._arrivals = Arrivals()
         self._counter: CounterField | None = None
@@ -178,7 +178,7 @@ class SensorStream:
         with self._entry as account:
             account.type = type_name
             account.expect(self._expected(sensor, types))
-        for consumer in self._choosing:
+        for consumer in self._of_sensors:
             consumer.enter(topic, type_name, sensor.name)
 
     def _expected(self, sensor: SensorSettings, types: MessageTypes) -> Expectation:
@@ -213,7 +213,7 @@ class SensorStream:
             is_refuted = bool(sent) and account.estimate.refuted
             if fresh:
                 drained = Drained(self._topic, self._type, self._sensor, fresh, lost, now_s, paused)
-                for consumer in self._choosing:
+                for consumer in self._of_sensors:
                     try:
                         consumer.choose(drained, account)
                     except Exception as error:  # noqa: BLE001 - a defect of one is none of the others'
@@ -226,8 +226,8 @@ class SensorStream:
         for consumer, defect in failed.items():
             count_failure(consumer, self._topic, defect)
         if fresh:
-            hand_on(drained, [each for each in self._choosing if each not in failed] if failed else self._choosing)
-            hand_on(drained, [each for each in self._by_choice if self._topic in each.topics])
+            hand_on(drained, [each for each in self._of_sensors if each not in failed] if failed else self._of_sensors)
+            hand_on(drained, [each for each in self._of_own_topics if self._topic in each.topics])
 
     def look(self, now_s: float) -> None:
         """All that waited was taken."""
@@ -236,5 +236,5 @@ class SensorStream:
     def close(self) -> None:
         """No more of it comes."""
         for consumer in self._consumers:
-            if consumer.choice is None or self._topic in consumer.topics:
+            if consumer.wanted_topics is None or self._topic in consumer.topics:
                 consumer.leave(self._topic)

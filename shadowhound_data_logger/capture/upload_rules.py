@@ -44,7 +44,7 @@ class NewestMessages(Consumer):
 
     def __init__(self, topics: Collection[str]) -> None:
         """Full names, one at least."""
-        self.choice = TopicChoice(EventSettings(), topics)
+        self.wanted_topics = TopicChoice(EventSettings(), topics)
         self.newest: dict[str, tuple[str, Taken, float]] = {}
         """Topic -> type, message, and when it was drained by the monotonic clock."""
 

@@ -9,7 +9,8 @@ import tarfile
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -19,13 +20,6 @@ import simplejpeg
 
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.untrusted import MOST_MEMBERS, check_pixels, check_size, open_image
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,9 +1,8 @@
 """The new objects of one group commit: their rows, and their files as parts until the transaction is durable.
 
 All content is written and synced beside the parts before the transaction begins, whole files before anything is locked, however
-long a copy takes. A file of the spool's own file system
-is linked, any other copied. Its source is nobody's to remove until the object that it is the content of is durable, so a death
-at any moment leaves the source, the object, or both.
+long a copy takes. A file of the spool's own file system is linked, any other copied. Its source is nobody's to remove until the
+object that it is the content of is durable, so a death at any moment leaves the source, the object, or both.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class Redating:
         self._record = record
         self._robot = robot
 
-    def date(self, item: DataObject) -> DataObject:
+    def mark(self, item: DataObject) -> DataObject:
         """The object with what is known of its time; held, or under another key, where that is not UTC."""
         boot_id = self._watch.boot_id
         offset_ns = self._offset_of(boot_id)

@@ -1,6 +1,7 @@
 """Makes room in the spool: what a full disk costs, decided object by object and recorded as evicted.
 
-This decides what is evicted; a disk that is full at once (ENOSPC) is ``ballast.py``, an open slice ``bags/recording.py``.
+This decides how much is evicted and when; the order is that of ``Index.evictable``. A disk that is full at once (ENOSPC) is
+``ballast.py``, an open slice ``bags/recording.py``.
 """
 
 from __future__ import annotations

@@ -75,7 +75,10 @@ class SpoolWriter:
 
     def on_commit(self, *, spooled: Callable[[Sequence[SpooledObject]], None] | None = None,
                   settled: Callable[[Collection[int]], None] | None = None) -> None:  # fmt: skip
-        """After each commit, its thread calls ``spooled`` with the new objects, and ``settled`` with the ids of the outcomes."""
+        """After each commit, its thread calls ``spooled`` with the new objects, and ``settled`` with the ids of the outcomes.
+
+        In a node these are ``Uploader.wake``, which adds the objects to what is to be sent, and ``Uploader.settled``.
+        """
         self._spooled = spooled or self._spooled
         self._settled = settled or self._settled
 

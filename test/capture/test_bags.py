@@ -187,7 +187,7 @@ def test_what_is_latched_is_in_each_bag() -> None:
 @pytest.mark.parametrize(('named', 'expected'), [((), {'/imu', '/odom'}), (('/rosout',), {'/rosout'})])
 def test_what_only_the_ring_takes_is_in_a_bag_where_it_is_named_alone(named: tuple[str, ...], expected: set[str]) -> None:
     """Without settings a bag has what the sensors take, whatever events keep; what is named needs no subscription more."""
-    bags: Any = SimpleNamespace(topics=frozenset(), wants_latched=True, choice=TopicChoice(BagSettings(), named))
+    bags: Any = SimpleNamespace(topics=frozenset(), wants_latched=True, wanted_topics=TopicChoice(BagSettings(), named))
     nothing: Any = None
     extra = ExtraTopics(Surroundings(nothing, nothing, nothing, nothing), [bags], {})
     sensors = dict.fromkeys(('/imu', '/odom'), False)
@@ -200,7 +200,7 @@ class Listener(Consumer):
     """Remembers what it was given."""
 
     def __init__(self, choice: TopicChoice | None, *topics: str) -> None:
-        self.choice = choice
+        self.wanted_topics = choice
         self.topics = frozenset(topics)
         self.given: list[tuple[str, str, list[int | None]]] = []
 

@@ -63,7 +63,7 @@ class Ear:
         self.consumer = EventConsumer(self.graph, EventSettings(**settings), self.ring, self.claims)
 
     def wanted(self, *graph: str) -> frozenset[str]:
-        return self.consumer.choice.wanted((), graph)
+        return self.consumer.wanted_topics.wanted((), graph)
 
     def take(self, topic: str, messages: Sequence[Taken], *, paused: bool = False) -> None:
         self.consumer.take(Drained(topic, STRING, '', messages, None, 0.0, paused))

@@ -55,7 +55,7 @@ class Recording:
 
     def __init__(self, node: Node) -> None:
         choice = TopicChoice(BagSettings(regex='^/crowd/'), ['/named'])
-        self.bags: Any = SimpleNamespace(topics=frozenset(), choice=choice, wants_latched=True, take=lambda _: None,
+        self.bags: Any = SimpleNamespace(topics=frozenset(), wanted_topics=choice, wants_latched=True, take=lambda _: None,
                                          leave=lambda _: None)  # fmt: skip
         self.group = PolledGroup()
         self.extra = ExtraTopics(Surroundings(node, self.group, Accounts(), MessageTypes()), [self.bags], {})

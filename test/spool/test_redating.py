@@ -40,7 +40,7 @@ class Run:
         """Objects whose messages were sent now, as the encoders make them."""
         items = [self.made(**each) for each in fields or ({},)]
         receive(self.spool, len(items))
-        return self.spool.commit([self.redating.date(item) for item in items])
+        return self.spool.commit([self.redating.mark(item) for item in items])
 
     def made(self, key: str = 'thor/camera/19700101/000110_front.jpg', **fields: Any) -> DataObject:
         now_ns = self.watch.wall_ns() if self.watch.is_set else self.watch.boot_ns()
@@ -126,7 +126,7 @@ def test_what_is_encoded_after_the_clock_was_set_is_dated_at_once(started: Calla
     run = started()
     item = run.made()
     clocks.set()
-    dated = run.redating.date(item)
+    dated = run.redating.mark(item)
     assert (dated.key, dated.held, dated.t_start_ns, dated.metadata['clock']) == (FINAL, None, NOON_NS, 'set_later')
 
 
@@ -134,7 +134,7 @@ def test_a_publisher_that_knows_the_time_is_believed(started: Callable[..., Run]
     """Its object goes under its date at once, though our clock is not set; by the boot clock it was just now."""
     run = started()
     item = run.made(FINAL, t_start_ns=NOON_NS, t_end_ns=NOON_NS + SECOND)
-    dated = run.redating.date(item)
+    dated = run.redating.mark(item)
     assert (dated.key, dated.held, dated.metadata['clock']) == (FINAL, None, 'publisher')
     assert dated.metadata['boot_end_ns'] == str(clocks.boot_ns())
     assert dated.metadata['boot_start_ns'] == str(clocks.boot_ns() - SECOND)
