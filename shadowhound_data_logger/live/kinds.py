@@ -269,13 +269,19 @@ def points_items(topic: str, at_ms: float, table: NDArray[Any], frame: str, size
     columns = np.ascontiguousarray(table.T, '<f4')  # numpy is ten times as fast along rows that are contiguous
     low, high = _box(columns)
     if not (np.all(low > -_FAR) and np.all(high < _FAR)):  # what is NaN is neither
-        columns = columns[:, (np.abs(columns) < _FAR).all(axis=0)]
+        is_near = (np.abs(columns) < _FAR).all(axis=0)
+        columns = np.array([column[is_near] for column in columns])
         low, high = _box(columns)
     span = high.astype('f8') - low
     scale = np.where(span > 0, span, 1.0) / 65_535
     for size in sizes:
-        steps = ((columns[:, :: _EVERY[size]] - low[:, None]) * (1 / scale).astype('f4')[:, None] + np.float32(0.5)).astype('<u2')
-        chosen = np.ascontiguousarray(steps.T)
+        sent = columns[:, :: _EVERY[size]]
+        chosen, steps = np.empty((sent.shape[1], 3), '<u2'), np.empty(sent.shape[1], '<f4')
+        for axis, column in enumerate(sent):  # one axis after the other: to turn a whole table takes numpy twice as long
+            np.subtract(column, low[axis], out=steps)
+            steps *= np.float32(1 / scale[axis])
+            steps += np.float32(0.5)
+            chosen[:, axis] = steps
         head = {
             'at': round(at_ms, 1), 'low': [round(float(value), 4) for value in low], 'step': [float(value) for value in scale],
             'points': len(chosen), 'frame': frame[:80],
