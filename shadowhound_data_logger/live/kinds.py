@@ -165,7 +165,7 @@ def _joints(message: Any) -> dict[str, float]:
 
 
 def _joints_table(cdrs: Sequence[bytes]) -> tuple[list[str], bytes] | None:
-    told, rows = cdrs[0][0:0], []
+    told, rows = b'', []
     for cdr in cdrs:
         begin = place = _after_text(cdr, _FRAME_ID)
         (count,) = _LENGTH.unpack_from(cdr, place)
