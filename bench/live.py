@@ -2,15 +2,15 @@
 """What the live page costs and how late it is: CPU of node and page without viewers and with some, and links that are slow.
 
     scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8 [--video] | --beside 0.5 | --browser | --pairs 7
-        | --minutes 60] [--kills 2]
+        | --minutes 60 | --floor] [--kills 2]
 
 Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a network
 namespace where what the page sends leaves at so many Mbit/s (tc htb; needs root); with ``--video`` the viewer takes the camera as
 WebRTC and decodes it. ``--beside`` gives a second viewer that reads so many Mbit/s, and says what that does to the first.
 ``--browser`` opens the page in a Chromium on a machine of its own (a network namespace): how late items come and are drawn, the
-first frame, outages of 10 s. ``--pairs``
-measures the node's CPU with and without viewers in turns, ``--minutes`` what the page holds while viewers come and go. One line
-of JSON for each part.
+first frame, outages of 10 s. ``--pairs`` measures the node's CPU with and without viewers in turns, ``--minutes`` what the page
+holds while viewers come and go. ``--floor`` measures the page with one viewer beside processes that only read the same topics
+(live_floor.py), all at the same time. One line of JSON for each part.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 from domains import free_domain
 from e2e.live_frames import Frames
 from e2e.machines import ROBOT, Machines
-from e2e.processes import Processes, until
+from e2e.processes import Process, Processes, until
 
+TOPICS = ['/camera/compressed', '/point_cloud2', '/imu', '/odom', '/joint_states', '/lowstate']
 KINDS = ('camera', 'cloud', 'imu', 'odom', 'joints', 'battery')
 
 
@@ -135,8 +136,7 @@ def private_mb(pid: int) -> float:
 
 def watched(url: str, count: int, seconds: float, pids: dict[str, int], *, deaf: int = 0, video: bool = False) -> dict[str, Any]:
     """So many viewers for so long, ``deaf`` of which read nothing: what each gets, and the CPU of the processes, % of a core."""
-    topics = ['/camera/compressed', '/point_cloud2', '/imu', '/odom', '/joint_states', '/lowstate']
-    watchers = [Watcher(url, topics) for _ in range(count)]
+    watchers = [Watcher(url, TOPICS) for _ in range(count)]
     for watcher in watchers:
         watcher.takes_video = video
 
@@ -228,10 +228,9 @@ def lasting(url: str, viewers: int, minutes: int, pid: int) -> dict[str, Any]:
 
 def beside(url: str, seconds: float, slow_mbps: float) -> dict[str, Any]:
     """What a viewer on a slow link does to one beside it: p95 of the fast one alone, and with the slow one."""
-    topics = ['/camera/compressed', '/point_cloud2', '/imu', '/odom', '/joint_states', '/lowstate']
 
     async def run(*, with_slow: bool) -> dict[str, Any]:
-        fast, slow = Watcher(url, topics), Watcher(url, topics)
+        fast, slow = Watcher(url, TOPICS), Watcher(url, TOPICS)
         tasks = [asyncio.create_task(fast.run()), *([asyncio.create_task(slow.run(bytes_s=slow_mbps * 125_000))] * with_slow)]
         await asyncio.sleep(4)
         fast.late_ms.clear()
@@ -243,6 +242,18 @@ def beside(url: str, seconds: float, slow_mbps: float) -> dict[str, Any]:
 
     rows = [asyncio.run(run(with_slow=with_slow)) for with_slow in (False, True, False, True)]
     return {'slow_mbps': slow_mbps, 'alone': [rows[0], rows[2]], 'beside': [rows[1], rows[3]]}
+
+
+def floor(url: str, seconds: float, processes: Processes, pids: dict[str, int]) -> dict[str, Any]:
+    """The page with one viewer, and what only reads the same: the node of a process, to hear the topics, and to take them."""
+    readers = {}
+    for do in ('join', 'hear', 'take'):
+        log = processes.folder / f'{do}.log'
+        readers[do] = Process(do, [str(Path(__file__).parent / 'live_floor.py'), do, *TOPICS], log, processes.environ)
+        processes.started.append(readers[do])
+    for reader in readers.values():
+        reader.said('ready')
+    return watched(url, 1, seconds, {**pids, **{do: reader.popen.pid for do, reader in readers.items()}})
 
 
 def shape(url: str, mbps: float) -> None:
@@ -271,6 +282,7 @@ def main() -> None:  # noqa: PLR0915 - one part after the other
     parser.add_argument('--browser', action='store_true')
     parser.add_argument('--pairs', type=int, default=0)
     parser.add_argument('--minutes', type=int, default=0)
+    parser.add_argument('--floor', action='store_true')
     parser.add_argument('--scale', type=float, default=1.0)
     given = parser.parse_args()
     if (given.link or given.browser) and 'LIVE_BENCH' not in os.environ:
@@ -296,6 +308,8 @@ def main() -> None:  # noqa: PLR0915 - one part after the other
             rows = [paired(url, given.viewers, given.seconds, given.pairs, pids)]
         elif given.minutes:
             rows = [lasting(url, given.viewers, given.minutes, live.popen.pid)]
+        elif given.floor:
+            rows = [floor(url, given.seconds, processes, pids)]
         elif given.beside:
             rows = [beside(url, given.seconds, given.beside)]
         elif given.link:

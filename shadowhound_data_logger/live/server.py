@@ -133,6 +133,7 @@ class LiveSettings:
 class _Connected:
     """A viewer, and who it is."""
 
+    ws: web.WebSocketResponse
     viewer: Viewer
     who: SignIn
     address: str
@@ -146,6 +147,30 @@ class _Connected:
     """Since when its link carries no full frames."""
     asks: asyncio.Task[None] | None = None
     """For video."""
+    transport: asyncio.Transport | None = None
+    """Its connection, as soon as it is a WebSocket."""
+    flushing: asyncio.Handle | None = None
+
+    def tell(self, item: LiveItem) -> None:
+        """Send it with all else that is told before the event loop's next round."""
+        self.viewer.offer(item)
+        if self.flushing is None:
+            self.flushing = asyncio.get_running_loop().call_soon(self.flush)
+
+    def flush(self) -> None:
+        """Write all that may be sent now, at once: each write costs as much as a frame does.
+
+        ``ws.send_bytes`` would write each frame by itself, and a large one in two parts. It would also wait for a full buffer;
+        here the window of the viewer limits what is in it.
+        """
+        self.flushing = None
+        if self.transport is None or self.transport.is_closing() or self.ws.closed:
+            return
+        parts: list[bytes] = []
+        while (frame := self.viewer.next_frame()) is not None:
+            parts += (_message_header(len(frame)), frame)
+        if parts:
+            self.transport.write(b''.join(parts))
 
 
 @dataclass(eq=False)
@@ -346,13 +371,15 @@ class LiveServer:
                 if item.topic in one.viewer.watched and one.viewer.size(item.topic) == item.size:
                     one.viewer.offer(item)
             self._offer_video(item)
+        for one in self._viewers:
+            one.flush()
 
     def _on_relayed(self, item: LiveItem) -> None:
         if item.kind == 'topics':
             self._told_topics = item
         for one in self._viewers:
             if not item.topic or item.topic in one.viewer.watched:
-                one.viewer.offer(item)
+                one.tell(item)
         self._offer_video(item)
 
     def _offer_video(self, item: LiveItem) -> None:
@@ -364,10 +391,10 @@ class LiveServer:
 
     def _offer_catalogue(self, one: _Connected) -> None:
         if self._told_topics is not None:
-            one.viewer.offer(self._told_topics)
+            one.tell(self._told_topics)
             return
         topics = [[topic, KINDS[name].name, name] for topic, name in self._graph.items() if name in KINDS]
-        one.viewer.offer(LiveItem('', 'topics', head={'topics': topics, 'problem': self.ros_problem}))
+        one.tell(LiveItem('', 'topics', head={'topics': topics, 'problem': self.ros_problem}))
 
     def _rewatch_soon(self) -> None:
         """Who chooses again and again makes no more subscriptions than others."""
@@ -439,7 +466,7 @@ class LiveServer:
             one.narrow_s = now_s
         elif now_s - one.narrow_s >= NARROW_S:
             one.narrow_s = now_s
-            one.viewer.offer(LiveItem('', 'video', head={'narrow': True}))
+            one.tell(LiveItem('', 'video', head={'narrow': True}))
 
     def _kind_of(self, topic: str) -> str:
         kind = KINDS.get(self._graph.get(topic, ''))
@@ -450,7 +477,7 @@ class LiveServer:
             figures = await self._loop.run_in_executor(self._pool, partial(self._figures.now, with_ledger=with_ledger))
         item = LiveItem('', 'figures', head={'at': round(time.monotonic() * 1e3, 1), 'figures': figures})
         for one in self._viewers:
-            one.viewer.offer(item)
+            one.tell(item)
 
     @property
     def _is_watched_from_afar(self) -> bool:
@@ -677,15 +704,16 @@ class LiveServer:
             return _problem(429, f'{MOST_VIEWERS} viewers are here, which is the most there may be', {'Retry-After': '10'})
         ws = web.WebSocketResponse(max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0)
         own = request.transport.get_extra_info('sockname') if request.transport is not None else None
-        one = _Connected(Viewer(), self._who(request), request.remote or '', own[0] if own else '', request.protocol)
+        one = _Connected(ws, Viewer(), self._who(request), request.remote or '', own[0] if own else '', request.protocol)
         self._viewers.add(one)  # before anything waits: the cap counts those that are coming
         try:
             await ws.prepare(request)
             _quicken(request)
+            one.transport = request.transport
             self._offer_catalogue(one)
             self._rewatch()
-            one.tasks = [asyncio.create_task(self._send(ws, one.viewer)), asyncio.create_task(self._receive(ws, one))]
-            await asyncio.wait(one.tasks, return_when=asyncio.FIRST_COMPLETED)
+            one.tasks = [asyncio.create_task(self._receive(one))]
+            await asyncio.wait(one.tasks)
         finally:
             self._viewers.discard(one)
             if one.asks is not None:
@@ -756,27 +784,19 @@ class LiveServer:
                 client.take(_parsed(message.data))
                 self._rewatch_soon()
 
-    async def _send(self, ws: web.WebSocketResponse, viewer: Viewer) -> None:
-        while True:
-            frame = viewer.next_frame()
-            if frame is None:
-                viewer.ready.clear()
-                await viewer.ready.wait()
-            else:
-                await ws.send_bytes(frame)
-
-    async def _receive(self, ws: web.WebSocketResponse, one: _Connected) -> None:
+    async def _receive(self, one: _Connected) -> None:
         viewer = one.viewer
         while True:
-            message = await ws.receive()
+            message = await one.ws.receive()
             one.heard_s = time.monotonic()
             if message.type == WSMsgType.BINARY and len(message.data) == 4:
                 viewer.acknowledge(int.from_bytes(message.data, 'little'))
+                one.flush()
             elif message.type == WSMsgType.TEXT:
                 said = _parsed(message.data)
                 ping, watched = said.get('ping'), said.get('watch')
                 if isinstance(ping, (int, float)):
-                    viewer.offer(LiveItem('', 'pong', head={'ping': ping, 'now': round(time.monotonic() * 1e3, 2)}))
+                    one.tell(LiveItem('', 'pong', head={'ping': ping, 'now': round(time.monotonic() * 1e3, 2)}))
                 if isinstance(watched, list):
                     viewer.watch(topic for topic in watched[:MOST_WATCHED] if isinstance(topic, str))
                     self._rewatch_soon()
@@ -797,7 +817,7 @@ class LiveServer:
 
     async def _take_video(self, one: _Connected, said: Mapping[str, Any]) -> None:
         def tell(what: Mapping[str, Any]) -> None:
-            one.viewer.offer(LiveItem('', 'video', head=what))
+            one.tell(LiveItem('', 'video', head=what))
 
         if not self.no_video and self._video is None:
             try:
@@ -811,6 +831,13 @@ class LiveServer:
             tell({'problem': self.no_video})
         else:
             await self._video.take(one, said, (one.at, one.address), tell)
+
+
+def _message_header(size: int) -> bytes:
+    """Before so many bytes that are a binary message from a server (RFC 6455, section 5.2)."""
+    if size < 126:
+        return bytes((0x82, size))
+    return b'\x82\x7e' + size.to_bytes(2, 'big') if size < 1 << 16 else b'\x82\x7f' + size.to_bytes(8, 'big')
 
 
 def _is_ours(record: logging.LogRecord) -> bool:

@@ -8,7 +8,6 @@ waits is small, or the newest of its topic.
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -60,11 +59,10 @@ class _Lane:
 class Viewer:
     """Decides what one browser is sent, and when. Used by the event loop alone.
 
-    ``offer`` what comes; ``next_frame`` until it is None, then wait for ``ready``; ``acknowledge`` what the browser says.
+    ``offer`` what comes, ``acknowledge`` what the browser says, and after either ``next_frame`` until it is None.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        self.ready = asyncio.Event()
         self.watched: frozenset[str] = frozenset()
         self.rate = FIRST_RATE
         """Bytes a second that the link carries, as measured."""
@@ -105,7 +103,6 @@ class Viewer:
             self._slots[item.topic] = item
         else:
             self._rows.setdefault(item.topic, deque(maxlen=MOST_ROWS_WAITING)).append(item)
-        self.ready.set()
 
     @property
     def window(self) -> int:
@@ -132,7 +129,6 @@ class Viewer:
                 # The mean of times, not of rates: one item that a buffer took at once says little about the link.
                 pace = max(self._now() - since_s, 1e-4) / (received - before)
                 self.rate = 1 / (0.7 / self.rate + 0.3 * max(pace, 1e-8))
-            self.ready.set()
 
     def choose_sizes(self) -> None:
         """For the link as it is now; called once a second."""

@@ -19,6 +19,7 @@ from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 STORE = get_typestore(Stores.LATEST)
 TYPES = MessageTypes()
 INTERFACES = Path(__file__).parents[2] / 'interfaces'
+ODOMETRY, JOINTS = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/JointState'
 
 
 def new(type_name: str, /, **given: Any) -> Any:
@@ -101,10 +102,11 @@ def test_a_raw_image_becomes_a_jpeg_of_each_size(encoding: str, channels: int) -
     assert [simplejpeg.decode_jpeg_header(item.body)[:2] for item in made] == [(240, 320), (120, 160), (60, 80)]
 
 
-def test_a_compressed_image_goes_as_it_came() -> None:
-    """Only a smaller one is made of it."""
+@pytest.mark.parametrize('kind', ['', 'jpeg', 'bgr8; jpeg compressed bgr8'])
+def test_a_compressed_image_goes_as_it_came(kind: str) -> None:
+    """Only a smaller one is made of it; what its format is called moves the rest."""
     jpeg = simplejpeg.encode_jpeg(np.zeros((480, 640, 3), np.uint8), 80, 'BGR')
-    message = new(COMPRESSED_IMAGE, header=header(), format='jpeg', data=np.frombuffer(jpeg, np.uint8))
+    message = new(COMPRESSED_IMAGE, header=header(), format=kind, data=np.frombuffer(jpeg, np.uint8))
     full, small = frames('/image', COMPRESSED_IMAGE, TYPES, 0.0, cdr(message, COMPRESSED_IMAGE), [FULL, SMALLEST])
     assert full.body == jpeg
     assert simplejpeg.decode_jpeg_header(small.body)[:2] == (120, 160)
@@ -183,3 +185,71 @@ def test_the_imu_of_a_go2_reads_the_same_both_ways(tmp_path: Path) -> None:
     assert np.frombuffer(at_once.body[16:], '<f4')[[0, 9, 19]].tolist() == [10.0, -5.0, -10.0]
     other = b'\0\0\0\0' + struct.pack('>13fb', *range(13), -5)
     assert np.frombuffer(series('/imu', KINDS[name], name, types, [(1.0, other)]).body[8:], '<f4')[9] == -5.0
+
+
+def both_ways(name: str, messages: list[tuple[float, bytes]]) -> tuple[bytes, bytes]:
+    """What a browser gets of these messages, read where CDR has it and field by field."""
+    kind = KINDS[name]
+    assert kind.table is not None
+    assert kind.table([cdr for _, cdr in messages]) is not None
+    at_once = series('/topic', kind, name, TYPES, messages)
+    return at_once.packed, series('/topic', kind._replace(table=None), name, TYPES, messages).packed
+
+
+@pytest.mark.parametrize('frame_id', ['', 'odom', 'a_frame', 'the_robot/odom'])
+def test_an_odometry_reads_the_same_both_ways(frame_id: str) -> None:
+    """Wherever its text moves the numbers."""
+    at_once, by_field = both_ways(ODOMETRY, [(10.0 * turn, odometry(frame_id, turn)) for turn in (1, 2)])
+    assert at_once == by_field
+
+
+@pytest.mark.parametrize('names', [['hip'], ['FL_hip', 'FL_calf_joint', ''], ['x' * 70, 'é']])
+def test_joints_read_the_same_both_ways(names: list[str]) -> None:
+    """With long names, with more positions than names, and with velocities."""
+    cdrs = [joints(names, np.arange(len(names) + 1) * turn, np.zeros(turn)) for turn in (1, 2)]
+    at_once, by_field = both_ways(JOINTS, [(10.0, cdrs[0]), (20.0, cdrs[1])])
+    assert at_once == by_field
+
+
+def test_joints_that_are_not_as_usual_are_read_by_field() -> None:
+    """Twice the same name, none, fewer positions than names, and other names in each message."""
+    table = KINDS[JOINTS].table
+    assert table is not None
+    usual = joints(['a', 'b'], np.zeros(2))
+    assert table([usual]) is not None
+    unusual = [[joints(['a', 'a'], np.zeros(2))], [joints([], np.zeros(0))], [joints(['a', 'b'], np.zeros(1))],
+               [usual, joints(['a', 'c'], np.zeros(2))], [usual, joints(['a', 'b', 'c'], np.zeros(3))]]  # fmt: skip
+    assert [table(cdrs) for cdrs in unusual] == [None] * len(unusual)
+
+
+@pytest.mark.parametrize('size', [-1, -8, 60, 20, 1])
+def test_what_is_cut_is_rejected(size: int) -> None:
+    """Even where all that is shown is there."""
+    for name, whole in ((ODOMETRY, odometry('odom', 1)), (JOINTS, joints(['a', 'b'], np.zeros(2), np.zeros(2)))):
+        with pytest.raises(Rejected):
+            series('/topic', KINDS[name], name, TYPES, [(1.0, whole[:size])])
+
+
+def test_what_is_too_large_for_float32_is_infinite() -> None:
+    """As numpy has it, which reads those that are not as usual."""
+    with np.errstate(over='ignore'):
+        item = series('/odom', KINDS[ODOMETRY], ODOMETRY, TYPES, [(1.0, odometry('odom', 1e300))])
+    assert np.isinf(np.frombuffer(item.body[8:], '<f4')[0])
+
+
+def odometry(frame_id: str, value: float) -> bytes:
+    point, turn = (
+        new('geometry_msgs/msg/Point', x=value, y=2.0, z=3.0),
+        new('geometry_msgs/msg/Quaternion', x=0.1, y=0.2, z=0.3, w=0.9),
+    )
+    zero = new('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
+    pose = new('geometry_msgs/msg/PoseWithCovariance', pose=new('geometry_msgs/msg/Pose', position=point, orientation=turn),
+               covariance=np.zeros(36))  # fmt: skip
+    twist = new('geometry_msgs/msg/TwistWithCovariance', twist=new('geometry_msgs/msg/Twist', linear=zero, angular=zero),
+                covariance=np.zeros(36))  # fmt: skip
+    return cdr(new(ODOMETRY, header=header(frame_id), child_frame_id='base', pose=pose, twist=twist), ODOMETRY)
+
+
+def joints(names: list[str], position: Any, velocity: Any = ()) -> bytes:
+    return cdr(new(JOINTS, header=header(), name=names, position=np.array(position, 'f8'), velocity=np.zeros(len(velocity)),
+                   effort=np.zeros(0)), JOINTS)  # fmt: skip

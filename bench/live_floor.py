@@ -1,0 +1,44 @@
+#!/usr/bin/env python3
+"""What the live page cannot cost less than: a process that subscribes as the page does, and takes the messages or does not.
+
+    scripts/with-env python bench/live_floor.py join|hear|take [TOPIC ...]
+
+``join``: the node alone; ``hear``: subscribed to the topics, and nothing is taken; ``take``: all is taken as the page does it,
+and thrown away. It says that it is ready, and runs until it is ended. ``bench/live.py --floor`` measures it beside the page.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import rclpy
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from shadowhound_data_logger.live.kinds import KINDS
+from shadowhound_data_logger.live.topics import POLL_S, _Watched
+
+DISCOVERY_S = 2.0
+
+
+def main() -> None:
+    do, topics = sys.argv[1], set(sys.argv[2:])
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = Node('live_floor', start_parameter_services=False, enable_rosout=False)
+    time.sleep(DISCOVERY_S)
+    known = {topic: types[0] for topic, types in node.get_topic_names_and_types() if topic in topics and do != 'join'}
+    watched = [_Watched(node, topic, name, KINDS[name], is_raw=False) for topic, name in known.items()]
+    print('ready', len(watched), flush=True)
+    next_s = time.monotonic()
+    while True:
+        next_s += POLL_S if do == 'take' else 1.0
+        time.sleep(max(0.0, next_s - time.monotonic()))
+        now_s = time.monotonic()
+        for one in watched if do == 'take' else ():
+            if one.is_due(now_s):
+                one.shown(one.reader.drain(one.most), now_s)
+
+
+if __name__ == '__main__':
+    main()
