@@ -547,6 +547,8 @@ def campaign(folder: Path, rounds: int, seed: int) -> tuple[Found, Happened]:
                 _end(robot.node, signal.SIGINT)
             found.wrong['imbalances'] += _imbalances(robot.home)
             progress('everything is read back')
+            told = {'damages': happened.damages, 'deaths': happened.deaths, 'published': happened.published}
+            (folder / 'happened.json').write_text(json.dumps(told, indent=1), encoding='utf-8')
             audit(found, happened, tower, s3, robot, store, folder)
         finally:
             store.close()
