@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
-import mmap
 import os
-import re
-import signal
 import struct
 import subprocess
 import sys
@@ -16,20 +12,15 @@ from pathlib import Path
 
 import pytest
 from domains import free_domain
+from ros.ports import CONDITION, DEAD, HEAD, LISTENERS, MUTEX, OTHER_MUTEX, SETTLED, ports_of, seem_to_process
 
 from shadowhound_data_logger.disk import flock
 from shadowhound_data_logger.ros import port_guard
-from shadowhound_data_logger.ros.port_guard import FOLDER, IN_USE, MAKING_S, PROCESSING, WAITING, settle
+from shadowhound_data_logger.ros.port_guard import IN_USE, MAKING_S, PROCESSING, WAITING, settle
 from shadowhound_data_logger.ros.shared_memory import PortGuard
 
 HERE = Path(__file__).parent
 PORT = 'fastrtps_port7411'
-HEAD, MUTEX, LISTENERS = 256, 40, 1024
-OTHER_MUTEX = 48
-"""Of aarch64."""
-CONDITION = 56 + 512 * 40 + 16
-DEAD = IN_USE | PROCESSING
-SETTLED = IN_USE | WAITING
 WAIT_S = 60.0
 
 
@@ -163,40 +154,6 @@ def test_a_program_without_ports_has_no_guard(monkeypatch: pytest.MonkeyPatch) -
     PortGuard().close()
 
 
-class Port:
-    """The memory of a port, as Fast DDS has it."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with path.open('r+b') as file:
-            self._memory = mmap.mmap(file.fileno(), 0)
-        node = self._memory.find(b'port_node_abi5\0')
-        for mutex in (MUTEX, OTHER_MUTEX):
-            start = node - ((CONDITION + 2 * mutex + 20 * LISTENERS + 17 + 7) & ~7)
-            if self._memory[start + 20 : start + 24] == struct.pack('=I', int(path.name.rpartition('port')[2])):
-                self._start, self._lock, self._first = start, start + CONDITION + mutex, start + CONDITION + 2 * mutex
-                break
-        else:
-            pytest.skip('ports are of another kind here')
-        self._libc = ctypes.CDLL(None)
-
-    @property
-    def flags(self) -> int:
-        return self._memory[self._first]
-
-    def seem_to_process(self) -> None:
-        """As whoever takes a message says it."""
-        self._memory[self._first] = DEAD
-
-    def be_marked_in_the_middle(self) -> None:
-        """As Fast DDS marks it, while a publisher that found it in order waits for its lock."""
-        word = ctypes.c_char.from_buffer(self._memory, self._lock)
-        assert self._libc.pthread_mutex_lock(ctypes.byref(word)) == 0
-        time.sleep(0.3)
-        self._memory[self._start + 44] &= ~1
-        assert self._libc.pthread_mutex_unlock(ctypes.byref(word)) == 0
-
-
 def until(condition: Callable[[], bool], what: str) -> None:
     end = time.monotonic() + WAIT_S
     while not condition():
@@ -216,27 +173,24 @@ class Pair:
         who = 'guarded' if is_guarded else 'listener'
         self.listener = subprocess.Popen([sys.executable, program, who, str(heard)], env=environ)
         until(heard.exists, 'the listener hears')
-        locks = re.compile(rf'{FOLDER}/fast(?:dds|rtps)_port\d+_el')
-        links = [each.readlink() for each in Path(f'/proc/{self.listener.pid}/fd').iterdir()]
-        self.ports = [Port(Path(str(link).removesuffix('_el'))) for link in links if locks.fullmatch(str(link))]
+        self.ports = ports_of(self.listener.pid)
         if not self.ports:
             pytest.skip('this middleware has no ports in shared memory')
 
     def kill_listener(self) -> None:
         """While it processes a message, as far as anybody can see."""
-        self.listener.send_signal(signal.SIGSTOP)
-        time.sleep(0.1)
-        for port in self.ports:
-            port.seem_to_process()
+        seem_to_process(self.listener.pid, self.ports)
         self.listener.kill()
         self.listener.wait()
 
-    def publishes(self, within_s: float = WAIT_S) -> bool:
+    def publishes(self, within_s: float = WAIT_S, but: Callable[[], object] = lambda: None) -> bool:
+        """``but`` undoes what the programs of other tests, which start meanwhile, settle."""
         before, end = self._published(), time.monotonic() + within_s
         while time.monotonic() < end:
+            but()
             if self._published() > before + 3:
                 return True
-            time.sleep(0.05)
+            time.sleep(0.02)
         return False
 
     def end(self) -> None:
@@ -274,9 +228,10 @@ def test_a_publisher_that_stands_still_goes_on(pair: Callable[[bool], Pair]) -> 
     two = pair(False)
     two.kill_listener()
     for port in two.ports:
+        port.seem_to_process()  # the program of another test may have settled it
         port.be_marked_in_the_middle()
-    assert not two.publishes(5.0), 'nothing stops it'
-    assert {port.path.name for port in two.ports} & set(settle())
+    assert not two.publishes(5.0, but=lambda: [port.seem_to_process() for port in two.ports]), 'nothing stops it'
+    settle()
     assert two.publishes()
 
 
