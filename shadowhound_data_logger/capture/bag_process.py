@@ -43,7 +43,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import BagError, DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.model import DataObject, RecordingRows
-from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
+from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -117,6 +117,7 @@ def main() -> int:
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     with dead_ports_avoided(get_default_context().get_domain_id()):
         node = Node(NODE)
+    guard = PortGuard()
     try:
         said = _record(node, given, stop)
     except DataLoggerError as error:
@@ -124,6 +125,7 @@ def main() -> int:
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+        guard.close()
     print(json.dumps(said), flush=True)  # noqa: T201
     return 0 if said.get('delivered') else 1
 

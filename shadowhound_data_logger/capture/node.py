@@ -26,7 +26,7 @@ from shadowhound_data_logger.capture.middleware import SETTING, Middleware
 from shadowhound_data_logger.capture.parameters import Parameters
 from shadowhound_data_logger.capture.pipeline import Pipeline, Ros
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
-from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided, orphans
+from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided, orphans
 from shadowhound_data_logger.ros_arguments import NODE, rules_for
 
 log = logging.getLogger(__name__)
@@ -165,6 +165,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
     stop = StopSignals()
     with middleware.profiled(os.environ), dead_ports_avoided(get_default_context().get_domain_id()) as avoided:
         node, name = make_node(arguments, is_public=not middleware.is_foreign)
+    guard = PortGuard()
     logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
     free_shared_memory()
     if avoided:
@@ -191,6 +192,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+        guard.close()
     return 0
 
 

@@ -22,6 +22,7 @@ from shadowhound_data_logger.doctor.context import to_child
 from shadowhound_data_logger.doctor.model import Check, Context, Result, Severity, error
 from shadowhound_data_logger.doctor.s3_put import single_requests
 from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.ros.port_guard import settle
 from shadowhound_data_logger.ros.shared_memory import orphans
 
 TIMEOUT_S: Final = 12.0
@@ -204,6 +205,8 @@ def _fixed(what: tuple[str, ...], context: Context) -> str:
         if kind == 'segments':
             freed = orphans(Path(name), is_freed=True)
             return f'freed {sum(each.bytes for each in freed) / 1e6:.0f} MB in {name}'
+        if kind == 'ports':
+            return f'settled {", ".join(settle(Path(name))) or "nothing"} in {name}'
         _create(name, context)
     except (OSError, DataLoggerError) as problem:
         return f'not done: {problem}'

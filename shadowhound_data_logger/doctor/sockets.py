@@ -13,6 +13,7 @@ from shadowhound_data_logger.doctor.model import Context, Result, error, info, o
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, middleware, running
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.options import IMAGE, POINT_CLOUD
+from shadowhound_data_logger.ros.port_guard import settle
 from shadowhound_data_logger.ros.shared_memory import orphans
 
 NAME: Final = 'sockets'
@@ -191,6 +192,15 @@ def _memory(context: Context, driver: list[Process]) -> Iterator[Result]:
             fix=('segments', str(folder)),
             segments=len(found),
             bytes=size,
+        )
+    if stuck := settle(folder, is_done=False):
+        yield warning(
+            'sockets.ports',
+            f'what killed processes have left in {folder} can stop others: {", ".join(stuck)}',
+            'it says that a message is being processed, or a port made, and Fast DDS may wait forever for the end of that',
+            'shadowhound-data doctor --fix  # the node does the same when it starts; a publisher that stands still then goes on',
+            fix=('ports', str(folder)),
+            ports=stuck,
         )
     try:
         disk = os.statvfs(context.root / 'dev/shm')

@@ -25,7 +25,7 @@ from shadowhound_data_logger.live.kinds import KINDS, RAW, Kind, LiveItem, cloud
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import MAX_TAKES, PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
-from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
+from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -81,6 +81,7 @@ class Topics:
         self._wanted, self._found, self._came = wanted, found, came
         self._types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         self._node: Node | None = None
+        self._guard: PortGuard | None = None
         self._graph: dict[str, str] = {}
         self._graph_s = self._next_s = 0.0
         self._watched: dict[str, _Watched] = {}
@@ -95,6 +96,7 @@ class Topics:
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         with dead_ports_avoided(get_default_context().get_domain_id()):
             self._node = Node(NODE, start_parameter_services=False, enable_rosout=False)
+        self._guard = PortGuard()
         self.worker.start()
 
     def wake(self) -> None:
@@ -111,6 +113,8 @@ class Topics:
         if self._node is not None:
             self._node.destroy_node()
         rclpy.try_shutdown()
+        if self._guard is not None:
+            self._guard.close()
 
     # -- the thread ------------------------------------------------------------------------------------------------
 

@@ -25,7 +25,7 @@ from std_msgs.msg import String
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.running import judge
-from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
+from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided
 from shadowhound_data_logger.untrusted import from_json
 
 log = logging.getLogger(__name__)
@@ -101,6 +101,7 @@ def telling(folder: PolicyFolder) -> Iterator[PolicyTopics]:
     try:
         with dead_ports_avoided(context.get_domain_id()):
             node = Node(NODE, context=context)
+        guard = PortGuard()
         topics = PolicyTopics(node, folder)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
@@ -119,5 +120,6 @@ def telling(folder: PolicyFolder) -> Iterator[PolicyTopics]:
             executor.shutdown(END_S)
             thread.join(END_S)
             node.destroy_node()
+            guard.close()
     finally:
         rclpy.try_shutdown(context=context)

@@ -6,14 +6,18 @@ Source: RobustExclusiveLock.hpp and SharedMemManager.hpp of Fast DDS 2.6, 2.14 a
 of which nothing tells whether somebody lives, and ``..._portN``, which are small and taken over by the next process of the same
 domain. That one may hear nothing of processes that wrote to the dead one: they go on with the segment that it replaced. Fast DDS
 mends that within a second, but not where the listener died between waiting for a message and processing it (SharedMemGlobal.hpp,
-``update_status_all_listeners``; Fast-DDS pull request 4737). ``dead_ports_avoided`` is for that.
+``update_status_all_listeners``; Fast-DDS pull request 4737). ``dead_ports_avoided`` is for that. What is worse, a listener that
+died while it processed a message can stop who writes to it: ``port_guard`` and ``PortGuard`` are for that.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import stat
+import subprocess
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -22,12 +26,16 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.disk import lock
+from shadowhound_data_logger.ros import port_guard
+from shadowhound_data_logger.ros.port_guard import FOLDER, settle
 
-FOLDER: Final = Path('/dev/shm')  # noqa: S108 - where Fast DDS has its segments
+log = logging.getLogger(__name__)
 STARTING_S: Final = 5.0
 """A process that starts has its file before it has its lock."""
 MOST_DEAD_PORTS: Final = 50
 """Fast DDS tries a hundred."""
+GUARD_END_S: Final = 2.0
+"""For a guard that is told to end; it is killed then."""
 _PORT: Final = re.compile(r'((?:fastdds|fastrtps)_port(\d{4,5}))_el')
 _LOCK: Final = re.compile(r'(?:fastdds|fastrtps)_[0-9a-f]{16}_el')
 
@@ -62,8 +70,10 @@ def dead_ports_avoided(domain: int, folder: Path = FOLDER, processes: Path = Pat
     """Participants that are made meanwhile take other ports than those of killed ones; yields the names of these.
 
     Only where a living process may still write to their segment; the others can be taken over. Fast DDS passes over a port whose
-    lock somebody has.
+    lock somebody has. What may stop those who write to dead ports is settled first: it cannot be once a port is taken over.
     """
+    if settled := settle(folder):
+        log.warning('what killed processes left in shared memory could have stopped others: settled %s', ', '.join(settled))
     first = 7400 + 250 * domain  # RTPS 2.2, 9.6.1.1; from 7000 on are readers with a network flow of their own, of any domain
     ours = (*range(7000, 7400), *range(first, first + 250))
     dead = {}
@@ -74,6 +84,49 @@ def dead_ports_avoided(domain: int, folder: Path = FOLDER, processes: Path = Pat
     written = sorted(_mapped(processes, dead), key=lambda name: (-dead[name], name))  # those that died last first
     with ExitStack() as held:
         yield [name for name in written[:MOST_DEAD_PORTS] if _has_lock(folder / f'{name}_el', held)]
+
+
+class PortGuard:
+    """A process that outlives this one for an instant, to settle its ports where it is killed; none where it has no ports.
+
+    Life: New once the participants are made; ``close`` when they are gone.
+    """
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        if not _has_ports():
+            return
+        command = [sys.executable, '-I', '-S', port_guard.__file__, str(os.getpid())]
+        environ = {name: value for name, value in os.environ.items() if name == 'LD_LIBRARY_PATH'}  # no credentials
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                env=environ,
+                start_new_session=True,  # Ctrl-C in a terminal, and what is sent to our whole group, is not for it
+            )
+        except OSError as error:
+            log.warning('no process looks after our shared memory should we be killed: %s', error)
+
+    def close(self) -> None:
+        if self._process is None:
+            return
+        try:
+            self._process.communicate(b'.', GUARD_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate()
+
+
+def _has_ports() -> bool:
+    """Whether this process listens through shared memory: it holds the lock of a port then."""
+    for descriptor in Path('/proc/self/fd').iterdir():
+        with suppress(OSError):  # closed meanwhile
+            if _PORT.fullmatch(descriptor.readlink().name):
+                return True
+    return False
 
 
 def _has_lock(path: Path, held: ExitStack) -> bool:

@@ -166,6 +166,13 @@ def deaf_tower(scene: Scene) -> None:
     scene.listen('0100007F:2328')
 
 
+def unfinished_port(scene: Scene) -> None:
+    """What a process has left that was killed while it made a port."""
+    port = scene.root / 'dev/shm/fastdds_port7411'
+    port.touch()
+    os.utime(port, (0, 0))
+
+
 def patched(target: str, value: object) -> Inject:
     """Something of the doctor's own modules is another for the time of the test."""
 
@@ -240,6 +247,7 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
                                           ('start the driver again', 'export FASTDDS_DEFAULT')),
     'small shared memory of a driver with Fast DDS 2': (driver_with_small_memory(ROS_DISTRO='humble'), 'sockets',
                                                         'sockets.driver', ('export FASTRTPS_DEFAULT',)),
+    'a port that a killed process has left': (unfinished_port, 'sockets', 'sockets.ports', ('--fix', 'goes on')),
     'node not running': (not_running, 'spool', 'node.running', ('sensor_logger_node',)),
     'node that is paused': (lambda scene: scene.run_node(paused=True), 'spool', 'node.status', ('/pause ', '{data: false}')),
     'publishers that the node does not hear': (unheard, 'spool', 'node.unheard', ('capture.rmw: robot', 'CYCLONEDDS_URI')),

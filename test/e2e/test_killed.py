@@ -14,6 +14,7 @@ import pytest
 from e2e.processes import Node, Processes, published, until
 from e2e.reading import TYPES, Objects, decode, stamp_ns
 from e2e.witness import recorded
+from ros.ports import SETTLED, ports_of, seem_to_process
 
 from shadowhound_data_logger.ros.shared_memory import FOLDER, orphans
 from shadowhound_data_logger.sim.tower import Tower
@@ -137,6 +138,17 @@ def test_the_next_node_frees_the_shared_memory_of_a_killed_one(processes: Proces
     processes.node()
     assert not [path for path in left if path.exists()]
     assert all(Path(path).exists() for path in segments[other] - owned)
+
+
+@pytest.mark.long('a kill')
+def test_a_killed_node_leaves_no_port_in_which_a_publisher_gets_stuck(processes: Processes) -> None:
+    """Though it dies while it processes a message: who looks after its ports tells Fast DDS before that looks."""
+    node = processes.node()
+    if not (ports := ports_of(node.popen.pid)):
+        pytest.skip('this middleware has no ports in shared memory')
+    seem_to_process(node.popen.pid, ports)
+    node.kill()
+    until(lambda: all(port.flags == SETTLED for port in ports), 'its ports are settled')
 
 
 def _maps(node: Node) -> str:
