@@ -389,6 +389,25 @@ def test_an_outage_of_ten_seconds(browser: Browser, tmp_path: Path, monkeypatch:
         assert sorted(wrong_ms)[len(wrong_ms) // 2] < 2500  # ages that stand still would be off by 5 s; how exact: bench/live.py
 
 
+def test_a_first_question_that_is_lost_is_asked_again(browser: Browser, watching: Watching) -> None:
+    """On a bad link the page may be there, and what it asks first is not answered."""
+    page: Any = browser.new_page()
+    lost: list[str] = []
+
+    def lose(route: Any) -> None:
+        if len(lost) < 2:
+            lost.append(route.request.url)
+            route.abort()
+        else:
+            route.continue_()
+
+    page.route('**/api/session', lose)
+    page.goto(watching.url)
+    holds(page, '(window.shadowhound.count.figures ?? 0) > 0')
+    assert len(lost) == 2
+    page.close()
+
+
 def told_of_names(now_ms: float) -> tuple[dict[str, Any], dict[str, Any]]:
     """Figures and gaps in which every text is hostile or long."""
     counts = dict.fromkeys(('received', 'stored', 'skipped', 'missed', 'pending', 'lost'), 1_234_567_890)

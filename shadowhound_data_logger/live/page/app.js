@@ -296,7 +296,7 @@ function App() {
     session.value = content;
     start();
   };
-  if (who === null) return html`<main class="alone"><p class="empty">…</p></main>`;
+  if (who === null) return html`<main class="alone"><p class="empty">Connecting …</p></main>`;
   if (who === false) return html`<main class="alone"><div class="panel"><${SignIn} onDone=${done} /></div></main>`;
   const told = figures.value;
   return html`<${Head} onSignIn=${open} />
@@ -328,11 +328,17 @@ function start() {
 // Whether the cookie is still good: a token that was replaced ends it.
 async function check() {
   try {
-    const answer = await fetch('/api/session');
+    const answer = await fetch('/api/session', { signal: AbortSignal.timeout(5000) });
     if (answer.status === 401) session.value = false;
     if (answer.ok && session.value?.role === undefined) session.value = await answer.json();
-  } catch { /* the link says that the robot cannot be reached */ }
+  } catch { /* the link says that the robot cannot be reached, or begin asks again */ }
+}
+
+// On a bad link the page may be there and its first question lost.
+async function begin() {
+  for (await check(); session.value === null; await check()) await new Promise((done) => { setTimeout(done, 1000); });
+  if (session.value) start();
 }
 
 render(html`<${App} />`, document.getElementById('app'));
-check().then(() => session.value && start());
+begin();
