@@ -52,7 +52,7 @@ _Group = tuple[Sequence[_Unit], Sequence[Outcome]]
 class SpoolWriter:
     """Collects objects and outcomes, and commits them on one thread.
 
-    New; ``on_commit``; open once; put, settle, flush from any thread; close once. ``_changed`` guards the lists.
+    New; ``on_commit``; open once; put, settle, flush from any thread; close once. The lock of ``_changed`` guards the lists.
     """
 
     def __init__(self, spool: Spool, commit_s: float = COMMIT_S) -> None:
@@ -60,7 +60,9 @@ class SpoolWriter:
         self._commit_s = commit_s
         self._spooled: Callable[[Sequence[SpooledObject]], None] = lambda _: None
         self._settled: Callable[[Collection[int]], None] = lambda _: None
-        self._changed = threading.Condition()
+        lock = threading.RLock()
+        self._changed = threading.Condition(lock)
+        self._hurried = threading.Condition(lock)  # ends the pause before a commit; what is put meanwhile wakes nobody
         self._units: deque[_Unit] = deque()
         self._outcomes: deque[Outcome] = deque()
         self._bytes = 0
@@ -118,6 +120,7 @@ class SpoolWriter:
             target = self._added
             self._urgent = True
             self._changed.notify_all()
+            self._hurried.notify_all()
             self._changed.wait_for(lambda: self._done >= target or self.damaged, deadline_s)
             return self._done >= target
 
@@ -128,6 +131,7 @@ class SpoolWriter:
         self.worker.stop()
         with self._changed:
             self._changed.notify_all()
+            self._hurried.notify_all()
         return self.worker.join(end - time.monotonic() + HEARTBEAT_S) and flushed
 
     def _step(self) -> None:
@@ -136,7 +140,7 @@ class SpoolWriter:
             now_s = time.monotonic()
             pause_s = max(self._last_commit + self._commit_s - now_s, self._commit_s / 2 if is_due else 0.0)
             if pause_s > 0 and not self._urgent:
-                self._changed.wait_for(lambda: self._urgent or self.worker.stopping, pause_s)
+                self._hurried.wait_for(lambda: self._urgent or self.worker.stopping, pause_s)
             units, outcomes = list(self._units), list(self._outcomes)
         self._last_commit = time.monotonic()
         try:
