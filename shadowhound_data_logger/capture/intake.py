@@ -219,11 +219,11 @@ class Intake:
 
 
 def until_poll(wall_s: float) -> float:
-    """Seconds from a poll to the next one, which is at a multiple of ``POLL_S``: half of that at least.
+    """Seconds from a poll to the next one, which is at a multiple of ``POLL_S``: a quarter of that at least.
 
     What the sensors keep once a second then comes with one poll, 0.2 s after the second begins, and is one burst for the spool.
     """
-    return POLL_S - ((wall_s + POLL_S / 2) % POLL_S - POLL_S / 2)
+    return POLL_S - ((wall_s + POLL_S / 4) % POLL_S - POLL_S / 4)
 
 
 def _each(steps: Sequence[Callable[[], None]]) -> None:
