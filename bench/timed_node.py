@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from shadowhound_data_logger.capture.sensor_logger_node import main
-from shadowhound_data_logger.model import DataObject, Outcome, Put, SpooledObject
+from shadowhound_data_logger.model import DataObject, Outcome, Put, RecordingRows, SpooledObject
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.s3 import S3Store
 
@@ -24,7 +24,7 @@ _commit, _put = Spool.commit, S3Store.put
 
 
 def timed_commit(
-    spool: Spool, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (), *,
+    spool: Spool, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (), rows: Sequence[RecordingRows] = (), *,
     durable: Callable[[list[SpooledObject]], None] = lambda _: None,
 ) -> list[SpooledObject]:  # fmt: skip
     def told(placed: list[SpooledObject]) -> None:
@@ -32,7 +32,7 @@ def timed_commit(
         durable_ns.update((item.id, now_ns) for item in placed)
         durable(placed)
 
-    return _commit(spool, objects, outcomes, durable=told)
+    return _commit(spool, objects, outcomes, rows, durable=told)
 
 
 def timed_put(store: S3Store, item: SpooledObject) -> Put:

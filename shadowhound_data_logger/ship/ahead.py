@@ -61,11 +61,17 @@ class Ahead:
         """The spool may hold others by now."""
         self._stale = True
 
-    def add(self, new: Iterable[SpooledObject]) -> None:
-        """These have just been spooled."""
+    def add(self, new: Collection[SpooledObject]) -> None:
+        """These have just been spooled. Where all that waits is here, and little, no look is needed to know them."""
         self._live.update((item.id, item) for item in new)
         while len(self._live) > LIVE:
             del self._live[next(iter(self._live))]
+        if not self.is_known or len(self) + len(new) >= FEW:
+            self.outdate()
+            return
+        both = sorted((*self._important.values(), *new), key=lambda item: (item.priority, item.id))
+        self._important = {item.id: item for item in both}
+        self._oldest.update((item.id, item) for item in new)
 
     def wants_look(self, now: float, since: Iterable[float]) -> bool:
         """Whether to look now: something changed, few are left, or not yet looked since one of those times."""

@@ -205,9 +205,11 @@ class Schedule:
     def wake(self, new: Sequence[SpooledObject] = ()) -> None:
         """The spool has new objects (``new``, where they are known), or has given some up."""
         with self._changed:
-            taken = self._taken()
-            self._ahead.add(item for item in new if item.id not in taken and not self._waits(item))
-            self._ahead.outdate()
+            if new:
+                taken = self._taken()
+                self._ahead.add([item for item in new if item.id not in taken and not self._waits(item)])
+            else:
+                self._ahead.outdate()
             self._notify(max(len(new), 1))
 
     def activate(self, active: bool) -> None:

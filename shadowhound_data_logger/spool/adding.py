@@ -102,8 +102,8 @@ class Adding:
         self._now_ns = now_ns
         self._bodies: list[Path] = []
         """Files that were written for this commit."""
-        self._said: dict[Path, Mapping[str, object]] = {}
-        """What the staged files say of themselves."""
+        self._said: dict[str, Mapping[str, object]] = {}
+        """What the staged files say of themselves, by their names: a Path takes longer to look up than to unlink."""
         self._unsynced: list[Path] = []
         self._added: list[tuple[SpooledObject, State]] = []
         self._taking: list[tuple[int, Path, Mapping[str, object] | None]] = []
@@ -147,7 +147,7 @@ class Adding:
         path = self._tree.part(number)
         if state in _STAYS and isinstance(item.body, FileBody):
             said = description(item, key, sha256, metadata)
-            self._taking.append((number, item.body.path, said if said != self._said.get(item.body.path) else None))
+            self._taking.append((number, item.body.path, said if said != self._said.get(str(item.body.path)) else None))
             path = self._tree.path(state, reason, item.bucket, key)
         added = SpooledObject(number, item.bucket, key, path, len(item.body), sha256, item.content_type, metadata, item.priority,
                               self._now_ns, waits_for(item.sensor, metadata, protected=item.protected))  # fmt: skip
@@ -175,10 +175,13 @@ class Adding:
     def place(self) -> list[SpooledObject]:
         """It is durable: give the files their names; returns the objects that may be shipped."""
         self._repeats.keep()
+        taken = {str(path) for _, path, _ in self._taking}
+        self._bodies = [path for path in self._bodies if str(path) not in taken]
         pending: list[SpooledObject] = []
         for item, state in self._added:
             if state is State.PENDING:
-                pending.append(replace(item, path=self._tree.waiting(item.id, item.bucket, item.key)))
+                path = self._tree.waiting(item.id, item.bucket, item.key)
+                pending.append(item if path == item.path else replace(item, path=path))
             elif state in {State.HELD, State.KEPT}:
                 self._tree.place(self._tree.part(item.id), item.path)
         return pending
@@ -197,7 +200,7 @@ class Adding:
         else:
             path = item.body.path
             describe(path, said)
-        self._said[path] = said
+        self._said[str(path)] = said
         self._unsynced.append(path)
         return item
 

@@ -85,12 +85,15 @@ class Tree:
         """Write a new file, to be synced; raises OSError (a full disk, say) and then leaves nothing behind."""
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         try:
-            with os.fdopen(descriptor, 'wb') as file:
-                file.write(body)
-                describe(file.fileno(), said)
+            rest = memoryview(body)
+            while rest:
+                rest = rest[os.write(descriptor, rest) :]
+            describe(descriptor, said)
         except OSError:
             path.unlink(missing_ok=True)
             raise
+        finally:
+            os.close(descriptor)
 
     def take_part(self, number: int, body: Path, said: Mapping[str, Any] | None) -> None:
         """Make a whole and synced file the part; ``said`` where it has to say something else. Raises OSError."""

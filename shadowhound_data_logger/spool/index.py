@@ -790,7 +790,7 @@ class Index:
         self._db.executemany(
             'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
-              json.dumps(row.rejected), json.dumps(row.dropped), row.last_kept_ns, row.first_ns,
+              _counts(row.rejected), _counts(row.dropped), row.last_kept_ns, row.first_ns,
               row.heard_ns, row.complete_ns) for row in snapshot.topics),
         )  # fmt: skip
         self._db.executemany(
@@ -798,12 +798,12 @@ class Index:
         )
         self._db.executemany(
             'INSERT OR REPLACE INTO publishers VALUES (?,?,?,?,?,?,?,?,?)',
-            ((session, row.topic, row.publisher, row.first, row.last, row.published, row.received, json.dumps(row.missed),
+            ((session, row.topic, row.publisher, row.first, row.last, row.published, row.received, _counts(row.missed),
               row.heard_ns) for row in snapshot.publishers),
         )  # fmt: skip
         self._db.executemany(
             'INSERT OR REPLACE INTO estimates VALUES (?,?,?,?,?)',
-            ((session, row.topic, row.estimated, row.unknown, json.dumps(row.missed))
+            ((session, row.topic, row.estimated, row.unknown, _counts(row.missed))
              for row in snapshot.topics if row.estimated or row.unknown or row.missed),
         )  # fmt: skip
         self._db.executemany(
@@ -889,6 +889,11 @@ def _split(key: str) -> tuple[str, str]:
     """Its folder, with the slash, and the rest."""
     folder, slash, name = key.rpartition('/')
     return folder + slash, name
+
+
+def _counts(by_reason: Mapping[str, int]) -> str:
+    """As JSON; nearly all are empty."""
+    return json.dumps(by_reason) if by_reason else '{}'
 
 
 def _digest(sha256: str) -> bytes:

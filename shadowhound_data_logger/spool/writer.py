@@ -1,7 +1,8 @@
 """The one thread that writes the spool: it groups finished objects and outcomes of deliveries into durable commits.
 
-At most one commit every ``commit_s``; the first after a quiet time happens at once. Objects that stay here until somebody asks
-for them wait up to ``HEARTBEAT_S`` for others to be committed with. A commit that fails (a full or read-only disk) is tried again
+At most one commit every ``commit_s``; the first after a quiet time waits half of that, because what one poll took comes as a
+burst of objects, and one commit costs less than two. Objects that stay here until somebody asks for them wait up to
+``HEARTBEAT_S`` for others to be committed with. A commit that fails (a full or read-only disk) is tried again
 with everything that was in it; meanwhile ``put`` blocks the encoders, not the intake.
 """
 
@@ -51,7 +52,7 @@ _Group = tuple[Sequence[_Unit], Sequence[Outcome]]
 class SpoolWriter:
     """Collects objects and outcomes, and commits them on one thread.
 
-    New; ``on_commit``; open once; put, settle, flush from any thread; close once. ``_changed`` guards the lists.
+    New; ``on_commit``; open once; put, settle, flush from any thread; close once. The lock of ``_changed`` guards the lists.
     """
 
     def __init__(self, spool: Spool, commit_s: float = COMMIT_S) -> None:
@@ -59,7 +60,9 @@ class SpoolWriter:
         self._commit_s = commit_s
         self._spooled: Callable[[Sequence[SpooledObject]], None] = lambda _: None
         self._settled: Callable[[Collection[int]], None] = lambda _: None
-        self._changed = threading.Condition()
+        lock = threading.RLock()
+        self._changed = threading.Condition(lock)
+        self._hurried = threading.Condition(lock)  # ends the pause before a commit; what is put meanwhile wakes nobody
         self._units: deque[_Unit] = deque()
         self._outcomes: deque[Outcome] = deque()
         self._bytes = 0
@@ -120,6 +123,7 @@ class SpoolWriter:
             target = self._added
             self._urgent = True
             self._changed.notify_all()
+            self._hurried.notify_all()
             self._changed.wait_for(lambda: self._done >= target or self.damaged, deadline_s)
             return self._done >= target
 
@@ -130,14 +134,16 @@ class SpoolWriter:
         self.worker.stop()
         with self._changed:
             self._changed.notify_all()
+            self._hurried.notify_all()
         return self.worker.join(end - time.monotonic() + HEARTBEAT_S) and flushed
 
     def _step(self) -> None:
         with self._changed:
-            self._changed.wait_for(lambda: self._due() or self.worker.stopping, HEARTBEAT_S)
-            pause_s = self._last_commit + self._commit_s - time.monotonic()
+            is_due = self._changed.wait_for(lambda: self._due() or self.worker.stopping, HEARTBEAT_S)
+            now_s = time.monotonic()
+            pause_s = max(self._last_commit + self._commit_s - now_s, self._commit_s / 2 if is_due else 0.0)
             if pause_s > 0 and not self._urgent:
-                self._changed.wait_for(lambda: self._urgent or self.worker.stopping, pause_s)
+                self._hurried.wait_for(lambda: self._urgent or self.worker.stopping, pause_s)
             units, outcomes = list(self._units), list(self._outcomes)
         self._last_commit = time.monotonic()
         try:

@@ -56,7 +56,9 @@ _SOCKET: Final = ((socket.IPPROTO_TCP, socket.TCP_NODELAY, 1), (socket.SOL_SOCKE
 _open_session: Any = URLLib3Session
 _prepared: Any = AWSPreparedRequest
 _create_parser: Any = create_parser
-_awaiting: Any = AWSConnection
+_Awaiting: Any = AWSConnection
+_HTTP: Any = AWSHTTPConnection
+_HTTPS: Any = AWSHTTPSConnection
 """Their stubs know less than they take."""
 
 
@@ -163,30 +165,58 @@ class ContentRequests:
         return headers
 
 
-def _skip_headers(_: object, fp: IO[bytes]) -> None:
-    """What may follow ``100 Continue``; botocore's own reads forever where the connection ends there."""
-    while fp.readline().strip():
-        pass
+class _Sending(_Awaiting):  # type: ignore[misc]
+    """Sends a request whose headers were made here in as few steps as that takes."""
+
+    _head = b''
+    """Of a request that has a body: it leaves with the first piece of that."""
+    _is_head_kept = False
+
+    def request(self, method: str, url: str, body: Any = None, headers: Any = None, *args: Any, **kwargs: Any) -> None:
+        sent = headers or {}
+        self._is_head_kept = body is not None and 'Expect' not in sent and sent.get('content-length', '0') != '0'
+        self._head = b''
+        super().request(method, url, body, headers, *args, **kwargs)
+
+    def putheader(self, name: str, *values: str | bytes) -> None:
+        """Printable ASCII ends no line: it needs none of the looks that urllib3 and http.client take at each header."""
+        value = values[0]
+        if len(values) == 1 and isinstance(value, str) and ':' not in name:
+            line = f'{name}: {value}'
+            if line.isascii() and line.isprintable():
+                self._buffer.append(line.encode('ascii'))
+                return
+        super().putheader(name, *values)
+
+    def _consume_headers(self, fp: IO[bytes]) -> None:
+        """What may follow ``100 Continue``; botocore's own reads forever where the connection ends there."""
+        while fp.readline().strip():
+            pass
+
+    def _send_output(self, message_body: Any = None, *args: Any, **kwargs: Any) -> None:
+        """Once refused, botocore sends nothing of the body, but asks for each piece, which waits for its time under the cap.
+
+        urllib3 takes this error for what it says, and reads the answer.
+        """
+        if self._is_head_kept and message_body is None:
+            self._head = b'\r\n'.join((*self._buffer, b'', b''))
+            self._buffer.clear()
+            return
+        super()._send_output(message_body, *args, **kwargs)
+        if self._response_received:
+            raise BrokenPipeError
+
+    def send(self, data: bytes) -> None:
+        head, self._head = self._head, b''
+        super().send(head + data)
 
 
-def _send_output(connection: Any, *args: Any, **kwargs: Any) -> None:
-    """Once refused, botocore sends nothing of the body, but asks for each piece, which waits for its time under the cap.
-
-    urllib3 takes this error for what it says, and reads the answer.
-    """
-    _awaiting._send_output(connection, *args, **kwargs)
-    if connection._response_received:
-        raise BrokenPipeError
+class _Connection(_Sending, _HTTP):  # type: ignore[misc]
+    pass
 
 
-class _Connection(AWSHTTPConnection):
-    _consume_headers = _skip_headers
-    _send_output = _send_output
-
-
-class _TLSConnection(AWSHTTPSConnection):
-    _consume_headers = _skip_headers
-    _send_output = _send_output
+class _TLSConnection(_Sending, _HTTPS):  # type: ignore[misc]
+    pass
 
 
 class _Pool(AWSHTTPConnectionPool):

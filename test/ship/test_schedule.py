@@ -5,7 +5,7 @@ from __future__ import annotations
 from ship.drive import Drive
 
 from shadowhound_data_logger.errors import BucketMissing, StoreUnavailable
-from shadowhound_data_logger.ship.ahead import LOOK_EVERY_S
+from shadowhound_data_logger.ship.ahead import FEW, LOOK_EVERY_S
 from shadowhound_data_logger.ship.schedule import Look, Rest
 
 AWAY = StoreUnavailable('Tower is away')
@@ -43,6 +43,29 @@ def test_what_is_urgent_overtakes_what_was_looked_up_before(drive: Drive) -> Non
     urgent = drive.spool.add(priority=0)[0]
     drive.schedule.wake()
     assert drive.next() == urgent
+
+
+def test_what_was_told_of_is_shipped_without_a_look(drive: Drive) -> None:
+    """Where nothing else waits, what has just been spooled is known, and goes in its order."""
+    assert drive.next() is None
+    looks = drive.spool.looks
+    later, sooner = drive.spool.add(priority=7)[0], drive.spool.add(priority=2)[0]
+    drive.schedule.wake([later, sooner])
+    assert drive.schedule.snapshot().ready == 2
+    for expected in (sooner, later):
+        assert drive.next() == expected
+        drive.deliver(expected)
+    assert drive.next() is None
+    assert drive.spool.looks == looks
+
+
+def test_where_much_waits_the_spool_is_asked_for_it(drive: Drive) -> None:
+    """What was told of is then a part of the backlog only."""
+    assert drive.next() is None
+    looks = drive.spool.looks
+    drive.schedule.wake(drive.spool.add(FEW))
+    assert drive.next()
+    assert drive.spool.looks > looks
 
 
 def test_an_object_is_claimed_once_until_it_is_settled(drive: Drive) -> None:

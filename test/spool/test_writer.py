@@ -69,6 +69,16 @@ def test_what_was_put_is_durable_after_a_flush(opened: Callable[..., SpoolWriter
     assert sorted(item.key for item in told) == sorted(str(number) for number in range(20))
 
 
+def test_a_burst_is_one_commit(opened: Callable[..., SpoolWriter], commits: list[int]) -> None:
+    """The first object after a quiet time waits for those that come with it."""
+    writing = opened(60.0)
+    for number in range(5):
+        writing.put(make(f'{number}', topic=None))
+    assert not commits
+    assert writing.flush(60)
+    assert commits == [5]
+
+
 def test_objects_share_commits(opened: Callable[..., SpoolWriter], spool: Spool, commits: list[int]) -> None:
     """After the first commit the others wait for the next one, which takes all of them."""
     writing = opened(60.0)

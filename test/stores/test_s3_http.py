@@ -1,0 +1,66 @@
+"""What one request is on the wire."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from shadowhound_data_logger.stores.s3_http import _Connection
+
+
+class _Socket:
+    """Notes what is sent, piece by piece."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+
+    def settimeout(self, _: object) -> None:
+        """It never waits."""
+
+    def sendall(self, data: bytes) -> None:
+        self.sent.append(data)
+
+    def close(self) -> None:
+        """It holds nothing."""
+
+
+@pytest.fixture
+def wire() -> tuple[Any, list[bytes]]:
+    """A connection that is open, and what it sends."""
+    connection: Any = _Connection('tower', 9000)
+    connection.sock = socket = _Socket()
+    return connection, socket.sent
+
+
+def test_the_head_leaves_with_the_first_piece_of_the_body(wire: tuple[Any, list[bytes]]) -> None:
+    """One packet, and one wake of the server, less for each object."""
+    connection, sent = wire
+    headers = {'host': 'tower:9000', 'content-length': '6', 'user-agent': 'me', 'x-amz-meta-sensor': 'imu'}
+    connection.request('PUT', '/b/k', body=iter([b'one', b'two']), headers=headers)
+    head, _, first = sent[0].partition(b'\r\n\r\n')
+    assert head.split(b'\r\n') == [
+        b'PUT /b/k HTTP/1.1', b'Accept-Encoding: identity', b'host: tower:9000', b'content-length: 6', b'user-agent: me',
+        b'x-amz-meta-sensor: imu',
+    ]  # fmt: skip
+    assert (first, sent[1:]) == (b'one', [b'two'])
+
+
+@pytest.mark.parametrize(('method', 'body', 'length'), [('GET', None, None), ('PUT', iter(()), '0')])
+def test_a_request_without_a_body_leaves_at_once(
+    wire: tuple[Any, list[bytes]], method: str, body: Any, length: str | None
+) -> None:
+    """Nothing comes that its head could wait for."""
+    connection, sent = wire
+    connection.request(method, '/b/k', body=body, headers={'host': 'tower', **({'content-length': length} if length else {})})
+    assert len(sent) == 1
+    assert sent[0].endswith(b'\r\n\r\n')
+
+
+@pytest.mark.parametrize(('name', 'value'), [('range', 'bytes=0-9\r\nhost: other'), ('x:y', 'z'), ('x\ny', 'z')])
+def test_no_header_can_bring_another_one(wire: tuple[Any, list[bytes]], name: str, value: str) -> None:
+    """A line break in what a server or a setting said is refused before anything is sent."""
+    connection, sent = wire
+    with pytest.raises(ValueError, match='Invalid header'):
+        connection.request('GET', '/b/k', headers={'host': 'tower', name: value})
+    assert not sent
