@@ -13,10 +13,10 @@ listener that died between waiting and processing (pull request 4737).
 A process that is killed while it makes a port leaves one that is never finished, and whoever opens that waits forever as well
 (managed_open_or_create_impl.hpp of boost interprocess). ``settle`` marks it as damaged, and the next process makes it anew.
 
-    python -I -S port_guard.py PID
+    flock --no-fork FILE python -I -S port_guard.py PID
 
-As a program it waits for the end of its parent, whatever ends that, and settles what is left; a byte on its standard input ends
-it before. It imports nothing of the package: it has 4 MB of its own.
+As a program, which ``flock`` becomes when the lock of its parent is free, it settles what that one left. It imports nothing of
+the package.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MAKING_S: Final = 5.0
 _MOST_BYTES: Final = 4 << 20
 """A port of 512 messages, as by default, has 52 KB."""
 _ENDING_S: Final = 5.0
-"""For a parent that has closed our standard input and is not gone yet: its locks go with it."""
+"""For a parent whose lock is free and that is not gone yet: its other locks go with it."""
 
 # The first word of a segment of boost interprocess, as managed_open_or_create_impl.hpp numbers them.
 _WORD: Final = struct.Struct('=I')
@@ -170,11 +170,9 @@ def _lock(descriptor: int, path: Path) -> bool | None:
 
 
 def main(parent: int) -> None:
-    """Wait for the end of the parent; then settle."""
+    """Wait until the parent is gone; then settle."""
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):  # who ends all that a service has left comes too early
         signal.signal(number, signal.SIG_IGN)
-    if os.read(0, 1):
-        return
     end_s = time.monotonic() + _ENDING_S
     while os.getppid() == parent and time.monotonic() < end_s:
         time.sleep(0.01)

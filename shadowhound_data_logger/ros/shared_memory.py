@@ -34,8 +34,6 @@ STARTING_S: Final = 5.0
 """A process that starts has its file before it has its lock."""
 MOST_DEAD_PORTS: Final = 50
 """Fast DDS tries a hundred."""
-GUARD_END_S: Final = 2.0
-"""For a guard that is told to end; it is killed then."""
 _PORT: Final = re.compile(r'((?:fastdds|fastrtps)_port(\d{4,5}))_el')
 _LOCK: Final = re.compile(r'(?:fastdds|fastrtps)_[0-9a-f]{16}_el')
 
@@ -89,35 +87,38 @@ def dead_ports_avoided(domain: int, folder: Path = FOLDER, processes: Path = Pat
 class PortGuard:
     """A process that outlives this one for an instant, to settle its ports where it is killed; none where it has no ports.
 
-    Life: New once the participants are made; ``close`` when they are gone.
+    Life: New once the participants are made; ``close`` when they are gone. Until then it is ``flock`` (1.8 MB), which waits for a
+    lock that this process has and nobody can take over, and then becomes ``port_guard``.
     """
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         if not _has_ports():
             return
-        command = [sys.executable, '-I', '-S', port_guard.__file__, str(os.getpid())]
-        environ = {name: value for name, value in os.environ.items() if name == 'LD_LIBRARY_PATH'}  # no credentials
+        self._locked = os.memfd_create('port_guard')
+        lock(self._locked)
+        program = [sys.executable, '-I', '-S', port_guard.__file__, str(os.getpid())]
+        environ = {name: os.environ[name] for name in ('PATH', 'LD_LIBRARY_PATH') if name in os.environ}  # no credentials
         try:
             self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
+                ['flock', '--no-fork', f'/proc/{os.getpid()}/fd/{self._locked}', *program],
+                stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 env=environ,
                 start_new_session=True,  # Ctrl-C in a terminal, and what is sent to our whole group, is not for it
             )
         except OSError as error:
-            log.warning('no process looks after our shared memory should we be killed: %s', error)
+            os.close(self._locked)
+            log.warning('no process looks after our shared memory should we be killed (util-linux has flock): %s', error)
 
     def close(self) -> None:
-        if self._process is None:
-            return
-        try:
-            self._process.communicate(b'.', GUARD_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.communicate()
+        """Idempotent."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+            os.close(self._locked)
 
 
 def _has_ports() -> bool:

@@ -251,6 +251,6 @@ def test_a_guard_settles_before_fast_dds_notices(pair: Callable[[bool], Pair]) -
 
 
 def test_the_guard_needs_nothing_of_the_package() -> None:
-    """It runs where Python finds no package, and ends with a byte on its input."""
-    command = [sys.executable, '-I', '-S', str(port_guard.__file__), str(os.getpid())]
-    assert subprocess.run(command, input=b'.', check=False, capture_output=True).returncode == 0
+    """It runs where Python finds no package."""
+    command = [sys.executable, '-I', '-S', str(port_guard.__file__), '0']
+    assert subprocess.run(command, check=False, capture_output=True).returncode == 0
