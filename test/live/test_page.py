@@ -244,6 +244,7 @@ def test_a_gap_stands_on_the_timeline_at_its_time(page: Page, watching: Watching
     assert page.wrong == []
 
 
+@pytest.mark.slow
 def test_back_in_time(page: Page, watching: Watching) -> None:
     """A click on the timeline shows that moment: frame, cloud, path and plots of then; it plays on from there.
 
