@@ -274,7 +274,7 @@ class BagRecovery:
 def _runs(path: Path) -> dict[str, list[NumberRun]]:
     """The numbers of a slice's messages, by topic; none of a topic where they do not rise, since several publishers have it."""
     found: dict[str, list[NumberRun]] = {}
-    with suppress(BagDamaged, OSError):  # then it is not known; the spool compares the file with its checksum
+    try:
         source = LocalFile(path)
         for message in read_messages(source, read_index(source), MessageFilter(0, 1 << 64, lambda _: True)):
             number, stamp_ns = message.sequence, message.publish_ns
@@ -283,6 +283,8 @@ def _runs(path: Path) -> dict[str, list[NumberRun]]:
                 runs[-1] = runs[-1]._replace(stop=number + 1, to_ns=stamp_ns)
             elif len(runs) <= MAX_RANGES:
                 runs.append(NumberRun(number, number + 1, stamp_ns, stamp_ns))
+    except (BagDamaged, OSError):
+        return {}  # the spool compares the file with its checksum
     return {
         topic: runs for topic, runs in found.items()
         if len(runs) <= MAX_RANGES and all(one.stop < two.start for one, two in pairwise(runs))
