@@ -56,6 +56,9 @@ class Wire:
     async def _set(self, mode: str | tuple[int, str]) -> None:
         self._mode = mode
         if self._server is not None:
+            for listening in self._server.sockets:
+                self._loop.remove_reader(listening.fileno())
+            await asyncio.sleep(0)  # Python 3.12 leaves open what it has accepted and the server only learns of once it is closed
             self._server.close()
             self._server = None
         for task in tuple(self._tasks):
