@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 DAMAGED: Final = 'damaged'
 REBUILT: Final = 'damaged index rebuilt'
-MILLISECOND: Final = 10**6
+MICROSECOND: Final = 1000
 _DAMAGED: Final = ('malformed', 'disk I/O', 'already exists', 'no such', 'decode', 'unsupported file format')
 
 
@@ -119,11 +119,14 @@ def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery, *, has_log
 
 
 def _stay_apart(tree: Tree, index: Index, now_ns: int) -> None:
-    """Give out no number that a process has given out which lives with the index before, until it finds that this was lost."""
+    """Give out no number that a process has given out which lives with the index before, until it finds that this was lost.
+
+    The index before may have been begun in the same second, and have adopted some files a millisecond since.
+    """
     known = {*index.sessions(ended=False), *index.sessions(ended=True)}
     strangers = set(tree.sessions()).difference(known)
     if strangers:
-        index.begin_after(max(strangers), now_ns // MILLISECOND)
+        index.begin_after(max(strangers), now_ns // MICROSECOND)
 
 
 def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:

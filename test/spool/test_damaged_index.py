@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from profiles import examples
 from spool.conftest import Open
-from spool.making import BUCKET, abandon, assert_whole, files, make, new_spool, put, reopened, rows, settle
+from spool.making import BUCKET, FakeClock, abandon, assert_whole, files, make, new_spool, put, reopened, rows, settle
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
@@ -69,6 +69,23 @@ def test_many_files_are_adopted_in_groups(opened: Open, root: Path, monkeypatch:
     (root / 'index.db').unlink()
     assert reopened(opened, root)['files adopted'] == 10
     assert assert_whole(root)['topics']['/camera']['stored'] == 11
+
+
+def test_rebuilt_indexes_give_out_different_numbers(opened: Open, root: Path, clock: FakeClock) -> None:
+    """A process that lives with the index before may be about to name a part by a number of that."""
+    spools = [opened()]
+    put(spools[0], *(make(f'{number}') for number in range(30)))
+    numbers: list[int] = []
+    for _ in range(2):
+        (root / 'index.db').rename(root / f'index.db.damaged-{len(numbers)}')
+        (root / 'index.db').touch()
+        clock.now_ns += 10_000_000
+        spools.append(opened())
+        numbers += [row['id'] for row in rows(root)]
+    for lost in spools[:2]:
+        with pytest.raises(SpoolError, match='start again'):
+            lost.close()
+    assert len(set(numbers)) == 60
 
 
 def test_a_lost_write_ahead_log(opened: Open, root: Path) -> None:
