@@ -33,8 +33,8 @@ SERVERS = ('process_request_thread', '_server_entry')
 """Threads of the stand-in servers (http.server, moto), which end with their clients or the session."""
 ENGINE = ('DaftBackgroundEventLoop', 'Dummy-')
 """Daft's own, of which a process keeps one set; the latter is what Python calls threads of another language."""
-MOST_WORKERS = 6 if profiles.LONG else 4
-"""Each collects all tests and loads all libraries, some 15 s of CPU; long tests mostly wait."""
+MOST_WORKERS = 6
+"""Each collects all tests and loads all libraries, some 6 s of CPU; many tests wait."""
 ONE_ROBOT_AT_A_TIME = (
     'test/e2e/test_bag.py', 'test/e2e/test_catalogue.py', 'test/e2e/test_go2_profile.py', 'test/e2e/test_killed.py',
     'test/e2e/test_raw_camera.py', 'test/sim/test_demo.py', 'test/sim/test_sim_go2_node.py',

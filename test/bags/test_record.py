@@ -53,6 +53,7 @@ def rosbags_of(home: Path) -> Path:
     return home / 'store' / 'sensor-data' / 'thor' / 'rosbags'
 
 
+@pytest.mark.long('starts more processes')
 def test_the_guides_function(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """It returns when the store has the bag, with every topic of the sensors that was published."""
     found = record_and_upload_rosbag('patrol', 2)

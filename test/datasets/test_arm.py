@@ -151,6 +151,7 @@ def test_the_arm_is_a_source_like_ours(house: House, exported: Exported) -> None
     assert found.wrong == []
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_an_offset_beyond_half_a_tick_is_refused(house: House, tmp_path: Path) -> None:
     """Of one given pair, half an hour away, nobody knows the offset; of one near by, to 0.2 ms a second."""
     mission = Mission('', begin_s=2000.0 * (EPISODES - 1), seconds=2)

@@ -126,6 +126,7 @@ def executor(command_fails: bool) -> Any:
     return Existing(config={})
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_the_guide_s_executor_and_query(
     server: Server, warm_home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -59,9 +59,8 @@ def test_a_store_of_twice_the_rate_keeps_up_with_what_is_live(drive: Drive, back
     assert len(found.old) >= len(LIVE) * (SECONDS - 1)
 
 
-@pytest.mark.parametrize(('backlog', 'least'), [
-    pytest.param((3,), 1 / 2, marks=LONG), ((9,), 1 / 8), pytest.param((3, 4, 6, 7, 9), 1 / 2, marks=LONG),
-], ids=IDS)  # fmt: skip
+@LONG
+@pytest.mark.parametrize(('backlog', 'least'), [((3,), 1 / 2), ((9,), 1 / 8), ((3, 4, 6, 7, 9), 1 / 2)], ids=IDS)
 def test_a_store_that_is_too_slow_is_shared_evenly(drive: Drive, backlog: tuple[int, ...], least: float) -> None:
     """Every second turn is that of the live ones, of which no priority goes without; the oldest of the backlog go on leaving.
 

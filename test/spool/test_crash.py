@@ -72,6 +72,7 @@ def goes_on(spool: Spool, root: Path, *, committed: bool) -> None:
     assert assert_whole(root)['topics']['/camera']['missed_by'] == {'restart': 3 if committed else 7}
 
 
+@pytest.mark.long('a death after each step')
 def test_death_at_any_moment_of_an_eviction(root: Path, moments: Moments) -> None:
     """Whatever was evicted is so in the ledger and has no file; the object that needed the room is there or not."""
     spool = new_spool(root, max_bytes=1 << 20)

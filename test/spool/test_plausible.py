@@ -70,6 +70,7 @@ def test_totals_of_other_objects_are_told(index: Path, opened: Open, caplog: pyt
 
 
 @pytest.mark.sampled
+@pytest.mark.long('which a campaign repeats')
 def test_random_edits(tmp_path: Path) -> None:
     """Whatever is changed in an index, a start works, ships nothing else than what was spooled, and sums close or it is told."""
     bodies = rotting.new_base(tmp_path / 'base')

@@ -265,6 +265,7 @@ def test_what_is_asked_for_or_protected_stays_as_it_is(make_robot: Callable[...,
     assert [row['samples'] for row in robot.kept()] == [30, 30, 1]
 
 
+@pytest.mark.long('a second of CPU or more')
 def test_an_hour_is_told_once(make_robot: Callable[..., Robot], caplog: pytest.LogCaptureFixture) -> None:
     """Where room is always short, what is new is thinned every few seconds, and the log does not say so each time."""
     caplog.set_level('INFO', 'shadowhound_data_logger')
