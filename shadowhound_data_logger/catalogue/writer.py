@@ -7,7 +7,7 @@ yet is the spool index's, and a part takes its rows off it in the transaction th
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from itertools import groupby
@@ -32,6 +32,8 @@ from shadowhound_data_logger.spool.index import Index
 MOST_ROWS: Final = 2000
 """At a time: 60 ms of CPU without their statistics, and 10 MB of memory meanwhile. While there are more, the next ones come with
 the next look."""
+OBJECTS_A_PART: Final = 400
+"""Of which one part has the statistics: meanwhile those of an object take some 30 KB of memory."""
 SOON_S: Final = 5.0
 """After a mission: until then its last objects are usually delivered."""
 KEPT_S: Final = 5.0
@@ -104,11 +106,19 @@ class CatalogueWriter:
         rows = [(item.id, row_of(item.bucket, item.key, item.size, item.content_type, item.metadata)) for item in new]
         made = [self._part(robot, date, found) for robot, date, found in parts.by_folder(rows)]
         self._handed += [frozenset(part.catalogues) for part in made]
-        said = {item.id: unpacked_statistics(item.statistics) for item in new if item.statistics}
-        told = [(number, one) for number, row in rows for one in statistic_rows(row, said.get(number, {}))]
+        packed = {item.id: item.statistics for item in new if item.statistics}
+        statistics = self._statistics_parts([(number, row) for number, row in rows if number in packed], packed)
         # Before the rows: what is told goes with those from the index, and statistics that are told twice do no harm.
-        return [*(self._part(*each, STATISTICS) for each in parts.by_folder(told)), *made, *self._gaps.parts(),
-                *self._kept_parts()]  # fmt: skip
+        return [*statistics, *made, *self._gaps.parts(), *self._kept_parts()]
+
+    def _statistics_parts(self, rows: list[tuple[int, Row]], packed: Mapping[int, bytes]) -> Iterator[DataObject]:
+        for begin in range(0, len(rows), OBJECTS_A_PART):
+            told = (
+                (number, one)
+                for number, row in rows[begin : begin + OBJECTS_A_PART]
+                for one in statistic_rows(row, unpacked_statistics(packed[number]))
+            )
+            yield from (self._part(*each, STATISTICS) for each in parts.by_folder(told))
 
     def _kept_parts(self) -> list[DataObject]:
         """Parts of the table of what is kept, of what is in none yet nor handed out. Raises SpoolError or sqlite3.Error."""

@@ -247,3 +247,17 @@ def test_statistics_go_into_parts_of_their_own_once_the_object_is_delivered(spoo
     ]  # fmt: skip
     spool.commit([statistics, rows, gaps])
     assert catalogue.parts() == []
+
+
+def test_statistics_of_many_objects_go_into_several_parts(
+    spool: Spool, catalogue: CatalogueWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each in one part, under names that differ: all of them at once would take more memory than the rows do."""
+    monkeypatch.setattr('shadowhound_data_logger.catalogue.writer.OBJECTS_A_PART', 2)
+    said = FieldStatistics()
+    said.add([{'x': 1.5}])
+    deliver(spool, put(spool, *(of(name, statistics=packed(said.told())) for name in 'abcde')))
+    made = [part for part in catalogue.parts() if '/_stats/' in part.key]
+    found = [pyarrow.parquet.read_table(io.BytesIO(part.body)).to_pylist() for part in made if isinstance(part.body, bytes)]
+    assert [sorted({row['key'] for row in rows}) for rows in found] == [['a', 'b'], ['c', 'd'], ['e']]
+    assert len({item.key for item in spool.commit(made)}) == 3
