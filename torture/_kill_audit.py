@@ -44,8 +44,6 @@ LOSS_S: Final = 1.25
 """What a kill may cost of what had been received: a batch of one second and the commit window."""
 SLACK_S: Final = 0.15
 """Two polls for a batch to be closed, and the commit itself."""
-OVERTAKEN_S: Final = 0.5
-"""One encoder may be killed over a message while the next one, of another encoder, is durable already."""
 DISCOVERY_S: Final = 3.0
 """Until a node that listens has been found by the publishers, on a busy machine."""
 
@@ -229,7 +227,8 @@ def _gaps(found: Audit, topic: str, sent_ns: Mapping[int, int], stored: set[int]
         first, place = place, bisect_left(times, end, place)
         if first < place:
             inside = [kill for kill in kills if start <= kill.at <= end]
-            inside = inside or [kill for kill in kills if end < kill.at <= end + OVERTAKEN_S][:1]
+            # One encoder may be killed over a message while the next one, of another encoder, is durable already.
+            inside = inside or [kill for kill in kills if end < kill.at <= end + LOSS_S + SLACK_S][:1]
             if inside:
                 gaps.append(_gap(found.wrong['lost beyond the bar'], topic, times[first:place], end, inside))
             else:
