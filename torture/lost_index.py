@@ -135,7 +135,7 @@ class Robot(joined.Killer):
             publisher.begin_numbered(stream.topic, 'p', stream.size, stream.period_s)
         for number in range(1, rounds + 1):
             self._goes_on(time.time_ns())
-            self._sleep(self._rng.uniform(STEADY_S, 2 * STEADY_S))  # who finds the last damage late has died of that one
+            self._sleep(self._rng.uniform(STEADY_S, 2 * STEADY_S))  # a node may notice the last damage only now
             what = self._damage()
             progress(f'{number}: {what}, {self._disturb()}')
         self._goes_on(time.time_ns())

@@ -33,7 +33,7 @@ MOST_ROWS: Final = 2000
 """At a time: 60 ms of CPU without their statistics, and 10 MB of memory meanwhile. While there are more, the next ones come with
 the next look."""
 OBJECTS_A_PART: Final = 400
-"""Of which one part has the statistics: meanwhile those of an object take some 30 KB of memory."""
+"""How many objects' statistics one part holds. While it is made, those of one object take tens of KB of memory."""
 SOON_S: Final = 5.0
 """After a mission: until then its last objects are usually delivered."""
 KEPT_S: Final = 5.0

@@ -121,7 +121,8 @@ def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery, *, has_log
 def _stay_apart(tree: Tree, index: Index, now_ns: int) -> None:
     """Give out no number that a process has given out which lives with the index before, until it finds that this was lost.
 
-    The index before may have been begun in the same second, and have adopted some files a millisecond since.
+    Numbers begin with the time in microseconds: a recovery adopts more than one file a millisecond, so with milliseconds two
+    indexes that were rebuilt shortly after each other could give out the same number.
     """
     known = {*index.sessions(ended=False), *index.sessions(ended=True)}
     strangers = set(tree.sessions()).difference(known)

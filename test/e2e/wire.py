@@ -58,7 +58,8 @@ class Wire:
         if self._server is not None:
             for listening in self._server.sockets:
                 self._loop.remove_reader(listening.fileno())
-            await asyncio.sleep(0)  # Python 3.12 leaves open what it has accepted and the server only learns of once it is closed
+            # asyncio hands accepted connections to the server a turn later; Python 3.12 never closes one that comes after close().
+            await asyncio.sleep(0)
             self._server.close()
             self._server = None
         for task in tuple(self._tasks):
