@@ -58,7 +58,7 @@ class Wire:
         if self._server is not None:
             for listening in self._server.sockets:
                 self._loop.remove_reader(listening.fileno())
-            # asyncio hands accepted connections to the server a turn later; Python 3.12 never closes one that comes after close().
+            # The server learns of an accepted connection a turn later; Python 3.12 never closes one that comes after close().
             await asyncio.sleep(0)
             self._server.close()
             self._server = None
