@@ -110,6 +110,10 @@ class BatchQueue:
             last = self._put
             return self._left.wait_for(lambda: self._first() > last, max(0.0, deadline_s))
 
+    def is_busy(self) -> bool:
+        """Whether a batch is in it or with an encoder; a moment ago."""
+        return bool(self._unfinished)
+
     def oldest(self) -> dict[str, int]:
         """Topic -> the first stamp of its batches that are not done."""
         with self._lock:

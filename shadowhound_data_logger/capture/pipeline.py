@@ -129,7 +129,8 @@ class Pipeline:
     def _make_stages(self) -> None:
         """Each with what it hands its work to; none runs yet."""
         settings = self._settings
-        self.writer = SpoolWriter(self.spool)
+        queue = BatchQueue(settings.queue)
+        self.writer = SpoolWriter(self.spool, expects=queue.is_busy)
         self.uploader = Uploader(self.spool, self._store, settings.upload, self.writer.settle)
         accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         place = BagPlace(settings.home / BAGS / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
@@ -137,7 +138,7 @@ class Pipeline:
         recovery = BagRecovery(place, settings.bag.priority)
         self.event_buffer = EventBuffer(node, settings, place, recovery, types)
         # Who listens to the robot; what is wanted besides the sensors' topics is shared with those further down.
-        queue, bag_queue = BatchQueue(settings.queue), BagQueue()
+        bag_queue = BagQueue()
         sensors = {sensor.name: sensor for sensor in settings.sensors}
         track = RobotTrack(settings.mission, types, self._clock, node.resolve_topic_name)
         self._rules = UploadRules(node, settings, types, self._clock, self._active_mission)

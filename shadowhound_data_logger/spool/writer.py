@@ -1,8 +1,8 @@
 """The one thread that writes the spool: it groups finished objects and outcomes of deliveries into durable commits.
 
-At most one commit every ``commit_s``; the first after a quiet time waits half of that, because what one poll took comes as a
-burst of objects, and one commit costs less than two. Objects that stay here until somebody asks for them wait up to
-``HEARTBEAT_S`` for others to be committed with. A commit that fails (a full or read-only disk) is tried again
+At most one commit every ``commit_s``; the first after a quiet time waits for the rest of its burst, half of that at most, because
+what one poll took comes as several objects, and one commit costs less than two. Objects that stay here until somebody asks for
+them wait up to ``HEARTBEAT_S`` for others to be committed with. A commit that fails (a full or read-only disk) is tried again
 with everything that was in it; meanwhile ``put`` blocks the encoders, not the intake.
 """
 
@@ -24,6 +24,8 @@ COMMIT_S: Final = 0.1
 """Least time between two commits."""
 MAX_WAITING_BYTES: Final = 32 << 20
 """Encoded bytes in memory before encoders have to wait."""
+QUIET_S: Final = 0.01
+"""A burst is over when nothing came for so long and nothing is expected."""
 HEARTBEAT_S: Final = 1.0
 """How often accounts and outcomes become durable when there is no object to commit them with."""
 MANY_OUTCOMES: Final = 64
@@ -55,9 +57,11 @@ class SpoolWriter:
     New; ``on_commit``; open once; put, settle, flush from any thread; close once. The lock of ``_changed`` guards the lists.
     """
 
-    def __init__(self, spool: Spool, commit_s: float = COMMIT_S) -> None:
+    def __init__(self, spool: Spool, commit_s: float = COMMIT_S, expects: Callable[[], bool] = lambda: False) -> None:
+        """``expects`` says whether more objects are in the making, which are worth waiting for; from its thread."""
         self.spool = spool
         self._commit_s = commit_s
+        self._expects = expects
         self._spooled: Callable[[Sequence[SpooledObject]], None] = lambda _: None
         self._settled: Callable[[Collection[int]], None] = lambda _: None
         lock = threading.RLock()
@@ -139,11 +143,9 @@ class SpoolWriter:
 
     def _step(self) -> None:
         with self._changed:
-            is_due = self._changed.wait_for(lambda: self._due() or self.worker.stopping, HEARTBEAT_S)
-            now_s = time.monotonic()
-            pause_s = max(self._last_commit + self._commit_s - now_s, self._commit_s / 2 if is_due else 0.0)
-            if pause_s > 0 and not self._urgent:
-                self._hurried.wait_for(lambda: self._urgent or self.worker.stopping, pause_s)
+            if self._changed.wait_for(lambda: self._due() or self.worker.stopping, HEARTBEAT_S):
+                self._await_burst()
+            self._pause(self._last_commit + self._commit_s - time.monotonic())
             units, outcomes = list(self._units), list(self._outcomes)
         self._last_commit = time.monotonic()
         try:
@@ -159,6 +161,18 @@ class SpoolWriter:
                 self.damaged = True
                 self._changed.notify_all()
             raise
+
+    def _await_burst(self) -> None:
+        """Until its last object has come; the caller holds the lock."""
+        end_s = time.monotonic() + self._commit_s / 2
+        while (left_s := end_s - time.monotonic()) > 0:
+            added = self._added
+            if self._pause(min(QUIET_S, left_s)) or (self._added == added and not self._expects()):
+                return
+
+    def _pause(self, seconds: float) -> bool:
+        """Whether it ended early, because somebody waits for the commit; the caller holds the lock."""
+        return self._hurried.wait_for(lambda: self._urgent or self.worker.stopping, max(0.0, seconds))
 
     def _groups(self, units: Sequence[_Unit], outcomes: Sequence[Outcome]) -> list[_Group]:
         """One commit of all, or several of a burst; also where the disk has no room, since files leave only after a commit.

@@ -45,8 +45,10 @@ def opened(spool: Spool) -> Iterator[Callable[..., SpoolWriter]]:
     """Opens writers and closes them afterwards."""
     made: list[SpoolWriter] = []
 
-    def make_writer(commit_s: float = 0.01, **callbacks: Callable[..., None]) -> SpoolWriter:
-        made.append(SpoolWriter(spool, commit_s))
+    def make_writer(
+        commit_s: float = 0.01, expects: Callable[[], bool] = lambda: False, **callbacks: Callable[..., None]
+    ) -> SpoolWriter:
+        made.append(SpoolWriter(spool, commit_s, expects))
         made[-1].on_commit(**callbacks)
         made[-1].open()
         return made[-1]
@@ -70,13 +72,22 @@ def test_what_was_put_is_durable_after_a_flush(opened: Callable[..., SpoolWriter
 
 
 def test_a_burst_is_one_commit(opened: Callable[..., SpoolWriter], commits: list[int]) -> None:
-    """The first object after a quiet time waits for those that come with it."""
-    writing = opened(60.0)
+    """The first object after a quiet time waits for those that are in the making, and no longer."""
+    in_the_making = [True]
+    writing = opened(600.0, expects=lambda: bool(in_the_making))
     for number in range(5):
         writing.put(make(f'{number}', topic=None))
     assert not commits
-    assert writing.flush(60)
+    in_the_making.clear()
+    until(lambda: bool(commits))
     assert commits == [5]
+
+
+def test_a_burst_that_does_not_end_is_waited_for_half_of_the_time(opened: Callable[..., SpoolWriter], commits: list[int]) -> None:
+    """However long something is in the making."""
+    writing = opened(0.1, expects=lambda: True)
+    writing.put(make('first', topic=None))
+    until(lambda: commits == [1])
 
 
 def test_objects_share_commits(opened: Callable[..., SpoolWriter], spool: Spool, commits: list[int]) -> None:
