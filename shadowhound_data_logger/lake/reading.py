@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import io
 import re
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -39,7 +40,8 @@ from shadowhound_data_logger.untrusted import check_size, is_path
 
 SMALL_BYTES: Final = 256 << 10
 """Up to here a file is read whole: of one-minute parts there are thousands, and a compacted day of a robot is larger."""
-PARTS_AT_A_TIME: Final = 180
+PARTS_AHEAD: Final = 4 * THREADS
+"""Small files that are asked for before their turn."""
 BATCH_BYTES: Final = 16 << 20
 """Of rows that are handed on together, and of a large file that is read at a time."""
 MOST_BYTES: Final = 256 << 20
@@ -163,9 +165,14 @@ def _bodies(source: Bucket, entries: Sequence[ObjectInfo]) -> Iterator[tuple[Obj
             return error
 
     with ThreadPoolExecutor(THREADS, 'lake-read') as pool:  # they wait for the server; several that parse hinder each other
-        for start in range(0, len(entries), PARTS_AT_A_TIME):
-            some = entries[start : start + PARTS_AT_A_TIME]
-            yield from zip(some, pool.map(body, some), strict=True)
+        coming = deque[tuple[ObjectInfo, Future[bytes | ObjectRefused | None]]]()
+        for entry in entries:
+            coming.append((entry, pool.submit(body, entry)))
+            if len(coming) == PARTS_AHEAD:
+                first, found = coming.popleft()
+                yield first, found.result()
+        for entry, found in coming:
+            yield entry, found.result()
 
 
 class _Choice(NamedTuple):
@@ -368,6 +375,8 @@ class _Part:
         texts = [name for name in places if self._body is None and self._of.columns[name] == STRING]
         told = {name: [self._told(number, name, places[name], choice) for number in groups] for name in texts}
         read = [name for name in places if all(text is None for text in told.get(name, ()))]
+        if len(read) == len(places):
+            return self._read(groups, places)
         found = dict(zip(read, self._read(groups, {name: places[name] for name in read}).columns, strict=True)) if read else {}
         for name in (name for name in places if name not in found):
             unsaid = [number for number, text in zip(groups, told[name], strict=True) if text is None]
@@ -563,11 +572,28 @@ _USUAL: Final = re.compile(
     b''.join((
         rb'\x26N\x1c\x15([\x00-\x7f])\x19(?:\x15N|\x25NN|\x35NNN|\x45NNNN)\x19\x18B\x15N\x16N\x16N\x16N\x26N',
         rb'(?:\x26N\x1c|\x3c)(?:[\x18\x28\x38\x48\x58]B|[\x16\x26\x36\x46]N|[\x11\x12\x21\x22])*\x00',
-        rb'\x19(?:\x1c(?:\x15N){3}\x00|\x2c(?:(?:\x15N){3}\x00){2}|\x3c(?:(?:\x15N){3}\x00){3}|\x4c(?:(?:\x15N){3}\x00){4})',
-        rb'(?:\x3c(?:(\x16)N\x19|\x29)\x06\x19(?=([\x06\x16\x26]))(?:\x06|\x16N|\x26NN)\x00)?\x00\x00',
+        rb'(?:\x19(?:\x1c(?:\x15N){3}\x00|\x2c(?:(?:\x15N){3}\x00){2}|\x3c(?:(?:\x15N){3}\x00){3}|\x4c(?:(?:\x15N){3}\x00){4})',
+        rb'(?:\x3c(?:(\x16)N\x19|\x29)\x06\x19(?=([\x06\x16\x26]))(?:\x06|\x16N|\x26NN)\x00)?)?\x00\x00',
     )).replace(b'N', _NUMBER).replace(b'B', _BYTES), re.DOTALL,
 )  # fmt: skip
-"""A ColumnChunk as pyarrow writes it: its type, whether its size statistics have bytes, and the head of their list of levels."""
+"""A ColumnChunk as pyarrow or a robot (``parquet.py``) writes it: its type, whether its size statistics have bytes, and the head
+of their list of levels."""
+_HEADS: Final = b''.join(bytes([step << 4]) for step in range(1, 16))
+
+
+def _heads(kind: int) -> bytes:
+    """Of fields of this type whose number is a little more than that of the field before."""
+    return b'[' + re.escape(bytes(head | kind for head in _HEADS)) + b']'
+
+
+def _flat(inside: bytes) -> bytes:
+    """A struct of whole numbers, flags, short texts and what is ``inside``."""
+    numbers = b'(?:' + b'|'.join(map(_heads, (4, 5, 6))) + b')' + _NUMBER
+    return b'(?:' + b'|'.join((numbers, _heads(8) + _BYTES, _heads(1), _heads(2), *([inside] if inside else []))) + b')*\\x00'
+
+
+_STRUCT: Final = re.compile(_flat(_heads(12) + _flat(_heads(12) + _flat(_heads(12) + _flat(_heads(12) + rb'\x00')))), re.DOTALL)
+"""A struct of that and of structs, as deep as that of a time."""
 _BYTE_ARRAY: Final = 6
 _FIXED: Final = {1: 1, 2: 1, 3: 1, 7: 8}
 """Bytes of flags, bytes and doubles."""
@@ -673,7 +699,8 @@ def _skipped(data: bytes, at: int, kind: int, depth: int = 0) -> int:
     if kind != 12:
         kind, count, at = _list_head(data, at)
         for _ in range(count):
-            at = _skipped(data, at, kind, depth + 1)
+            usual = _STRUCT.match(data, at) if kind == 12 else None
+            at = _skipped(data, at, kind, depth + 1) if usual is None else usual.end()
         return at
     while head := data[at]:
         at = at + 1 if head >> 4 else _varint(data, at + 1)[1]

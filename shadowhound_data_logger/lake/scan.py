@@ -22,10 +22,12 @@ from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.forgotten import forgotten_entries, forgotten_names, without
 from shadowhound_data_logger.lake.live_files import Day, days, robots
-from shadowhound_data_logger.lake.reading import PARTS_AT_A_TIME, SMALL_BYTES, Only
+from shadowhound_data_logger.lake.reading import SMALL_BYTES, Only
 from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.model import ObjectInfo
 
+PARTS_AT_A_TIME: Final = 720
+"""Small parts that are one group: half a day of a robot."""
 KEY: Final = ('bucket', 'key')
 _TIMES: Final = ('robot', *KEY, 't_start_ns', 't_end_ns')
 ROW: Final = (*KEY, 't_start_ns')

@@ -21,6 +21,8 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner, Result
 from hostile import bad_parts
+from hypothesis import given
+from hypothesis import strategies as st
 from lake.making import NOON_NS, add, add_part, content, fill, folder_store, keys, row
 
 from shadowhound_data_logger import lake
@@ -263,6 +265,52 @@ def test_columns_as_pyarrow_writes_them_are_known_by_a_pattern(how: dict[str, An
     monkeypatch.setattr(reading, '_USUAL', re.compile(b'(?!)'))
     assert _sizes(by_pattern[0]) == _sizes(reading._picked(body, begin, reading._FOOTER)[0])
     assert (shorter < (len(walked) - shorter) / 2) == (not {'write_statistics', 'write_page_index'} & set(how))
+
+
+def test_a_part_of_a_robot_is_known_by_patterns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They find of its footer what a walk through all fields finds, and spare that walk."""
+    body = parts.encode([row('camera', NOON_NS + number * 10**9) for number in range(10)])
+    begin, _ = bad_parts.footer_of(body)
+    calls: list[int] = []
+    for name in ('_picked', '_skipped'):
+        walk = getattr(reading, name)
+        monkeypatch.setattr(reading, name, lambda *given, walk=walk: calls.append(1) or walk(*given))
+    by_pattern, end = reading._picked(body, begin, reading._FOOTER)
+    shorter = len(calls)
+    for name in ('_USUAL', '_STRUCT'):
+        monkeypatch.setattr(reading, name, re.compile(b'(?!)'))
+    walked, its_end = reading._picked(body, begin, reading._FOOTER)
+    assert (_sizes(by_pattern), end) == (_sizes(walked), its_end)
+    assert 20 * shorter < len(calls) - shorter
+
+
+def _structs(depth: int) -> st.SearchStrategy[bytes]:
+    """In Thrift's compact protocol, with structs in them."""
+    number = st.integers(0, (1 << 64) - 1).map(_varint)
+    kinds: dict[int, st.SearchStrategy[bytes]] = {
+        1: st.just(b''), 2: st.just(b''), 4: number, 5: number, 6: number,
+        8: st.binary(max_size=130).map(lambda text: _varint(len(text)) + text), **({12: _structs(depth - 1)} if depth else {}),
+    }  # fmt: skip
+    field = st.sampled_from(sorted(kinds)).flatmap(
+        lambda kind: st.tuples(st.integers(1, 15), kinds[kind]).map(lambda made: bytes((made[0] << 4 | kind,)) + made[1])
+    )
+    return st.lists(field, max_size=5).map(lambda fields: b''.join(fields) + b'\0')
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes((*out, value))
+
+
+@given(st.one_of(_structs(4), st.binary(max_size=40)), st.binary(max_size=20))
+def test_the_pattern_of_a_struct_ends_where_a_walk_ends(data: bytes, after: bytes) -> None:
+    """Whatever it is given: it matches no more and no less."""
+    found = reading._STRUCT.match(data + after)
+    if found is not None:
+        assert found.end() == reading._skipped(data + after, 0, 12)
 
 
 def _sizes(footer: dict[int, Any]) -> list[Any]:
