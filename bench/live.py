@@ -51,7 +51,7 @@ class Watcher:
     def __init__(self, url: str, topics: list[str]) -> None:
         self.url, self.topics = url, topics
         self.late_ms: dict[str, list[float]] = {}
-        self.bytes = 0
+        self.bytes = self.acknowledgements = 0
         self.takes_video = False
 
     async def run(self, *, reads: bool = True, bytes_s: float = 0.0) -> None:
@@ -68,13 +68,20 @@ class Watcher:
             if not reads:
                 await asyncio.sleep(3600)
             said_s = time.monotonic()
+            telling: asyncio.Task[None] | None = None
+
+            async def tell() -> None:  # after what came with it, as link.js does
+                if (said := frames.acknowledgement()) is not None:
+                    self.acknowledgements += 1
+                    await ws.send_bytes(said)
+
             async for message in ws:
                 self.bytes += len(message.data)
                 if bytes_s:
                     await asyncio.sleep(len(message.data) / bytes_s)
                 items = frames.take(message.data)
-                if (said := frames.acknowledgement()) is not None:
-                    await ws.send_bytes(said)
+                if telling is None or telling.done():
+                    telling = asyncio.create_task(tell())
                 for head, body in items:
                     if head['kind'] == 'video' and self.takes_video:
                         await video.told(head)
@@ -87,7 +94,9 @@ class Watcher:
                     await ws.send_json({'ping': said_s})
 
     def told(self, seconds: float) -> dict[str, Any]:
-        found: dict[str, Any] = {'mbps': round(self.bytes * 8e-6 / seconds, 2)}
+        found: dict[str, Any] = {
+            'mbps': round(self.bytes * 8e-6 / seconds, 2), 'acknowledgements_hz': round(self.acknowledgements / seconds, 1)
+        }  # fmt: skip
         for kind, unordered in sorted(self.late_ms.items()):
             late = sorted(unordered)
             found[kind] = {'hz': round(len(late) / seconds, 1), 'median_ms': round(statistics.median(late), 1),
@@ -145,6 +154,7 @@ def watched(url: str, count: int, seconds: float, pids: dict[str, int], *, deaf:
         await asyncio.sleep(15 if video else 4)  # discovery; receivers of video learn what their link carries
         for watcher in watchers:
             watcher.late_ms.clear()
+            watcher.acknowledgements = 0
         sizes = [watcher.bytes for watcher in watchers]
         before, began = {name: cpu_s(pid) for name, pid in pids.items()}, time.monotonic()
         await asyncio.sleep(seconds)

@@ -142,6 +142,7 @@ class _Connection:
         self.ws, self._came = ws, came
         self._parts: dict[int, bytearray] = {}
         self._received = self._told = 0
+        self._telling: asyncio.Task[None] | None = None
         self._pings: deque[tuple[float, float]] = deque(maxlen=PINGS)
 
     async def read(self) -> None:
@@ -153,9 +154,8 @@ class _Connection:
                 return
             frame = message.data
             self._received += len(frame)
-            if self._received - self._told >= ACKNOWLEDGED:
-                self._told = self._received
-                await self.ws.send_bytes((self._received & 0xFFFF_FFFF).to_bytes(4, 'little'))
+            if self._received - self._told >= ACKNOWLEDGED and (self._telling is None or self._telling.done()):
+                self._telling = asyncio.create_task(self._tell())  # after what has come with it: a burst is acknowledged once
             lane, flags = frame[0], frame[1]
             if lane == SMALL_LANE:
                 self._take_several(frame)
@@ -168,6 +168,11 @@ class _Connection:
                 raise ValueError('it sends more than any robot does')
             if flags & 2:
                 self._take(bytes(self._parts.pop(lane)))
+
+    async def _tell(self) -> None:
+        self._told = self._received
+        with suppress(ConnectionError, RuntimeError):  # it has ended, as ``read`` says
+            await self.ws.send_bytes((self._received & 0xFFFF_FFFF).to_bytes(4, 'little'))
 
     def _take_several(self, frame: bytes) -> None:
         place = 4

@@ -2,8 +2,8 @@
 
 A frame of the WebSocket is a byte with its lane, a byte of flags (1: an item begins, 2: it ends), two of nothing, and a part of
 an item (``kinds.LiveItem.packed``); on lane 0 it is several whole items, each after a uint32 with its length. Each browser says
-every 2 KB how many bytes of frames it has received, as a uint32 that wraps. No more than a window of them is under way; what
-waits is small, or the newest of its topic.
+how many bytes of frames it has received, as a uint32 that wraps: after 2 KB or more, once for all that came at once. No more than
+a window of them is under way; what waits is small, or the newest of its topic.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MOST_ROWS_WAITING: Final = 12
 """Items of a series, each of some 33 ms; older ones are left out."""
 SMALL_LANE: Final = 0
 ACKNOWLEDGED: Final = 2 << 10
-"""Bytes, after which a browser says so."""
+"""Bytes, at least, before a browser says so again."""
 BEGIN, END = 1, 2
 WEIGHTS: Final[Mapping[str, float]] = {'figures': 4.0, 'camera': 4.0, 'cloud': 1.0}
 """How bulk topics share a link."""

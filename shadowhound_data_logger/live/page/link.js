@@ -5,7 +5,7 @@
 // bytes, and its body.
 
 const SILENT_MS = 3000; // the robot says something each second
-const ACKNOWLEDGED = 2048; // bytes
+const ACKNOWLEDGED = 2048; // bytes, at least, between two acknowledgements
 const TICK_MS = 250;
 const PING_MS = 500;
 const PINGS = 12;
@@ -64,6 +64,15 @@ export class Link {
     const parts = new Map();
     let received = 0;
     let told = 0;
+    let isTelling = false;
+    // On receipt, not when it is drawn. A burst is acknowledged once: its frames wait before this message to ourselves, of
+    // which a hidden tab gets as many as any other.
+    const telling = new MessageChannel();
+    telling.port1.onmessage = () => {
+      isTelling = false;
+      told = received;
+      if (socket.readyState === WebSocket.OPEN) socket.send(Uint32Array.of(received % 2 ** 32));
+    };
     socket.binaryType = 'arraybuffer';
     this.socket = socket;
     this.triedAt = this.heardAt = performance.now();
@@ -82,9 +91,9 @@ export class Link {
       this.heardAt = performance.now();
       received += data.byteLength;
       this.bytes += data.byteLength;
-      if (received - told >= ACKNOWLEDGED) {
-        told = received;
-        socket.send(Uint32Array.of(received % 2 ** 32)); // on receipt, not when it is drawn
+      if (received - told >= ACKNOWLEDGED && !isTelling) {
+        isTelling = true;
+        telling.port2.postMessage(null);
       }
       const [lane, flags] = new Uint8Array(data, 0, 2);
       if (lane === 0) return this.takeSeveral(data);
@@ -104,6 +113,7 @@ export class Link {
       }
     };
     socket.onclose = () => {
+      telling.port1.close();
       if (socket !== this.socket) return;
       this.socket = null;
       this.onState('lost');
