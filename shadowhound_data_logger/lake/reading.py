@@ -335,8 +335,7 @@ class _Part:
         """The columns of the schema that it has, and how many bytes they take."""
         places = _places(self._file, schema, self._of)
         groups = range(self._about.num_row_groups)
-        if choice.wanted is not None and len(groups) > 1:
-            bounds = _bounds(choice.wanted)
+        if choice.wanted is not None and (bounds := _bounds(choice.wanted)):
             groups = [number for number in groups if _may_hold(self._about.row_group(number), places, bounds)]  # type: ignore[assignment]
         some: list[int] = []
         size = 0
