@@ -17,7 +17,7 @@ from shadowhound_data_logger.bags.description import slice_info
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, missing_of
-from shadowhound_data_logger.disk import fingerprint, lock, replacing
+from shadowhound_data_logger.durable_files import fingerprint, lock, replacing
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, check_document, read_whole

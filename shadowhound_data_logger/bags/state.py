@@ -35,7 +35,7 @@ from shadowhound_data_logger.bags.manifest import (
     read_mission,
 )
 from shadowhound_data_logger.bags.naming import slice_file, slice_number
-from shadowhound_data_logger.disk import sync
+from shadowhound_data_logger.durable_files import sync
 from shadowhound_data_logger.errors import BagDamaged, NameRefused
 from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo

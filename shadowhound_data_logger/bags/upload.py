@@ -20,7 +20,7 @@ from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.upload_plan import Outgoing, UploadPlan, archive_of, finished, plan_of
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.errors import BagError, ForeignObject
 from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
 from shadowhound_data_logger.retry import steadily

@@ -18,7 +18,7 @@ from shadowhound_data_logger.bags.description import BagPart, Description, of_me
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, RecordedTopic, SliceEntry
 from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, prefix_of
 from shadowhound_data_logger.bags.remote import ARCHIVE, natural
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_key, check_name
 from shadowhound_data_logger.mcap.index import read_index

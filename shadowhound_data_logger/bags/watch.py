@@ -25,7 +25,7 @@ from shadowhound_data_logger.bags.upload import deliver, is_confirmed, opened_sp
 from shadowhound_data_logger.bags.upload_plan import Outgoing, UploadPlan, finished
 from shadowhound_data_logger.clock import SECOND, Clock, iso
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.disk import flock, replacing
+from shadowhound_data_logger.durable_files import flock, replacing
 from shadowhound_data_logger.errors import BagError, DataLoggerError
 from shadowhound_data_logger.stores import open_store
 

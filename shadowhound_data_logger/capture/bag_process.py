@@ -38,7 +38,7 @@ from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.node import StopSignals
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import BagError, DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import check_name

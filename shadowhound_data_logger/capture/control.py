@@ -18,7 +18,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.spool.control import ANSWER_S, MAX_REQUEST_BYTES, NAME, address, name_of
 from shadowhound_data_logger.worker import Worker
 

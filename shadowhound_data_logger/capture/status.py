@@ -31,7 +31,7 @@ from shadowhound_data_logger.capture.watchdog import Watchdog
 from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.disk import replacing
+from shadowhound_data_logger.durable_files import replacing
 from shadowhound_data_logger.ship.requests import RequestServer, RequestStatus
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus
 from shadowhound_data_logger.spool.account_rows import Totals

@@ -27,7 +27,7 @@ import shadowhound_data_logger
 from shadowhound_data_logger.datasets.episodes import TOLD, build
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.plan import EpisodePlan
-from shadowhound_data_logger.disk import fingerprint, flock, lock, replacing
+from shadowhound_data_logger.durable_files import fingerprint, flock, lock, replacing
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.options import StoreSettings
 

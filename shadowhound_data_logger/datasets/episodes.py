@@ -41,7 +41,7 @@ from shadowhound_data_logger.datasets.ticks import (
     whole_fps,
 )
 from shadowhound_data_logger.datasets.video import VideoWriter
-from shadowhound_data_logger.disk import replacing
+from shadowhound_data_logger.durable_files import replacing
 from shadowhound_data_logger.errors import BagDamaged, LakeError, ObjectRefused, Rejected
 from shadowhound_data_logger.lake import decode, labels
 from shadowhound_data_logger.lake.prefetch import Place

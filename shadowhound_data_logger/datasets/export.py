@@ -28,7 +28,7 @@ from shadowhound_data_logger.datasets.mobile import forget, synchronize, task_of
 from shadowhound_data_logger.datasets.plan import ChosenMission, EpisodePlan
 from shadowhound_data_logger.datasets.report import draw
 from shadowhound_data_logger.datasets.ticks import whole_fps
-from shadowhound_data_logger.disk import flock, replacing
+from shadowhound_data_logger.durable_files import flock, replacing
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

@@ -27,7 +27,7 @@ from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, utc
 from shadowhound_data_logger.datasets.features import ARM_COMMANDS, ARM_JOINTS, ARM_TOPICS, JOINT_STATE
 from shadowhound_data_logger.datasets.lerobot import matrix
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import ForeignObject, LakeError, SettingError
 from shadowhound_data_logger.keys import dated
 from shadowhound_data_logger.lake.bucket import put_part

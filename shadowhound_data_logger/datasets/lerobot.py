@@ -42,7 +42,7 @@ from shadowhound_data_logger.datasets.features import (
     StatePart,
 )
 from shadowhound_data_logger.datasets.video import feature_info, frames_at, video_frames
-from shadowhound_data_logger.disk import fingerprint, replacing, sync
+from shadowhound_data_logger.durable_files import fingerprint, replacing, sync
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.training import DIGEST_FILES, INFO, LABEL_TABLE, digest_of

@@ -27,7 +27,7 @@ from shadowhound_data_logger.datasets.features import ARM_COMMANDS, ARM_JOINTS, 
 from shadowhound_data_logger.datasets.lerobot import OURS, SOURCE_TABLE, VIDEO, EpisodeRow, Lerobot
 from shadowhound_data_logger.datasets.plan import EpisodePlan
 from shadowhound_data_logger.datasets.series import Recordings, Series
-from shadowhound_data_logger.disk import replacing
+from shadowhound_data_logger.durable_files import replacing
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.keys import is_name, printable
 from shadowhound_data_logger.lake import decode

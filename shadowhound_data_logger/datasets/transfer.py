@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, Lerobot
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake.training import INFO
 from shadowhound_data_logger.model import ObjectInfo, SpooledObject

@@ -25,7 +25,7 @@ from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, OURS, SOURC
 from shadowhound_data_logger.datasets.series import pictures_of
 from shadowhound_data_logger.datasets.transfer import DatasetPlace
 from shadowhound_data_logger.datasets.video import ssim
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import Bucket

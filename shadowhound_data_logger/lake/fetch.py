@@ -16,7 +16,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Final
 
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import AccessDenied, BucketMissing, LakeError, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetched import FOLDER, UNWRITABLE, Fetched, Verified

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Final
 
 from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.disk import lock
+from shadowhound_data_logger.durable_files import lock
 from shadowhound_data_logger.errors import LakeError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ from typing import Any
 
 from shadowhound_data_logger.catalogue import parts
 from shadowhound_data_logger.catalogue.schema import COLUMNS
-from shadowhound_data_logger.disk import replacing
+from shadowhound_data_logger.durable_files import replacing
 from shadowhound_data_logger.keys import is_name
 from shadowhound_data_logger.lake.live_files import backfilled_key
 

@@ -16,7 +16,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import LakeError, PolicyRefused
 from shadowhound_data_logger.policies.content import check_content
 from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json

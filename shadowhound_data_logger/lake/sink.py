@@ -37,7 +37,7 @@ from shadowhound_data_logger.catalogue.gaps import GAPS, WITHDRAWN
 from shadowhound_data_logger.catalogue.labels import LABELS, REMOVED
 from shadowhound_data_logger.catalogue.schema import FORGOTTEN, OBJECTS, TableSchema
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.errors import LakeError, SettingError, SinkUnavailable
 from shadowhound_data_logger.lake import search
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket

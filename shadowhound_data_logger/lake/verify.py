@@ -20,7 +20,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
 
-from shadowhound_data_logger.disk import lock
+from shadowhound_data_logger.durable_files import lock
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket

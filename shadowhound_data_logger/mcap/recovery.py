@@ -23,7 +23,7 @@ from typing import Final
 from mcap.opcode import Opcode
 from mcap.records import Chunk, Metadata
 
-from shadowhound_data_logger.disk import fingerprint, sync
+from shadowhound_data_logger.durable_files import fingerprint, sync
 from shadowhound_data_logger.mcap.format import (
     CHUNK,
     MESSAGE,

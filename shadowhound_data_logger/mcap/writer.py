@@ -12,7 +12,7 @@ from typing import Final
 
 from mcap.opcode import Opcode
 
-from shadowhound_data_logger.disk import sync
+from shadowhound_data_logger.durable_files import sync
 from shadowhound_data_logger.mcap.format import (
     CHUNK,
     MESSAGE,

@@ -17,7 +17,7 @@ from functools import partial
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.disk import replacing
+from shadowhound_data_logger.durable_files import replacing
 from shadowhound_data_logger.errors import TrackingRefused
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, prepared

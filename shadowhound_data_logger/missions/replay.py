@@ -28,7 +28,7 @@ from typing import Final
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.dating import Dating
-from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.errors import DataLoggerError, TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.dating import give_date
 from shadowhound_data_logger.missions.delivery import Delivery

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import PolicyRefused
 from shadowhound_data_logger.policies.manifest import MANIFEST, SIGNATURE, PolicyManifest
 from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json, from_strict_json

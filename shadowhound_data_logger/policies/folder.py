@@ -24,7 +24,7 @@ from typing import Any, Final
 
 import orjson
 
-from shadowhound_data_logger import disk
+from shadowhound_data_logger import durable_files
 from shadowhound_data_logger.errors import PolicyError, PolicyRefused
 from shadowhound_data_logger.policies import signing
 from shadowhound_data_logger.policies.content import check_files
@@ -152,7 +152,7 @@ class PolicyFolder:
     @contextmanager
     def changing(self) -> Iterator[PolicyState]:
         """The state, to be changed and written; nobody else changes it meanwhile."""
-        with disk.flock(self.path / 'lock'):
+        with durable_files.flock(self.path / 'lock'):
             state = self.state()
             yield state
             self._write(state)
@@ -163,17 +163,17 @@ class PolicyFolder:
         for parent, _, files in os.walk(place):
             for file in files:
                 path = Path(parent, file)
-                disk.sync(path)
+                durable_files.sync(path)
                 path.chmod(0o400)
-            disk.sync(Path(parent))
+            durable_files.sync(Path(parent))
         with self.changing() as state:
             state.verified = [*(each for each in state.verified if each != name), name][-MOST_REMEMBERED:]
         os.replace(place, self.versions / name)
-        disk.sync(self.versions)
+        durable_files.sync(self.versions)
 
     def activate(self, name: str) -> str | None:
         """Make this version the active one, unless another one was pinned meanwhile; its id. Raises PolicyRefused, OSError."""
-        with disk.flock(self.path / 'lock'):
+        with durable_files.flock(self.path / 'lock'):
             state = self.state()
             if state.pin not in {None, name}:
                 return state.pin
@@ -184,7 +184,7 @@ class PolicyFolder:
     def use(self, name: str) -> None:
         """Activate and pin a version, also one that misbehaved. Raises PolicyRefused, OSError."""
         self.check(name, self.state())
-        with disk.flock(self.path / 'lock'):  # for which a rollback does not wait long
+        with durable_files.flock(self.path / 'lock'):  # for which a rollback does not wait long
             state = self.state()
             manifest = self.check(name, state, hashes=False)
             state.bad.pop(name, None)
@@ -197,7 +197,7 @@ class PolicyFolder:
         ``of`` is the version that misbehaved: where another one is active meanwhile, that stays. Where there is no good one,
         none is active. Raises PolicyError where none was.
         """
-        with disk.flock(self.path / 'lock'):
+        with durable_files.flock(self.path / 'lock'):
             state, now = self.state(), self.current()
             if now is None:
                 raise PolicyError('no policy is active')
@@ -231,7 +231,7 @@ class PolicyFolder:
 
     def clean(self, keep: int) -> list[str]:
         """Remove the oldest versions beyond ``keep``, but none that is active, pinned, next to roll back to, or in use."""
-        with disk.flock(self.path / 'lock'):
+        with durable_files.flock(self.path / 'lock'):
             state, now = self.state(), self.current()
             wanted = {now, state.pin, self._last_good(state, now or '')}
             spare = [name for name in self.installed() if name not in wanted]
@@ -247,7 +247,7 @@ class PolicyFolder:
         place = self.versions / name
         descriptor = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
-            if not disk.lock(descriptor, wait=False):
+            if not durable_files.lock(descriptor, wait=False):
                 return False
             os.replace(place, self._gone(name))
         finally:
@@ -286,15 +286,15 @@ class PolicyFolder:
             part.unlink(missing_ok=True)
             part.symlink_to(f'{self.versions.name}/{name}')
             os.replace(part, self._current)
-        disk.sync(self.path)
+        durable_files.sync(self.path)
 
     def _write(self, state: PolicyState) -> None:
         state.history = state.history[-MOST_REMEMBERED:]
         state.bad = dict([*state.bad.items()][-MOST_REMEMBERED:])
         told = {'format': 1, **{name: getattr(state, name) for name in PolicyState.__slots__}}
-        with disk.replacing(self.path / 'state.json', is_synced=True, mode=0o600) as file:
+        with durable_files.replacing(self.path / 'state.json', is_synced=True, mode=0o600) as file:
             file.write(orjson.dumps(told, option=orjson.OPT_INDENT_2) + b'\n')
-        disk.sync(self.path)
+        durable_files.sync(self.path)
 
 
 def id_refused_as_old(state: PolicyState, manifest: PolicyManifest) -> bool:

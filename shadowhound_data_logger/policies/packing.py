@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import ForeignObject, PolicyError, PolicyRefused
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.policies import signing

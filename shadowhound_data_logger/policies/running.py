@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import config, disk
+from shadowhound_data_logger import config, durable_files
 from shadowhound_data_logger.errors import PolicyError
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import PolicyManifest
@@ -81,7 +81,7 @@ def active(home: str | os.PathLike[str] | None = None, environ: Mapping[str, str
                 raise
             continue
         try:
-            disk.lock(descriptor, shared=True)
+            durable_files.lock(descriptor, shared=True)
             if os.fstat(descriptor).st_nlink and (folder.versions / name).exists():
                 folder.check_owner()
                 manifest = folder.check(name, folder.state())

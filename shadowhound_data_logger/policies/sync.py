@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import disk
+from shadowhound_data_logger import durable_files
 from shadowhound_data_logger.bandwidth import BYTES_PER_MEGABIT
 from shadowhound_data_logger.errors import ObjectRefused, PolicyError, PolicyRefused, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo
@@ -101,7 +101,7 @@ class PolicySync:
         A version that was refused within the last hour is refused again, without a look at it, unless ``again``.
         """
         self.folder.make()
-        with disk.flock(self.folder.path / 'sync.lock', wait=False) as is_ours:
+        with durable_files.flock(self.folder.path / 'sync.lock', wait=False) as is_ours:
             if not is_ours:
                 raise PolicyError('another process is looking for policies here', remedy='wait until it is done')
             if self._revoke():
@@ -220,7 +220,7 @@ class PolicySync:
 
         Not for ever: of a store that damages what it sends, and then breaks off, not more than twice the file is thrown away.
         """
-        if path.is_file() and disk.fingerprint(path) == (wanted.size, wanted.sha256):
+        if path.is_file() and durable_files.fingerprint(path) == (wanted.size, wanted.sha256):
             return
         had, most_anew = -1, traffic.begun_anew + 1
         while True:

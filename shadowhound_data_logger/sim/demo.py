@@ -23,7 +23,7 @@ from typing import Final
 from rich.console import Console
 
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.sim import demo_audit, demo_mission, demo_processes, demo_report, demo_run
 from shadowhound_data_logger.sim.mlflow_access import READER

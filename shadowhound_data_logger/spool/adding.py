@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.disk import sync
+from shadowhound_data_logger.durable_files import sync
 from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State, waits_for
 from shadowhound_data_logger.spool.binding import free_key

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.keys import check_key, check_name
 from shadowhound_data_logger.model import DataObject, FileBody, State

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.clock_watch import ClockWatch
-from shadowhound_data_logger.disk import replacing
+from shadowhound_data_logger.durable_files import replacing
 
 log = logging.getLogger(__name__)
 

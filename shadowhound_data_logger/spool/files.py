@@ -28,7 +28,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
-from shadowhound_data_logger.disk import sync
+from shadowhound_data_logger.durable_files import sync
 from shadowhound_data_logger.model import DataObject, FileBody, State
 
 log = logging.getLogger(__name__)

@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
-from shadowhound_data_logger.disk import sync
+from shadowhound_data_logger.durable_files import sync
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import (
     EVENTS_WHEN,

@@ -23,7 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.disk import fingerprint, lock
+from shadowhound_data_logger.durable_files import fingerprint, lock
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import SINKS

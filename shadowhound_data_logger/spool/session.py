@@ -10,7 +10,7 @@ import os
 from dataclasses import replace
 
 from shadowhound_data_logger.clock import Clock
-from shadowhound_data_logger.disk import lock
+from shadowhound_data_logger.durable_files import lock
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index

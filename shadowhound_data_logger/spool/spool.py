@@ -21,7 +21,7 @@ from typing import Final
 
 from shadowhound_data_logger.clock import SECOND, Clock
 from shadowhound_data_logger.config import KeepSettings, SpoolSettings
-from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, RecordingRows, SpooledObject, State
 from shadowhound_data_logger.spool import binding

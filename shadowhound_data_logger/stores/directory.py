@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.bandwidth import Pace
-from shadowhound_data_logger.disk import fingerprint, flock, sync
+from shadowhound_data_logger.durable_files import fingerprint, flock, sync
 from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.base import Content, changed_meanwhile, too_large

@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import BUCKET, prefix_of
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile

@@ -14,7 +14,7 @@ from missions.fakes import FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.missions import missions
-from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.delivery import Delivery

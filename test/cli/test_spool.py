@@ -18,7 +18,7 @@ from shadowhound_data_logger.cli import spool as drains
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.cli.output import progress
 from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Outcome, State
 from shadowhound_data_logger.ship.uploader import UploadStatus

@@ -11,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from shadowhound_data_logger.disk import fingerprint
+from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.recovery import read_info
 

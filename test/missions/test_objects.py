@@ -12,7 +12,7 @@ from spool.making import make, new_spool, put, rows
 
 from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.disk import flock
+from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
 from shadowhound_data_logger.missions.journal import read

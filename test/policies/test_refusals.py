@@ -23,7 +23,7 @@ import pytest
 from onnx import helper, numpy_helper
 from policies.models import ACTION, STATE, Scene, Spark, linear, trained
 
-from shadowhound_data_logger import disk
+from shadowhound_data_logger import durable_files
 from shadowhound_data_logger.errors import PolicyError, PolicyRefused
 from shadowhound_data_logger.policies import active, packing, signing, smoke, sync
 from shadowhound_data_logger.policies.content import check_content, check_files
@@ -525,7 +525,7 @@ def test_no_rollback_waits_for_gigabytes(second: Scene, monkeypatch: pytest.Monk
     def asks(act: Callable[..., object]) -> Callable[..., object]:
         def acts(*given: Any, **named: Any) -> object:
             if named.get('hashes', True):
-                with disk.flock(second.folder.path / 'lock', wait=False) as is_free:
+                with durable_files.flock(second.folder.path / 'lock', wait=False) as is_free:
                     held.append(not is_free)
             return act(*given, **named)
 
