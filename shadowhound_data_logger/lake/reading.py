@@ -570,13 +570,15 @@ _BYTES: Final = b'(?:' + b'|'.join(re.escape(bytes([size])) + b'.{%d}' % size fo
 _USUAL: Final = re.compile(
     b''.join((
         rb'\x26N\x1c\x15([\x00-\x7f])\x19(?:\x15N|\x25NN|\x35NNN|\x45NNNN)\x19\x18B\x15N\x16N\x16N\x16N\x26N',
-        rb'(?:\x26N\x1c|\x3c)(?:[\x18\x28\x38\x48\x58]B|[\x16\x26\x36\x46]N|[\x11\x12\x21\x22])*\x00',
+        rb'(?:\x26N\x1c|\x3c)(?:[\x18\x28\x38\x48\x58]B|[\x16\x26\x36\x46]N|[\x11\x12\x21\x22]){0,64}\x00',
         rb'(?:\x19(?:\x1c(?:\x15N){3}\x00|\x2c(?:(?:\x15N){3}\x00){2}|\x3c(?:(?:\x15N){3}\x00){3}|\x4c(?:(?:\x15N){3}\x00){4})',
         rb'(?:\x3c(?:(\x16)N\x19|\x29)\x06\x19(?=([\x06\x16\x26]))(?:\x06|\x16N|\x26NN)\x00)?)?\x00\x00',
     )).replace(b'N', _NUMBER).replace(b'B', _BYTES), re.DOTALL,
 )  # fmt: skip
 """A ColumnChunk as pyarrow or a robot (``parquet.py``) writes it: its type, whether its size statistics have bytes, and the head
 of their list of levels."""
+_FIELDS: Final = 64
+"""Of a struct that a pattern knows: it remembers each, and a hostile one has millions."""
 _HEADS: Final = b''.join(bytes([step << 4]) for step in range(1, 16))
 
 
@@ -588,7 +590,11 @@ def _heads(kind: int) -> bytes:
 def _flat(inside: bytes) -> bytes:
     """A struct of whole numbers, flags, short texts and what is ``inside``."""
     numbers = b'(?:' + b'|'.join(map(_heads, (4, 5, 6))) + b')' + _NUMBER
-    return b'(?:' + b'|'.join((numbers, _heads(8) + _BYTES, _heads(1), _heads(2), *([inside] if inside else []))) + b')*\\x00'
+    return (
+        b'(?:'
+        + b'|'.join((numbers, _heads(8) + _BYTES, _heads(1), _heads(2), *([inside] if inside else [])))
+        + b'){0,%d}\\x00' % _FIELDS
+    )
 
 
 _STRUCT: Final = re.compile(_flat(_heads(12) + _flat(_heads(12) + _flat(_heads(12) + _flat(_heads(12) + rb'\x00')))), re.DOTALL)

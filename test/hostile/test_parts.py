@@ -11,6 +11,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable, Collection
 from contextlib import closing
 from pathlib import Path
@@ -311,6 +312,20 @@ def test_the_pattern_of_a_struct_ends_where_a_walk_ends(data: bytes, after: byte
     found = reading._STRUCT.match(data + after)
     if found is not None:
         assert found.end() == reading._skipped(data + after, 0, 12)
+
+
+@pytest.mark.parametrize(
+    'begin', [b'', b'\x26\x00\x1c\x15\x00\x19\x15\x00\x19\x18\x00\x15\x00\x16\x00\x16\x00\x16\x00\x26\x00\x3c']
+)
+def test_a_struct_of_a_million_fields_takes_no_memory(begin: bytes) -> None:
+    """What a pattern remembers of it is bounded."""
+    pattern, data = reading._USUAL if begin else reading._STRUCT, begin + b'\x11' * (1 << 20) + b'\0\0\0'
+    tracemalloc.start()
+    try:
+        assert pattern.match(data) is None
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def _sizes(footer: dict[int, Any]) -> list[Any]:
