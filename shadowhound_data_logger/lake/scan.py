@@ -27,7 +27,9 @@ from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.model import ObjectInfo
 
 PARTS_AT_A_TIME: Final = 720
-"""Small parts that are one group: half a day of a robot."""
+"""Small parts that are one group at most: half a day of a robot."""
+GROUP_BYTES: Final = 16 << 20
+"""The same of their bytes: groups are read side by side, and handed on one by one."""
 KEY: Final = ('bucket', 'key')
 _TIMES: Final = ('robot', *KEY, 't_start_ns', 't_end_ns')
 ROW: Final = (*KEY, 't_start_ns')
@@ -54,11 +56,24 @@ def planned(source: Bucket, wanted: Wanted, findings: Findings) -> Iterator[Part
     for _, whole in groupby((day for day in found if day not in apart), lambda day: day.robot):
         plain = [entry for day in whole for entry in day.entries]
         small = [entry for entry in plain if entry.size <= SMALL_BYTES]
-        for start in range(0, len(small), PARTS_AT_A_TIME):
-            yield PartGroup(small[start : start + PARTS_AT_A_TIME])
+        yield from map(PartGroup, _grouped(small))
         for entry in plain:
             if entry.size > SMALL_BYTES:
                 yield PartGroup([entry])
+
+
+def _grouped(entries: Sequence[ObjectInfo]) -> Iterator[list[ObjectInfo]]:
+    """The same in their order, as many at a time as one group has."""
+    group: list[ObjectInfo] = []
+    size = 0
+    for entry in entries:
+        if group and (len(group) == PARTS_AT_A_TIME or size + entry.size > GROUP_BYTES):
+            yield group
+            group, size = [], 0
+        group.append(entry)
+        size += entry.size
+    if group:
+        yield group
 
 
 def catalogue_rows(source: Bucket, parts: PartGroup, columns: Sequence[str], wanted: Wanted, findings: Findings,
