@@ -111,7 +111,7 @@ class BatchQueue:
             return self._left.wait_for(lambda: self._first() > last, max(0.0, deadline_s))
 
     def is_busy(self) -> bool:
-        """Whether a batch is in it or with an encoder; a moment ago."""
+        """Whether a batch waits or is with an encoder; reads without the lock, so it may be a moment old."""
         return bool(self._unfinished)
 
     def oldest(self) -> dict[str, int]:

@@ -41,7 +41,7 @@ from shadowhound_data_logger.untrusted import check_size, is_path
 SMALL_BYTES: Final = 256 << 10
 """Up to here a file is read whole: of one-minute parts there are thousands, and a compacted day of a robot is larger."""
 PARTS_AHEAD: Final = 4 * THREADS
-"""Small files that are asked for before their turn."""
+"""How many small files are requested before their turn."""
 BATCH_BYTES: Final = 16 << 20
 """Of rows that are handed on together, and of a large file that is read at a time."""
 MOST_BYTES: Final = 256 << 20
@@ -578,27 +578,22 @@ _USUAL: Final = re.compile(
 """A ColumnChunk as pyarrow or a robot (``parquet.py``) writes it: its type, whether its size statistics have bytes, and the head
 of their list of levels."""
 _FIELDS: Final = 64
-"""Of a struct that a pattern knows: it remembers each, and a hostile one has millions."""
-_HEADS: Final = b''.join(bytes([step << 4]) for step in range(1, 16))
+"""At most, in a struct that a pattern matches: matching takes memory for each, and a hostile struct has millions."""
 
 
 def _heads(kind: int) -> bytes:
-    """Of fields of this type whose number is a little more than that of the field before."""
-    return b'[' + re.escape(bytes(head | kind for head in _HEADS)) + b']'
+    """The first byte of a field of this type, whose number is up to 15 more than that of the field before."""
+    return b'[' + re.escape(bytes(step << 4 | kind for step in range(1, 16))) + b']'
 
 
 def _flat(inside: bytes) -> bytes:
     """A struct of whole numbers, flags, short texts and what is ``inside``."""
-    numbers = b'(?:' + b'|'.join(map(_heads, (4, 5, 6))) + b')' + _NUMBER
-    return (
-        b'(?:'
-        + b'|'.join((numbers, _heads(8) + _BYTES, _heads(1), _heads(2), *([inside] if inside else [])))
-        + b'){0,%d}\\x00' % _FIELDS
-    )
+    numbers = (_heads(kind) + _NUMBER for kind in (4, 5, 6))
+    return b'(?:%b){0,%d}\\x00' % (b'|'.join((*numbers, _heads(8) + _BYTES, _heads(1), _heads(2), inside)), _FIELDS)
 
 
 _STRUCT: Final = re.compile(_flat(_heads(12) + _flat(_heads(12) + _flat(_heads(12) + _flat(_heads(12) + rb'\x00')))), re.DOTALL)
-"""A struct of that and of structs, as deep as that of a time."""
+"""A struct with structs in it, nested as deeply as the type of a timestamp column."""
 _BYTE_ARRAY: Final = 6
 _FIXED: Final = {1: 1, 2: 1, 3: 1, 7: 8}
 """Bytes of flags, bytes and doubles."""

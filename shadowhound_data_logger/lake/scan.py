@@ -27,9 +27,9 @@ from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.model import ObjectInfo
 
 PARTS_AT_A_TIME: Final = 720
-"""Small parts that are one group at most: half a day of a robot."""
+"""The most small parts in a group: half a day of a robot."""
 GROUP_BYTES: Final = 16 << 20
-"""The same of their bytes: groups are read side by side, and handed on one by one."""
+"""The most bytes of small parts in a group: groups are read in parallel, each as a whole."""
 KEY: Final = ('bucket', 'key')
 _TIMES: Final = ('robot', *KEY, 't_start_ns', 't_end_ns')
 ROW: Final = (*KEY, 't_start_ns')
@@ -63,7 +63,7 @@ def planned(source: Bucket, wanted: Wanted, findings: Findings) -> Iterator[Part
 
 
 def _grouped(entries: Sequence[ObjectInfo]) -> Iterator[list[ObjectInfo]]:
-    """The same in their order, as many at a time as one group has."""
+    """Split into groups of limited number and size, in the same order."""
     group: list[ObjectInfo] = []
     size = 0
     for entry in entries:

@@ -155,7 +155,7 @@ class _Connection:
             frame = message.data
             self._received += len(frame)
             if self._received - self._told >= ACKNOWLEDGED and (self._telling is None or self._telling.done()):
-                self._telling = asyncio.create_task(self._tell())  # after what has come with it: a burst is acknowledged once
+                self._telling = asyncio.create_task(self._tell())  # runs once the frames that have arrived are read
             lane, flags = frame[0], frame[1]
             if lane == SMALL_LANE:
                 self._take_several(frame)

@@ -58,7 +58,7 @@ class SpoolWriter:
     """
 
     def __init__(self, spool: Spool, commit_s: float = COMMIT_S, expects: Callable[[], bool] = lambda: False) -> None:
-        """``expects`` says whether more objects are in the making, which are worth waiting for; from its thread."""
+        """``expects``, called by the writer's thread, says whether more objects are being made that are worth waiting for."""
         self.spool = spool
         self._commit_s = commit_s
         self._expects = expects
@@ -163,7 +163,7 @@ class SpoolWriter:
             raise
 
     def _await_burst(self) -> None:
-        """Until its last object has come; the caller holds the lock."""
+        """Wait until its last object has come, half of ``commit_s`` at most; the caller holds the lock."""
         end_s = time.monotonic() + self._commit_s / 2
         while (left_s := end_s - time.monotonic()) > 0:
             added = self._added
@@ -171,7 +171,7 @@ class SpoolWriter:
                 return
 
     def _pause(self, seconds: float) -> bool:
-        """Whether it ended early, because somebody waits for the commit; the caller holds the lock."""
+        """Wait. True if it ended early, because somebody waits for the commit; the caller holds the lock."""
         return self._hurried.wait_for(lambda: self._urgent or self.worker.stopping, max(0.0, seconds))
 
     def _groups(self, units: Sequence[_Unit], outcomes: Sequence[Outcome]) -> list[_Group]:

@@ -65,8 +65,8 @@ export class Link {
     let received = 0;
     let told = 0;
     let isTelling = false;
-    // On receipt, not when it is drawn. A burst is acknowledged once: its frames wait before this message to ourselves, of
-    // which a hidden tab gets as many as any other.
+    // Frames are acknowledged on receipt, not when they are drawn, and a burst once: the frames of it that have already arrived are
+    // handled before this message to ourselves. Unlike a timer, it is not delayed in a hidden tab.
     const telling = new MessageChannel();
     telling.port1.onmessage = () => {
       isTelling = false;
