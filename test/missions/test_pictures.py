@@ -18,7 +18,6 @@ from shadowhound_data_logger.missions.drawing import NAMES, Drawing
 from shadowhound_data_logger.missions.folder import MissionFolder, missions, read_json
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.missions.pictures import make, material_of, read_path
-from shadowhound_data_logger.missions.plots import _speed
 
 WIDTH = 800
 
@@ -118,6 +117,8 @@ def test_a_trajectory_is_read(tmp_path: Path, text: str, expected: list[tuple[fl
 
 def test_a_speed_is_no_noise() -> None:
     """Centimetres of noise at 20 Hz do not make a robot that walks at 0.5 m/s a runner; time that stands gives no speed."""
+    from shadowhound_data_logger.missions.plots import _speed  # loads matplotlib, for which only the worker that runs it waits
+
     time = np.arange(0, 20, 0.05)
     xy = np.stack([0.5 * time, np.zeros_like(time)], axis=1) + np.random.default_rng(1).normal(0, 0.01, (len(time), 2))
     assert np.abs(_speed(time, xy)[20:-20] - 0.5).max() < 0.08
