@@ -219,11 +219,12 @@ class Intake:
 
 
 def until_poll(wall_s: float) -> float:
-    """Seconds from a poll to the next one, which is at a multiple of ``POLL_S``: a quarter of that at least.
+    """Seconds from a poll to the next one, which is halfway between two multiples of ``POLL_S``: a quarter of that at least.
 
-    What the sensors keep once a second then comes with one poll, 0.2 s after the second begins, and is one burst for the spool.
+    What the sensors keep once a second then comes with one poll, 0.1 s after the second begins, and is one burst for the spool:
+    by then the first message is there of every topic with ten a second or more.
     """
-    return POLL_S - ((wall_s + POLL_S / 4) % POLL_S - POLL_S / 4)
+    return POLL_S - ((wall_s - POLL_S / 4) % POLL_S - POLL_S / 4)
 
 
 def _each(steps: Sequence[Callable[[], None]]) -> None:
