@@ -134,12 +134,11 @@ class Spool:
             self._leave(session)
 
     def commit(self, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (),
-               rows: Sequence[RecordingRows] = (), *,
-               durable: Callable[[list[SpooledObject]], None] = lambda _: None) -> list[SpooledObject]:  # fmt: skip
+               rows: Sequence[RecordingRows] = (), *, leave_files: bool = False) -> list[SpooledObject]:  # fmt: skip
         """One group commit. Returns the objects that may be shipped now, under their final keys.
 
         It does not cut what it is given: all is one transaction, for which other processes wait (``MOST_OBJECTS``).
-        ``durable`` gets them as well, before the files of delivered objects are removed: that may take as long as the commit.
+        ``leave_files``: those of what was delivered wait for ``remove_files``, which may take longer than the commit.
         Raises OSError or sqlite3.OperationalError when nothing of it became durable; the caller tries again. Objects
         for which there is no room at all are recorded as evicted, those whose file is gone as quarantined.
         """
@@ -148,10 +147,19 @@ class Spool:
             with self._lock:
                 placed = self._ballast.work(lambda: self._commit(ready, outcomes, rows))
                 self._ballast.keep(self._tree.free_bytes, self._settings.min_free_bytes)
-            durable(placed)
-            self._settle(outcomes)
             remove_sources(self._tree, objects, ready)
+        if not leave_files:
+            self.remove_files(outcomes)
         return placed
+
+    def remove_files(self, outcomes: Iterable[Outcome]) -> None:
+        """Let the files follow their rows, which are durable; after a kill the next start does it."""
+        for outcome in outcomes:
+            item = outcome.item
+            if outcome.state is State.QUARANTINED:
+                self._set_apart(item, outcome.reason)
+            elif outcome.state in _LEFT and not self._tree.remove(item.path):
+                self._tree.remove(self._tree.waiting(item.id, item.bucket, item.key))
 
     def fits(self, objects: Sequence[DataObject]) -> bool:
         """Whether there is room for all of them before anything leaves the disk. Raises OSError."""
@@ -516,15 +524,6 @@ class Spool:
         if item.answers is not None and not index.requests.take_answer(*item.answers, self._clock.wall_ns()):
             return False
         return index.take_uncatalogued(item.catalogues) and index.take_untold(item.tells)
-
-    def _settle(self, outcomes: Iterable[Outcome]) -> None:
-        """Let the files follow their rows."""
-        for outcome in outcomes:
-            item = outcome.item
-            if outcome.state is State.QUARANTINED:
-                self._set_apart(item, outcome.reason)
-            elif outcome.state in _LEFT and not self._tree.remove(item.path):
-                self._tree.remove(self._tree.waiting(item.id, item.bucket, item.key))
 
     def _set_apart(self, item: SpooledObject, reason: str | None) -> None:
         """Unless a retry, or another process's start, lets it wait again by now; where one is at it, the next start does it.

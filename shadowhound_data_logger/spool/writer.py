@@ -8,6 +8,7 @@ with everything that was in it; meanwhile ``put`` blocks the encoders, not the i
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import threading
 import time
@@ -30,6 +31,8 @@ HEARTBEAT_S: Final = 1.0
 """How often accounts and outcomes become durable when there is no object to commit them with."""
 MANY_OUTCOMES: Final = 64
 """So many outcomes are worth a commit of their own."""
+FILES_A_SETTLEMENT: Final = 2
+"""Whoever settles an object takes away so many files of earlier ones: more than one, so that they become fewer."""
 MOST_BYTES: Final = 4 << 20
 """In one commit: nothing else is done in the spool while its files are written and synced."""
 HANGING_S: Final = 10.0
@@ -69,6 +72,10 @@ class SpoolWriter:
         self._hurried = threading.Condition(lock)  # ends the pause before a commit; what is put meanwhile wakes nobody
         self._units: deque[_Unit] = deque()
         self._outcomes: deque[Outcome] = deque()
+        self._leaving: deque[Outcome] = deque()
+        """Durable, with files that are still here."""
+        self._removing = threading.Lock()
+        """Held while one of these is removed."""
         self._bytes = 0
         self._added = self._done = 0
         self._written = Counter[str]()
@@ -108,13 +115,17 @@ class SpoolWriter:
             self._changed.notify_all()
 
     def settle(self, outcomes: Sequence[Outcome]) -> None:
-        """Queue outcomes of deliveries for the next commit; never waits."""
+        """Queue outcomes of deliveries for the next commit; never waits for one.
+
+        Beside a backlog that is delivered it takes longer to remove files than to commit: those who settle do it as they go.
+        """
         with self._changed:
             was_due = self._due()
             self._outcomes.extend(outcomes)
             self._added += len(outcomes)
             if self._due() and not was_due:  # else it is awake, and one wake an outcome would only cost
                 self._changed.notify_all()
+        self._remove_files(FILES_A_SETTLEMENT * len(outcomes), wait=False)
 
     def written(self) -> tuple[int, int]:
         """Objects that became durable since it was opened, and the messages in them."""
@@ -139,9 +150,13 @@ class SpoolWriter:
         with self._changed:
             self._changed.notify_all()
             self._hurried.notify_all()
-        return self.worker.join(end - time.monotonic() + HEARTBEAT_S) and flushed
+        ended = self.worker.join(end - time.monotonic() + HEARTBEAT_S)
+        if ended:
+            self._remove_files()
+        return ended and flushed
 
     def _step(self) -> None:
+        self._remove_files(until=self._commit_is_due)
         with self._changed:
             if self._changed.wait_for(lambda: self._due() or self.worker.stopping, HEARTBEAT_S):
                 self._await_burst()
@@ -161,6 +176,20 @@ class SpoolWriter:
                 self.damaged = True
                 self._changed.notify_all()
             raise
+
+    def _remove_files(self, most: float = math.inf, until: Callable[[], bool] = lambda: False, *, wait: bool = True) -> None:
+        """Let files of what is settled follow their rows; unless ``wait``, not where another thread does."""
+        if self._removing.acquire(blocking=wait):
+            try:
+                while most > 0 and self._leaving and not until():
+                    self.spool.remove_files((self._leaving.popleft(),))
+                    most -= 1
+            finally:
+                self._removing.release()
+
+    def _commit_is_due(self) -> bool:
+        with self._changed:
+            return self._urgent or (time.monotonic() >= self._last_commit + self._commit_s and self._due())
 
     def _await_burst(self) -> None:
         """Wait until its last object has come, half of ``commit_s`` at most; the caller holds the lock."""
@@ -191,7 +220,10 @@ class SpoolWriter:
 
     def _commit(self, units: Sequence[_Unit], outcomes: Sequence[Outcome]) -> None:
         objects, rows = [item for unit in units for item in unit.objects], [each for unit in units for each in unit.rows]
-        self.spool.commit(objects, outcomes, rows, durable=lambda spooled: self._committed(units, outcomes, spooled))
+        if objects and self._leaving and not self.spool.fits(objects):
+            self._remove_files()
+        self._committed(units, outcomes, self.spool.commit(objects, outcomes, rows, leave_files=True))
+        self._leaving.extend(outcomes)
 
     def _due(self) -> bool:
         """Whether there is something that waits for a commit; the caller holds the lock."""

@@ -6,7 +6,7 @@ import errno
 import hashlib
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -245,6 +245,62 @@ def disk_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DiskOf:
         return beside
 
     return of
+
+
+def test_files_that_leave_make_way_for_a_commit(
+    opened: Callable[..., SpoolWriter], spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What comes while they are removed is durable before all of them are gone; at the end they are."""
+    items = spool.commit([make(f'{number}', topic=None) for number in range(20)])
+    remove, pending_then = spool.remove_files, list[int]()
+
+    def removing(outcomes: Sequence[Outcome]) -> None:
+        if not pending_then:
+            writing.put(make('new', topic=None))
+        pending_then.append(spool.pending_count())
+        remove(outcomes)
+
+    monkeypatch.setattr(spool, 'remove_files', removing)
+    writing = opened(0.0)
+    writing.settle([Outcome(item, State.DELIVERED) for item in items])
+    assert writing.close(60)
+    assert (len(pending_then), pending_then[0], pending_then[-1]) == (20, 0, 1)
+    assert not any(item.path.exists() for item in items)
+    assert_whole(root)
+
+
+def test_whoever_settles_removes_files_meanwhile(
+    opened: Callable[..., SpoolWriter], spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of what was settled before, so that the writer's thread can commit."""
+    items = spool.commit([make(f'{number}', topic=None) for number in range(5)])
+    commit, remove = spool.commit, spool.remove_files
+    may_commit, is_committing, removed_by = threading.Event(), threading.Event(), list[int]()
+
+    def committing(objects: list[DataObject], *more: Any, **told: Any) -> list[SpooledObject]:
+        if objects:
+            is_committing.set()
+            assert may_commit.wait(60)
+        return commit(objects, *more, **told)
+
+    def removing(outcomes: Sequence[Outcome]) -> None:
+        if not removed_by:
+            writing.put(make('new', topic=None))
+        removed_by.append(threading.get_ident())
+        remove(outcomes)
+
+    monkeypatch.setattr(spool, 'commit', committing)
+    monkeypatch.setattr(spool, 'remove_files', removing)
+    writing = opened(0.0)
+    writing.prompt = True
+    writing.settle([Outcome(item, State.DELIVERED) for item in items[:4]])
+    assert is_committing.wait(60)
+    writing.settle([Outcome(items[4], State.DELIVERED)])
+    assert [ident == threading.get_ident() for ident in removed_by] == [False, True, True]
+    may_commit.set()
+    assert writing.close(60)
+    assert not any(item.path.exists() for item in items)
+    assert_whole(root)
 
 
 def test_what_was_delivered_leaves_a_full_disk_first(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
