@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from shadowhound_data_logger.capture.sensor_logger_node import main
 from shadowhound_data_logger.model import DataObject, Outcome, Put, RecordingRows, SpooledObject
@@ -25,14 +25,12 @@ _commit, _put = Spool.commit, S3Store.put
 
 def timed_commit(
     spool: Spool, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (), rows: Sequence[RecordingRows] = (), *,
-    durable: Callable[[list[SpooledObject]], None] = lambda _: None,
+    leave_files: bool = False,
 ) -> list[SpooledObject]:  # fmt: skip
-    def told(placed: list[SpooledObject]) -> None:
-        now_ns = time.time_ns()
-        durable_ns.update((item.id, now_ns) for item in placed)
-        durable(placed)
-
-    return _commit(spool, objects, outcomes, rows, durable=told)
+    placed = _commit(spool, objects, outcomes, rows, leave_files=leave_files)
+    now_ns = time.time_ns()
+    durable_ns.update((item.id, now_ns) for item in placed)
+    return placed
 
 
 def timed_put(store: S3Store, item: SpooledObject) -> Put:

@@ -140,6 +140,11 @@ def fits(tree: Tree, objects: Sequence[DataObject]) -> bool:
     return tree.free_bytes() >= sum(map(_cost, objects)) + BALLAST_BYTES
 
 
+def is_short(tree: Tree, settings: SpoolSettings, objects: Sequence[DataObject]) -> bool:
+    """Whether something would have to leave the disk for these objects."""
+    return tree.free_bytes() < sum(map(_cost, objects)) + max(BALLAST_BYTES, settings.min_free_bytes)
+
+
 def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, there: int, now_ns: int) -> int:
     """Evict the least important, of these the oldest, until ``needed`` bytes fit; returns how many objects that took."""
     evicted = 0

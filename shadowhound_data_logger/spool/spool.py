@@ -44,7 +44,7 @@ from shadowhound_data_logger.spool.request_table import (
     RequestTable,
     WaitingObject,
 )
-from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, evict_old, fits, make_room, thin_out
+from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, evict_old, fits, is_short, make_room, thin_out
 from shadowhound_data_logger.spool.session import Session, carry
 from shadowhound_data_logger.spool.thinning import ThinnableObject, Thinned, thin
 from shadowhound_data_logger.spool.usage import SpoolUsage, usage_of
@@ -138,7 +138,7 @@ class Spool:
         """One group commit. Returns the objects that may be shipped now, under their final keys.
 
         It does not cut what it is given: all is one transaction, for which other processes wait (``MOST_OBJECTS``).
-        ``leave_files``: those of what was delivered wait for ``remove_files``, which may take longer than the commit.
+        ``leave_files``: files of what is delivered or evicted wait for ``remove_files``, which may take longer than the commit.
         Raises OSError or sqlite3.OperationalError when nothing of it became durable; the caller tries again. Objects
         for which there is no room at all are recorded as evicted, those whose file is gone as quarantined.
         """
@@ -148,12 +148,12 @@ class Spool:
                 placed = self._ballast.work(lambda: self._commit(ready, outcomes, rows))
                 self._ballast.keep(self._tree.free_bytes, self._settings.min_free_bytes)
             remove_sources(self._tree, objects, ready)
-        if not leave_files:
-            self.remove_files(outcomes)
+        if follow := [each for each in outcomes if not leave_files or each.state is State.QUARANTINED]:
+            self.remove_files(follow)
         return placed
 
     def remove_files(self, outcomes: Iterable[Outcome]) -> None:
-        """Let the files follow their rows, which are durable; after a kill the next start does it."""
+        """Let the files of committed outcomes follow their rows; after a kill the next start does it."""
         for outcome in outcomes:
             item = outcome.item
             if outcome.state is State.QUARANTINED:
@@ -164,6 +164,10 @@ class Spool:
     def fits(self, objects: Sequence[DataObject]) -> bool:
         """Whether there is room for all of them before anything leaves the disk. Raises OSError."""
         return fits(self._tree, objects)
+
+    def is_short(self, objects: Sequence[DataObject]) -> bool:
+        """Whether something would have to leave the disk for them. Raises OSError."""
+        return is_short(self._tree, self._settings, objects)
 
     def knows(self, bucket: str, key: str, sha256: str) -> bool:
         """Whether this content was spooled under this (wanted) key, whatever became of it: a source of it is not needed any more.

@@ -4,6 +4,9 @@ At most one commit every ``commit_s``; the first after a quiet time waits for th
 what one poll took comes as several objects, and one commit costs less than two. Objects that stay here until somebody asks for
 them wait up to ``HEARTBEAT_S`` for others to be committed with. A commit that fails (a full or read-only disk) is tried again
 with everything that was in it; meanwhile ``put`` blocks the encoders, not the intake.
+
+Files of delivered objects are removed between commits, by this thread and by those that settle, or before one where the disk is
+short.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Final, NamedTuple
 
 from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.model import DataObject, FileBody, Outcome, RecordingRows, SpooledObject
+from shadowhound_data_logger.model import DataObject, FileBody, Outcome, RecordingRows, SpooledObject, State
 from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
 from shadowhound_data_logger.worker import Worker
 
@@ -32,7 +35,7 @@ HEARTBEAT_S: Final = 1.0
 MANY_OUTCOMES: Final = 64
 """So many outcomes are worth a commit of their own."""
 FILES_A_SETTLEMENT: Final = 2
-"""Whoever settles an object takes away so many files of earlier ones: more than one, so that they become fewer."""
+"""Files of earlier objects that ``settle`` removes for each outcome: more than one, or they would become no fewer."""
 MOST_BYTES: Final = 4 << 20
 """In one commit: nothing else is done in the spool while its files are written and synced."""
 HANGING_S: Final = 10.0
@@ -57,7 +60,8 @@ _Group = tuple[Sequence[_Unit], Sequence[Outcome]]
 class SpoolWriter:
     """Collects objects and outcomes, and commits them on one thread.
 
-    New; ``on_commit``; open once; put, settle, flush from any thread; close once. The lock of ``_changed`` guards the lists.
+    New; ``on_commit``; open once; put, settle, flush from any thread; close once. The lock of ``_changed`` guards the lists,
+    but for ``_leaving``, to which the thread alone adds, and from which takes who holds ``_removing``.
     """
 
     def __init__(self, spool: Spool, commit_s: float = COMMIT_S, expects: Callable[[], bool] = lambda: False) -> None:
@@ -73,9 +77,8 @@ class SpoolWriter:
         self._units: deque[_Unit] = deque()
         self._outcomes: deque[Outcome] = deque()
         self._leaving: deque[Outcome] = deque()
-        """Durable, with files that are still here."""
+        """Outcomes that are durable and whose files are still here."""
         self._removing = threading.Lock()
-        """Held while one of these is removed."""
         self._bytes = 0
         self._added = self._done = 0
         self._written = Counter[str]()
@@ -117,7 +120,7 @@ class SpoolWriter:
     def settle(self, outcomes: Sequence[Outcome]) -> None:
         """Queue outcomes of deliveries for the next commit; never waits for one.
 
-        Beside a backlog that is delivered it takes longer to remove files than to commit: those who settle do it as they go.
+        It also removes files of some objects settled before: while a backlog leaves, one thread does not keep up with that.
         """
         with self._changed:
             was_due = self._due()
@@ -152,13 +155,14 @@ class SpoolWriter:
             self._hurried.notify_all()
         ended = self.worker.join(end - time.monotonic() + HEARTBEAT_S)
         if ended:
-            self._remove_files()
+            self._remove_files(until=lambda: time.monotonic() >= end)
         return ended and flushed
 
     def _step(self) -> None:
-        self._remove_files(until=self._commit_is_due)
+        heartbeat_s = time.monotonic() + HEARTBEAT_S
+        self._remove_files(until=lambda: time.monotonic() >= heartbeat_s or self._may_commit(), wait=False)
         with self._changed:
-            if self._changed.wait_for(lambda: self._due() or self.worker.stopping, HEARTBEAT_S):
+            if self._changed.wait_for(lambda: self._due() or self.worker.stopping, heartbeat_s - time.monotonic()):
                 self._await_burst()
             self._pause(self._last_commit + self._commit_s - time.monotonic())
             units, outcomes = list(self._units), list(self._outcomes)
@@ -178,18 +182,21 @@ class SpoolWriter:
             raise
 
     def _remove_files(self, most: float = math.inf, until: Callable[[], bool] = lambda: False, *, wait: bool = True) -> None:
-        """Let files of what is settled follow their rows; unless ``wait``, not where another thread does."""
+        """Let files of what is settled follow their rows; unless ``wait``, not while another thread does."""
         if self._removing.acquire(blocking=wait):
             try:
                 while most > 0 and self._leaving and not until():
-                    self.spool.remove_files((self._leaving.popleft(),))
+                    self.spool.remove_files((self._leaving[0],))
+                    self._leaving.popleft()
                     most -= 1
             finally:
                 self._removing.release()
 
-    def _commit_is_due(self) -> bool:
+    def _may_commit(self) -> bool:
+        """Whether a commit is due and its pause is over."""
         with self._changed:
-            return self._urgent or (time.monotonic() >= self._last_commit + self._commit_s and self._due())
+            is_now = time.monotonic() >= self._last_commit + self._commit_s
+            return self._urgent or self.worker.stopping or (is_now and self._due())
 
     def _await_burst(self) -> None:
         """Wait until its last object has come, half of ``commit_s`` at most; the caller holds the lock."""
@@ -220,10 +227,11 @@ class SpoolWriter:
 
     def _commit(self, units: Sequence[_Unit], outcomes: Sequence[Outcome]) -> None:
         objects, rows = [item for unit in units for item in unit.objects], [each for unit in units for each in unit.rows]
-        if objects and self._leaving and not self.spool.fits(objects):
+        if self._leaving and self.spool.is_short(objects):
             self._remove_files()
-        self._committed(units, outcomes, self.spool.commit(objects, outcomes, rows, leave_files=True))
-        self._leaving.extend(outcomes)
+        spooled = self.spool.commit(objects, outcomes, rows, leave_files=True)
+        self._leaving.extend(outcome for outcome in outcomes if outcome.state is not State.QUARANTINED)
+        self._committed(units, outcomes, spooled)
 
     def _due(self) -> bool:
         """Whether there is something that waits for a commit; the caller holds the lock."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -173,10 +174,10 @@ def test_a_death_in_the_middle_of_a_retry(home: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize('reopens', [False, True])
-def test_what_waits_again_before_its_file_was_set_apart(home: Path, *, reopens: bool) -> None:
+def test_what_waits_again_before_its_file_was_set_apart(home: Path, monkeypatch: pytest.MonkeyPatch, *, reopens: bool) -> None:
     """A retry, or another process's start, between the row and the file: the file stays where the object waits."""
 
-    def meanwhile(_: object) -> None:
+    def meanwhile() -> None:
         if reopens:
             other = new_spool(home / 'spool')
             other.open()
@@ -187,7 +188,15 @@ def test_what_waits_again_before_its_file_was_set_apart(home: Path, *, reopens: 
     spool = new_spool(home / 'spool')
     spool.open()
     (item,) = put(spool, make('thor/camera/x.jpg', b'x'))
-    spool.commit(outcomes=[Outcome(item, State.QUARANTINED, 'access_denied')], durable=meanwhile)
+    remove = spool.remove_files
+
+    def remove_later(outcomes: Iterable[Outcome]) -> None:
+        meanwhile()
+        remove(outcomes)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(spool, 'remove_files', remove_later)
+        spool.commit(outcomes=[Outcome(item, State.QUARANTINED, 'access_denied')])
     assert states(home)['x.jpg'] == 'pending'
     assert_whole(home / 'spool')
     settle(spool, item, State.QUARANTINED, 'access_denied')

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from ship.fakes import until
-from spool.making import assert_whole, files, make, receive, rows
+from spool.making import assert_whole, files, make, new_spool, receive, rows
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger import worker
@@ -263,8 +263,10 @@ def test_files_that_leave_make_way_for_a_commit(
     monkeypatch.setattr(spool, 'remove_files', removing)
     writing = opened(0.0)
     writing.settle([Outcome(item, State.DELIVERED) for item in items])
+    assert writing.flush(60)
+    until(lambda: len(pending_then) == 20)
     assert writing.close(60)
-    assert (len(pending_then), pending_then[0], pending_then[-1]) == (20, 0, 1)
+    assert (pending_then[0], pending_then[-1]) == (0, 1)
     assert not any(item.path.exists() for item in items)
     assert_whole(root)
 
@@ -292,8 +294,10 @@ def test_whoever_settles_removes_files_meanwhile(
     monkeypatch.setattr(spool, 'commit', committing)
     monkeypatch.setattr(spool, 'remove_files', removing)
     writing = opened(0.0)
+    settling = threading.Thread(target=writing.settle, args=[[Outcome(item, State.DELIVERED) for item in items[:4]]])
     writing.prompt = True
-    writing.settle([Outcome(item, State.DELIVERED) for item in items[:4]])
+    settling.start()
+    settling.join()
     assert is_committing.wait(60)
     writing.settle([Outcome(items[4], State.DELIVERED)])
     assert [ident == threading.get_ident() for ident in removed_by] == [False, True, True]
@@ -301,6 +305,40 @@ def test_whoever_settles_removes_files_meanwhile(
     assert writing.close(60)
     assert not any(item.path.exists() for item in items)
     assert_whole(root)
+
+
+def test_files_that_leave_make_room_before_anything_is_evicted(
+    root: Path, disk_of: DiskOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the disk is short by ``spool.min_free_bytes`` alone, and what was delivered had a commit of its own."""
+    body = bytes(200_000)
+    cost = len(body) + OVERHEAD_BYTES
+    disk_of(100 * cost)
+    spool = new_spool(root, min_free_bytes=95 * cost)
+    spool.open()
+    writing = SpoolWriter(spool, 0.0)
+    remove, removed = spool.remove_files, list[Outcome]()
+
+    def removing(outcomes: Sequence[Outcome]) -> None:
+        if not removed:
+            for number in range(4):
+                receive(spool)
+                writing.put(make(f'new{number}', body))
+        removed.extend(outcomes)
+        remove(outcomes)
+
+    monkeypatch.setattr(spool, 'remove_files', removing)
+    for number in range(4):
+        receive(spool)
+        spool.commit([make(f'old{number}', body)])
+    writing.open()
+    writing.settle([Outcome(item, State.DELIVERED) for item in spool.pending(4)])
+    assert writing.flush(60)
+    until(lambda: writing.written()[0] == 4)
+    assert writing.close(60)
+    found = assert_whole(root)['objects']
+    assert (len(removed), found['delivered'], found['pending'], found['evicted']) == (4, 4, 4, 0)
+    spool.close()
 
 
 def test_what_was_delivered_leaves_a_full_disk_first(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
