@@ -222,7 +222,7 @@ def until_poll(wall_s: float) -> float:
     """Seconds from a poll to the next one, which is halfway between two multiples of ``POLL_S``: a quarter of that at least.
 
     What the sensors keep once a second then comes with one poll, 0.1 s after the second begins, and is one burst for the spool:
-    by then the first message is there of every topic with ten a second or more.
+    by then every topic of 10 Hz or more has sent its first message.
     """
     return POLL_S - ((wall_s - POLL_S / 4) % POLL_S - POLL_S / 4)
 
