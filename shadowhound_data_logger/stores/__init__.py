@@ -6,7 +6,10 @@ How fast bytes may leave is kept by ``bandwidth.py``, how long a retry waits by 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores.directory import DirectoryStore
@@ -24,7 +27,8 @@ def open_store(settings: StoreSettings, upload: UploadSettings) -> ObjectStore:
     """
     store: ObjectStore = DirectoryStore(settings.directory)
     if settings.endpoint_url:
-        from shadowhound_data_logger.stores.s3 import S3Store  # noqa: PLC0415 - botocore costs 60 MB and half a second
+        with _without_pyopenssl():
+            from shadowhound_data_logger.stores.s3 import S3Store  # noqa: PLC0415 - botocore costs 60 MB and half a second
 
         store = S3Store(settings, upload)
     store.open()
@@ -43,3 +47,17 @@ def open_reader(settings: StoreSettings) -> ObjectStore:
     store = ObstoreStore(settings, UploadSettings())
     store.open()
     return store
+
+
+@contextmanager
+def _without_pyopenssl() -> Iterator[None]:
+    """Hide pyOpenSSL, which botocore loads and never uses: 12 MB in each process where the extra ``webrtc`` is installed."""
+    modules: dict[str, Any] = sys.modules
+    if 'OpenSSL' in modules:
+        yield
+        return
+    modules['OpenSSL'] = None  # to import it is an error meanwhile
+    try:
+        yield
+    finally:
+        del modules['OpenSSL']
