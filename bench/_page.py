@@ -190,8 +190,11 @@ def _latency(figures: Figures) -> str:
     words = {'durable': 'durable: the group commit returned', 'confirmed': 'confirmed: the put returned',
              'created_ns': 'index: `created_ns`', 'settled_ns': 'index: `settled_ns`'}  # fmt: skip
     names = ('p50', 'p90', 'p99', 'max')
-    rows = [(words[name], *(f'{row[each]:.0f} ms' for each in names)) for name, row in figures['ms'].items()]
-    return _table(('from the stamp until', *names), rows)
+    told = [(words[name], row) for name, row in figures['ms'].items()]
+    if leaving := figures.get('leaving'):
+        waiting = ', then '.join(f'{count:,}' for count in leaving['waiting'])
+        told.append((f'durable while a backlog leaves ({waiting} objects)', leaving['ms']))
+    return _table(('from the stamp until', *names), [(what, *(f'{row[each]:.0f} ms' for each in names)) for what, row in told])
 
 
 def _encode(figures: Figures) -> str:

@@ -48,7 +48,7 @@ STEPS: Final = (
     Step('full_rate', ('--seconds', '60', '--away', '300'), ('--seconds', '10', '--away', '10')),
     Step('backlog_memory', (), ('--seconds', '5', '--away', '10', '--back', '20')),
     Step('bag_recording', ('--seconds', '40'), ('--seconds', '10')),
-    Step('latency', ('--seconds', '30'), ('--seconds', '8')),
+    Step('latency', ('--seconds', '30'), ('--seconds', '8', '--away', '10')),
     Step('drain', ('--rounds', '5', '--scale', '0.3'), ('--rounds', '2', '--scale', '0.1')),
     Step('mission_calls', ('--seconds', '20'), ('--seconds', '3')),
     Step('missions', quick=('--points', '10000')),
